@@ -36,7 +36,7 @@ import numpy as np
 from benchmarks.conveyor_station import spec_of
 from benchmarks.report import Figure, Report
 from runtime.core.types import Float64
-from runtime.processes.coordinator.session.machine import State
+from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.sim.conveyor import COURSE_S, Conveyor
 
@@ -106,7 +106,7 @@ def _row(episodes: list[Chased]) -> dict[str, Any]:
         name: float(np.mean([getattr(one, field) for one in episodes])) for name, field in figures.items()
     }
     shares = [round(one.share, 4) for one in episodes]
-    held = sum(one.state != State.RUNNING for one in episodes)
+    held = sum(one.state != SessionState.RUNNING for one in episodes)
     row = {"strategy": first.strategy, "delay": first.delay, "episodes": len(episodes), **means}
     return row | {"shares": shares, "held": held}
 
@@ -142,9 +142,9 @@ def _follow(station: Lockstep, conveyor: Conveyor) -> Float64:
     """Set up, run until the course is over; returns the arms' commands [ticks, D] of the course."""
     session, commanded = station.coordinator.session, []
     station.connect()
-    station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+    station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
     station.command("setup")
-    station.until(lambda: session.state is State.READY, 60.0, "set-up")
+    station.until(lambda: session.state is SessionState.READY, 60.0, "set-up")
     station.command("run")
     end = station.clock.now() + _ARRIVING_S + COURSE_S
 

@@ -20,8 +20,8 @@ from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.plugins import variants
 from runtime.core.types import ActionChunk, Conditioning, Float32, Float64, Observation, RobotCommand
+from runtime.ipc.session_state import SessionState
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.processes.coordinator.session.machine import State
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.station import spec as station_spec
 from runtime.station.spec import StationSpec
@@ -155,9 +155,9 @@ def _run(spec: KnownPlan) -> tuple[int, Mapping[int, Float32]]:
     with closing(Lockstep(spec)) as station:
         session = station.coordinator.session
         station.connect()
-        station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+        station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
         station.command("setup")
-        station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
+        station.until(lambda: session.state is not SessionState.SETTING_UP, 60.0, "set-up")
         station.command("run")
         end = station.step + _TICKS + 1
 

@@ -116,7 +116,7 @@ def _check(made: StationSpec) -> int:
 
 def run_in_lockstep(made: StationSpec) -> int:
     """Run, print how it went, export it, publish what ended well; returns the exit code."""
-    from runtime.processes.coordinator.session.transitions import State
+    from runtime.ipc.session_state import SessionState
     from runtime.processes.lockstep import lockstep
 
     done = lockstep.run(made)
@@ -130,7 +130,7 @@ def run_in_lockstep(made: StationSpec) -> int:
 
         print(f"export   {export(Path(episode['path']), made.deployment.data)}")
     # A run that held was ended by nobody's judgement: it is kept, but neither published nor a success.
-    well = done.state is State.READY and episode.get("status", "finished") == "finished"
+    well = done.state is SessionState.READY and episode.get("status", "finished") == "finished"
     into = made.deployment.publish
     if well and into.dataset and episode and made.deployment.run.mode != "sim":
         from runtime.datasets.published import publish

@@ -58,7 +58,7 @@ def _do(client: StationClient, given: argparse.Namespace) -> int:
 def _attended(client: StationClient, given: argparse.Namespace) -> int:
     status = attend(client, given.command, arguments(given), _silent if given.json else _say)
     _show(status, given.json)
-    return _outcome("" if status["state"] == "ready" else f"{status['state']}, {status['reason']}")
+    return _outcome("" if status["state_is"]["ready"] else f"{status['state']}, {status['reason']}")
 
 
 def _within(
@@ -105,7 +105,7 @@ def _setup(client: StationClient, given: argparse.Namespace) -> int:
     if not given.cancel:
         return _attended(client, given)
     status = client.status()
-    if status["state"] != "setting_up":  # else it would stop a run
+    if not status["state_is"]["preparing"]:  # else it would stop a run
         raise Refused(f"there is no set-up to cancel: the station is {status['state']}")
     return _within(client, given, "stop", {})
 
@@ -118,7 +118,7 @@ def _run(client: StationClient, given: argparse.Namespace) -> int:
 
 
 def _approach(client: StationClient, given: argparse.Namespace) -> int:
-    if client.status()["state"] == "running":
+    if client.status()["state_is"]["going"]:
         return _within(client, given, "approach", {}, "motion_done")
     return _attended(client, given)
 
@@ -176,7 +176,7 @@ def _record(client: StationClient, given: argparse.Namespace) -> int:
 
 def _release(client: StationClient, given: argparse.Namespace) -> int:
     client.command("release")
-    _show(client.wait(lambda status: status["state"] != "faulted", _RELEASE_S), given.json)
+    _show(client.wait(lambda status: not status["state_is"]["latched"], _RELEASE_S), given.json)
     return DONE
 
 

@@ -23,11 +23,11 @@ from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError
 from runtime.core.types import EEF_WIDTH, ActionChunk, Conditioning, Float64, Observation
+from runtime.ipc.session_state import SessionState
 from runtime.kinematics.forward import ChainForward
 from runtime.motion.timeline import difference
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.coordinator.inference.worker import LockstepRunner
-from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.lockstep.lockstep import Around, Lockstep
 from runtime.spaces.end_effectors import EndEffectors
 from runtime.station import spec as station_spec
@@ -311,9 +311,9 @@ def _run(spec: SeldomPlan, made: Scenario, random: np.random.Generator) -> Plann
     with closing(Lockstep(spec, around=around)) as station:
         session = station.coordinator.session
         station.connect()
-        station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+        station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
         station.command("setup")
-        station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
+        station.until(lambda: session.state is not SessionState.SETTING_UP, 60.0, "set-up")
         station.command("run")
         end = station.step + _TICKS
 
@@ -322,7 +322,7 @@ def _run(spec: SeldomPlan, made: Scenario, random: np.random.Generator) -> Plann
             row, step = status["smoothed"].astype(np.float64), int(status["step"])
             if np.isfinite(row).all():
                 planned.rows[step] = row
-            if session.state is not State.RUNNING:
+            if session.state is not SessionState.RUNNING:
                 planned.held |= {step, step + 1}  # in the former an answer may be laid that is told no more
             if not station.coordinator.inference.continues:
                 planned.other.add(step + 1)
@@ -344,13 +344,13 @@ def _run(spec: SeldomPlan, made: Scenario, random: np.random.Generator) -> Plann
 def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -> None:
     """What a person might do now."""
     state = station.coordinator.session.state
-    if state is State.READY:
+    if state is SessionState.READY:
         station.command("run")
-    elif state is State.HOLDING:
+    elif state is SessionState.HOLDING:
         station.command("resume" if random.random() < 0.7 else "stop")
-    elif state is State.RUNNING and random.random() < 0.3:
+    elif state is SessionState.RUNNING and random.random() < 0.3:
         station.command("halt" if random.random() < 0.7 else "stop")
-    elif state is State.RUNNING:
+    elif state is SessionState.RUNNING:
         kind = str(random.choice(_KINDS))
         station.command("tune", strategy=made.strategy if kind == "rtc" else {"kind": kind})
 

@@ -81,7 +81,7 @@ def start(visitor: Visitor, page: LivePage, choice: Choice) -> int:
 
 def take(page: LivePage) -> None:
     """Take the station once it is there."""
-    page.follow(lambda state: state["state"] != "disconnected", "waiting for the station", went_on)
+    page.follow(lambda state: state["state_is"]["connected"], "waiting for the station", went_on)
     page.claim()
     page.follow(lambda state: state["lease"]["epoch"] == page.epoch, "waiting for the lease", went_on)
 
@@ -101,14 +101,14 @@ def _elapsed(state: Mapping[str, Any]) -> float:
 def set_up_and_run(page: LivePage, trial: int, lockstep: bool = False) -> None:
     """Set the station up for a prepared trial, and begin its run."""
     page.command("setup", trial)
-    set_up = page.follow(lambda state: state["state"] != "setting_up", "setting up", went_on)
-    if set_up["state"] != "ready":
+    set_up = page.follow(lambda state: not state["state_is"]["preparing"], "setting up", went_on)
+    if not set_up["state_is"]["ready"]:
         raise VisitFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
     page.command("run", trial)
     # One that holds at once, because an observation was late, has begun too: it is resumed. In lockstep, as fast as the
     # machine, one may have begun and ended between two looks.
-    begun = ("running", "holding", "ready") if lockstep else ("running", "holding")
-    page.follow(lambda state: state["state"] in begun, "starting the run", went_on)
+    begun = "set_up" if lockstep else "run_open"
+    page.follow(lambda state: state["state_is"][begun], "starting the run", went_on)
 
 
 def report(done: Done) -> dict[str, Any]:
@@ -132,17 +132,17 @@ def run_to_its_end(page: LivePage, trial: int, limit: float, lockstep: bool = Fa
             succeeded = 0.0
         elif not succeeded:
             succeeded = state["clock"]
-        return state["state"] != "running" or bool(succeeded and state["clock"] - succeeded >= _REST_S)
+        return not state["state_is"]["going"] or bool(succeeded and state["clock"] - succeeded >= _REST_S)
 
     for resumed in range(_RESUMES + 1):
         state = page.follow(over, "running", lambda now: (went_on(now), _elapsed(now)))
-        if state["state"] != "holding" or resumed == _RESUMES:
+        if not state["state_is"]["held"] or resumed == _RESUMES:
             break
         page.command("resume", trial)
-        page.follow(lambda now: now["state"] != "holding", "resuming", went_on)
-    if state["state"] in ("running", "holding"):
+        page.follow(lambda now: not now["state_is"]["held"], "resuming", went_on)
+    if state["state_is"]["run_open"]:
         page.command("stop")
-    page.follow(lambda now: now["state"] not in ("running", "holding"), "stopping", went_on)
+    page.follow(lambda now: not now["state_is"]["run_open"], "stopping", went_on)
     return resumed
 
 

@@ -94,5 +94,5 @@ class Preflight(models.Model):
     def tone(self) -> str:
         """Its colour, by the name the style sheets have for it."""
         if self.status == PreflightStatus.RUNNING:
-            return "running"
-        return "ready" if self.verdict == Verdict.OK else "holding" if not self.verdict else "faulted"
+            return "ok"
+        return "active" if self.verdict == Verdict.OK else "warn" if not self.verdict else "danger"

@@ -32,7 +32,6 @@ from runtime.config.loader import ConfigurationError, server_of
 from runtime.ipc.messages import Command
 
 log = logging.getLogger(__name__)
-_AT_WORK = ("setting_up", "running", "holding")
 _LOOK_S = 0.5  # how long another station may take to say which server it uses
 _UNTOLD = timedelta(hours=1)  # after which one is over of which nobody said how long it may take
 
@@ -104,7 +103,7 @@ def _first_station() -> Station:
     stations = list(station_list())
     for station in stations:
         try:
-            if wire_to(station.name).status(timeout=_LOOK_S).get("state") not in _AT_WORK:
+            if not wire_to(station.name).status(timeout=_LOOK_S)["state_is"]["at_work"]:
                 return station
         except StationGone:
             continue
@@ -133,9 +132,9 @@ def _require_free(server: str, besides: Station) -> None:
             ack = wire_to(other.name).request(Command(str(uuid4()), "policy_server"), timeout=_LOOK_S)
         except StationGone:
             continue
-        if ack.data.get("server") == server and ack.data.get("state") in _AT_WORK:
+        if ack.data.get("server") == server and ack.data["state_is"]["at_work"]:
             raise Conflict(
-                f"{other} is {str(ack.data['state']).replace('_', ' ')} with the same policy server: a preflight would "
+                f"{other} is {ack.data['state_is']['label']} with the same policy server: a preflight would "
                 "disturb it; wait until its run is over"
             )
 

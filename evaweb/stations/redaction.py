@@ -18,6 +18,7 @@ _SHOWN = (
     "station",
     "robot",
     "state",
+    "state_is",
     "allowed",
     "guarded",
     "mode",
@@ -64,7 +65,7 @@ def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
     shown = {key: snapshot[key] for key in _SHOWN if key in snapshot}
     shown["reason"] = sight.told(str(snapshot.get("reason") or ""))
     shown |= {key: empty for key, empty in _COVERED.items() if key in snapshot}
-    if shown.get("state") == "setting_up":
+    if (snapshot.get("state_is") or {}).get("preparing"):
         shown["stage"] = "setting up"
     if isinstance(snapshot.get("facts"), Mapping):
         shown["facts"] = {key: value for key, value in snapshot["facts"].items() if key not in _FACTS}

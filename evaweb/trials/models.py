@@ -206,14 +206,14 @@ class TrialStatus(models.TextChoices):
 
 
 _TONES = {
-    TrialStatus.PREPARED: "ready",
-    TrialStatus.RUNNING: "running",
-    TrialStatus.PAUSED: "holding",
-    TrialStatus.ENDED: "holding",
-    TrialStatus.INTERRUPTED: "faulted",
-    TrialStatus.SCORED: "idle",
-    TrialStatus.VOIDED: "idle",
-    TrialStatus.ABANDONED: "idle",
+    TrialStatus.PREPARED: "active",
+    TrialStatus.RUNNING: "ok",
+    TrialStatus.PAUSED: "warn",
+    TrialStatus.ENDED: "warn",
+    TrialStatus.INTERRUPTED: "danger",
+    TrialStatus.SCORED: "neutral",
+    TrialStatus.VOIDED: "neutral",
+    TrialStatus.ABANDONED: "neutral",
 }
 
 

@@ -21,11 +21,9 @@ from evaweb.stations.models import Command, Station
 from evaweb.trials import lifecycle
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import Trial, TrialStatus
+from runtime.ipc.session_state import SessionState
 
 log = logging.getLogger(__name__)
-
-# The session's state -> what that means for a trial that is under way. Any other state interrupts it.
-_MEANING = {"running": Move.RESUME, "holding": Move.PAUSE, "ready": Move.END}
 
 
 def run_changed(*, station: Station, event: Mapping[str, Any], boot: str | None = None) -> Trial | None:
@@ -104,7 +102,8 @@ def _find_trial_of(station: Station, episode: UUID | None) -> None:
 def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | None:
     """The event of an accepted `run`: from its number on the station's events are about this trial."""
     data = event.get("data") or {}
-    if data.get("to") != "running" or data.get("from") == "running":
+    before, after = (SessionState.of(str(data.get(end))) for end in ("from", "to"))
+    if after is None or not after.going or (before is not None and before.going):
         return None
     command = Command.objects.filter(pk=_uuid(data.get("uuid")), station=station, kind="run").first()
     asked = (command.args.get("trial") or {}) if command else {}
@@ -146,7 +145,10 @@ def _meaning(state: str, unbegun: Mapping[str, Any]) -> Move:
     """A run that never began is no attempt: it is made again as it is where nothing of it was opened, else repeated."""
     if unbegun:
         return Move.GIVE_BACK if unbegun.get("unopened") else Move.INTERRUPT
-    return _MEANING.get(state, Move.INTERRUPT)
+    session = SessionState.of(state)
+    if session is None or not session.set_up:
+        return Move.INTERRUPT
+    return Move.END if session.ready else Move.RESUME if session.moving else Move.PAUSE
 
 
 def _given_back(trial: Trial, reason: str) -> None:

@@ -37,8 +37,8 @@ def drive(spec: StationSpec, client: StationClient) -> dict[str, Any]:
     attended = Attended(client)
     attended.begin()
     status = attended.run()
-    how, well = status["reason"], status["state"] == "ready"
-    if status["state"] == "holding":
+    how, well = status["reason"], status["state_is"]["ready"]
+    if status["state_is"]["held"]:
         client.command("stop")
     try:
         status = attended.conclude()
@@ -79,16 +79,16 @@ class Attended:
         """Wait for the station, claim it, set it up; raises RuntimeFault with the reason where it is not ready."""
         self._wait_for_start()
         self._client.claim()
-        self.until(lambda s: s["state"] != "disconnected", _START_S, "the first observation")
+        self.until(lambda s: s["state_is"]["connected"], _START_S, "the first observation")
         self._client.command("setup")
-        status = self.until(lambda s: s["state"] != "setting_up", _SETUP_S, "set-up")
-        if status["state"] != "ready":
+        status = self.until(lambda s: not s["state_is"]["preparing"], _SETUP_S, "set-up")
+        if not status["state_is"]["ready"]:
             raise RuntimeFault(f"set-up failed: {status['reason']}")
 
     def run(self) -> dict[str, Any]:
         """One run to its end, however it ends; returns the status then."""
         self._client.command("run")
-        return self.until(lambda s: s["state"] != "running", math.inf, "the end of the run")
+        return self.until(lambda s: not s["state_is"]["going"], math.inf, "the end of the run")
 
     def conclude(self) -> dict[str, Any]:
         """Wait until what was recorded, if anything was, is on disk; returns the status then."""

@@ -222,9 +222,9 @@ export class CollectPanel {
     while (performance.now() < until) {
       const { snapshot } = this.#store;
       why = whyNotStart(snapshot, this.session) || this.#commands.reason("run");
-      const open = Boolean(snapshot?.collect?.episode) || snapshot?.state === "running";
+      const open = Boolean(snapshot?.collect?.episode) || snapshot?.state_is.going;
       if (!open && !why) return "";
-      if (!open && snapshot?.state !== "holding" && why === "arm first") return snapshot.collect.why_not || why;
+      if (!open && !snapshot?.state_is.held && why === "arm first") return snapshot.collect.why_not || why;
       await new Promise((resolve) => setTimeout(resolve, 50));
     }
     return why || "the robot is not at rest";

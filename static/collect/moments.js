@@ -1,9 +1,9 @@
 // What the buttons of the Collect page mean at each moment, and why not; nothing here touches the page.
 
 /** What the big button does now: {kind, text}. Wherever the robot moves it stops; only at rest does it start. */
-export function big({ state } = {}) {
-  if (state === "setting_up") return { kind: "stop", text: "Cancel the set-up" };
-  if (state === "running" || state === "holding") return { kind: "stop", text: "Stop and save" };
+export function big({ state_is: is } = {}) {
+  if (is?.preparing) return { kind: "stop", text: "Cancel the set-up" };
+  if (is?.run_open) return { kind: "stop", text: "Stop and save" };
   return { kind: "run", text: "Start" };
 }
 
@@ -22,8 +22,8 @@ export function subject(collect, seen) {
 }
 
 /** Why nothing can be said of an episode now, "" where it can. */
-export function whyNotLabel({ state, collect } = {}, episode) {
-  if (collect?.episode && (state === "running" || state === "holding")) return "stop and save first";
+export function whyNotLabel({ state_is: is, collect } = {}, episode) {
+  if (collect?.episode && is?.run_open) return "stop and save first";
   if (!episode) return "no episode yet";
   return discarded(collect, episode) ? "the episode is discarded" : "";
 }
@@ -56,18 +56,18 @@ export function leaderWords(collect) {
 }
 
 /** The arm in words: that the next episode may begin, or why it may not. */
-export function armWords({ state, collect } = {}) {
+export function armWords({ state_is: is, collect } = {}) {
   if (!collect) return "";
-  if (collect.episode && state === "running") return "recording";
+  if (collect.episode && is?.going) return "recording";
   return collect.armed ? "armed: Start begins an episode" : collect.why_not || "not armed";
 }
 
 /** The step to do now. */
-export function step(snapshot, session) {
-  const { state, collect } = snapshot ?? {};
-  if (!session) return "session";
-  if (state === "running" || state === "holding") return "record";
-  if (state !== "ready" || !collect?.set_up) return "setup";
+export function step(snapshot, opened) {
+  const { state_is: is, collect } = snapshot ?? {};
+  if (!opened) return "session";
+  if (is?.run_open) return "record";
+  if (!is?.ready || !collect?.set_up) return "setup";
   const { last } = collect;
   return last && !last.result && !last.discarded ? "result" : "record";
 }

@@ -2,7 +2,7 @@
 
 import { get, RequestFailed } from "../site/api.js";
 import { quietFragments } from "../site/fragments.js";
-import { words } from "./live/words.js";
+import { badge } from "./live/badge.js";
 
 const EVERY_MS = 4000;
 
@@ -11,7 +11,7 @@ async function ask(element) {
   const reason = document.querySelector(`[data-live-reason="${CSS.escape(name)}"]`);
   try {
     const { snapshot, gone } = await get(`/api/v1/stations/${encodeURIComponent(name)}`);
-    show(element, snapshot?.state);
+    show(element, snapshot?.state_is);
     reason.textContent = snapshot ? snapshot.reason : gone;
   } catch (error) {
     if (!(error instanceof RequestFailed)) throw error;
@@ -20,10 +20,10 @@ async function ask(element) {
   }
 }
 
-function show(element, state) {
-  element.toggleAttribute("data-stale", !state);
-  element.dataset.state = state ?? "";
-  element.textContent = state ? words(state) : "not running";
+function show(element, session) {
+  element.toggleAttribute("data-stale", !session);
+  badge(element, session);
+  element.textContent = session ? session.label : "not running";
 }
 
 function askAll() {

@@ -95,11 +95,11 @@ class Pane {
     const { chunks, header } = this.#episode;
     if (chunks.spans.length) mark(element, "chunk", "--mark-chunk", "hairline", "Where another chunk takes over; the strip over the curves has its number");
     if (chunks.overlaps.length) mark(element, "overlap", "--mark-overlap", "patch", "Steps that several chunks made");
-    if (header.held.length) mark(element, "held", "--holding-soft", "patch", "Nobody asked the robot for anything");
-    if (safety.includes(1)) mark(element, "changed", "--holding", "tick", "Safety had another action sent than was asked for");
-    if (safety.includes(2)) mark(element, "refused", "--faulted", "tick", "Safety let nothing be sent");
+    if (header.held.length) mark(element, "held", "--warn-soft", "patch", "Nobody asked the robot for anything");
+    if (safety.includes(1)) mark(element, "changed", "--warn", "tick", "Safety had another action sent than was asked for");
+    if (safety.includes(2)) mark(element, "refused", "--danger", "tick", "Safety let nothing be sent");
     if (header.marks.length) mark(element, "event", "--text-normal", "tick", "Something that the list of events tells, at the top of the plot");
-    if (header.marks.some(({ kind }) => tunes(kind))) mark(element, "tuned", "--ready", "hairline", "Another strategy, or other parameters, from here on");
+    if (header.marks.some(({ kind }) => tunes(kind))) mark(element, "tuned", "--active", "hairline", "Another strategy, or other parameters, from here on");
     const { spaces } = this.#episode;
     if (!spaces.includes("joint")) this.#legend.explain("raw", `The policy speaks in ${spaces.join(", ") || "no"} space: it has no joint to draw.`);
   }

@@ -50,7 +50,7 @@ export class Lane {
     const wide = Math.max(1, end - begin);
     const own = id === chosen && legible;
     ctx.globalAlpha = own ? 1 : legible && odd ? 0.24 : 0.42;
-    ctx.fillStyle = css(own ? "--curve-4" : id === 0 ? "--holding" : "--mark-chunk");
+    ctx.fillStyle = css(own ? "--curve-4" : id === 0 ? "--warn" : "--mark-chunk");
     ctx.fillRect(begin, top, wide, tall);
     ctx.globalAlpha = 1;
     const name = id === 0 ? "held" : String(id);

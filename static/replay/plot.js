@@ -128,12 +128,12 @@ export class Plot {
   #drawBehind(plot) {
     this.#inside(plot, (ctx, x, place) => {
       const { top, height } = place;
-      ctx.fillStyle = css("--holding-soft");
+      ctx.fillStyle = css("--warn-soft");
       for (const [from, to] of this.#behind.held) ctx.fillRect(x(from), top, Math.max(1, x(to) - x(from)), height);
       this.#lane.behind(ctx, x, place);
       for (const { time, kind } of this.#behind.marks) {
         const tall = tunes(kind) ? height : EVENT_HEIGHT * devicePixelRatio;
-        ctx.fillStyle = css(tunes(kind) ? "--ready" : "--text-normal");
+        ctx.fillStyle = css(tunes(kind) ? "--active" : "--text-normal");
         ctx.fillRect(Math.round(x(time)), top, 2 * devicePixelRatio, tall);
       }
       if (this.#shown(RAW.name)) this.#drawRaw(plot, ctx, x);
@@ -171,7 +171,7 @@ export class Plot {
     this.#inside(plot, (ctx, x, { top, height }) => {
       const tall = SAFETY_HEIGHT * devicePixelRatio;
       for (const { time, refused } of this.#behind.safety) {
-        ctx.fillStyle = css(refused ? "--faulted" : "--holding");
+        ctx.fillStyle = css(refused ? "--danger" : "--warn");
         ctx.fillRect(x(time), top + height - tall * (refused ? 2 : 1), Math.max(1, devicePixelRatio), tall * (refused ? 2 : 1));
       }
     });

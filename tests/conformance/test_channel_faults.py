@@ -14,7 +14,7 @@ import pytest
 import zmq
 
 from runtime.clients.channel.message import LARGEST
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from tests.processes import eventually
 from tests.runtime.clients.channel.bench import Bench, Script
 
@@ -57,7 +57,7 @@ MESSAGES: dict[str, tuple[list[bytes], str]] = {
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     made = Bench(tmp_path_factory.mktemp("station"))
-    made.reach(State.IDLE)
+    made.reach(SessionState.IDLE)
     yield made
     made.close()
 

@@ -16,10 +16,11 @@ import zmq
 from runtime.ipc.bus import CommandServer, Endpoints, EventLog, Key, Publisher
 from runtime.ipc.identity import forged, identified, lacking
 from runtime.ipc.messages import Ack, Command, Event
+from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.session.effects import Effects, GuardFacts
 from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
-from runtime.processes.coordinator.session.transitions import STOPPING, SessionEvent, State
+from runtime.processes.coordinator.session.transitions import STOPPING, SessionEvent
 
 DIM = 14
 
@@ -101,7 +102,7 @@ class StandIn:
     def ready(self) -> None:
         """As after a set-up."""
         self.enter(SessionEvent.CONNECTED)
-        self.do(lambda: self.session._enter(State.READY, "set up"))
+        self.do(lambda: self.session._enter(SessionState.READY, "set up"))
 
     def situated(self, situation: GuardFacts) -> None:
         """Let the guards of commands see this."""
@@ -126,6 +127,7 @@ class StandIn:
             "station": self.name,
             "robot": "agilex_piper",
             "state": str(self.session.state),
+            "state_is": self.session.state.told(),
             "reason": self.session.reason,
             "allowed": self.session.allowed(),
             "guarded": self.session.guarded(),
@@ -144,7 +146,7 @@ class StandIn:
         before = self.session.state
         if self.session.observe(happening, reason):
             text = f"{before} -> {self.session.state}: {reason}"
-            data = {"state": str(self.session.state)}
+            data = {"state": str(self.session.state), "state_is": self.session.state.told()}
             self.events.append(Event("state", text, time.monotonic(), data=data))
 
     def _run(self, ended: threading.Event) -> None:

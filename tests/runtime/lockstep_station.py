@@ -13,8 +13,8 @@ import numpy as np
 from runtime.config import loader
 from runtime.core.errors import PolicyError
 from runtime.core.types import ActionChunk, Conditioning, Float64, Observation, RobotCommand, Space
+from runtime.ipc.session_state import SessionState
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.station import spec as station_spec
@@ -210,7 +210,7 @@ class Station(Lockstep):
         self.connect()
 
     @property
-    def state(self) -> State:
+    def state(self) -> SessionState:
         return self.coordinator.session.state
 
     @property
@@ -222,12 +222,12 @@ class Station(Lockstep):
         left = self.step + ticks
         self.until(lambda: self.step >= left, ticks + 1.0, "ticks")
 
-    def reach(self, state: State, seconds: float = 30.0) -> None:
+    def reach(self, state: SessionState, seconds: float = 30.0) -> None:
         self.until(lambda: self.state is state, seconds, f"{state}")
 
     def ready(self, **arguments: Any) -> Station:
         self.prepare(**arguments)
-        assert self.state is State.READY, self.reason
+        assert self.state is SessionState.READY, self.reason
         return self
 
     def running(self, ticks: int = 30) -> Station:
@@ -247,9 +247,11 @@ class Station(Lockstep):
 
     def prepare(self, **arguments: Any) -> None:
         """Set up, to whatever end."""
-        self.until(lambda: self.state in (State.IDLE, State.READY), 30.0, "a state to set up from")
+        self.until(
+            lambda: self.state in (SessionState.IDLE, SessionState.READY), 30.0, "a state to set up from"
+        )
         self.command("setup", **arguments)
-        self.until(lambda: self.state is not State.SETTING_UP, 60.0, "set-up")
+        self.until(lambda: self.state is not SessionState.SETTING_UP, 60.0, "set-up")
 
     def events(self, kind: str) -> list[str]:
         return [event["text"] for event in self.coordinator.events.since(0) if event["kind"] == kind]

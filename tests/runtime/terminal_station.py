@@ -4,13 +4,14 @@ import math
 from copy import deepcopy
 
 from runtime.ipc.messages import Ack
+from tests.standing import standing
 
 STATUS = {
     "boot": "boot-1",
     "station": "bench-1",
     "robot": "toy",
     "transport": "zmq",
-    "state": "ready",
+    **standing("ready"),
     "reason": "set up",
     "allowed": ["setup", "run", "estop"],
     "stage": "idle",
@@ -61,7 +62,7 @@ AIM = {
 
 
 def status(state="ready", **changes):
-    return deepcopy(STATUS) | {"state": state} | changes
+    return deepcopy(STATUS) | standing(state) | changes
 
 
 class Script:

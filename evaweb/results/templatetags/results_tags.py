@@ -19,10 +19,10 @@ from evaweb.statistics.proportions import Proportion
 
 register = template.Library()
 _TONES = {
-    PlanState.DRAFT: "ready",
-    PlanState.FROZEN: "running",
-    PlanState.CLOSED: "holding",
-    PlanState.REVEALED: "idle",
+    PlanState.DRAFT: "active",
+    PlanState.FROZEN: "ok",
+    PlanState.CLOSED: "warn",
+    PlanState.REVEALED: "neutral",
 }
 
 

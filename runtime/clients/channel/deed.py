@@ -46,6 +46,10 @@ class Scene:
         return str(self.status["state"])
 
     @property
+    def state_is(self) -> Mapping[str, Any]:
+        return self.status["state_is"]  # type: ignore[no-any-return]
+
+    @property
     def verb(self) -> str:
         return f"web:{self.message.name}"
 

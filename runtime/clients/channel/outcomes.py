@@ -10,8 +10,8 @@ from typing import Any
 from runtime.clients.terminal.settling import CALM_TICKS, Settled, busy
 
 KEPT = 1000
-# The state in which each goes on; the rest goes on within the state it was given in.
-_WHILE = {"setup": "setting_up", "home": "setting_up", "run": "running", "resume": "running"}
+# What the session is while each goes on; the rest goes on within the state it was given in.
+_WHILE = {"setup": "preparing", "home": "preparing", "run": "going", "resume": "going"}
 _WITHIN = {
     "step": "",
     "commit": "",
@@ -54,13 +54,13 @@ class Outcome:
             self._end("unknown", "the station was restarted")
             return
         during = _WHILE.get(self.kind)
-        if self.kind == "approach" and self.before["state"] == "ready":
-            during = "setting_up"
+        if self.kind == "approach" and not self.before["state_is"]["run_open"]:
+            during = "preparing"
         if during is None:
             self._settle(status, events_since)
-        elif status["state"] == "ready":
+        elif status["state_is"]["ready"]:
             self._end("done", status["reason"])
-        elif status["state"] != during:
+        elif not status["state_is"][during]:
             self._end("failed", f"{status['state']}: {status['reason']}")
 
     def _settle(self, status: dict[str, Any], events_since: Events) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 from runtime.clients.channel.selection import Selection
 
-_STARTED = ("ready", "running", "holding")
 _CLI_MODES = {"continuous": "real", "preview": "step"}
 _REPLAY = (
     *("dataset_dir", "episode_id", "n_episodes", "task", "frame_index", "total_frames"),
@@ -54,20 +53,21 @@ def _robot(snapshot: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "robot_type": snapshot["robot"],
         "transport_type": snapshot["transport"],
-        "transport_connected": snapshot["state"] != "disconnected",
+        "transport_connected": snapshot["state_is"]["connected"],
         "image_min_hz": min(pictures, default=None),
         "gripper_locks": {arm: gripper["locked"] for arm, gripper in snapshot["grippers"].items()},
     }
 
 
 def _session(snapshot: Mapping[str, Any], selection: Selection, newest: str) -> dict[str, Any]:
-    state, policy = snapshot["state"], snapshot["policy"]
-    started = state in _STARTED
+    state, state_is, policy = snapshot["state"], snapshot["state_is"], snapshot["policy"]
+    started = state_is["set_up"]
+    rests = state_is["idle"] or state_is["ready"]
     return {
         "policy_connected": started and not policy["lost"],
         "policy_error": snapshot["reason"] if policy["lost"] else None,
         # What waits for an end of whatever goes on, waits for this word.
-        "session_status": "idle" if state in ("idle", "ready") else state,
+        "session_status": "idle" if rests else state,
         "selected_task": selection.task if selection.task is not None else snapshot["task"],
         "selected_collect_task": selection.collect_task,
         "selected_strategy": snapshot["strategy"],
@@ -76,7 +76,7 @@ def _session(snapshot: Mapping[str, Any], selection: Selection, newest: str) -> 
         "init_ready": started,
         "setup_stage": snapshot["stage"],
         "ckpt_label": snapshot["checkpoint"].get("name"),
-        "last_error": newest or (snapshot["reason"] if state in ("holding", "faulted") else None),
+        "last_error": newest or (snapshot["reason"] if state_is["held"] or state_is["latched"] else None),
         "state": state,
         "reason": snapshot["reason"],
         "allowed": snapshot["allowed"],

@@ -10,7 +10,6 @@ from runtime.clients.channel.deed import Deed, Scene, Step
 STOPS = ("stop", "halt", "rollout_stop")  # verbs that overtake whatever waits
 _STOPPING_INTENTS = ("accept", "cancel")  # of operator_action
 _MODES = {"real": "continuous", "sim": "sim", "step": "preview", "preview": "preview", "manual": "manual"}
-_STARTED = ("ready", "running", "holding")
 _TABS = "there are no tabs here: nothing is done"
 
 
@@ -65,14 +64,14 @@ def _setup(scene: Scene) -> Deed:
 
 def _connected(scene: Scene) -> Deed:
     scene.nothing()
-    if scene.state == "disconnected":
+    if not scene.state_is["connected"]:
         scene.refuse(f"the station connects by itself, and is not connected: {scene.status['reason']}")
     return Deed(note="the station connects by itself, and is connected")
 
 
 def _set_up(scene: Scene) -> Deed:
     scene.nothing()
-    if scene.state not in _STARTED:
+    if not scene.state_is["set_up"]:
         scene.refuse(f"the station is {scene.state}, and this is a part of web:setup: give that, and wait")
     return Deed(note="the set-up has done it")
 
@@ -83,12 +82,12 @@ def _run(scene: Scene) -> Deed:
 
 
 def _go_on(scene: Scene) -> Deed:
-    return _plain("resume")(scene) if scene.state == "holding" else _run(scene)
+    return _plain("resume")(scene) if scene.state_is["held"] else _run(scene)
 
 
 def _saved(scene: Scene) -> Deed:
     scene.nothing()
-    if scene.state in ("running", "holding"):
+    if scene.state_is["run_open"]:
         scene.refuse("a run is open, and is recorded as it goes on: web:rollout_stop closes it")
     episode = scene.status["episode"]
     if not episode.get("path"):
@@ -98,7 +97,7 @@ def _saved(scene: Scene) -> Deed:
 
 def _reset(scene: Scene) -> Deed:
     """After a trial; a run that was halted is over then, one that goes on is not ended by it."""
-    end: tuple[Step, ...] = (("stop", {}),) if scene.state == "holding" else ()
+    end: tuple[Step, ...] = (("stop", {}),) if scene.state_is["held"] else ()
     return Deed((*end, ("home", {})))
 
 
@@ -206,10 +205,11 @@ def _action(scene: Scene) -> Deed:
 
 
 def _toggle(scene: Scene) -> Deed:
-    kinds = {"ready": ("run", scene.selection.run), "running": ("stop", {})}
-    if scene.state not in kinds:
+    if scene.state_is["going"]:
+        return Deed((("stop", {}),))
+    if not scene.state_is["ready"]:
         scene.refuse(f"the station is {scene.state}: say web:run, web:stop or web:setup, whichever is meant")
-    return Deed((kinds[scene.state],))
+    return Deed((("run", scene.selection.run),))
 
 
 def _grip(action: str, side: str) -> Callable[[Scene], Deed]:

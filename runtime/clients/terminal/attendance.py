@@ -14,13 +14,13 @@ from runtime.clients.client import Refused, StationClient
 from runtime.clients.terminal.figures import away, line
 from runtime.clients.terminal.keys import Keys, NoKeys, keys
 
-# Commands that go on after they were accepted, and the states in which they do.
+# Commands that go on after they were accepted, and what the session is while they do.
 LASTING = {
-    "setup": ("setting_up",),
-    "home": ("setting_up",),
-    "approach": ("setting_up",),
-    "run": ("running",),
-    "resume": ("running",),
+    "setup": "preparing",
+    "home": "preparing",
+    "approach": "preparing",
+    "run": "going",
+    "resume": "going",
 }
 _KEYS = {"\n": "step", "c": "commit", "x": "cancel", "q": "stop"}
 _KEYED = {  # what the keys are, by the mode of the run
@@ -45,7 +45,7 @@ def attend(client: StationClient, kind: str, arguments: dict[str, Any], tell: Te
         status = client.status()
         with _keys_of(kind, status) as keyboard:
             progress = _Steady(tell) if isinstance(keyboard, NoKeys) else _Keyed(tell, status["mode"])
-            while status["state"] in LASTING[kind]:
+            while status["state_is"][LASTING[kind]]:
                 if pressed.is_set():
                     raise KeyboardInterrupt
                 client.renew()
@@ -62,7 +62,7 @@ def attend(client: StationClient, kind: str, arguments: dict[str, Any], tell: Te
 
 def _keys_of(kind: str, status: dict[str, Any]) -> Keys:
     """The keyboard of a run that a person drives, where there is one."""
-    if "running" not in LASTING[kind] or status["mode"] not in _KEYED:
+    if LASTING[kind] != "going" or status["mode"] not in _KEYED:
         return NoKeys()
     return keys()
 

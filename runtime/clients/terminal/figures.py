@@ -6,8 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-_OPEN = ("running", "holding")
-
 
 def line(status: Mapping[str, Any], me: str | None = None) -> str:
     """One line for a person; with `me`, a lease that somebody else holds is named too."""
@@ -19,11 +17,11 @@ def line(status: Mapping[str, Any], me: str | None = None) -> str:
 
 
 def _headline(status: Mapping[str, Any]) -> str:
-    state = status["state"]
+    state, state_is = status["state"], status["state_is"]
     doing = ""
-    if state == "setting_up":
+    if state_is["preparing"]:
         doing = f" ({status['stage']})"
-    elif state in _OPEN:
+    elif state_is["run_open"]:
         doing = f" ({status['mode']}{', ' if status['phase'] else ''}{status['phase']})"
     reason = f": {status['reason']}" if status["reason"] else ""
     return f"{state.upper()}{doing}{reason}"

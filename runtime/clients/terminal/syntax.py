@@ -11,10 +11,11 @@ from typing import Any, get_args
 
 from runtime.core.types import Result
 from runtime.ipc.messages import Mode
+from runtime.ipc.session_state import SessionState
 
 # States of a station, and phases of a run that goes on.
 WORDS = (
-    *("disconnected", "idle", "setting_up", "ready", "running", "holding", "faulted"),
+    *SessionState,
     *("asking", "executing", "waiting", "proposed", "moving", "approaching", "starved"),
 )
 _TRIPLES = (

@@ -26,6 +26,7 @@ from runtime.ipc.messages import (
     decode,
     encode,
 )
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop, SharedState
 from runtime.kinematics.forward import ChainForward
 from runtime.kinematics.loading import Loading
@@ -45,7 +46,7 @@ from runtime.processes.coordinator.operations import Parts, SessionActions
 from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
 from runtime.processes.coordinator.runs import Runs
 from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
-from runtime.processes.coordinator.session.transitions import SessionEvent, State
+from runtime.processes.coordinator.session.transitions import SessionEvent
 from runtime.processes.coordinator.session.tuning import strategy_of
 from runtime.processes.coordinator.setup.sequence import SetUp
 from runtime.processes.coordinator.snapshot import View, control_figures, facts, snapshot
@@ -142,7 +143,7 @@ class Coordinator:
         """As it was last set up or tuned."""
         return self.operations.spec
 
-    def _state(self) -> State:
+    def _state(self) -> SessionState:
         return self.session.state
 
     @property
@@ -215,7 +216,7 @@ class Coordinator:
             self.media_report = message
         elif isinstance(message, ReceptionReport):
             self.reception_report = message
-            self.runs.saw(message.truth, self.session.state is State.RUNNING)
+            self.runs.saw(message.truth, self.session.state is SessionState.RUNNING)
 
     def _unlock(self) -> None:
         """A control that was restarted, or obeys the e-stop, knows of no locks, another may: none, in any case."""
@@ -253,7 +254,7 @@ class Coordinator:
             self.say(Event("recording_failed", opened.error, self.clock.now()))
         elif opened.uuid:
             self.say(Event("episode_opened", f"recording {opened.uuid}", self.clock.now()))
-        failure = self.runs.opened(opened, self.session.state is State.RUNNING)
+        failure = self.runs.opened(opened, self.session.state is SessionState.RUNNING)
         if failure:
             self.collecting.unopened()
             self._observe(SessionEvent.RUN_FAILED, failure)
@@ -281,7 +282,8 @@ class Coordinator:
         before, run = self.session.state, self.runs.open
         if self.session.observe(happening, reason):
             text = f"{before} -> {self.session.state}: {reason}"
-            data = {"state": str(self.session.state), **self._unbegun(run)}
+            state = self.session.state
+            data = {"state": str(state), "state_is": state.told(), **self._unbegun(run)}
             self.say(Event("state", text, self.clock.now(), data=data))
 
     def _unbegun(self, run: Run | None) -> dict[str, Any]:

@@ -16,9 +16,10 @@ from runtime.core.clock import Clock
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import DiscardRequest, LabelRequest, RunRequest
 from runtime.ipc.messages import EpisodeClosed, Event
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.coordinator.inference.inference import Inference
-from runtime.processes.coordinator.session.transitions import SessionEvent, State
+from runtime.processes.coordinator.session.transitions import SessionEvent
 from runtime.processes.coordinator.setup.sequence import SetUp
 from runtime.recording.labels import Label, append, newest
 from runtime.recording.schema import Schema
@@ -135,11 +136,11 @@ class Demonstrations:
         if happening in DISARMING:
             self.disarm(reason)
 
-    def look(self, state: State) -> tuple[SessionEvent, str] | None:
+    def look(self, state: SessionState) -> tuple[SessionEvent, str] | None:
         """Once per pump: what is to be told to the session; an arm that nobody uses falls by itself."""
         now, run = self._clock.now(), self.run
         self._hear_node()
-        if self.set_up and state is State.READY:
+        if self.set_up and state is SessionState.READY:
             self._aim()
         if run is not None:
             self.touch()
@@ -169,9 +170,9 @@ class Demonstrations:
             self._reported_at = at
             self._reported = [*self._reported[-39:], at]
 
-    def _missed(self, run: Run, state: State) -> tuple[SessionEvent, str] | None:
+    def _missed(self, run: Run, state: SessionState) -> tuple[SessionEvent, str] | None:
         """A node that was told to drive, and reports no action."""
-        if not self._node_leads or run.begun is None or state is not State.RUNNING:
+        if not self._node_leads or run.begun is None or state is not SessionState.RUNNING:
             return None
         since = max(self._reported_at or -math.inf, run.followed)
         silent = self._clock.now() - since

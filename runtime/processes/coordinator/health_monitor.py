@@ -11,9 +11,10 @@ from runtime.cameras.telling import complaints
 from runtime.core.clock import Clock
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.messages import ReceptionReport
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop, SharedState
 from runtime.processes.coordinator.lease import Lease
-from runtime.processes.coordinator.session.transitions import SessionEvent, State
+from runtime.processes.coordinator.session.transitions import SessionEvent
 from runtime.station.run import Run
 from runtime.station.spec import StationSpec
 
@@ -56,13 +57,13 @@ class HealthMonitor:
         self.estop = ""  # who pressed and why, while it is latched
         self._pressed: float | None = None  # when the flag was seen without its latch
 
-    def notice(self, state: State, run: Run | None) -> Iterator[Noticed]:
+    def notice(self, state: SessionState, run: Run | None) -> Iterator[Noticed]:
         """What there is to tell the session, which is in `state` before the first of it."""
         yield from self._family(state)
         yield from self._estop(state)
         yield from self._leases()
         yield from self._link()
-        if run is not None and run.begun is not None and state is State.RUNNING:
+        if run is not None and run.begun is not None and state is SessionState.RUNNING:
             yield from self._end_of(run)
 
     def absent(self) -> str:
@@ -77,27 +78,27 @@ class HealthMonitor:
             camera for camera, number in zip(self._page.layout.cameras, numbers, strict=False) if not number
         ]
 
-    def _family(self, state: State) -> Iterator[Noticed]:
+    def _family(self, state: SessionState) -> Iterator[Noticed]:
         for name in SIBLINGS:
             generation = self._page.generation(name)
             if generation != self._generations[name]:
                 self._generations[name] = generation
                 reason = f"the process {name} died and was restarted: set up again"
                 yield Noticed(SessionEvent.FAMILY_DIED, reason, name)
-        absent = self.absent() if state is State.RUNNING else ""  # a set-up looks for itself
+        absent = self.absent() if state is SessionState.RUNNING else ""  # a set-up looks for itself
         if absent:
             silent = self._page.silence(absent, self._clock.now())
             yield Noticed(SessionEvent.HELD, f"no sign of life from the process {absent} {silent}")
 
-    def _estop(self, state: State) -> Iterator[Noticed]:
+    def _estop(self, state: SessionState) -> Iterator[Noticed]:
         latched = self._page.estop is EStop.LATCHED
-        if latched and state is not State.FAULTED:
+        if latched and state is not SessionState.FAULTED:
             pressed = self._latch.read()
             if not (pressed and pressed.wall) and self._just_pressed():  # absent, or half written
                 return
             self.estop = f"by {pressed.by}: {pressed.why}" if pressed else "pressed"
             yield Noticed(SessionEvent.ESTOPPED, f"e-stop {self.estop}: make safe, then release")
-        elif not latched and state is State.FAULTED:
+        elif not latched and state is SessionState.FAULTED:
             self.estop, self._pressed = "", None
             yield Noticed(SessionEvent.RELEASED, "e-stop released: set up again")
 

@@ -20,6 +20,7 @@ from runtime.ipc.command_arguments import (
     TuneRequest,
 )
 from runtime.ipc.messages import Event, Mode
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.processes.coordinator.demonstrations import Demonstrations
@@ -27,7 +28,6 @@ from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.runs import Runs
 from runtime.processes.coordinator.session.effects import Effects, GuardFacts, Told
-from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.coordinator.session.tuning import strategy_of, tuned
 from runtime.processes.coordinator.setup.sequence import SetUp
 from runtime.station.spec import StationSpec
@@ -54,7 +54,7 @@ class SessionActions(Effects):
         self,
         spec: StationSpec,
         parts: Parts,
-        state: Callable[[], State],
+        state: Callable[[], SessionState],
         absent: Callable[[], str],
         say: Callable[[Event], None],
     ) -> None:
@@ -234,12 +234,12 @@ class SessionActions(Effects):
             raise RuntimeFault(
                 f"gripper: {asked.action} would move the robot's own, and the run's mode is sim; allowed: lock, unlock"
             )
-        free = run is None or run.mode == "manual" or self._state() is State.HOLDING
+        free = run is None or run.mode == "manual" or self._state() is SessionState.HOLDING
         return self.manual.grip(asked, free)
 
     def approach(self) -> None:
         made, first = self.inference.proposal, self.setup.first_action
-        if self._state() is not State.READY and made is not None:
+        if self._state() is not SessionState.READY and made is not None:
             self.runs.approach(self.manual.checked("approach", made.rows[0]))
         elif first is not None:
             self.setup.first_action = self.manual.checked("approach", first)

@@ -15,12 +15,12 @@ from runtime.core.plugins import variants
 from runtime.ipc.command_arguments import PolicyServerRequest, PreflightReportRequest, PreflightRequest, read
 from runtime.ipc.identity import named
 from runtime.ipc.messages import Ack, Command, Event
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from runtime.station.preflight_child import Preflights
 from runtime.station.spec import StationSpec
 
 PREFLIGHT_QUERIES = ("preflight", "preflight_report", "policy_server")
-_AT_WORK = (State.SETTING_UP, State.RUNNING, State.HOLDING)
+_AT_WORK = (SessionState.SETTING_UP, SessionState.RUNNING, SessionState.HOLDING)
 
 
 class PreflightDesk:
@@ -30,7 +30,7 @@ class PreflightDesk:
         self,
         in_force: Callable[[], StationSpec],
         own: StationSpec,
-        state: Callable[[], State],
+        state: Callable[[], SessionState],
         say: Callable[[Event], None],
         clock: Clock,
         preflights: Preflights | None = None,
@@ -79,9 +79,9 @@ class PreflightDesk:
         if state in _AT_WORK:
             raise RuntimeFault(
                 f"preflight is not allowed while {state}: the station's machine and policy are at work; allowed while "
-                f"{', '.join(other for other in State if other not in _AT_WORK)}"
+                f"{', '.join(other for other in SessionState if other not in _AT_WORK)}"
             )
-        if state is not State.READY:
+        if state is not SessionState.READY:
             return
         settings = changed(self._own.resolved, asked.changes, "preflight").deployment
         exclusive = getattr(variants("runtime.policies")[settings.policy.kind], "EXCLUSIVE", False)
@@ -100,7 +100,7 @@ class PreflightDesk:
         settings = self._in_force().deployment
         if asked.policy is not None:
             settings = changed(self._own.resolved, {"policy": asked.policy}, "policy_server").deployment
-        return {"server": server_of(settings), "state": str(self._state())}
+        return {"server": server_of(settings), "state": str(self._state()), "state_is": self._state().told()}
 
     def _note(self, text: str, data: dict[str, Any]) -> None:
         self._say(Event("preflight", text, self._clock.now(), data=data))

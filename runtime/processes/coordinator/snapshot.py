@@ -13,6 +13,7 @@ from robots.units import units_of
 from runtime.core.plugins import variants
 from runtime.core.types import Float64
 from runtime.ipc.messages import MediaReport, PolicyMode, ReceptionReport
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.coordinator.demonstrations import Demonstrations
 from runtime.processes.coordinator.inference.inference import Inference
@@ -20,7 +21,6 @@ from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.runs import Runs
 from runtime.processes.coordinator.session.machine import SessionMachine
-from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.coordinator.setup.sequence import SetUp, Stage, first_action
 from runtime.station.spec import StationSpec
 
@@ -62,6 +62,7 @@ def snapshot(view: View) -> dict[str, Any]:
         "station": settings.station,
         "robot": view.spec.robot.name,
         "state": str(session.state),
+        "state_is": session.state.told(),
         "reason": session.reason,
         "allowed": session.allowed(),
         "guarded": session.guarded(),
@@ -171,7 +172,7 @@ def _inference(view: View) -> dict[str, Any]:
 def _phase(view: View) -> str:
     """What a run that goes on is doing, in one word; "" where none does, or it has not begun."""
     run, control = view.runs.open, view.shared.control.read()
-    if run is None or run.begun is None or view.session.state is not State.RUNNING:
+    if run is None or run.begun is None or view.session.state is not SessionState.RUNNING:
         return ""
     moving = bytes(control["behaviour"]) == b"motion"
     states = (

@@ -19,11 +19,11 @@ from runtime.core.types import Observation
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.identity import LOCAL
 from runtime.ipc.messages import Ack, Command
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.control.process import make_tick
 from runtime.processes.coordinator.coordinator import Coordinator
 from runtime.processes.coordinator.inference.worker import LockstepRunner, Runner
-from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.guard.process import Guard
 from runtime.processes.media.episode_closing import Close, at_once
 from runtime.processes.media.process import Media, make_recorder
@@ -40,7 +40,7 @@ class LockstepRun:
     """How a lockstep run went: the episode as media closed it, the last state, every event."""
 
     episode: dict[str, Any]
-    state: State
+    state: SessionState
     reason: str
     ticks: int
     events: list[dict[str, Any]] = field(default_factory=list)
@@ -132,7 +132,7 @@ class Lockstep:
             )
         )
 
-    def until(self, reached: Callable[[], bool], seconds: float, what: str) -> State:
+    def until(self, reached: Callable[[], bool], seconds: float, what: str) -> SessionState:
         """Tick until `reached`, return the state then; raises SetupError after `seconds` of virtual time."""
         end = self.clock.now() + seconds
         while not reached():
@@ -177,15 +177,15 @@ def run(spec: StationSpec, longest: float = 3600.0) -> LockstepRun:
     session = station.coordinator.session
     try:
         station.connect()
-        station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+        station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
         station.command("setup")
-        prepared = station.until(lambda: session.state is not State.SETTING_UP, 120.0, "set-up")
-        if prepared is not State.READY:
+        prepared = station.until(lambda: session.state is not SessionState.SETTING_UP, 120.0, "set-up")
+        if prepared is not SessionState.READY:
             raise SetupError(f"set-up failed: {session.reason}")
         station.command("run")
-        how = station.until(lambda: session.state is not State.RUNNING, longest, "run")
+        how = station.until(lambda: session.state is not SessionState.RUNNING, longest, "run")
         why = session.reason
-        if how is State.HOLDING:
+        if how is SessionState.HOLDING:
             station.command("stop")
         for _ in range(3):  # the end goes from the coordinator to media and back
             station.tick()

@@ -20,11 +20,11 @@ from runtime.core.clock import Clock, MonotonicClock, VirtualClock
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.realtime import LOCKSTEP
 from runtime.ipc.bus import Endpoints, Key
+from runtime.ipc.session_state import SessionState
 from runtime.processes.control.process import Lateness
 from runtime.processes.coordinator.inference.requests import PolicyResponse
 from runtime.processes.coordinator.inference.worker import DeclaredRunner
 from runtime.processes.coordinator.process import CommandService
-from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.guard.process import Desk
 from runtime.processes.lockstep.lockstep import Around, Lockstep
 from runtime.processes.media.crash_repair import start_repair
@@ -144,7 +144,7 @@ class ServedLockstep(Lockstep):
     def tick(self) -> None:
         """One control period; a run that is over ends within it."""
         super()._pass()
-        if why := self._over(self.coordinator.session.state is State.RUNNING):
+        if why := self._over(self.coordinator.session.state is SessionState.RUNNING):
             self.coordinator.finish(why)
         super().tick()
         self._figures.add(0.0, 0)
@@ -158,7 +158,7 @@ class ServedLockstep(Lockstep):
         """Whether time stands still: nothing goes on that needs it, or somebody is waited for."""
         if self._asking.begin() or self.media.closing:
             return True
-        if self.coordinator.session.state not in (State.IDLE, State.READY):
+        if self.coordinator.session.state not in (SessionState.IDLE, SessionState.READY):
             return False
         moving = bytes(self.shared.control.read()["behaviour"]) == b"motion"
         return not (moving or self.coordinator.runs.alone or self.shared.rings["orders"].waiting)
@@ -166,14 +166,17 @@ class ServedLockstep(Lockstep):
     def _fast(self) -> bool:
         """Whether nobody is waited for, who would want to see it as it happens."""
         state, run = self.coordinator.session.state, self.coordinator.run
-        if state is State.RUNNING:
+        if state is SessionState.RUNNING:
             return run is None or run.mode not in _ON_DEMAND
-        return state is State.SETTING_UP
+        return state is SessionState.SETTING_UP
 
     def _stand(self) -> None:
         """Hear and tell, while it is still now; what begins, begins with a tick."""
         self.guard.watch()
-        closing, rests = self.media.closing, self.coordinator.session.state in (State.IDLE, State.READY)
+        closing, rests = (
+            self.media.closing,
+            self.coordinator.session.state in (SessionState.IDLE, SessionState.READY),
+        )
         if closing:
             self.media.collect()
         elif rests:

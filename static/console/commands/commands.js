@@ -111,7 +111,7 @@ export class Commands {
       const kind = button.dataset.command ?? button.dataset.gate;
       const own = "settling" in button.dataset ? "it has just come up: look, then press again" : (button.dataset.blocked ?? "");
       setReason(button, own || (AT_THE_DESK.includes(kind) ? this.#deskReason() : this.reason(kind)));
-      if (button.dataset.onlyState) button.hidden = this.#store.snapshot?.state !== button.dataset.onlyState;
+      if (button.dataset.onlyWhile) button.hidden = !this.#store.snapshot?.state_is[button.dataset.onlyWhile];
     }
   }
 

@@ -109,7 +109,7 @@ export class LeaseControls {
   }
 
   #leaving(event) {
-    if (this.#store.lease === "mine" && this.#store.snapshot.state === "running") event.preventDefault();
+    if (this.#store.lease === "mine" && this.#store.snapshot.state_is.going) event.preventDefault();
   }
 
   /** A tablet that darkens its screen would hide the page. */

@@ -1,9 +1,7 @@
 // Why a command cannot be given now, in a sentence. Whether it can is the station's own word: snapshot.allowed.
 
 import { STOPPING } from "./stops.js";
-import { verb, words } from "../live/words.js";
-
-const AT_WORK = ["setting_up", "running", "holding"];
+import { verb } from "../live/words.js";
 
 const MODES = { step: "step or preview", commit: "preview", cancel: "step, preview or manual", move: "manual" };
 
@@ -18,12 +16,12 @@ export function refusal(kind, { fresh, role, lease, snapshot }) {
 }
 
 /** "" where the station allows `kind`; its own sentence where it is only not allowed just now. */
-export function whyNot(kind, { allowed, guarded = {}, state }) {
+export function whyNot(kind, { allowed, guarded = {}, state_is: is }) {
   if (allowed.includes(kind)) return "";
   if (guarded[kind]) return guarded[kind];
-  if (MODES[kind]) return state === "holding" ? "the robot holds: resume or stop first" : `run in the mode ${MODES[kind]} first`;
+  if (MODES[kind]) return is.held ? "the robot holds: resume or stop first" : `run in the mode ${MODES[kind]} first`;
   const possible = allowed.filter((one) => one !== "estop").map(verb).join(", ") || "nothing";
-  return `not while ${words(state)}; possible now: ${possible}`;
+  return `not while ${is.label}; possible now: ${possible}`;
 }
 
 /** Why no preflight of a checkpoint can be asked for now, "" where one can; nobody needs the lease for it. */
@@ -31,5 +29,5 @@ export function whyNoPreflight({ fresh, role, snapshot }, checkpoint) {
   if (role === "viewer") return "a viewer watches; an administrator can make you an operator";
   if (!checkpoint) return "choose a checkpoint: what is deployed is asked by Set up";
   if (!fresh) return ""; // the worker asks where the station does not run
-  return AT_WORK.includes(snapshot?.state) ? `not while ${words(snapshot.state)}: the policy is at work` : "";
+  return snapshot?.state_is.at_work ? `not while ${snapshot.state_is.label}: the policy is at work` : "";
 }

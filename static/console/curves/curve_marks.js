@@ -5,7 +5,7 @@
 export const MARKS = [
   { name: "chunk", colour: "--mark-chunk", shape: "hairline", means: "A hairline where another chunk takes over; beside it the chunk at the cursor, 0 for the held target" },
   { name: "overlap", colour: "--mark-overlap", shape: "patch", means: "A band where an action is made of more than one chunk; beside it of how many at the cursor" },
-  { name: "safety", colour: "--holding", shape: "tick", means: "A tick where safety changed or refused the action" },
+  { name: "safety", colour: "--warn", shape: "tick", means: "A tick where safety changed or refused the action" },
 ];
 
 const SAMPLE_S = 0.1; // how long a sample stands for at most: some come late, and nothing lies between

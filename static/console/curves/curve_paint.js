@@ -11,7 +11,7 @@ const MOST_SEAMS = 200; // more of them in a pane would be a surface
 export class Paint {
   #seam = css("--mark-chunk");
   #band = css("--mark-overlap");
-  #limit = css("--holding");
+  #limit = css("--warn");
   #simulation = GHOSTS.simulated.colour;
 
   /** Under the curves. */

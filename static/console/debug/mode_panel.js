@@ -96,7 +96,7 @@ export class ModePanel {
   /** A first action far from the present pose: a warning, and a choice. */
   #drawFar(snapshot, mode, open) {
     const proposal = open && mode === "preview" ? snapshot.proposal : null;
-    const before = !open && snapshot?.state === "ready" && POLICY_MODES.includes(mode) && mode !== "sim" ? snapshot.first_action : null;
+    const before = !open && snapshot?.state_is.ready && POLICY_MODES.includes(mode) && mode !== "sim" ? snapshot.first_action : null;
     const far = [proposal, before].find((one) => one?.far);
     part("far").hidden = !far;
     if (far) write("far-text", proposal ? `This chunk begins ${distance(far)}.` : `The policy's first action is ${distance(far)}: approach it on a limited path first, or run from here.`);

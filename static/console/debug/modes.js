@@ -19,9 +19,9 @@ export const SEEN = {
 };
 
 /** The command of the one big button at this moment, "" where none is wanted; `key` of its label in LABELS. */
-export function primary({ state, mode, proposal }) {
-  if (state === "holding") return "resume";
-  if (state !== "running") return "run";
+export function primary({ state_is: is, mode, proposal }) {
+  if (is?.held) return "resume";
+  if (!is?.going) return "run";
   if (mode === "step") return "step";
   if (mode === "preview") return proposal?.chunk ? "commit" : "step";
   return mode === "manual" ? "move" : "run";
@@ -45,8 +45,8 @@ const PHASES = {
 };
 
 /** What the run is doing, in words; "" where nothing is open. */
-export function phase({ state, phase: now, control, rate }) {
-  if (!now || !["running", "setting_up", "holding"].includes(state)) return "";
+export function phase({ state_is: is, phase: now, control, rate }) {
+  if (!now || !is.at_work) return "";
   if (now !== "executing") return PHASES[now] ?? words(now);
   const left = control?.remaining ?? 0;
   return left > 0 && rate ? `executing, ${(left / rate).toFixed(1)} s ahead` : "executing";

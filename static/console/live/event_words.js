@@ -92,10 +92,10 @@ export function sentence({ kind, text }) {
 
 /** "bad" for what endangers robot or record, "warn" for what a person should have seen, "good" where that is over, else "". */
 export function weight({ kind, text, data = {} }) {
-  if (BAD.has(kind) || (kind === "state" && data.state === "faulted")) return "bad";
+  if (BAD.has(kind) || (kind === "state" && data.state_is?.latched)) return "bad";
   if (WARN.has(kind) || kind.startsWith("source_")) return "warn";
   if (kind === "drives") return data.enabled === false || data.faults?.length ? "bad" : "good";
   if (GOOD.has(kind)) return "good";
-  if (kind === "state") return ["holding", "disconnected"].includes(data.state) ? "warn" : "";
+  if (kind === "state") return data.state_is?.held || data.state_is?.connected === false ? "warn" : "";
   return kind === "command" && /: (refused|failed)\b/.test(text) ? "warn" : "";
 }

@@ -1,6 +1,7 @@
 // The status bar and the box that says what a person has to do: state by place, not by pop-up.
 
-import { ADVICE, age, duration, figure, words } from "./words.js";
+import { badge } from "./badge.js";
+import { advice, age, duration, figure, words } from "./words.js";
 
 const TITLES = { mine: "This page commands", elsewhere: "You command on another page", free: "Nobody commands" };
 const shown = (name) => document.querySelectorAll(`[data-show="${name}"]`);
@@ -25,9 +26,8 @@ function drawState(store) {
   const snapshot = store.snapshot;
   for (const element of shown("state")) {
     element.toggleAttribute("data-stale", !store.fresh);
-    if (snapshot && store.fresh) element.dataset.state = snapshot.state;
-    else delete element.dataset.state;
-    const text = store.fresh ? words(snapshot.state) : trouble(store).word;
+    badge(element, store.fresh ? snapshot.state_is : null);
+    const text = store.fresh ? snapshot.state_is.label : trouble(store).word;
     if (element.textContent !== text) element.textContent = text;
     element.title = store.fresh ? snapshot.reason : trouble(store).reason;
   }
@@ -46,21 +46,21 @@ function trouble(store) {
 
 function drawSituation(store) {
   const box = document.getElementById("situation");
-  const advice = store.fresh ? ADVICE[store.snapshot.state] : null;
+  const asked = store.fresh ? advice(store.snapshot.state_is) : null;
   const lost = !store.fresh && store.snapshotAt !== -Infinity;
   const dead = !store.fresh && store.open && !store.link.ok;
-  box.hidden = !(advice || lost || dead);
+  box.hidden = !(asked || lost || dead);
   if (box.hidden) return;
   const { word, reason } = store.fresh ? { word: "", reason: store.snapshot.reason } : trouble(store);
-  box.dataset.kind = store.fresh ? store.snapshot.state : "lost";
-  part(box, "title").textContent = advice ? advice.title : `Nothing is known: ${word}`;
+  box.dataset.tone = store.fresh ? store.snapshot.state_is.tone : "neutral";
+  part(box, "title").textContent = asked ? asked.title : `Nothing is known: ${word}`;
   part(box, "reason").textContent = reason;
-  part(box, "advice").textContent = advice ? advice.advice : "The robot goes on as its runtime decides; the hardware stop is yours.";
+  part(box, "advice").textContent = asked ? asked.advice : "The robot goes on as its runtime decides; the hardware stop is yours.";
   const busy = document.querySelectorAll("#steps [data-command]:not([hidden])");
   const elsewhere = new Set([...busy].map((button) => button.dataset.command));
   for (const button of part(box, "buttons").children) {
     const kind = button.dataset.command;
-    button.hidden = !advice?.buttons.includes(kind) || elsewhere.has(kind);
+    button.hidden = !asked?.buttons.includes(kind) || elsewhere.has(kind);
   }
 }
 
@@ -90,12 +90,12 @@ function drawFigures(store, snapshot) {
 }
 
 /** How far the set-up is, or what an idle station waits for: the reason why a set-up failed among it. */
-function drawStage({ state, stage, reason }) {
-  const text = state === "setting_up" ? `${words(stage)} …` : state === "idle" ? reason : "";
+function drawStage({ state_is: is, stage, reason }) {
+  const text = is.preparing ? `${words(stage)} …` : is.idle ? reason : "";
   write("stage", text);
   for (const element of shown("stage")) {
     element.hidden = !text;
-    element.dataset.state = state;
+    element.toggleAttribute("data-idle", is.idle);
   }
 }
 

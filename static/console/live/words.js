@@ -1,23 +1,27 @@
-// Words for what the station says; the states themselves, and what is allowed in them, are the runtime's.
+// Words for what the station says; the states, what they mean (`state_is`) and what is allowed in them are the runtime's.
 
-/** What a state asks of the person at the bench; nothing where the station can be left alone. */
-export const ADVICE = {
-  disconnected: {
+const ADVICE = {
+  away: {
     title: "No complete picture of the robot",
     advice: "Start the execution node; check the cameras that are grey.",
     buttons: [],
   },
-  holding: {
+  held: {
     title: "The robot holds",
     advice: "Look at the bench first.",
     buttons: ["resume", "stop"],
   },
-  faulted: {
+  latched: {
     title: "E-stop is latched",
     advice: "After the release, set up again.",
     buttons: ["release"],
   },
 };
+
+/** What a state asks of the person at the bench; undefined where the station can be left alone. */
+export function advice({ connected, held, latched }) {
+  return latched ? ADVICE.latched : held ? ADVICE.held : connected ? undefined : ADVICE.away;
+}
 
 /** Why the server closes the socket of a page, by its code. */
 export const CLOSED = {

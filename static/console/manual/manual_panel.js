@@ -77,9 +77,9 @@ export class ManualPanel {
     this.#say(said);
   }
 
-  #follow({ facts, state, mode, run }) {
+  #follow({ facts, state_is: is, mode, run }) {
     if (facts?.joint_names && facts.joint_names.join() !== this.#names) this.#build(facts);
-    const elsewhere = state === "setting_up" || state === "faulted" || (run?.number && mode !== "manual");
+    const elsewhere = is.preparing || is.latched || (run?.number && mode !== "manual");
     if (elsewhere && this.#edited) this.reset(); // what was meant for another moment is not sent by accident
     const send = document.querySelector('[data-command="move"]');
     send.dataset.blocked = this.#edited ? "" : "the target is where the robot is: move a slider, take a step, or choose a pose";

@@ -104,7 +104,7 @@ function nameGhosts(tags, scene, shown) {
     commanded: "commanded pose",
   };
   for (const [ghost, { colour }] of Object.entries(GHOSTS)) tags.show(ghost, scene.draws(ghost) && words[ghost], colour);
-  tags.show("reach", shown.reach, "var(--holding)");
+  tags.show("reach", shown.reach, "var(--warn)");
 }
 
 function buttons(scene, shown, name) {

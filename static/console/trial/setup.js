@@ -5,8 +5,8 @@ import { duration, words } from "../live/words.js";
 const MARKS = { done: "✓", active: "▸", waiting: "·", failed: "✕", skipped: "–" };
 
 /** Whether the stages are to be shown: while they go on, and after one failed until the next try. */
-export function unfinished({ state, stages = [] }) {
-  return state === "setting_up" || (state === "idle" && stages.some((stage) => stage.state === "failed"));
+export function unfinished({ state_is: is, stages = [] }) {
+  return is.preparing || (is.idle && stages.some((stage) => stage.state === "failed"));
 }
 
 /** Seconds of a stage in words; nothing for one that has not begun. */
@@ -25,11 +25,11 @@ export function setUp(store) {
       list.hidden = !stages.length;
       fill(list, stages);
       const line = list.parentElement.querySelector('[data-show="stage"]'); // says the same while it goes on
-      line.toggleAttribute("data-said", Boolean(stages.length) && snapshot.state === "setting_up");
+      line.toggleAttribute("data-said", Boolean(stages.length) && snapshot.state_is.preparing);
     }
     const failed = stages.some((stage) => stage.state === "failed");
     for (const name of document.querySelectorAll("[data-set-up-name]")) name.textContent = failed ? "Retry" : "Set up";
-    for (const button of document.querySelectorAll("[data-hidden-state]")) button.hidden = snapshot.state === button.dataset.hiddenState;
+    for (const button of document.querySelectorAll("[data-hidden-while]")) button.hidden = snapshot.state_is[button.dataset.hiddenWhile];
   };
   store.on("snapshot", draw);
   document.body.addEventListener("htmx:afterSettle", draw);

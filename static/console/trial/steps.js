@@ -4,16 +4,15 @@ import { step } from "../../collect/moments.js";
 
 /** The step that `panel` (data of the fragment) and the live state ask for. */
 export function current({ panel, status, setUp }, snapshot) {
-  const state = snapshot?.state ?? "disconnected";
+  const is = snapshot?.state_is;
   if (panel === "debug") {
-    if (state === "running" || state === "holding" || state === "ready") return "run";
-    return "setup";
+    return is?.set_up ? "run" : "setup";
   }
   if (panel === "collect") return step(snapshot, document.querySelector("[data-session-uuid]"));
   if (status === "ended") return "score";
   if (status === "running" || status === "paused") return "run";
-  if (status === "prepared") return setUp === "yes" && state === "ready" ? "run" : "setup";
-  return state === "setting_up" ? "setup" : "choose";
+  if (status === "prepared") return setUp === "yes" && is?.ready ? "run" : "setup";
+  return is?.preparing ? "setup" : "choose";
 }
 
 /** Show it: the steps before it are done, those after it wait. */

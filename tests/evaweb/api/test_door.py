@@ -26,7 +26,7 @@ from evaweb.lookups import Lookups
 from evaweb.rarely import Rarely
 from evaweb.stations import leases
 from evaweb.stations.models import Command
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from tests import presses
 from tests.evaweb.noted import settled
 from tests.processes import eventually
@@ -287,7 +287,7 @@ def test_a_station_of_a_long_name_is_none(token):
 def test_without_the_database_who_is_remembered_stops_and_anybody_presses(live, ann, token, runtime, away):
     runtime.ready()
     lease = leases.claim(user=ann, station=live, page="p1")
-    runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
+    runtime.do(lambda: runtime.session._enter(SessionState.RUNNING, ""))
     assert post(f"{live.name}/estop", token=token)[0] == 200
     away.set()
     halt = {"uuid": str(uuid4()), "kind": "halt", "page": "p1", "epoch": lease.epoch}

@@ -18,7 +18,7 @@ from evaweb.api.tokens import token_create
 from evaweb.credentials import SESSION, credentials
 from evaweb.stations import leases
 from evaweb.stations.models import Command
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from tests.evaweb.api.test_door import asked, written
 from tests.evaweb.noted import settled
 
@@ -106,7 +106,7 @@ def test_a_browser_is_told_what_it_may_send_from_our_pages_alone(live):
 def test_a_stop_needs_the_csrf_token_and_a_page_of_ours(live, ann, session, runtime):
     runtime.ready()
     lease = leases.claim(user=ann, station=live, page="p1")
-    runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
+    runtime.do(lambda: runtime.session._enter(SessionState.RUNNING, ""))
     connections.close_all()
     token = {"cookie": f"{NAME}={session}; {CSRF}={'a' * 32}", "x-csrftoken": "a" * 32}
 

@@ -12,6 +12,7 @@ from runtime.ipc.messages import Mode
 from runtime.processes.coordinator.session.machine import COMMANDS
 from runtime.strategies.base import StrategyParameters
 from tests.evaweb.console.test_modules import NODE, run
+from tests.standing import standing
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="Node is not installed: the page's modules are not run")
 MODES = get_args(Mode)
@@ -43,9 +44,13 @@ def test_every_mode_of_the_runtime_is_offered_with_a_line() -> None:
 )
 def test_there_is_one_big_button_at_each_moment(state: str, mode: str, chunk: int, button: str) -> None:
     proposal = {"chunk": chunk} if chunk else {}
-    given = {"state": state, "mode": mode, "proposal": proposal}
+    given = {**standing(state), "mode": mode, "proposal": proposal}
 
     assert run("debug/modes.js", "return m.primary(given)", given) == button
+
+
+def test_before_any_news_the_big_button_is_there() -> None:
+    assert run("debug/modes.js", "return m.primary(given)", {"mode": "preview"}) == "run"
 
 
 def test_the_mode_that_is_shown_is_that_of_the_open_run_whatever_was_chosen() -> None:
@@ -71,11 +76,11 @@ def test_what_the_run_does_is_said_in_words() -> None:
         "debug/modes.js",
         body,
         [
-            {"state": "running", "phase": "executing", "control": {"remaining": 45}, "rate": 30},
-            {"state": "running", "phase": "asking"},
-            {"state": "running", "phase": "something_new"},
-            {"state": "ready", "phase": "executing"},
-            {"state": "running", "phase": ""},
+            {**standing("running"), "phase": "executing", "control": {"remaining": 45}, "rate": 30},
+            {**standing("running"), "phase": "asking"},
+            {**standing("running"), "phase": "something_new"},
+            {**standing("ready"), "phase": "executing"},
+            {**standing("running"), "phase": ""},
         ],
     )
 
@@ -109,7 +114,7 @@ def store(**more: Any) -> dict[str, Any]:
     """A page that commands; `more` is of the snapshot or of the page."""
     page = {"fresh": True, "role": "operator", "lease": "mine"}
     page |= {key: more.pop(key) for key in tuple(more) if key in page}
-    return {**page, "snapshot": {"state": "running", "mode": "continuous", "allowed": [], **more}}
+    return {**page, "snapshot": {**standing("running"), "mode": "continuous", "allowed": [], **more}}
 
 
 def test_a_stop_needs_no_news_and_everything_else_does() -> None:
@@ -137,9 +142,9 @@ def test_who_does_not_command_is_told_how_to() -> None:
     ("kind", "situation", "reason"),
     [
         ("step", {"guarded": {"step": "the policy is being asked"}}, "the policy is being asked"),
-        ("step", {"state": "ready"}, "run in the mode step or preview first"),
-        ("commit", {"state": "idle"}, "run in the mode preview first"),
-        ("move", {"state": "holding"}, "the robot holds: resume or stop first"),
+        ("step", {**standing("ready")}, "run in the mode step or preview first"),
+        ("commit", {**standing("idle")}, "run in the mode preview first"),
+        ("move", {**standing("holding")}, "the robot holds: resume or stop first"),
         ("home", {"allowed": ["stop", "estop"]}, "not while running; possible now: Stop"),
         ("home", {"allowed": ["estop"]}, "not while running; possible now: nothing"),
         ("stop", {"allowed": ["stop"]}, ""),
@@ -470,11 +475,11 @@ def test_stages_are_shown_while_they_go_on_and_after_one_failed() -> None:
     failed = [{"name": "connect", "state": "failed", "seconds": 5.0}]
     done = [{"name": "connect", "state": "done", "seconds": 0.2}]
     snapshots = [
-        {"state": "setting_up", "stages": done},
-        {"state": "idle", "stages": failed},
-        {"state": "idle", "stages": done},
-        {"state": "ready", "stages": done},
-        {"state": "idle"},
+        {**standing("setting_up"), "stages": done},
+        {**standing("idle"), "stages": failed},
+        {**standing("idle"), "stages": done},
+        {**standing("ready"), "stages": done},
+        {**standing("idle")},
     ]
 
     assert run("trial/setup.js", "return given.map((snapshot) => m.unfinished(snapshot))", snapshots) == [

@@ -24,7 +24,8 @@ from evaweb.lookups import Lookups
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
 from evaweb.stations.runtime_client import StationWire
-from runtime.processes.coordinator.session.transitions import SessionEvent, State
+from runtime.ipc.session_state import SessionState
+from runtime.processes.coordinator.session.transitions import SessionEvent
 from tests import presses
 from tests.evaweb.noted import settled
 from tests.processes import eventually
@@ -460,7 +461,7 @@ def test_a_run_goes_on_for_a_minute_without_the_database_and_stops_work_for_long
         await _written()
 
     runtime.ready()
-    runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
+    runtime.do(lambda: runtime.session._enter(SessionState.RUNNING, ""))
     run(scenario())
 
 
@@ -468,7 +469,7 @@ def test_a_run_goes_on_for_a_minute_without_the_database_and_stops_work_for_long
 def test_the_holder_stops_over_the_socket_and_it_is_written_down_later(live, ann, bob, runtime, kind, state):
     lease = leases.claim(user=ann, station=live, page="p1")
     runtime.ready()
-    runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
+    runtime.do(lambda: runtime.session._enter(SessionState.RUNNING, ""))
     uuid = str(uuid4())
 
     async def scenario():
@@ -627,7 +628,7 @@ def test_an_aim_that_hangs_keeps_no_stop_and_no_command_waiting(live, ann, runti
     lease = leases.claim(user=ann, station=live, page="p1")
     runtime.swallows.add("aim")
     runtime.ready()
-    runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
+    runtime.do(lambda: runtime.session._enter(SessionState.RUNNING, ""))
 
     async def scenario():
         page = await Page(live.name, ann).open()
@@ -757,7 +758,7 @@ def test_a_page_that_opens_while_the_database_is_away_can_stop(live, ann, runtim
     """By whom is known where this process has seen the login before."""
     lease = leases.claim(user=ann, station=live, page="p1")
     runtime.ready()
-    runtime.do(lambda: runtime.session._enter(State.RUNNING, ""))
+    runtime.do(lambda: runtime.session._enter(SessionState.RUNNING, ""))
     away = threading.Event()
     look = credentials.look
 

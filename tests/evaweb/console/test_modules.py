@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaweb.console import parts
+from tests.standing import standing
 
 MODULES = Path(__file__).parents[3] / "static" / "console"
 NODE = shutil.which("node")
@@ -346,7 +347,7 @@ def test_of_nothing_there_is_no_quantile() -> None:
     ],
 )
 def test_the_step_to_do_now_follows_trial_and_state(panel: dict[str, str], state: str, step: str) -> None:
-    assert run("trial/steps.js", "return m.current(given[0], given[1])", [panel, {"state": state}]) == step
+    assert run("trial/steps.js", "return m.current(given[0], given[1])", [panel, standing(state)]) == step
 
 
 def test_an_identity_is_a_random_uuid_of_version_four() -> None:
@@ -491,9 +492,9 @@ def test_no_value_is_a_gap_to_the_plot() -> None:
 
 def test_an_event_is_said_in_words_with_its_weight() -> None:
     events = [
-        {"kind": "state", "text": "setting_up -> ready: 50 rows", "data": {"state": "ready"}},
-        {"kind": "state", "text": "running -> holding: halted", "data": {"state": "holding"}},
-        {"kind": "state", "text": "running -> faulted: e-stop", "data": {"state": "faulted"}},
+        {"kind": "state", "text": "setting_up -> ready: 50 rows", "data": standing("ready")},
+        {"kind": "state", "text": "running -> holding: halted", "data": standing("holding")},
+        {"kind": "state", "text": "running -> faulted: e-stop", "data": standing("faulted")},
         {"kind": "command", "text": "run by ann: accepted"},
         {"kind": "command", "text": "run by bob: refused, web:ann:6b9c-1 holds the lease"},
         {"kind": "source_frames_lost", "text": "source: frames lost (3 so far)"},

@@ -36,11 +36,12 @@ const area = document.getElementById("estop-area");
 const kinds = [];
 const look = async () => { await settled(); kinds.push(area.dataset.kind ?? "rest"); };
 const sent = [];
-const store = { on(_, take) { this.take = take; }, snapshot: { state: "idle" }, page: "p1", epoch: 1 };
-const state = (name) => { store.snapshot = { state: name }; store.take(); };
+const told = (name) => ({ state: name, state_is: { latched: name === "faulted" } });
+const store = { on(_, take) { this.take = take; }, snapshot: told("idle"), page: "p1", epoch: 1 };
+const state = (name) => { store.snapshot = told(name); store.take(); };
 let ours = 0;
 performance.now = () => 1000 * ours;  // this page's clock, which the test moves [s]
-const news = (name, clock, boot = "b1") => { store.snapshot = { state: name, clock, boot }; store.take(); };
+const news = (name, clock, boot = "b1") => { store.snapshot = { ...told(name), clock, boot }; store.take(); };
 const socket = { send: (message) => { sent.push(message); return true; } };
 const way = { there: true, estop: "/stops/estop", ask: async () => true };
 const late = () => timers.forEach((take) => take());

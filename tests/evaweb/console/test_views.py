@@ -474,7 +474,7 @@ def test_a_trial_that_goes_on_can_be_ended(
 
     html = text_of(browser, "/stations/bench-1/eval/panel")
 
-    visible = {kind: [tag for tag in buttons(html, kind) if "data-only-state" not in tag] for kind in shown}
+    visible = {kind: [tag for tag in buttons(html, kind) if "data-only-while" not in tag] for kind in shown}
     assert all(visible.values()), visible
     assert not any(buttons(html, kind) for kind in absent)
     assert 'data-limit="40.0"' in html

@@ -7,6 +7,7 @@ import pytest
 from evaweb.lab import once, patience
 from evaweb.lab.patience import STILL_S, NoReply, VisitFailed, until
 from evaweb.lab.visitor import LivePage, NotYet
+from tests.standing import standing
 
 
 class Clock:
@@ -68,8 +69,8 @@ def test_a_refusal_is_told_at_once(clock):
     assert clock.now == 0.0
 
 
-def station(clock: Clock, **said):
-    state = {"boot": "b", "sequence": 3, "state": "running", "reason": "", "stages": [], "truth": {}}
+def station(clock: Clock, at="running", **said):
+    state = {"boot": "b", "sequence": 3, **standing(at), "reason": "", "stages": [], "truth": {}}
     return state | {"clock": clock.now, "lease": {"epoch": 1}, "run": {"number": 1, "elapsed": 0.0}} | said
 
 
@@ -95,7 +96,7 @@ def test_a_run_on_a_slow_machine_is_watched_to_its_end_by_its_own_clock(clock):
     def says():
         elapsed = clock.now / 100
         state = "running" if elapsed < 40 else "ready"
-        return station(clock, state=state, run={"number": 1, "elapsed": elapsed})
+        return station(clock, state, run={"number": 1, "elapsed": elapsed})
 
     assert once.run_to_its_end(Page(clock, says), 1, 40.0, lockstep=True) == 0
     assert clock.now > 4000
@@ -116,7 +117,7 @@ def test_a_run_that_stands_still_or_never_ends_is_an_error(clock, elapsed, fault
 
 def test_that_the_clock_of_the_station_goes_on_is_no_progress_of_a_set_up(clock):
     stages = [{"name": "connect", "state": "active", "seconds": 0.0}]
-    page = Page(clock, lambda: station(clock, state="setting_up", stages=stages))
+    page = Page(clock, lambda: station(clock, "setting_up", stages=stages))
     with pytest.raises(VisitFailed, match="setting up: no progress for 180 s; it is setting_up"):
         once.set_up_and_run(page, 1)
     assert page.asked == ["setup"]

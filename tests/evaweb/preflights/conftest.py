@@ -11,6 +11,7 @@ from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint
 from runtime.ipc.messages import Ack, Command
 from tests.evaweb.trials import builders
+from tests.standing import standing
 
 OK = {
     "verdict": "ok",
@@ -74,7 +75,7 @@ class Runtime:
     def status(self, timeout: float | None = None) -> Mapping[str, Any]:
         if self.gone is not None:
             raise self.gone
-        return {"state": self.state}
+        return standing(self.state)
 
     def request(self, command: Command, timeout: float | None = None, **how: Any) -> Ack:
         self.heard.append(command)
@@ -85,7 +86,7 @@ class Runtime:
 
             raise NoAnswer(f"no answer to {command.kind}")
         if command.kind == "policy_server":
-            return Ack(command.uuid, "done", data={"server": self.server, "state": self.state})
+            return Ack(command.uuid, "done", data={"server": self.server, **standing(self.state)})
         if command.kind == "preflight":
             if self.refuses:
                 return Ack(command.uuid, "refused", self.refuses)

@@ -223,14 +223,14 @@ def test_verdicts_have_the_runtimes_words():
 
 def test_a_row_says_in_words_how_it_stands(ask):
     row = ask()
-    assert (row.label, row.tone) == ("under way", "running")
+    assert (row.label, row.tone) == ("under way", "ok")
     row.status, row.report = PreflightStatus.DONE, OK
-    assert (row.label, row.tone) == ("usable", "ready")
+    assert (row.label, row.tone) == ("usable", "active")
     row.report = CLOSED
-    assert (row.label, row.tone) == ("port closed", "faulted")
+    assert (row.label, row.tone) == ("port closed", "danger")
     row.report = {"verdict": "something_new"}
     assert row.label == "something_new"
     row.status, row.report = PreflightStatus.LOST, None
-    assert (row.label, row.tone) == ("without a report", "holding")
+    assert (row.label, row.tone) == ("without a report", "warn")
     assert "bench-1" in str(row)
     assert uuid4() != row.pk

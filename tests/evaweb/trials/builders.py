@@ -15,6 +15,7 @@ from evaweb.stations.models import Station
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Trial
 from runtime.ipc.messages import Ack, Command
+from tests.standing import standing
 
 BOOT = "boot-1"
 
@@ -120,7 +121,7 @@ class Wire:
     fault: Exception | None = None
     episode: uuid.UUID = field(default_factory=uuid.uuid4)
     heard: list[Command] = field(default_factory=list)
-    snapshot: Mapping[str, Any] = field(default_factory=lambda: {"state": "ready", "boot": BOOT})
+    snapshot: Mapping[str, Any] = field(default_factory=lambda: {**standing("ready"), "boot": BOOT})
 
     def request(self, command: Command, **how: Any) -> Ack:
         """The answer, or the fault."""

@@ -10,7 +10,7 @@ import av
 import numpy as np
 import pytest
 
-from runtime.processes.coordinator.session.machine import State
+from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.sim import demo
@@ -26,10 +26,10 @@ RECORDED = ["recording.enabled=true", "recording.min_free_bytes=0"]
 def ready(station: Lockstep) -> None:
     session = station.coordinator.session
     station.connect()
-    station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+    station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
     station.command("setup")
-    station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
-    assert session.state is State.READY, session.reason
+    station.until(lambda: session.state is not SessionState.SETTING_UP, 60.0, "set-up")
+    assert session.state is SessionState.READY, session.reason
 
 
 def go(station: Lockstep, seconds: float) -> None:
@@ -85,7 +85,7 @@ def test_a_camera_that_ends_in_a_run_is_named_refuses_the_policy_and_recording_g
         ready(station)
         station.command("run")
         go(station, 6.0)
-        assert station.coordinator.session.state is State.HOLDING
+        assert station.coordinator.session.state is SessionState.HOLDING
         held = station.coordinator.session.reason
         rows = station.coordinator.snapshot()["recording"]["rows"]
         go(station, 1.0)
@@ -113,7 +113,7 @@ def test_a_camera_that_cannot_be_opened_is_named_while_the_station_waits_for_it(
         session = station.coordinator.session
         station.connect()
         go(station, 1.0)
-        assert session.state is State.DISCONNECTED
+        assert session.state is SessionState.DISCONNECTED
         why = f"camera {CAMERA} ({film}) is opening: there is no such file"
         assert session.reason == f"no picture has arrived from {CAMERA}; {why}"
         said = [
@@ -136,8 +136,8 @@ def test_the_set_up_fails_by_name_where_a_camera_is_gone(tmp_path: Path) -> None
         go(station, 0.5)
         station.command("setup")
         session = station.coordinator.session
-        station.until(lambda: session.state is not State.SETTING_UP, 10.0, "set-up")
-        assert session.state is not State.READY
+        station.until(lambda: session.state is not SessionState.SETTING_UP, 10.0, "set-up")
+        assert session.state is not SessionState.READY
         assert f"camera {CAMERA} ({film}) is lost: not a video" in session.reason
 
 

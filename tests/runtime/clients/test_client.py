@@ -8,9 +8,9 @@ from runtime.core.errors import TransportError
 from runtime.ipc.bus import CommandServer, Endpoints, Publisher
 from runtime.ipc.command_arguments import RunRequest
 from runtime.ipc.messages import Ack, Command
+from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.session.machine import SessionMachine
-from runtime.processes.coordinator.session.transitions import State
 from tests.runtime.processes.coordinator.session.test_machine import Recorded
 
 
@@ -27,7 +27,7 @@ class Station:
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
-    def restart(self, boot, state=State.READY):
+    def restart(self, boot, state=SessionState.READY):
         self.boot, self.effects, self.lease = boot, Recorded(), Lease(5.0)
         self.session = SessionMachine(self.effects, self.lease, boot, lambda: self.time)
         self.session.state = state
@@ -95,7 +95,7 @@ def test_a_command_is_given_under_the_lease_and_by_the_newest_status(client, sta
     given = station.received[-1]
     assert (given.holder, given.epoch, given.boot, given.sequence) == ("anna", 1, "boot-1", 1)
     assert given.valid_until == pytest.approx(1002.0, abs=1.0)
-    assert station.session.state is State.RUNNING
+    assert station.session.state is SessionState.RUNNING
 
 
 def test_arguments_may_have_the_words_of_the_clients_own(client, station):
@@ -121,7 +121,7 @@ def test_a_repeated_identity_is_not_carried_out_twice(client, station):
     client.command("run", identity="only-once")
     client.command("stop")
     assert client.command("run", identity="only-once").status == "accepted"
-    assert station.session.state is State.READY
+    assert station.session.state is SessionState.READY
 
 
 def test_a_refusal_is_raised_with_its_reason(client, station):
@@ -133,7 +133,7 @@ def test_somebody_elses_lease_is_respected_and_named(client, connect, station):
     client.claim()
     with pytest.raises(Refused, match=r"anna holds the lease for another 5\.0 s"):
         connect("ben").command("run")
-    assert station.session.state is State.READY
+    assert station.session.state is SessionState.READY
 
 
 def test_a_higher_epoch_takes_over(client, connect):
@@ -281,4 +281,4 @@ def test_two_terminals_of_one_person_are_one_holder(connect, station):
     other.command("halt")
     attending._renewed -= 1.0
     attending.renew()
-    assert station.session.state is State.HOLDING
+    assert station.session.state is SessionState.HOLDING

@@ -11,10 +11,11 @@ from runtime.clients.headless import drive, summary
 from runtime.core.errors import RecordingError, RuntimeFault, SetupError, TransportError
 from runtime.recording import export
 from tests.sources import ROOT
+from tests.standing import standing
 
 STATUS = {
     "boot": "boot-1",
-    "state": "idle",
+    **standing("idle"),
     "reason": "",
     "stage": "idle",
     "mode": "continuous",
@@ -42,7 +43,7 @@ CLOSED = {"path": "/data/episodes/one", "status": "finished", "rows": 240}
 
 
 def status(state, **changes):
-    return deepcopy(STATUS) | {"state": state} | changes
+    return deepcopy(STATUS) | standing(state) | changes
 
 
 def event(number, kind, text=""):

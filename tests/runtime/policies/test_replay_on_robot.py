@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import robots
+from runtime.ipc.session_state import SessionState
 from runtime.policies import replay
-from runtime.processes.coordinator.session.transitions import State
 from tests.runtime.lockstep_station import Station, StubPlan, spec_of
 from tests.runtime.quality import built
 
@@ -59,7 +59,7 @@ def test_it_is_approached_then_run_and_goes_on_after_a_hold(station: Station, tm
     station.ready(**set_up(folder))
     assert station.coordinator.snapshot()["first_action"]["far"]
     station.command("approach")
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     # The way is to the newest answer of the warm-up, which is a few rows on.
     assert station.robot.position[0] == pytest.approx(float(actions[0, 0]), abs=0.03)
     station.command("run", duration_s=ROWS / 30 + 1.0)
@@ -72,6 +72,6 @@ def test_it_is_approached_then_run_and_goes_on_after_a_hold(station: Station, tm
     assert (
         abs(float(station.robot.position[0]) - held) < 0.05
     )  # it does not catch up with the time it was held
-    station.until(lambda: station.state is State.READY, 30.0, "the run ends by itself")
+    station.until(lambda: station.state is SessionState.READY, 30.0, "the run ends by itself")
     assert station.robot.position[0] == pytest.approx(float(actions[-1, 0]), abs=0.01)
     station.close()

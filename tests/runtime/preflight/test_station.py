@@ -9,11 +9,12 @@ import pytest
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.messages import Command, Event
+from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
-from runtime.processes.coordinator.session.transitions import State
 from runtime.station.preflight_child import Flight
 from tests.runtime.lockstep_station import Station, spec_of
 from tests.runtime.preflight.bench import LEROBOT, WIRES, planned
+from tests.standing import standing
 
 OWN = planned(WIRES["openpi"], "ws://127.0.0.1:8000")
 GRPC = "grpc://127.0.0.1:8080"
@@ -49,7 +50,7 @@ class Recorder:
 
 class Desk:
     def __init__(self, in_force: Any = OWN) -> None:
-        self.state = State.IDLE
+        self.state = SessionState.IDLE
         self.events: list[Event] = []
         self.flights = Recorder()
         self.desk = PreflightDesk(
@@ -65,12 +66,12 @@ class Desk:
         return self.desk.handle(Command("u1", kind, args, user="ann"), "boot-1")
 
 
-@pytest.mark.parametrize("state", State)
-def test_it_begins_only_where_nothing_is_at_work(state: State) -> None:
+@pytest.mark.parametrize("state", SessionState)
+def test_it_begins_only_where_nothing_is_at_work(state: SessionState) -> None:
     desk = Desk()
     desk.state = state
     ack = desk.ask("preflight", id="one", checkpoint={"id": 1, "name": "pi0"})
-    free = state not in (State.SETTING_UP, State.RUNNING, State.HOLDING)
+    free = state not in (SessionState.SETTING_UP, SessionState.RUNNING, SessionState.HOLDING)
     assert (ack.status == "done") is free
     assert len(desk.flights.started) == free
     if free:
@@ -104,13 +105,13 @@ def test_arguments_are_checked(args: dict[str, Any], says: str) -> None:
 
 def test_a_server_with_one_clients_checkpoint_is_not_taken_from_a_station_that_is_ready() -> None:
     desk = Desk(planned(WIRES["lerobot"], GRPC))
-    desk.state = State.READY
+    desk.state = SessionState.READY
     table = {**LEROBOT, "url": "grpc://localhost:8080", "checkpoint": "user/other"}
     refused = desk.ask("preflight", id="one", policy=table)
     assert "ready to run with this server" in refused.reason
     assert desk.ask("preflight", id="one", policy={**table, "url": "grpc://127.0.0.1:9"}).status == "done"
     assert desk.ask("preflight", id="two", policy={"url": "ws://127.0.0.1:8080"}).status == "done"
-    desk.state = State.IDLE
+    desk.state = SessionState.IDLE
     assert desk.ask("preflight", id="three", policy=table).status == "done"
 
 
@@ -134,7 +135,7 @@ def test_reports_and_servers_are_told() -> None:
     desk = Desk(planned(WIRES["openpi"], "ws://127.0.0.1:8001"))
     assert desk.ask("preflight_report", id="one").data["running"] is True
     assert "not known here" in desk.ask("preflight_report", id="two").reason
-    assert desk.ask("policy_server").data == {"server": "127.0.0.1:8001", "state": "idle"}
+    assert desk.ask("policy_server").data == {"server": "127.0.0.1:8001", **standing("idle")}
     assert desk.ask("policy_server", policy={}).data["server"] == "127.0.0.1:8000"
     assert desk.ask("policy_server", policy={"url": "ws://gpu:7"}).data["server"] == "gpu:7"
     assert desk.ask("policy_server", policy={"uri": "x"}).status == "refused"
@@ -146,12 +147,12 @@ def test_a_station_takes_its_policy_back_for_a_set_up_and_for_a_run(tmp_path: An
     flights = Recorder()
     monkeypatch.setattr(station.coordinator.preflights, "_preflights", flights)
     try:
-        station.until(lambda: station.state is State.IDLE, 5.0, "first observation")
+        station.until(lambda: station.state is SessionState.IDLE, 5.0, "first observation")
         assert station._handle("preflight", {"id": "one"}).status == "done"
         station.command("setup")
         assert flights.cancelled == ["setup by lockstep"]
         assert "not allowed while setting_up" in station._handle("preflight", {"id": "two"}).reason
-        station.reach(State.READY)
+        station.reach(SessionState.READY)
         station.command("run")
         assert flights.cancelled[1:] == ["run by lockstep"]
         station.go(3)

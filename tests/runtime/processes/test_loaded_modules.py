@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import pytest
 
 from benchmarks.start import PROGRAMS, loaded, started
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from tests.crash.lab import Lab
 from tests.sources import ROOT
 
@@ -78,18 +78,22 @@ def story(tmp_path_factory):
         ) as station:
             client = station.client
             client.command("setup")
-            states.append(client.wait(lambda seen: seen["state"] != State.SETTING_UP, lab.patience))
+            states.append(client.wait(lambda seen: seen["state"] != SessionState.SETTING_UP, lab.patience))
             client.command("run")
             states.append(client.wait(lambda seen: seen["policy"]["answers"] > 3, lab.patience))
             client.estop("a test")
-            states.append(client.wait(lambda seen: seen["state"] == State.FAULTED, lab.patience))
+            states.append(client.wait(lambda seen: seen["state"] == SessionState.FAULTED, lab.patience))
     return folder / "station", states
 
 
 @pytest.mark.slow
 def test_a_station_starts_runs_and_stops_where_modules_of_other_kinds_are_broken(story):
     _, states = story
-    assert [seen["state"] for seen in states] == [State.READY, State.RUNNING, State.FAULTED]
+    assert [seen["state"] for seen in states] == [
+        SessionState.READY,
+        SessionState.RUNNING,
+        SessionState.FAULTED,
+    ]
 
 
 @pytest.mark.slow

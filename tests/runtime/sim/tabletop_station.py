@@ -20,7 +20,7 @@ from robots import Robot
 from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.types import Float64, UInt8
-from runtime.processes.coordinator.session.machine import State
+from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.sim.bench import Bench, camera_arm
 from runtime.sim.in_poses import InPoses
@@ -107,7 +107,7 @@ class Trial:
 
     success: bool
     milestones: dict[str, bool]
-    state: State
+    state: SessionState
     reason: str
     events: list[dict[str, Any]]
     seconds: float
@@ -178,16 +178,16 @@ def pick_and_place(
     with served(name, seed, data, assignments, serve) as (made, station):
         session, table = station.coordinator.session, made.bench.table
         station.connect()
-        station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+        station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
         station.command("setup")
-        station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
-        assert session.state is State.READY, session.reason
+        station.until(lambda: session.state is not SessionState.SETTING_UP, 60.0, "set-up")
+        assert session.state is SessionState.READY, session.reason
         station.command("run")
         began = station.clock.now()
 
         def over() -> bool:
             late = station.clock.now() > began + _SECONDS
-            return late or bool(table.truth()["success"]) or session.state is not State.RUNNING
+            return late or bool(table.truth()["success"]) or session.state is not SessionState.RUNNING
 
         station.until(over, 2 * _SECONDS, "the trial")
         truth = table.truth()

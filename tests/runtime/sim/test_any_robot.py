@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runtime.processes.coordinator.session.machine import State
+from runtime.ipc.session_state import SessionState
 from tests.runtime.sim.tabletop_station import pick_and_place
 
 EVERY_MILESTONE = {"grasped": True, "lifted": True, "over_plate": True, "placed": True}
@@ -21,7 +21,7 @@ def assert_placed(name, seed, data, assignments=()):
     trial = pick_and_place(name, seed, data, assignments)
     assert trial.success, trial.events
     assert trial.milestones == EVERY_MILESTONE
-    assert trial.state is State.RUNNING
+    assert trial.state is SessionState.RUNNING
 
 
 def test_one_arm_puts_the_block_on_the_plate(tmp_path):

@@ -19,8 +19,8 @@ import robots
 from runtime.config.loader import load
 from runtime.core.clock import MonotonicClock
 from runtime.core.types import Observation
+from runtime.ipc.session_state import SessionState
 from runtime.policies import gr00t
-from runtime.processes.coordinator.session.machine import State
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.script import Script
 from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place, planned
@@ -85,7 +85,7 @@ def test_a_trial_through_gr00t_puts_the_block_on_the_plate(tmp_path: Path, versi
 
     trial = pick_and_place("tabletop_ur5e", 0, tmp_path, assignments, serve)
     assert trial.success, trial.events
-    assert trial.state is State.RUNNING
+    assert trial.state is SessionState.RUNNING
     assert servers[0].failures == []
 
 

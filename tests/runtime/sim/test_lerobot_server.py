@@ -17,8 +17,8 @@ import robots
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import SetupError
 from runtime.core.types import Observation
+from runtime.ipc.session_state import SessionState
 from runtime.policies import lerobot
-from runtime.processes.coordinator.session.machine import State
 from runtime.sim.script import Script
 from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place, planned
 
@@ -156,5 +156,5 @@ def test_a_trial_through_lerobot_puts_the_block_on_the_plate(tmp_path: Path) -> 
 
     trial = pick_and_place("tabletop_ur5e", 0, tmp_path, assignments, serve)
     assert trial.success, trial.events
-    assert trial.state is State.RUNNING
+    assert trial.state is SessionState.RUNNING
     assert servers[0].failures == []

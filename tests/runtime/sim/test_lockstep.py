@@ -19,7 +19,7 @@ from runtime.core.clock import VirtualClock
 from runtime.core.errors import SetupError
 from runtime.ipc.identity import LOCAL
 from runtime.ipc.messages import Ack, Command
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.server import ServedLockstep
 from runtime.recording.reader import open_episode
 from runtime.sim import lockstep, serve
@@ -53,17 +53,17 @@ class Operator:
         self._given: list[str] = []
         self._ended: list[tuple[str, set[int]]] = []
         station.connect()
-        self._until(State.IDLE)
+        self._until(SessionState.IDLE)
         self._give("lease_claim")
 
     def trial(self, policy: str, seed: int, seconds: float) -> None:
         bench = {"id": str(uuid.uuid4()), "seed": seed}
         self._give("setup", policy={"url": policy}, bench=bench)
-        self._until(State.READY, State.IDLE)
+        self._until(SessionState.READY, SessionState.IDLE)
         session, runs = self.station.coordinator.session, self.station.coordinator.runs
-        assert session.state is State.READY, session.reason
+        assert session.state is SessionState.READY, session.reason
         self._given.append(self._give("run", duration_s=seconds).data["episode"])
-        self._until(State.READY)
+        self._until(SessionState.READY)
         self._ended.append((session.reason, set(self.station.coordinator.inference.metrics.delays)))
         while self._dawdles and runs.last_episode.get("uuid") != self._given[-1]:
             self.station.turn()
@@ -101,7 +101,7 @@ class Operator:
         assert ack.status == "accepted", ack.reason
         return ack
 
-    def _until(self, *states: State) -> None:
+    def _until(self, *states: SessionState) -> None:
         for _ in range(TURNS):
             if self.station.coordinator.session.state in states:
                 return

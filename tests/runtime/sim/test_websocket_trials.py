@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import robots
-from runtime.processes.coordinator.session.machine import State
+from runtime.ipc.session_state import SessionState
 from runtime.sim.faults import Fault
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.roboarena_server import Arena, RoboarenaServer
@@ -74,7 +74,7 @@ def test_a_policy_on_this_wire_puts_the_block_on_the_plate(wire: str, tmp_path: 
     assignments, serve = TRIALS[wire]
     trial = pick_and_place("tabletop_ur5e", 0, tmp_path, assignments, serve)
     assert trial.success, (trial.reason, trial.milestones, trial.events)
-    assert trial.state is State.RUNNING
+    assert trial.state is SessionState.RUNNING
 
 
 def test_a_reset_that_the_server_does_not_acknowledge_holds_the_robot_with_what_it_said(
@@ -85,12 +85,12 @@ def test_a_reset_that_the_server_does_not_acknowledge_holds_the_robot_with_what_
     with served("tabletop_ur5e", 0, tmp_path, ARENA, refusing) as (_, station):
         session = station.coordinator.session
         station.connect()
-        station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+        station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
         station.command("setup")
-        station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
-        assert session.state is State.READY, session.reason
+        station.until(lambda: session.state is not SessionState.SETTING_UP, 60.0, "set-up")
+        assert session.state is SessionState.READY, session.reason
         station.command("run")
-        station.until(lambda: session.state is not State.RUNNING, 60.0, "the end of patience")
-        assert session.state is State.HOLDING
+        station.until(lambda: session.state is not SessionState.RUNNING, 60.0, "the end of patience")
+        assert session.state is SessionState.HOLDING
         assert "the policy server at ws://127.0.0.1" in session.reason
         assert "reports an error: done" in session.reason

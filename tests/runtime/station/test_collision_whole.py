@@ -14,9 +14,9 @@ from runtime.core.clock import VirtualClock
 from runtime.core.errors import RuntimeFault
 from runtime.core.types import Float64, Observation
 from runtime.ipc.messages import Order, TickDone, decode, encode
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop, SharedState
 from runtime.processes.control.process import make_tick
-from runtime.processes.coordinator.session.transitions import State
 from tests.runtime.collision_samples import collisions, turned
 from tests.runtime.lockstep_station import Station, spec_of
 from tests.runtime.tick_bench import RecordingSink
@@ -41,7 +41,7 @@ def test_a_run_whose_arms_meet_goes_on_is_warned_of_once_and_each_tick_says_so_i
     tmp_path: Path,
 ) -> None:
     station = run(tmp_path, "warn", recorded=True)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     (begun,), (over,) = station.events("near"), station.events("near_sum")
     assert "left_arm/" in begun
     assert "actions came too near, nearest: left_arm/" in over
@@ -55,7 +55,7 @@ def test_a_run_whose_arms_meet_goes_on_is_warned_of_once_and_each_tick_says_so_i
 
 def test_where_collisions_are_refused_the_robot_stops_before_it_and_the_run_holds(tmp_path: Path) -> None:
     station = run(tmp_path, "refuse")
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     assert "actions refused" in station.reason
     assert "right_arm/" in station.reason
     sent = station.robot.sent.astype(float)
@@ -90,7 +90,7 @@ def entangled() -> Float64:
 def test_homing_through_the_other_arm_fails_the_set_up_with_what_to_do(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, start=entangled(), setup={"home": True}))
     station.prepare()
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert "going to the pose 'home': left_arm/link" in station.reason
     assert station.reason.endswith("go by another pose, or move the robot by hand first")
     assert np.allclose(station.robot.position, entangled(), atol=1e-6)
@@ -101,7 +101,7 @@ def test_homing_by_command_through_the_other_arm_is_refused_and_nothing_changes(
     station = Station(spec_of(tmp_path, start=entangled())).ready()
     with pytest.raises(RuntimeFault, match="going to the pose 'home': left_arm/link"):
         station.command("home")
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     assert np.allclose(station.robot.position, entangled(), atol=1e-6)
     station.close()
 

@@ -12,8 +12,8 @@ from uuid import uuid4
 import pytest
 
 from runtime.ipc.messages import Ack, Command
+from runtime.ipc.session_state import SessionState
 from runtime.policies import openpi
-from runtime.processes.coordinator.session.transitions import State
 from tests.runtime.lockstep_station import Station, StubPlan, spec_of
 
 CANARY = "the canary sings"
@@ -37,7 +37,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Station
     monkeypatch.setattr(StubPlan, "_policy", build)
     monkeypatch.setenv("LAB_SECRET", CANARY)
     made = Station(spec_of(tmp_path))
-    made.until(lambda: made.state is State.IDLE, 30.0, "a state to set up from")
+    made.until(lambda: made.state is SessionState.IDLE, 30.0, "a state to set up from")
     yield made
     made.close()
 
@@ -87,7 +87,7 @@ def test_nothing_is_sent_to_whoever_asks_for_a_secret(
     assert ("tables are for administrators" in ack.reason) or ("a table from the web may name" in ack.reason)
     assert CANARY not in ack.reason
     station.go(5)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert heard(server) == b""
 
 
@@ -97,7 +97,7 @@ def test_a_table_without_names_is_set_up_and_the_stations_own_account_may_name_w
 ) -> None:
     table = {"api_key_env": "LAB_SECRET"} if role == "local" else {}
     assert asked(station, server, role, vouched, **table).status == "accepted"
-    station.until(lambda: station.state is not State.SETTING_UP, 60.0, "the end of the set-up")
+    station.until(lambda: station.state is not SessionState.SETTING_UP, 60.0, "the end of the set-up")
     assert (CANARY.encode() in heard(server)) == (role == "local")
 
 

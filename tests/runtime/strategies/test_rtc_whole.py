@@ -15,7 +15,7 @@ import pytest
 
 from runtime.core.plugins import variants
 from runtime.core.types import Float32, Float64, UInt8
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.script import Answer, Script
 from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, column, spec_of
@@ -131,7 +131,7 @@ def test_a_chunk_continues_what_the_robot_is_committed_to_whatever_the_policy_wo
 ) -> None:
     with wired(tmp_path, dialect, "rtc") as station:
         station.running(90)
-        assert station.state is State.RUNNING, station.reason
+        assert station.state is SessionState.RUNNING, station.reason
         told = station.coordinator.snapshot()["policy"]["rtc"]
         assert (told["conditioned"], told["predicted_delay"]) == (True, DELAY)
         assert seams(station).max() < 0.015  # of the 0.08 that it wavers
@@ -146,14 +146,14 @@ def test_without_it_the_same_policy_wavers(tmp_path: Path) -> None:
 def test_a_policy_that_does_not_speak_it_is_refused_at_set_up_and_when_it_is_tuned_to(tmp_path: Path) -> None:
     with wired(tmp_path, "none", "rtc") as station:
         station.prepare()
-        assert station.state is State.IDLE
+        assert station.state is SessionState.IDLE
         assert "does not continue a chunk" in station.reason
     with wired(tmp_path, "none", "async") as station:
         station.running(10)
         with pytest.raises(Exception, match="does not continue a chunk"):
             station.command("tune", strategy={"kind": "rtc"})
         station.go(10)
-        assert station.state is State.RUNNING
+        assert station.state is SessionState.RUNNING
 
 
 # What each dialect sends, row by row
@@ -174,7 +174,7 @@ def asked_in_a_run(tmp_path: Path, dialect: str, **settings: Any) -> Requests:
         warm = len(log.asked)
         station.command("run")
         station.go(60)
-        assert station.state is State.RUNNING, station.reason
+        assert station.state is SessionState.RUNNING, station.reason
         steps = [step for step, _ in chunks(station)]
     assert len(steps) > 6
     asked, answered = log.asked[warm : warm + len(steps)], log.answered[warm : warm + len(steps)]

@@ -17,7 +17,7 @@ import pytest
 import robots
 from runtime.config import loader
 from runtime.core.clock import MonotonicClock
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.station import spec as station_spec
@@ -100,15 +100,15 @@ def demonstration(
     session = station.coordinator.session
     try:
         station.connect()
-        station.until(lambda: session.state is State.IDLE, 30.0, "first observation")
+        station.until(lambda: session.state is SessionState.IDLE, 30.0, "first observation")
         station.command("setup", collect=True)
-        station.until(lambda: session.state is not State.SETTING_UP, 30.0, "set-up")
-        assert session.state is State.READY, session.reason
+        station.until(lambda: session.state is not SessionState.SETTING_UP, 30.0, "set-up")
+        assert session.state is SessionState.READY, session.reason
         station.command("arm")
         station.command("run")
         begun = station.step
         station.until(lambda: station.step > begun + 60, 30.0, "demonstration")
-        assert session.state is State.RUNNING, session.reason
+        assert session.state is SessionState.RUNNING, session.reason
         station.command("label", result="success")
         station.command("stop")
         station.until(lambda: station.coordinator.snapshot()["collect"]["last"] is not None, 10.0, "the file")

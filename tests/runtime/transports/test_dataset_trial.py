@@ -12,7 +12,7 @@ from runtime.config import loader
 from runtime.core.errors import TransportError
 from runtime.datasets.published import publish
 from runtime.datasets.reader import open_dataset
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.station import spec as station_spec
@@ -70,7 +70,7 @@ def test_every_frame_is_observed_once_and_every_recorded_action_is_executed(
 ) -> None:
     spec = foreign(tmp_path / "set", version)
     done = lockstep.run(trial(tmp_path))
-    assert (done.state, done.reason) == (State.READY, "the recording that is the source has ended")
+    assert (done.state, done.reason) == (SessionState.READY, "the recording that is the source has ended")
     episode, length = open_episode(Path(done.episode["path"])), LENGTHS[EPISODE]
     assert episode.frames == length
     assert np.array_equal(stacked(episode.rows, "qpos"), column(EPISODE, "joints", length, spec))
@@ -93,7 +93,7 @@ def test_a_trial_of_v30_is_published_as_v30_and_played_again(tmp_path: Path) -> 
     }
     policy = {"kind": "replay", "path": str(tmp_path / "again"), "horizon": 8}
     twice = lockstep.run(trial(tmp_path, transport=again, policy=policy))
-    assert twice.state is State.READY, twice.reason
+    assert twice.state is SessionState.READY, twice.reason
     episode, length = open_episode(Path(twice.episode["path"])), LENGTHS[EPISODE]
     assert np.array_equal(stacked(episode.rows, "qpos"), column(EPISODE, "joints", length, spec))
     assert np.array_equal(stacked(episode.ticks, "executed"), column(EPISODE, "action", length, spec))
@@ -103,7 +103,7 @@ def test_a_trial_of_v30_is_published_as_v30_and_played_again(tmp_path: Path) -> 
 def test_a_recording_slower_than_control_is_paced_by_its_own_rate(tmp_path: Path, version: str) -> None:
     foreign(tmp_path / "set", version, fps=12.5)
     done = lockstep.run(trial(tmp_path, control={"rate": 50.0}, recording={"fps": 50.0, "min_free_bytes": 0}))
-    assert done.state is State.READY, done.reason
+    assert done.state is SessionState.READY, done.reason
     episode, length = open_episode(Path(done.episode["path"])), LENGTHS[EPISODE]
     assert episode.frames == 4 * (length - 1) + 1
     wanted = [shown(EPISODE, k // 4) for k in range(episode.frames)]
@@ -113,7 +113,7 @@ def test_a_recording_slower_than_control_is_paced_by_its_own_rate(tmp_path: Path
 def test_the_mock_policy_moves_over_a_recording_without_a_server(tmp_path: Path) -> None:
     foreign(tmp_path / "set", "v3.0")
     done = lockstep.run(trial(tmp_path, policy={"kind": "mock"}, strategy={"kind": "async"}))
-    assert (done.state, done.reason) == (State.READY, "the recording that is the source has ended")
+    assert (done.state, done.reason) == (SessionState.READY, "the recording that is the source has ended")
     episode = open_episode(Path(done.episode["path"]))
     sent = stacked(episode.ticks, "executed")
     assert len(sent) == LENGTHS[EPISODE]

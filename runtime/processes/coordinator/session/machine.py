@@ -8,6 +8,7 @@ from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import ARGUMENTS, read
 from runtime.ipc.identity import named
 from runtime.ipc.messages import Ack, AckStatus, Command
+from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.session.effects import Effects, Told
 from runtime.processes.coordinator.session.transitions import (
@@ -20,7 +21,6 @@ from runtime.processes.coordinator.session.transitions import (
     REASONS,
     STOPPING,
     SessionEvent,
-    State,
 )
 
 LEASE_COMMANDS = ("lease_claim", "lease_renew", "lease_give_up")
@@ -35,7 +35,7 @@ class SessionMachine:
         self._lease = lease
         self._boot = boot
         self._now = now
-        self.state = State.DISCONNECTED
+        self.state = SessionState.DISCONNECTED
         self.reason = "waiting for the first observation"
         self.sequence = 0
         self._answers: dict[str, Ack] = {}
@@ -54,7 +54,7 @@ class SessionMachine:
             for kind, rule in COMMANDS.items()
             if self.state in rule.allowed and not rule.guard(self.state, situation)
         ]
-        if self.state is State.SETTING_UP:
+        if self.state is SessionState.SETTING_UP:
             commands.extend(CANCELLING)
         return [*commands, "estop"]
 
@@ -120,13 +120,13 @@ class SessionMachine:
         self._enter(after, reason)
         return True
 
-    def _stop_for(self, before: State, reason: str) -> None:
-        if before is State.SETTING_UP:
+    def _stop_for(self, before: SessionState, reason: str) -> None:
+        if before is SessionState.SETTING_UP:
             self._effects.cancel_setup(reason)
         self._effects.hold(reason)
 
-    def _interrupt(self, before: State, reason: str) -> None:
-        if before is State.SETTING_UP:
+    def _interrupt(self, before: SessionState, reason: str) -> None:
+        if before is SessionState.SETTING_UP:
             self._effects.cancel_setup(reason)
         self._effects.end_run("interrupted", reason)
 
@@ -173,7 +173,7 @@ class SessionMachine:
         if command.kind == "estop":
             raise RuntimeFault("the e-stop has a socket of its own: send it to the guard")
         rule = COMMANDS[command.kind]
-        if self.state is State.SETTING_UP and command.kind in CANCELLING:
+        if self.state is SessionState.SETTING_UP and command.kind in CANCELLING:
             rule = CANCEL
         takes = ARGUMENTS[command.kind]
         asked = read(command.kind, takes, command.args) if takes else None
@@ -200,7 +200,7 @@ class SessionMachine:
         if refusal:
             raise RuntimeFault(refusal)
 
-    def _enter(self, state: State, reason: str) -> None:
+    def _enter(self, state: SessionState, reason: str) -> None:
         self.state, self.reason = state, reason
         self.sequence += 1
 

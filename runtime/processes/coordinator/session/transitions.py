@@ -7,19 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.session.effects import Effects, GuardFacts, Told
-
-
-class State(StrEnum):
-    """The session's state; one word each, the same everywhere."""
-
-    DISCONNECTED = "disconnected"
-    IDLE = "idle"
-    SETTING_UP = "setting_up"
-    READY = "ready"
-    RUNNING = "running"
-    HOLDING = "holding"
-    FAULTED = "faulted"
 
 
 class SessionEvent(StrEnum):
@@ -40,10 +29,10 @@ class SessionEvent(StrEnum):
     FAMILY_DIED = "family_died"  # a process of the family was restarted
 
 
-Guard = Callable[[State, GuardFacts], str]  # why it is not allowed just now, "" where it is
+Guard = Callable[[SessionState, GuardFacts], str]  # why it is not allowed just now, "" where it is
 
 
-def _always(state: State, situation: GuardFacts) -> str:
+def _always(state: SessionState, situation: GuardFacts) -> str:
     return ""
 
 
@@ -59,13 +48,13 @@ class Rule:
     `after` None leaves the state as it is. What a command takes is in runtime.ipc.command_arguments.ARGUMENTS.
     """
 
-    allowed: tuple[State, ...]
-    after: State | Mapping[State, State] | None
+    allowed: tuple[SessionState, ...]
+    after: SessionState | Mapping[SessionState, SessionState] | None
     effect: Callable[[Effects, Any], Told | None]
     guard: Guard = _always
     stays: Callable[[Any], bool] = lambda asked: False  # by what it took, whether the state is left as it is
 
-    def next(self, state: State, asked: Any = None) -> State | None:
+    def next(self, state: SessionState, asked: Any = None) -> SessionState | None:
         """The state after it, None for the same; `asked` is what it took."""
         if self.stays(asked):
             return None
@@ -75,21 +64,21 @@ class Rule:
 _NO_COLLECTION = "this station collects nothing: its deployment has no [collection]"
 
 
-def _may_run(state: State, situation: GuardFacts) -> str:
+def _may_run(state: SessionState, situation: GuardFacts) -> str:
     unarmed = situation.collecting and not situation.armed
     return "the station is set up to collect and is not armed: arm first" if unarmed else ""
 
 
-def _may_resume(state: State, situation: GuardFacts) -> str:
+def _may_resume(state: SessionState, situation: GuardFacts) -> str:
     unarmed = situation.mode == "collect" and not situation.armed
     return "a demonstration is open and the station is not armed: arm first, or stop" if unarmed else ""
 
 
-def _may_collect(state: State, situation: GuardFacts) -> str:
+def _may_collect(state: SessionState, situation: GuardFacts) -> str:
     return "" if situation.collection else _NO_COLLECTION
 
 
-def _may_arm(state: State, situation: GuardFacts) -> str:
+def _may_arm(state: SessionState, situation: GuardFacts) -> str:
     if not situation.collection:
         return _NO_COLLECTION
     if not situation.collecting:
@@ -97,26 +86,26 @@ def _may_arm(state: State, situation: GuardFacts) -> str:
     return "it is armed already" if situation.armed else situation.unled
 
 
-def _may_disarm(state: State, situation: GuardFacts) -> str:
+def _may_disarm(state: SessionState, situation: GuardFacts) -> str:
     if not situation.collection:
         return _NO_COLLECTION
     return "" if situation.armed else "it is not armed"
 
 
-def _untried(state: State, situation: GuardFacts) -> str:
+def _untried(state: SessionState, situation: GuardFacts) -> str:
     return "the open run is one of a trial: what is measured may not be changed" if situation.trial else ""
 
 
 _OPENING = "the run has not begun, its recording is being opened: try again in a moment"
 
 
-def _may_grip(state: State, situation: GuardFacts) -> str:
-    if state is State.RUNNING and situation.opening:
+def _may_grip(state: SessionState, situation: GuardFacts) -> str:
+    if state is SessionState.RUNNING and situation.opening:
         return _OPENING
     return _untried(state, situation)
 
 
-def _may_step(state: State, situation: GuardFacts) -> str:
+def _may_step(state: SessionState, situation: GuardFacts) -> str:
     if situation.mode not in ("step", "preview"):
         return f"the run's mode is {situation.mode}, and step is for step and preview"
     if situation.opening:  # what is asked for now would be forgotten when it begins
@@ -128,7 +117,7 @@ def _may_step(state: State, situation: GuardFacts) -> str:
     return "the last chunk is still being executed" if situation.executing else ""
 
 
-def _may_commit(state: State, situation: GuardFacts) -> str:
+def _may_commit(state: SessionState, situation: GuardFacts) -> str:
     if situation.mode != "preview":
         return f"the run's mode is {situation.mode}, and commit is for preview"
     if situation.approaching:  # control would not take the chunk, and it would be gone
@@ -136,27 +125,27 @@ def _may_commit(state: State, situation: GuardFacts) -> str:
     return "" if situation.proposed else "no chunk is shown: step first"
 
 
-def _may_cancel(state: State, situation: GuardFacts) -> str:
+def _may_cancel(state: SessionState, situation: GuardFacts) -> str:
     if situation.mode in ("step", "preview", "manual"):
         return _OPENING if situation.opening else ""
     return f"the run's mode is {situation.mode}, and cancel is for step, preview and manual: stop or halt it"
 
 
-def _may_move(state: State, situation: GuardFacts) -> str:
+def _may_move(state: SessionState, situation: GuardFacts) -> str:
     if situation.mode == "manual":
         return _OPENING if situation.opening else ""
     return f"the run's mode is {situation.mode}, and move is for manual"
 
 
-def _may_approach(state: State, situation: GuardFacts) -> str:
-    if state is State.READY:
+def _may_approach(state: SessionState, situation: GuardFacts) -> str:
+    if state is SessionState.READY:
         return "" if situation.first_action else "the policy's first action is not known: set up again"
     if situation.mode != "preview":
         return f"the run's mode is {situation.mode}, and approach is for preview"
     return "" if situation.proposed else "no chunk is shown: step first"
 
 
-S = State
+S = SessionState
 _STOPPED = "stopped by the operator"
 COMMANDS: dict[str, Rule] = {
     "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda e, asked: e.begin_setup(asked)),
@@ -188,9 +177,9 @@ COMMANDS: dict[str, Rule] = {
     ),
     "arm": Rule((S.READY, S.HOLDING), None, lambda e, _: e.arm(), guard=_may_arm),
     "disarm": Rule((S.READY, S.HOLDING), None, lambda e, _: e.disarm(), guard=_may_disarm),
-    "label": Rule(tuple(State), None, lambda e, asked: e.label(asked), guard=_may_collect),
+    "label": Rule(tuple(SessionState), None, lambda e, asked: e.label(asked), guard=_may_collect),
     "discard": Rule(
-        tuple(State),
+        tuple(SessionState),
         {S.RUNNING: S.READY, S.HOLDING: S.READY},
         lambda e, asked: e.discard(asked),
         guard=_may_collect,
@@ -201,7 +190,7 @@ COMMANDS: dict[str, Rule] = {
 CANCELLING = ("stop", "halt")
 STOPPING = ("stop", "halt", "estop")  # never stale
 # What happens by itself: (happening, state) -> the state after it. Pairs that are not here change nothing.
-EVENT_TRANSITIONS: dict[tuple[SessionEvent, State], State] = {
+EVENT_TRANSITIONS: dict[tuple[SessionEvent, SessionState], SessionState] = {
     (SessionEvent.CONNECTED, S.DISCONNECTED): S.IDLE,
     (SessionEvent.INCOMPLETE, S.DISCONNECTED): S.DISCONNECTED,
     (SessionEvent.DISPLACED, S.READY): S.IDLE,
@@ -219,7 +208,7 @@ EVENT_TRANSITIONS: dict[tuple[SessionEvent, State], State] = {
     (SessionEvent.LEASE_ENDED, S.RUNNING): S.HOLDING,
     (SessionEvent.LEASE_ENDED, S.SETTING_UP): S.IDLE,
     (SessionEvent.RELEASED, S.FAULTED): S.IDLE,
-    **{(SessionEvent.ESTOPPED, state): S.FAULTED for state in State if state is not S.FAULTED},
+    **{(SessionEvent.ESTOPPED, state): S.FAULTED for state in SessionState if state is not S.FAULTED},
     **{(SessionEvent.FAMILY_DIED, state): S.IDLE for state in (S.READY, S.RUNNING, S.HOLDING, S.SETTING_UP)},
 }
 

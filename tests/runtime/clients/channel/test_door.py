@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from runtime.clients.channel.names import Names
 from runtime.clients.client import Refused, StationClient
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from tests import presses
 from tests.processes import eventually
 from tests.runtime.clients.channel.bench import Bench
@@ -26,11 +26,11 @@ FAR = [STANDS[0] + 0.05, *STANDS[1:]]
 def start(tmp_path):
     made = []
 
-    def start(state=State.IDLE, **options):
+    def start(state=SessionState.IDLE, **options):
         bench = Bench(tmp_path, **options)
         made.append(bench)
-        bench.reach(State.IDLE)
-        if state is not State.IDLE:
+        bench.reach(SessionState.IDLE)
+        if state is not SessionState.IDLE:
             script = bench.script(client="first")
             assert script.result(script.cmd("setup"))["result"] == "done"
             script.command("give_up")
@@ -121,7 +121,7 @@ def test_the_script_of_the_document_sets_up_and_runs(start):
 
 
 def test_arguments_are_checked_before_the_answer_and_nothing_is_changed(start):
-    bench = start(State.READY)
+    bench = start(SessionState.READY)
     script = bench.script()
     assert "duration_s" in refused(script.command("run", duration_s=-1))
     assert "timeout" in refused(script.command("run", timeout=1e9))  # a word of the client's own
@@ -132,7 +132,7 @@ def test_arguments_are_checked_before_the_answer_and_nothing_is_changed(start):
     assert "colour" in refused(script.command("setup", colour="red"))
     assert "k_max" in refused(script.cmd('update_infer_params:{"k_max": "many"}'))
     assert "needs 14 finite numbers" in refused(script.cmd('init_move:{"qpos": [0]}'))
-    assert bench.station.state is State.READY
+    assert bench.station.state is SessionState.READY
 
 
 def test_what_the_station_refuses_is_told_with_what_is_allowed(start):
@@ -152,7 +152,7 @@ def test_a_failed_set_up_is_told_as_the_result_with_its_reason(start):
 
 
 def test_the_same_id_is_done_once_and_another_commands_id_is_refused(start):
-    bench = start(State.READY)
+    bench = start(SessionState.READY)
     script = bench.script()
     identity = "0b1c7f1e-57a1-4f0e-9b43-0a8a0d2f8a11"
     run = accepted(script.send(command="run", id=identity))
@@ -161,12 +161,12 @@ def test_the_same_id_is_done_once_and_another_commands_id_is_refused(start):
     assert script.result(run)["result"] == "failed"
     assert script.send(command="run", id=identity)["result"] == "failed"
     assert "was given to 'run' before" in refused(script.send(command="resume", id=identity))
-    assert bench.station.state is State.HOLDING
+    assert bench.station.state is SessionState.HOLDING
     done(script.send(command="stop", id=identity))  # a stop is obeyed all the same
 
 
 def test_chunk_by_chunk_and_by_hand(start):
-    bench = start(State.READY)
+    bench = start(SessionState.READY)
     script = bench.script()
     done(script.cmd("select_mode:step"))
     accepted(script.cmd("start"))
@@ -236,11 +236,11 @@ def test_a_terminal_is_refused_while_a_script_holds_it(start):
 
 
 def test_a_script_that_dies_loses_its_lease_and_the_robot_holds(start):
-    bench = start(State.READY, silence_s=0.5)
+    bench = start(SessionState.READY, silence_s=0.5)
     script = bench.script()
     accepted(script.cmd("start"))
     script.close()
-    bench.reach(State.HOLDING)
+    bench.reach(SessionState.HOLDING)
     assert "lease" in bench.station.reason
     other = bench.script()
     done(other.cmd("stop"))
@@ -248,7 +248,7 @@ def test_a_script_that_dies_loses_its_lease_and_the_robot_holds(start):
 
 @pytest.mark.parametrize("scripts", ["together", "apart"])
 def test_a_dashboard_does_not_keep_a_dead_scripts_lease(start, scripts):
-    bench = start(State.READY, silence_s=0.5, scripts=scripts)
+    bench = start(SessionState.READY, silence_s=0.5, scripts=scripts)
     dashboard = bench.script()
     assert dashboard.query("status")["state"] == "ready"
     accepted(bench.script().cmd("start"))
@@ -262,7 +262,7 @@ def test_a_dashboard_does_not_keep_a_dead_scripts_lease(start, scripts):
 
 
 def test_a_dashboards_stop_button_does_not_make_it_a_script(start):
-    bench = start(State.READY, silence_s=0.5)
+    bench = start(SessionState.READY, silence_s=0.5)
     dashboard = bench.script()
     accepted(bench.script().cmd("start"))
     done(dashboard.cmd("stop"))
@@ -272,17 +272,17 @@ def test_a_dashboards_stop_button_does_not_make_it_a_script(start):
 
 @pytest.mark.parametrize("question", ["status", "result"])
 def test_a_script_waits_with_a_connection_for_every_question(start, question):
-    bench = start(State.READY, silence_s=1.0)
+    bench = start(SessionState.READY, silence_s=1.0)
     run = accepted(bench.script().cmd("start"))
     until = time.monotonic() + 2.5
     while time.monotonic() < until:
         bench.script().query(question, id=run["id"])
-        assert bench.station.state is State.RUNNING
+        assert bench.station.state is SessionState.RUNNING
         time.sleep(0.1)
 
 
 def test_a_script_that_asks_now_and_then_keeps_it(start):
-    bench = start(State.READY, silence_s=1.0)
+    bench = start(SessionState.READY, silence_s=1.0)
     script = bench.script()
     accepted(script.cmd("start"))
     until = time.monotonic() + 2.5
@@ -321,7 +321,7 @@ def test_two_scripts_at_once_get_answers_of_their_own(start):
 
 @pytest.mark.parametrize("verb", ["reset", "console_reset", "operator_action:rollout_reset:node"])
 def test_a_reset_ends_a_halted_run_and_goes_home(start, verb):
-    script = start(State.READY).script()
+    script = start(SessionState.READY).script()
     done(script.cmd("select_mode:manual"))
     accepted(script.cmd("start"))
     done(script.cmd("manual_qpos:" + ",".join(map(str, FAR))))
@@ -342,21 +342,21 @@ def test_a_reset_that_cannot_go_home_is_refused(start):
 
 @pytest.mark.parametrize("verb", ["halt", "stop", "operator_action:cancel:node"])
 def test_any_script_of_the_channel_stops_what_another_has_begun(start, verb):
-    bench = start(State.READY)
+    bench = start(SessionState.READY)
     accepted(bench.script(client="one").cmd("start"))
     answer = done(bench.script().cmd(verb))
     assert answer["state"] == ("holding" if verb == "halt" else "ready")
 
 
 def test_a_stop_is_not_refused_for_its_arguments(start):
-    bench = start(State.READY)
+    bench = start(SessionState.READY)
     script = bench.script()
     accepted(script.cmd("start"))
     done(script.command("halt", whatever=[1]))
 
 
 def test_the_estop_needs_no_lease_and_no_main(start):
-    bench = start(State.READY)
+    bench = start(SessionState.READY)
     runner = bench.script()
     accepted(runner.cmd("start"))
     bench.frozen = True  # the coordinator answers nothing any more
@@ -365,12 +365,12 @@ def test_the_estop_needs_no_lease_and_no_main(start):
     answer = done(presser.command("estop", why="smoke"))
     assert "measured position" in answer["reason"]
     bench.frozen = False
-    bench.reach(State.FAULTED)
+    bench.reach(SessionState.FAULTED)
     assert "smoke" in bench.station.reason
     assert waiting.socket.poll(10_000)
     assert json.loads(waiting.socket.recv())["ok"] is False
     done(runner.command("release"))
-    bench.reach(State.IDLE)
+    bench.reach(SessionState.IDLE)
 
 
 @pytest.mark.parametrize(("key", "name"), [("command", "estop"), ("cmd", "web:estop"), ("cmd", "estop")])
@@ -433,7 +433,7 @@ def test_any_argument_of_a_verb_is_answered(noisy, verb, argument):
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory):
     bench = Bench(tmp_path_factory.mktemp("noisy"))
-    bench.reach(State.IDLE)
+    bench.reach(SessionState.IDLE)
     script = bench.script()
     yield script
     assert script.query("status")["state"] == "idle"

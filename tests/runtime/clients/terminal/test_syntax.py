@@ -2,7 +2,8 @@ import pytest
 
 from runtime.clients.terminal import syntax
 from runtime.clients.terminal.syntax import parse
-from runtime.processes.coordinator.session.transitions import COMMANDS, State
+from runtime.ipc.session_state import SessionState
+from runtime.processes.coordinator.session.transitions import COMMANDS
 
 
 def said(*words):
@@ -69,7 +70,7 @@ def test_every_command_of_the_session_can_be_said():
 
 
 def test_every_state_can_be_waited_for():
-    assert set(State) <= set(syntax.WORDS)
+    assert set(SessionState) <= set(syntax.WORDS)
 
 
 def test_the_data_folder_can_be_said_before_and_after_the_command(monkeypatch):

@@ -22,11 +22,11 @@ from runtime.core.errors import (
     TunnelError,
     UnreachableError,
 )
+from runtime.ipc.session_state import SessionState
 from runtime.policies.base import Policy
 from runtime.policies.tunnel import policy as tunnelled
 from runtime.policies.tunnel.policy import TunnelledPolicy
 from runtime.policies.tunnel.process import free_port
-from runtime.processes.coordinator.session.machine import State
 from runtime.sim.faults import Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
@@ -373,7 +373,7 @@ def assignments(tunnel: dict[str, Any]) -> list[str]:
 def test_a_trial_through_a_tunnel_puts_the_block_on_the_plate(ssh_server: Begin, tmp_path: Path) -> None:
     trial = pick_and_place("tabletop_ur5e", 0, tmp_path / "data", assignments(ssh_server().settings()))
     assert trial.success, (trial.reason, trial.milestones, trial.events)
-    assert trial.state is State.RUNNING
+    assert trial.state is SessionState.RUNNING
 
 
 def test_a_run_holds_naming_the_tunnel_that_broke_and_goes_on_when_it_is_up_again(
@@ -383,15 +383,15 @@ def test_a_run_holds_naming_the_tunnel_that_broke_and_goes_on_when_it_is_up_agai
     with served("tabletop_ur5e", 0, tmp_path / "data", assignments(server.settings())) as (_, station):
         session = station.coordinator.session
         station.connect()
-        station.until(lambda: session.state is not State.DISCONNECTED, 5.0, "first observation")
+        station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
         station.command("setup")
-        station.until(lambda: session.state is not State.SETTING_UP, 60.0, "set-up")
-        assert session.state is State.READY, session.reason
+        station.until(lambda: session.state is not SessionState.SETTING_UP, 60.0, "set-up")
+        assert session.state is SessionState.READY, session.reason
         station.command("run")
         station.until(lambda: station.coordinator.inference.metrics.answers > 2, 20.0, "answers")
         server.stop()
-        station.until(lambda: session.state is not State.RUNNING, 60.0, "the end of patience")
-        assert session.state is State.HOLDING
+        station.until(lambda: session.state is not SessionState.RUNNING, 60.0, "the end of patience")
+        assert session.state is SessionState.HOLDING
         assert f"127.0.0.1:{server.port} is down since" in session.reason
         server.start()
         policy = station.coordinator.inference.policy
@@ -401,5 +401,5 @@ def test_a_run_holds_naming_the_tunnel_that_broke_and_goes_on_when_it_is_up_agai
         answers = station.coordinator.inference.metrics.answers
         station.command("resume")
         station.until(lambda: station.coordinator.inference.metrics.answers > answers + 2, 20.0, "answers")
-        assert session.state is State.RUNNING, session.reason
+        assert session.state is SessionState.RUNNING, session.reason
     assert server.log().count("Accepted publickey") == 2

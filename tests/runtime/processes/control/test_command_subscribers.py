@@ -8,9 +8,9 @@ import pytest
 
 from runtime.core.errors import TransportError
 from runtime.core.types import RobotCommand
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState, SharedStateLayout
 from runtime.processes.control.command_subscribers import SubscriberCheck
-from runtime.processes.coordinator.session.transitions import State
 from runtime.transports.base import Sink
 from tests.runtime.lockstep_station import Station, spec_of
 
@@ -103,7 +103,7 @@ def test_it_is_in_the_status_before_anything_is_set_up_and_leaves_it(
     found = {"/left": ""}
     monkeypatch.setattr(station.robot, "unheard", lambda: dict(found), raising=False)
     station.go(90)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert station.coordinator.snapshot()["link"]["unheard"] == {"/left": ""}
     found.clear()
     station.go(90)

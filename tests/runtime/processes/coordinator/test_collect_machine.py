@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import initialize, rule
 
 from runtime.config import loader
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from runtime.recording.labels import newest
 from runtime.station import spec as station_spec
 from tests.runtime.collect_station import CollectPlan, CollectStation
@@ -49,7 +49,7 @@ class Collects(test_session_machine.Machine):
         before = station.collect["episode"] or (list(self.opened)[-1] if self.opened else None)
         self.command((pressed, {}), 0)
         if pressed == "run" and collects and not armed:
-            assert station.state is not State.RUNNING
+            assert station.state is not SessionState.RUNNING
         if pressed == "discard" and before is not None and self.label_of(before):
             self.opened[before] = True
         self.tick(wait)
@@ -62,14 +62,14 @@ class Collects(test_session_machine.Machine):
         self.does, self.keeps_lease = "ramp", True
         if "leader" in self.station.made.built:
             self.station.leader.silent = False
-        if self.station.state is State.FAULTED:
+        if self.station.state is SessionState.FAULTED:
             self.release(3)
         for kind, arguments in (("stop", {}), ("setup", {"collect": True}), ("arm", {}), ("run", {})):
             self.tick(3)
             if kind in self.station.coordinator.session.allowed():
                 self.command((kind, arguments), 1)
             for _ in range(200):
-                if self.station.state is State.SETTING_UP:
+                if self.station.state is SessionState.SETTING_UP:
                     self.tick(1)
         self.tick(wait)
 
@@ -97,12 +97,14 @@ class Collects(test_session_machine.Machine):
         run = main.run
         if run is not None and run.mode == "collect" and run.uuid:
             self.opened.setdefault(run.uuid, False)
-            assert main.session.state is not State.RUNNING or main.collecting.armed, "nobody leads unarmed"
+            assert main.session.state is not SessionState.RUNNING or main.collecting.armed, (
+                "nobody leads unarmed"
+            )
 
     def asked(self) -> bool:
         main = self.station.coordinator
         leads = main.run is not None and main.run.mode == "collect"
-        return super().asked() or (leads and main.session.state is State.RUNNING)
+        return super().asked() or (leads and main.session.state is SessionState.RUNNING)
 
     def label_of(self, episode: str) -> Any:
         label = newest(Path(self.folder.name), episode)

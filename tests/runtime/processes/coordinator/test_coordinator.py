@@ -7,8 +7,8 @@ import pytest
 
 from runtime.core.errors import SetupError
 from runtime.ipc.messages import UNHEARD, Command, EpisodeOpened, Event, encode
+from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.coordinator import Coordinator
-from runtime.processes.coordinator.session.transitions import State
 from tests.runtime.lockstep_station import STANDS, Station, ramp, spec_of
 
 
@@ -24,20 +24,21 @@ def without(station: Station, process: str, seconds: float) -> None:
 def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(tmp_path: Path, process: str) -> None:
     station = Station(spec_of(tmp_path)).running(10)
     without(station, process, 1.5)
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     assert f"no sign of life from the process {process}" in station.reason
     station.go(1)
     station.command("resume")
     station.go(5)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     station.close()
 
 
 @pytest.mark.parametrize(
-    ("answer", "state"), [("slow", State.HOLDING), ("hold", State.HOLDING), ("stop", State.READY)]
+    ("answer", "state"),
+    [("slow", SessionState.HOLDING), ("hold", SessionState.HOLDING), ("stop", SessionState.READY)],
 )
 def test_a_run_whose_chunks_all_come_too_late_is_ended_by_the_rule_of_starvation(
-    tmp_path: Path, answer: str, state: State
+    tmp_path: Path, answer: str, state: SessionState
 ) -> None:
     late = spec_of(tmp_path, lambda seen, number: ramp(seen.step, 2), delay=4, faults={"starvation": answer})
     station = Station(late).ready()
@@ -49,10 +50,11 @@ def test_a_run_whose_chunks_all_come_too_late_is_ended_by_the_rule_of_starvation
 
 
 @pytest.mark.parametrize(
-    ("answer", "state"), [("slow", State.HOLDING), ("hold", State.HOLDING), ("stop", State.READY)]
+    ("answer", "state"),
+    [("slow", SessionState.HOLDING), ("hold", SessionState.HOLDING), ("stop", SessionState.READY)],
 )
 def test_a_run_of_which_no_answer_can_be_used_is_ended_by_the_rule_of_errors(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, state: State
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, state: SessionState
 ) -> None:
     station = Station(spec_of(tmp_path, faults={"policy_error": answer, "starvation": "slow"})).ready()
     monkeypatch.setattr(station.coordinator.inference.requests, "note", lambda answered: [][0])
@@ -74,7 +76,7 @@ def test_an_arm_that_was_moved_while_ready_makes_the_station_idle_and_stays_wher
         station.robot.position = moved.copy()
         station.go(1)
     station.go(30)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert "0.5" in station.reason  # by which it is known that it was moved; where it ends is followed
     assert "from where it was told to hold" in station.reason
     arms = [dim for dim in range(len(STANDS)) if dim not in station.spec.robot.gripper_dims]
@@ -86,7 +88,7 @@ def test_cameras_that_send_nothing_are_named(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path))
     station.robot.cameras.remove("cam_left_wrist")
     station.go(10)
-    assert station.state is State.DISCONNECTED
+    assert station.state is SessionState.DISCONNECTED
     assert station.reason == "no picture has arrived from cam_left_wrist"
     sequence = station.coordinator.session.sequence
     station.go(30)
@@ -106,7 +108,7 @@ def test_a_recording_without_a_run_that_fails_is_over_and_a_run_may_begin(tmp_pa
         station.command("record_stop")
     station.command("run")
     station.go(3)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     station.close()
 
 
@@ -123,14 +125,14 @@ def test_the_death_of_control_closes_a_recording_without_a_run_and_a_run_records
     alone = station.command("record_start").data["episode"]
     station.go(5)
     restarted(station, "control")
-    assert (station.state, station.media.recording) == (State.IDLE, False)
+    assert (station.state, station.media.recording) == (SessionState.IDLE, False)
     ended = station.coordinator.runs.last_episode
     assert (ended["uuid"], ended["status"]) == (alone, "interrupted")
     assert ended["reason"] == "the process control died and was restarted: set up again"
     station.ready()
     own = station.command("run").data["episode"]
     station.go(5)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     assert station.stop().manifest["uuid"] == own
     station.close()
 
@@ -142,7 +144,7 @@ def test_the_death_of_the_guard_leaves_a_recording_without_a_run_open_until_it_i
     alone = station.command("record_start").data["episode"]
     station.go(5)
     restarted(station, "guard")
-    assert (station.state, station.media.recording) == (State.IDLE, True)
+    assert (station.state, station.media.recording) == (SessionState.IDLE, True)
     station.ready()
     with pytest.raises(SetupError, match="a recording without a run is open: record stop first"):
         station.command("run")
@@ -189,7 +191,7 @@ def test_a_media_that_does_not_read_keeps_nobody_from_stopping(tmp_path: Path, h
     else:
         station.guard.press("anna", "a test")
     station.go(10)
-    assert station.state is (State.READY if how == "stop" else State.FAULTED)
+    assert station.state is (SessionState.READY if how == "stop" else SessionState.FAULTED)
     assert station.coordinator.run is None
     station.close()
 
@@ -207,7 +209,7 @@ def test_a_media_that_does_not_read_costs_the_record_and_not_the_station(tmp_pat
     station.shared.rings["minutes"].push = lambda payload: False
     station.media.digest = lambda: None
     station.go(20)
-    assert station.state in (State.RUNNING, State.HOLDING)
+    assert station.state in (SessionState.RUNNING, SessionState.HOLDING)
     assert np.isfinite(station.robot.sent).all()
     station.close()
 
@@ -228,6 +230,6 @@ def test_events_from_before_main_was_there_are_kept_and_nothing_that_was_told_is
         "source_frozen_cam_high",
     ]
     assert station.coordinator.unheard == told["unheard"]
-    assert station.state is State.DISCONNECTED  # as it begins, until it has looked itself
+    assert station.state is SessionState.DISCONNECTED  # as it begins, until it has looked itself
     assert station.reason == "waiting for the first observation"
     station.close()

@@ -12,8 +12,8 @@ import pytest
 from runtime.config import loader
 from runtime.core.errors import RecordingError, SetupError
 from runtime.datasets.published import publish
+from runtime.ipc.session_state import SessionState
 from runtime.processes.control.process import Loop, make_tick, outlive
-from runtime.processes.coordinator.session.transitions import State
 from runtime.recording.labels import labels
 from runtime.recording.reader import Episode
 from runtime.station import spec as station_spec
@@ -126,19 +126,19 @@ def test_a_leader_that_is_far_away_is_approached_before_it_is_followed(tmp_path:
     station.command("arm")
     station.command("run")
     station.go(10)
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     assert "1.20 rad" in station.reason
     assert not station.collect["armed"]
     assert "1.20 rad" in station.collect["why_not"]
     station.command("stop")
     station.go(3)
     station.command("approach")
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     assert station.robot.position[LEFT] == pytest.approx(station.leader.joints[LEFT], abs=0.01)
     station.command("arm")
     station.command("run")
     station.go(10)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     station.close()
 
 
@@ -149,7 +149,7 @@ def test_a_leader_that_falls_silent_holds_the_robot_and_takes_the_arm(tmp_path: 
     station.go(30)
     station.leader.silent = True
     station.go(20)
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     assert "has said nothing for" in station.reason
     assert station.events("starvation") == []
     assert not station.collect["armed"]
@@ -177,7 +177,7 @@ def test_no_leader_fails_the_set_up_with_its_sentence(tmp_path: Path) -> None:
     station = collecting(tmp_path)
     station.made.built["mute"] = True
     station.prepare(collect=True)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert "the leader in the test says nothing" in station.reason
     station.close()
 
@@ -273,9 +273,9 @@ def test_a_node_that_reports_no_action_fails_the_run_within_two_seconds(tmp_path
     station.robot.leaderless = True  # type: ignore[attr-defined]
     station.command("run")
     station.go(55)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     station.go(15)
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     assert "reports no action within 2 s" in station.reason
     assert not station.collect["armed"]
     station.go(5)
@@ -291,7 +291,7 @@ def test_a_node_that_stops_reporting_is_told_to_end_and_the_episode_is_kept_open
     station.go(40)
     station.robot.leaderless = True  # type: ignore[attr-defined]
     station.go(70)
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     assert "has reported no action for" in station.reason
     station.go(6)
     assert station.robot.told[-1][0] == "collect_stop"
@@ -368,7 +368,7 @@ def test_the_arm_falls_with_its_sentence(tmp_path: Path, cause: str) -> None:
         station.go(15)
     elif cause == "moved":
         station.command("home")
-        station.reach(State.READY)
+        station.reach(SessionState.READY)
         station.robot.blocked = True
         station.robot.position[LEFT] += 1.0
         station.go(30)
@@ -487,7 +487,7 @@ def test_an_episode_does_not_begin_without_what_the_schema_asks_for(tmp_path: Pa
     station = collecting(tmp_path, streams=["effort"]).armed()
     station.command("run")
     station.go(5)
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     assert "measures no effort" in station.reason
     station.close()
 
@@ -518,7 +518,7 @@ def test_discarding_ends_the_open_episode_keeps_its_files_and_the_next_may_begin
     station.go(20)
     episode = station.collect["episode"]
     station.command("discard")
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     station.command("run")
     station.go(10)
     assert station.collect["last"] == {
@@ -531,7 +531,7 @@ def test_discarding_ends_the_open_episode_keeps_its_files_and_the_next_may_begin
     assert station.collect["episode"] not in (None, episode)
     station.command("label", episode=episode, result="fail")
     assert [label.discarded for label in labels(tmp_path, episode)] == [True, True]
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     with pytest.raises(SetupError, match="is the open one"):
         station.command("discard", episode=station.collect["episode"])
     station.close()

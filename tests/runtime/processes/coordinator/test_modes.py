@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from runtime.core.errors import PolicyError, PolicyLostError, SetupError
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from tests.runtime.lockstep_station import STANDS, Station, column, on_time, ramp, spec_of
 
 LEFT_GRIPPER = 6
@@ -20,7 +20,7 @@ def begun(tmp_path: Path, mode: str, rows: Any = on_time, **settings: Any) -> St
     station = Station(spec_of(tmp_path, rows, **settings)).ready()
     station.command("run", mode=mode)
     station.go(3)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     return station
 
 
@@ -113,7 +113,7 @@ def test_approach_goes_to_where_the_shown_chunk_begins_and_commit_executes_it_fr
     assert np.allclose(station.robot.position, ramp(400, 1)[0], atol=1e-3)
     station.command("commit")
     station.go(12)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     assert np.allclose(station.robot.position, ramp(404, 1)[0], atol=5e-3)
     station.close()
 
@@ -124,8 +124,8 @@ def test_a_far_first_action_is_said_at_set_up_and_can_be_approached_before_the_r
     assert first["far"]
     assert "far" in station.reason
     station.command("approach")
-    assert station.state is State.SETTING_UP
-    station.reach(State.READY)
+    assert station.state is SessionState.SETTING_UP
+    station.reach(SessionState.READY)
     assert not station.coordinator.snapshot()["first_action"]["far"]
     assert station.reason == "at the policy's first action"
     station.close()
@@ -197,7 +197,7 @@ def test_cancelling_a_motion_stops_on_the_way_and_the_run_goes_on(tmp_path: Path
     station.command("cancel")
     station.go(15)
     assert phase(station) == "waiting"
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     assert STANDS[0] < station.robot.position[0] < goal[0] - 0.05
     station.command("move", pose="ready")
     station.go(2)
@@ -240,7 +240,7 @@ def test_a_gripper_opens_by_hand_while_the_station_is_ready(tmp_path: Path) -> N
     assert np.allclose(
         np.delete(station.robot.position, LEFT_GRIPPER), np.delete(STANDS, LEFT_GRIPPER), atol=1e-4
     )
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     station.close()
 
 
@@ -293,7 +293,7 @@ def test_another_strategy_takes_over_within_a_run_without_a_gap_or_a_jump(
     station = Station(spec_of(tmp_path, strategy=before, delay=2)).running(25)
     station.command("tune", strategy={"kind": after})
     station.go(60)
-    assert station.state is State.RUNNING, station.reason
+    assert station.state is SessionState.RUNNING, station.reason
     assert station.coordinator.snapshot()["strategy"] == after
     assert station.events("starved") == []
     sent = station.robot.sent
@@ -338,7 +338,7 @@ def test_a_strategy_that_there_is_not_is_refused_and_nothing_changes(
         station.command("tune", strategy=strategy)
     assert station.coordinator.snapshot()["tuning"] == before
     station.go(20)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     station.close()
 
 
@@ -362,14 +362,14 @@ LOST, WRONG = PolicyLostError("no answer within 2 s"), PolicyError("actions have
 @pytest.mark.parametrize(
     ("error", "answer", "state", "status"),
     [
-        (LOST, "hold", State.HOLDING, ""),
-        (LOST, "stop", State.READY, "failed"),
-        (WRONG, "hold", State.HOLDING, ""),
-        (WRONG, "stop", State.READY, "failed"),
+        (LOST, "hold", SessionState.HOLDING, ""),
+        (LOST, "stop", SessionState.READY, "failed"),
+        (WRONG, "hold", SessionState.HOLDING, ""),
+        (WRONG, "stop", SessionState.READY, "failed"),
     ],
 )
 def test_a_policy_that_fails_is_answered_as_the_deployment_says(
-    tmp_path: Path, error: Exception, answer: str, state: State, status: str
+    tmp_path: Path, error: Exception, answer: str, state: SessionState, status: str
 ) -> None:
     faults = {"policy_lost": answer, "policy_error": answer}
     station = Station(spec_of(tmp_path, Failing(error, 4, 1000), faults=faults)).running(30)
@@ -387,7 +387,7 @@ def test_slowly_means_going_on_with_what_is_planned_and_with_the_policy_when_it_
 ) -> None:
     faults = {"policy_lost": "slow", "policy_error": "slow"}
     station = Station(spec_of(tmp_path, Failing(error, 6, 2), faults=faults)).running(90)
-    assert station.state is State.RUNNING, station.reason
+    assert station.state is SessionState.RUNNING, station.reason
     assert len(station.events("policy_back")) == 1
     assert station.events("starved") == []  # what was planned has lasted
     station.close()
@@ -397,14 +397,14 @@ def test_slowly_means_going_on_with_what_is_planned_and_with_the_policy_when_it_
 def test_patience_ends_in_holding_and_the_run_can_be_resumed(tmp_path: Path, strategy: str) -> None:
     policy = Failing(LOST, 6, 10**6)
     station = Station(spec_of(tmp_path, policy, strategy=strategy)).running(10)
-    station.reach(State.HOLDING)
+    station.reach(SessionState.HOLDING)
     asked = policy.asked
     station.go(60)
     assert policy.asked == asked  # while it holds nobody is asked
     policy.left = 0
     station.command("resume")
     station.go(40)
-    assert station.state is State.RUNNING, station.reason
+    assert station.state is SessionState.RUNNING, station.reason
     station.close()
 
 
@@ -425,15 +425,15 @@ def test_a_run_whose_first_action_is_farther_than_a_jump_moves_nothing_and_holds
 ) -> None:
     station = Station(spec_of(tmp_path, lambda o, n: ramp(400, 20), strategy=strategy)).ready()
     station.command("run")
-    station.reach(State.HOLDING)
+    station.reach(SessionState.HOLDING)
     assert "allowed 0.5 (safety.jump): approach it, or start elsewhere" in station.reason
     assert np.allclose(station.robot.sent, STANDS, atol=1e-6)
     station.command("stop")
     station.command("approach")
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     station.command("run")
     station.go(20)
-    assert station.state is State.RUNNING, station.reason
+    assert station.state is SessionState.RUNNING, station.reason
     station.close()
 
 
@@ -448,13 +448,13 @@ def left_gripper(station: Station) -> float:
     return float(station.robot.position[LEFT_GRIPPER])
 
 
-@pytest.mark.parametrize("state", [State.READY, State.HOLDING])
+@pytest.mark.parametrize("state", [SessionState.READY, SessionState.HOLDING])
 @pytest.mark.parametrize("locked", [False, True])
 def test_the_end_of_the_lease_stops_a_gripper_that_is_on_its_way(
-    tmp_path: Path, state: State, locked: bool
+    tmp_path: Path, state: SessionState, locked: bool
 ) -> None:
     station = closed_gripper(begun(tmp_path, "continuous"))
-    station.command("halt" if state is State.HOLDING else "stop")
+    station.command("halt" if state is SessionState.HOLDING else "stop")
     station.go(5)
     if locked:
         station.command("gripper", arm="left_arm", action="lock")
@@ -494,10 +494,10 @@ def test_an_e_stop_forgets_locks_on_both_sides(tmp_path: Path) -> None:
     station.guard.press("lockstep", "a test")
     station.go(20)
     at = left_gripper(station)
-    assert station.state is State.FAULTED
+    assert station.state is SessionState.FAULTED
     station.command("release")
     station.go(30)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert left_gripper(station) == at
     assert not station.coordinator.snapshot()["grippers"]["left_arm"]["locked"]
     station.close()
@@ -546,7 +546,7 @@ def test_an_arm_that_was_moved_while_a_person_looks_holds_the_run(tmp_path: Path
         station.robot.position = station.robot.position + 0.02 * np.eye(14)[0]
         station.go(1)
     station.go(30)
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     assert "from where it was told to hold" in station.reason
     assert station.coordinator.inference.proposal is None
     if station.robot.commands:
@@ -572,7 +572,7 @@ def test_a_run_is_merged_by_the_strategy_it_was_set_up_with_also_by_a_control_th
     station.command("setup", strategy={"kind": "sync"})
     for _ in station.shared.rings["orders"].drain():
         pass  # a control that begins knows the deployment alone
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     station.command("run", trial={"id": 1})
     station.go(20)
     assert set(column(station.stop().raw, "strategy")) <= {"sync", ""}
@@ -582,7 +582,7 @@ def test_a_run_is_merged_by_the_strategy_it_was_set_up_with_also_by_a_control_th
 def test_a_chunk_that_is_too_long_is_named_as_such(tmp_path: Path) -> None:
     station = begun(tmp_path, "continuous", lambda o, n: ramp(o.step, 20 if n < 6 else 5000))
     station.go(30)
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     assert station.reason == "the policy answered with 5000 rows; allowed: at most 2000 in one chunk"
     station.close()
 
@@ -601,7 +601,7 @@ def test_a_failure_that_was_cancelled_is_not_held_against_the_next_question(tmp_
     station.go(200)
     station.command("step")
     station.go(15)
-    assert station.state is State.RUNNING, station.reason
+    assert station.state is SessionState.RUNNING, station.reason
     station.close()
 
 
@@ -614,7 +614,7 @@ def test_the_end_of_a_motion_before_is_not_taken_for_the_end_of_homing(tmp_path:
     station.command("home")  # control has said that it is done, the coordinator has not heard it yet
     station.go(3)
     assert station.coordinator.setup.stage == "going to the pose"
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     assert np.abs(station.robot.position[~station.spec.limits.grippers]).max() < 1e-3
     station.close()
 
@@ -629,7 +629,7 @@ def test_a_gripper_that_a_policy_wants_beyond_its_travel_is_no_obstacle_to_an_ap
 
     station = Station(spec_of(tmp_path, rows)).ready()
     station.command("approach")
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     assert left_gripper(station) == pytest.approx(0.0, abs=1e-6)
     station.command("run", mode="preview")
     station.go(3)
@@ -649,7 +649,7 @@ def test_a_late_policy_that_means_to_begin_where_the_robot_stands_begins(tmp_pat
     station = Station(spec_of(tmp_path, rows, delay=28)).ready()
     station.command("run", duration_s=1.3)
     station.go(38)
-    assert station.state is State.RUNNING, station.reason
+    assert station.state is SessionState.RUNNING, station.reason
     assert station.events("far_start")
     assert np.abs(np.diff(station.robot.sent, axis=0)).max() < 0.15
     station.close()

@@ -14,9 +14,9 @@ import zmq
 
 from runtime.ipc.bus import GREEDY, Endpoints, Key
 from runtime.ipc.messages import Ack, Command, decode, encode
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
 from runtime.processes.coordinator.process import CommandService
-from runtime.processes.coordinator.session.transitions import State
 from tests import presses
 from tests.runtime.lockstep_station import Station, spec_of
 
@@ -105,9 +105,9 @@ def test_a_stop_that_cannot_be_verified_is_obeyed_and_recorded_so(
     client.send_multipart([encode(stop), signature] if signature else [encode(stop)])
     for _ in range(PATIENCE):
         bench.service.serve(0.01)
-        if bench.coordinator.session.state is not State.RUNNING:
+        if bench.coordinator.session.state is not SessionState.RUNNING:
             break
-    assert bench.coordinator.session.state is (State.READY if kind == "stop" else State.HOLDING)
+    assert bench.coordinator.session.state is (SessionState.READY if kind == "stop" else SessionState.HOLDING)
     (event,) = [event for event in bench.told("command") if event["data"]["uuid"] == stop.uuid]
     assert event["text"] == f"{kind} by ann (unverified): accepted"
     assert bench.journalled()[-1]["role"] == "unverified"
@@ -142,9 +142,9 @@ def test_without_its_key_a_station_still_stops_and_refuses_the_rest(bench: Bench
     client.send_multipart([encode(stop), signature])
     for _ in range(PATIENCE):
         bench.service.serve(0.01)
-        if bench.coordinator.session.state is State.READY:
+        if bench.coordinator.session.state is SessionState.READY:
             break
-    assert bench.coordinator.session.state is State.READY
+    assert bench.coordinator.session.state is SessionState.READY
 
 
 def test_repeats_of_a_stop_get_the_first_ones_answer_and_one_line(bench: Bench) -> None:
@@ -205,7 +205,7 @@ def test_a_press_at_the_wrong_socket_stops_the_robot_and_is_latched_by_the_guard
     assert bench.ask(bench.client(), Command("p", "estop", {"why": "smoke"})).status == "accepted"
     assert bench.coordinator.shared.estop is EStop.LATCHED
     bench.station.go(40)
-    assert bench.coordinator.session.state is State.FAULTED
+    assert bench.coordinator.session.state is SessionState.FAULTED
     assert json.loads((bench.folder / "estop.json").read_text("utf-8"))["why"] == "smoke"
     assert bench.journalled()[-1]["kind"] == "estop"
     assert bench.told("command")[-1]["text"].endswith(": accepted, smoke")

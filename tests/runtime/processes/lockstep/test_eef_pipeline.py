@@ -13,8 +13,8 @@ import pytest
 from runtime.config import loader
 from runtime.core.pose_format import PoseFormat
 from runtime.core.types import ActionChunk, ActionMode, Conditioning, Float64, Observation
+from runtime.ipc.session_state import SessionState
 from runtime.kinematics.base import IkFlag
-from runtime.processes.coordinator.session.transitions import State
 from runtime.spaces.conversion import ActionSpaces
 from runtime.spaces.pose_rows import PoseRows
 from runtime.spaces.relative_poses import absolute
@@ -136,7 +136,7 @@ def test_a_policy_that_means_to_begin_far_away_is_found_out_although_the_first_s
     assert first["far"]
     assert first["distance"] == pytest.approx(0.9, abs=0.01)
     station.command("run")
-    station.reach(State.HOLDING)
+    station.reach(SessionState.HOLDING)
     assert "the first action is 0.9" in station.reason
     station.close()
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from runtime.core.errors import SetupError
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
-from runtime.processes.coordinator.session.transitions import State
 from tests.runtime.lockstep_station import MOVED, Station, spec_of
 
 JOINT = "left_arm.joint0"
@@ -60,9 +60,9 @@ def test_nothing_that_moves_begins_while_a_joint_has_leapt(tmp_path):
     misread(station, 0.0)  # it reads where it is held again
     station.command("run")
     station.go(30)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     misread(station, LEAP)
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     for said in refused(station, [("resume", {}), ("gripper", {"action": "open"})]):
         assert JOINT in said
 
@@ -77,7 +77,7 @@ def test_joints_that_are_no_numbers_or_noise_let_nothing_run_on(tmp_path, fault)
         misread(station, reads.get(fault, lambda: rng.normal(0.0, 0.05))(), ticks=1)
     if fault == "small noise":
         station.command("run")
-        assert station.state is State.RUNNING
+        assert station.state is SessionState.RUNNING
     else:
         refused(station)
 
@@ -87,7 +87,7 @@ def test_a_spike_costs_nothing_but_the_moment(tmp_path):
     misread(station, LEAP, ticks=1)
     misread(station, 0.0, ticks=6)
     station.command("run")
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
 
 
 @pytest.mark.parametrize("home", [True, False])
@@ -96,7 +96,7 @@ def test_the_first_set_up_after_a_leap_takes_the_robot_over_where_it_is_read(tmp
     station = ready(tmp_path, home)
     if not home:  # what was moved once is held from then on
         station.command("home")
-        station.until(lambda: station.state is State.READY, 60.0, "home")
+        station.until(lambda: station.state is SessionState.READY, 60.0, "home")
     station.robot.blocked = True
     station.robot.position[MOVED[0]] += LEAP
     station.go(45)
@@ -106,14 +106,14 @@ def test_the_first_set_up_after_a_leap_takes_the_robot_over_where_it_is_read(tmp
     meant = station.robot.position[MOVED[0]]
     station.until(lambda: abs(station.robot.sent[-1][MOVED[0]] - meant) < 0.15, 8.0, "the command there")
     station.robot.blocked = False
-    station.until(lambda: station.state is not State.SETTING_UP, 60.0, "set-up")
-    assert station.state is State.READY, station.reason
+    station.until(lambda: station.state is not SessionState.SETTING_UP, 60.0, "set-up")
+    assert station.state is SessionState.READY, station.reason
     assert not station.events("refusals")
     moved = np.abs(np.diff(station.robot.sent[count - 1 :], axis=0))
     assert (moved <= station.spec.limits.velocity / station.spec.rate * 1.05).all()
     station.command("run")
     station.go(30)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
 
 
 def test_a_set_up_that_cannot_follow_says_which_encoder_is_off(tmp_path):
@@ -122,7 +122,7 @@ def test_a_set_up_that_cannot_follow_says_which_encoder_is_off(tmp_path):
     misread(station, LEAP)
     stood = station.robot.position[MOVED[0]]
     station.prepare()
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert JOINT in station.reason
     assert "is its encoder off" in station.reason
     station.go(60)
@@ -136,6 +136,6 @@ def test_a_run_does_not_begin_where_a_joint_is_in_doubt_once_its_recording_is_op
         SharedState, "doubt", f"{JOINT} reads 0.450 rad and is held at 0.000"
     )  # said before, so no event
     station.go(30)
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     assert JOINT in station.reason
     assert station.coordinator.runs.open is None

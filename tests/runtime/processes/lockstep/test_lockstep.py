@@ -14,8 +14,8 @@ from runtime.core.errors import PolicyError, SetupError
 from runtime.core.types import Float64, Observation
 from runtime.datasets.published import publish
 from runtime.ipc.estop_latch import Latch
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
-from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.station import spec as station_spec
@@ -99,7 +99,7 @@ def test_two_runs_are_recorded_equal_to_the_last_bit(tmp_path: Path, strategy: s
     for name in ("one", "two"):
         made = spec_of(tmp_path / name, strategy=strategy, delay=delay, run={"duration_s": 2.0})
         done = lockstep.run(made)
-        assert done.state is State.READY, done.reason
+        assert done.state is SessionState.READY, done.reason
         episodes.append(open_episode(Path(done.episode["path"])))
     one, two = episodes
     for table in TABLES:
@@ -168,7 +168,7 @@ def test_a_policy_that_answers_nan_leads_to_holding_with_a_named_reason(
         return answer
 
     station = Station(spec_of(tmp_path, rows, strategy=strategy)).running(0)
-    station.reach(State.HOLDING)
+    station.reach(SessionState.HOLDING)
     assert "nan for left_arm.joint2 in row 4" in station.reason
     station.go(30)
     assert finite_and_within_limits(station)
@@ -180,7 +180,7 @@ def test_a_policy_that_answers_nan_leads_to_holding_with_a_named_reason(
 def test_a_policy_with_the_wrong_dimension_fails_the_set_up_with_a_sentence(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, lambda o, n: np.zeros((10, 13))))
     station.prepare()
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert "joint actions of shape (10, 13); agilex_piper takes [H, 14]" in station.reason
     assert station.robot.commands == []
     assert station.policy.calls[-1] == "close"
@@ -200,7 +200,7 @@ def test_a_policy_that_raises_in_the_middle_of_a_run_is_held_and_not_asked_again
         return ramp(observation.step, 20)
 
     station = Station(spec_of(tmp_path, rows, delay=delay)).running(0)
-    station.reach(State.HOLDING)
+    station.reach(SessionState.HOLDING)
     assert str(error) in station.reason
     assert type(error).__name__ in station.reason
     asked = station.policy.calls.count("infer")
@@ -220,7 +220,7 @@ def test_a_policy_that_jumps_is_refused_and_held(tmp_path: Path) -> None:
         return answer
 
     station = Station(spec_of(tmp_path, rows, strategy="sync")).running(0)
-    station.reach(State.HOLDING)
+    station.reach(SessionState.HOLDING)
     assert "10 actions refused in a row" in station.reason
     assert "left_arm.joint0 would be 1.5" in station.reason
     assert "from where it is measured" in station.reason
@@ -230,7 +230,7 @@ def test_a_policy_that_jumps_is_refused_and_held(tmp_path: Path) -> None:
 
 def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, lambda o, n: ramp(o.step, 5), delay=7)).running(0)
-    station.reach(State.HOLDING, 10.0)
+    station.reach(SessionState.HOLDING, 10.0)
     assert "no usable chunk" in station.reason
     assert len(station.events("chunk_dropped")) >= 2
     assert (station.robot.sent == STANDS.astype(np.float32)).all()
@@ -239,7 +239,7 @@ def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_p
 
 def test_of_a_policy_that_does_not_answer_it_is_said_since_when(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, delay=300)).running(0)
-    station.reach(State.HOLDING, 20.0)
+    station.reach(SessionState.HOLDING, 20.0)
     reason = r"no usable chunk for [\d.]+ s: the policy was asked [1-9][\d.]* s ago and has not answered yet"
     assert re.fullmatch(reason, station.reason), station.reason
     station.close()
@@ -273,7 +273,7 @@ def test_the_e_stop_in_the_middle_of_a_run_faults_and_sends_the_measured_positio
     station.robot.blocked = True
     station.robot.position = STANDS + 0.01
     station.go(20)
-    assert station.state is State.FAULTED
+    assert station.state is SessionState.FAULTED
     assert "ada: smoke" in station.reason
     arms = [dim for dim in range(len(STANDS)) if dim not in station.spec.robot.gripper_dims]
     assert (station.robot.sent[-12:, arms] == (STANDS + 0.01).astype(np.float32)[arms]).all()
@@ -294,13 +294,13 @@ def test_an_e_stop_is_told_with_who_pressed_where_the_disk_has_it_soon(
     station = Station(spec_of(tmp_path)).running(30)
     station.shared.set_estop(EStop.LATCHED)
     station.go(3)
-    assert station.state is State.RUNNING  # control obeys already; nobody knows yet who it was
+    assert station.state is SessionState.RUNNING  # control obeys already; nobody knows yet who it was
     if on_disk:
         Latch(station.spec.deployment.station_dir).set("ada", "smoke")
         station.go(2)
     else:
         station.go(6)
-    assert station.state is State.FAULTED
+    assert station.state is SessionState.FAULTED
     assert reason in station.reason
     station.close()
 
@@ -320,7 +320,7 @@ def test_the_e_stop_is_latched_on_disk_and_read_before_the_first_command_of_a_se
     second = Station(made)
     second.robot.silent = True  # not seen yet: nobody knows where it is
     second.go(10)
-    assert second.state is State.FAULTED
+    assert second.state is SessionState.FAULTED
     assert second.robot.commands == []
     second.robot.silent = False
     second.go(10)
@@ -329,10 +329,10 @@ def test_the_e_stop_is_latched_on_disk_and_read_before_the_first_command_of_a_se
         second.command("setup")
     second.command("release")
     second.go(3)
-    assert second.state is State.IDLE
+    assert second.state is SessionState.IDLE
     assert Latch(made.deployment.station_dir).read() is None
     second.running(20)
-    assert second.state is State.RUNNING
+    assert second.state is SessionState.RUNNING
     second.close()
 
 
@@ -341,7 +341,7 @@ def test_the_duration_ends_the_run_and_time_on_hold_does_not_count(tmp_path: Pat
     station.command("halt")
     station.go(45)
     station.command("resume")
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     assert "2 s are over" in station.reason
     station.go(3)
     outcome = station.episode().outcome
@@ -356,7 +356,7 @@ def test_the_duration_ends_the_run_and_time_on_hold_does_not_count(tmp_path: Pat
 def test_halt_and_resume_keep_one_episode_with_its_held_rows_marked(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, delay=3)).running(30)
     station.command("halt")
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     asked = station.policy.calls.count("infer")
     station.go(20)
     assert station.policy.calls.count("infer") == asked  # halted is not asked
@@ -380,10 +380,10 @@ def test_a_run_that_is_halted_before_it_began_begins_when_it_is_resumed(tmp_path
     station.command("run")
     station.command("halt")  # media has not even heard of the run
     station.go(30)
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     assert station.policy.calls.count("reset") == 1
     station.command("resume")
-    station.reach(State.READY, 5.0)
+    station.reach(SessionState.READY, 5.0)
     assert "1 s are over" in station.reason
     assert station.policy.calls.count("reset") == 2
     station.go(3)
@@ -398,7 +398,7 @@ def test_stop_writes_the_outcome_and_holds(tmp_path: Path) -> None:
     assert episode.outcome["status"] == "finished"
     assert episode.outcome["reason"] == "stopped by the operator"
     assert episode.outcome["frames"] == episode.rows.num_rows
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     before = len(station.robot.commands)
     station.go(10)
     assert len(station.robot.commands) == before + 10  # holding is never silence
@@ -442,7 +442,7 @@ def test_a_policy_that_cannot_end_its_rollout_keeps_no_run_from_ending(
     assert "may still keep the rollout that is over: the server is mute" in caplog.text
     station.command("run")
     station.go(20)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     station.close()
 
 
@@ -462,18 +462,18 @@ def test_a_lease_that_is_not_renewed_holds_the_robot(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, lease={"ttl_s": 1.0})).running(20)
     for _ in range(40):
         station.tick()
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     assert "the lease was not renewed" in station.reason
     station.command("resume")
     station.go(10)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     station.close()
 
 
 def test_a_node_that_falls_silent_holds_the_robot(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path)).running(30)
     station.robot.silent = True
-    station.reach(State.HOLDING, 3.0)
+    station.reach(SessionState.HOLDING, 3.0)
     assert "old, allowed" in station.reason
     station.close()
 
@@ -490,13 +490,13 @@ def test_homing_comes_to_the_pose_within_the_limits_of_motions(tmp_path: Path) -
 
 def test_a_halt_while_it_homes_stops_it(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, setup={"home": True}))
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     station.command("setup")
     station.go(15)
-    assert station.state is State.SETTING_UP
+    assert station.state is SessionState.SETTING_UP
     station.command("halt")
     station.go(20)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert (station.robot.sent[-5:] == station.robot.sent[-1]).all()
     assert np.abs(station.robot.position - station.spec.robot.poses["home"]).max() > 0.1
     station.close()
@@ -512,7 +512,7 @@ def test_without_room_on_the_disk_nothing_is_begun_and_the_refusal_says_how_much
         station.command(kind)
     station.go(5)
     assert (station.state, station.coordinator.run, station.coordinator.runs.alone) == (
-        State.READY,
+        SessionState.READY,
         None,
         False,
     )
@@ -529,7 +529,7 @@ def test_a_recording_that_cannot_be_opened_ends_a_trial_before_it_began_and_says
     (tmp_path / "episodes").write_text("in its place")
     ack = station.command("run", trial={"id": 1})
     station.go(5)
-    assert (station.state, station.coordinator.run) == (State.READY, None)
+    assert (station.state, station.coordinator.run) == (SessionState.READY, None)
     assert "disk error while creating" in station.reason
     assert station.robot.commands == []
     told = [event for event in station.coordinator.events.since(0) if event["data"].get("state") == "ready"][
@@ -575,7 +575,7 @@ def test_a_trial_is_refused_where_nothing_is_recorded(tmp_path: Path) -> None:
 def test_where_evidence_is_not_wanted_a_run_goes_on_without_its_recording(tmp_path: Path) -> None:
     made = spec_of(tmp_path, recording={"min_free_bytes": 10**15, "on_failure": "continue"})
     station = Station(made).running(30)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     assert len(station.events("recording_failed")) == 1
     assert station.robot.position[0] > STANDS[0] + 0.03
     station.close()
@@ -584,13 +584,13 @@ def test_where_evidence_is_not_wanted_a_run_goes_on_without_its_recording(tmp_pa
 def test_a_run_whose_recording_was_lost_is_not_resumed(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path)).running(20)
     station.robot.picture = lambda number: np.zeros((24, 32, 3), np.uint8)  # another size from now on
-    station.reach(State.HOLDING, 5.0)
+    station.reach(SessionState.HOLDING, 5.0)
     assert "must be uint8" in station.reason
     station.go(3)
     assert station.coordinator.runs.last_episode["status"] == "failed"
     with pytest.raises(SetupError, match=r"the recording of this run has ended .*stop, then run"):
         station.command("resume")
-    assert station.state is State.HOLDING
+    assert station.state is SessionState.HOLDING
     station.command("stop")
     station.close()
 
@@ -644,7 +644,7 @@ def test_what_was_published_plays_through_the_whole_pipeline_unchanged(tmp_path:
         "recording": {"min_free_bytes": 0},
     }
     done = lockstep.run(station_spec.spec_of(loader.resolve(tree, {}, "test")))
-    assert (done.state, done.reason) == (State.READY, "the recording that is the source has ended")
+    assert (done.state, done.reason) == (SessionState.READY, "the recording that is the source has ended")
     source, copy = open_episode(Path(first.episode["path"])), open_episode(Path(done.episode["path"]))
     assert copy.frames == source.frames == 60
     for name in ("index", "time", "qpos", "action", "eef", "eef_action"):
@@ -657,7 +657,7 @@ def test_what_was_published_plays_through_the_whole_pipeline_unchanged(tmp_path:
 def test_no_command_ever_leaves_before_set_up(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path))
     station.go(30)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert station.robot.commands == []
     station.close()
 

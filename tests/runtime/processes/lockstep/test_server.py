@@ -21,7 +21,7 @@ from runtime.ipc.bus import Endpoints, Subscriber, TransportError
 from runtime.ipc.endpoints import account
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.messages import Ack, Command, decode, encode
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep import server as served_lockstep
 from runtime.processes.lockstep.server import ServedLockstep
 from runtime.processes.media.episode_closing import Close, in_background
@@ -46,7 +46,7 @@ class Client:
         self._endpoints = Endpoints(made.deployment.station_dir)
         self._coordinator = self._connected("coordinator", "commands")
         self._guard = self._connected("guard", "estop")
-        self.until(State.IDLE)
+        self.until(SessionState.IDLE)
         assert self.ask("lease_claim", epoch=0).status == "accepted"
 
     def _connected(self, process: str, key: str) -> zmq.Socket[Any]:
@@ -55,7 +55,7 @@ class Client:
         return socket
 
     @property
-    def state(self) -> State:
+    def state(self) -> SessionState:
         return self.station.coordinator.session.state
 
     @property
@@ -93,7 +93,7 @@ class Client:
             self.station.turn()
         return self.station.step - before
 
-    def until(self, *states: State) -> None:
+    def until(self, *states: SessionState) -> None:
         for _ in range(TURNS):
             if self.state in states:
                 return
@@ -102,7 +102,7 @@ class Client:
 
     def ready(self) -> Client:
         self.accepted("setup")
-        self.until(State.READY)
+        self.until(SessionState.READY)
         return self
 
     def running(self, ticks: int = 20) -> Client:
@@ -182,7 +182,7 @@ def test_time_stands_still_before_and_after_a_set_up_and_its_station_is_seen_all
 
 def test_a_run_goes_on_without_waiting_for_anybodys_time(client: Client) -> None:
     client.ready().running(100)  # not a moment of theirs
-    assert client.state is State.RUNNING
+    assert client.state is SessionState.RUNNING
 
 
 def test_what_waits_for_a_person_goes_no_faster_than_they_live(client: Client) -> None:
@@ -236,7 +236,7 @@ def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: 
 
 def test_no_tick_more_passes_after_a_run(client: Client) -> None:
     client.ready().accepted("run", duration_s=1.0)
-    client.until(State.READY)
+    client.until(SessionState.READY)
     while client.station._asking.begin():  # the policy is told that the rollout is over
         pass
     assert client.turn(20, 0.1) == 0
@@ -257,7 +257,7 @@ def test_who_sets_up_while_a_recording_is_closed_finds_the_same_as_who_comes_lat
     monkeypatch.setattr(served_lockstep, "in_background", slowly)
     client = Client(made, lambda running: "over" if running and client.station.step > 60 else "")
     client.ready().accepted("run")
-    client.until(State.READY)
+    client.until(SessionState.READY)
     client.accepted("setup")
     assert client.turn(20) == 0
     gate.set()
@@ -285,7 +285,7 @@ def test_a_time_that_cannot_be_is_refused(client: Client) -> None:
         infer(*given).actions, timing={"policy.infer_ms": -1.0}
     )
     client.accepted("setup")
-    client.until(State.IDLE)
+    client.until(SessionState.IDLE)
     assert "policy_timing.infer_ms is -1.0: lockstep goes by it; allowed: 0 or more" in client.reason
 
 
@@ -298,7 +298,7 @@ def test_a_run_ends_where_its_bench_says_so_and_its_episode_is_whole(made: StubP
 
     client = Client(made, over)
     client.ready().accepted("run")
-    client.until(State.READY)
+    client.until(SessionState.READY)
     assert client.reason == "the block lies there"
     outcome = client.episode().outcome
     assert outcome is not None
@@ -308,7 +308,7 @@ def test_a_run_ends_where_its_bench_says_so_and_its_episode_is_whole(made: StubP
     assert client.station.coordinator.snapshot()["recording"]["uuid"] == ""
     again = client.station.step
     client.running(20)  # at once, and as whole
-    assert client.state is State.RUNNING
+    assert client.state is SessionState.RUNNING
     assert client.station.step >= again + 20
     client.close()
 
@@ -318,10 +318,10 @@ def test_a_run_ends_where_its_bench_says_so_and_its_episode_is_whole(made: StubP
 
 def test_a_lease_that_is_not_renewed_in_the_peoples_time_holds_the_robot(client: Client) -> None:
     client.ready().running(200)  # more than a lease lasts, of its own time
-    assert client.state is State.RUNNING
+    assert client.state is SessionState.RUNNING
     client.turn(1, 6.0)
     client.turn(5)
-    assert client.state is State.HOLDING
+    assert client.state is SessionState.HOLDING
     assert "the lease was not renewed" in client.reason
     assert client.ask("resume").reason == "nobody holds the lease: claim it first"
 
@@ -336,7 +336,7 @@ def test_a_command_is_void_after_its_time_whatever_the_stations_own_is(client: C
     client.ready().running(100)
     client.people.advance(2.0)
     client.accepted("halt")
-    assert client.state is State.HOLDING
+    assert client.state is SessionState.HOLDING
 
 
 @pytest.mark.parametrize("during", ["idle", "run", "call"])
@@ -351,12 +351,12 @@ def test_the_e_stop_is_obeyed_at_once(client: Client, during: str) -> None:
     assert (answer.status, answer.data["station"], answer.data["latched"]) == ("done", "bench", "anew")
     gate.set()
     client.turn(20, 1 / 30)
-    assert client.state is State.FAULTED
+    assert client.state is SessionState.FAULTED
     assert f"account:{account(os.getuid())}: smoke" in client.reason
     assert Latch(client.station.spec.deployment.station_dir).read() is not None
     client.accepted("release")
     client.turn(20, 1 / 30)
-    assert client.state is State.IDLE
+    assert client.state is SessionState.IDLE
     assert Latch(client.station.spec.deployment.station_dir).read() is None
 
 
@@ -364,7 +364,7 @@ def test_a_policy_that_hangs_keeps_nobody_from_stopping(client: Client) -> None:
     gate = client.ready().running().hangs()
     assert client.turn(20) == 0
     client.accepted("stop")
-    assert client.state is State.READY
+    assert client.state is SessionState.READY
     gate.set()
 
 

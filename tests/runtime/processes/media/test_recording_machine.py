@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from runtime.ipc.messages import Ack
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from runtime.recording.reader import open_episode
 from runtime.station.run import Run
 from tests.runtime.lockstep_station import Station, spec_of
@@ -56,7 +56,7 @@ class Recorded(RuleBasedStateMachine):
 
     @rule(trial=st.booleans(), wait=ticks)
     def run(self, trial: bool, wait: int) -> None:
-        if self.station.state is State.IDLE:
+        if self.station.state is SessionState.IDLE:
             self.station.prepare()
         ack = self.give("run", **({"trial": {"id": 1}} if trial else {}))
         if ack.status == "accepted":
@@ -113,7 +113,7 @@ class Recorded(RuleBasedStateMachine):
             self.give(kind)
             self.go(SETTLED)
         self.run(trial=True, wait=SETTLED)
-        assert self.station.state is State.RUNNING
+        assert self.station.state is SessionState.RUNNING
         assert self.station.stop().frames > 0
 
     @invariant()

@@ -1,6 +1,6 @@
 import pytest
 
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from runtime.processes.reception.drive_status import Drives
 from tests.runtime.lockstep_station import Station, spec_of
 
@@ -54,7 +54,7 @@ def test_a_robot_whose_drives_are_off_is_not_set_up_until_they_are_on(tmp_path):
     station = Station(spec_of(tmp_path))
     station.robot.drives = {"enabled": False, "faults": ["axis 2 is hot"]}
     station.prepare()
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert "drives are disabled (axis 2 is hot)" in station.reason
     assert station.coordinator.snapshot()["drives"] == station.robot.drives
     assert station.events("drives") == ["drives disabled; drive fault: axis 2 is hot"]

@@ -8,6 +8,7 @@ from runtime.core.clock import VirtualClock
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import BenchRequest, LabelRequest, RunRequest, SetUpRequest
 from runtime.ipc.messages import Ack, Command
+from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.session import machine as session_module
 from runtime.processes.coordinator.session.effects import Effects, GuardFacts
@@ -17,10 +18,9 @@ from runtime.processes.coordinator.session.transitions import (
     EVENT_TRANSITIONS,
     STOPPING,
     SessionEvent,
-    State,
 )
 
-S, H = State, SessionEvent
+S, H = SessionState, SessionEvent
 EFFECTS = {
     "setup": "begin_setup",
     "run": "begin_run",
@@ -232,7 +232,7 @@ class Bench:
         return [done[0] for done in self.effects.done]
 
 
-@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("state", SessionState)
 def test_what_is_allowed_in_a_state_is_what_its_guards_say_in_every_situation(state):
     bench = Bench(state)
     for situation in SITUATIONS:
@@ -244,7 +244,7 @@ def test_what_is_allowed_in_a_state_is_what_its_guards_say_in_every_situation(st
         assert all(guarded.values()), situation
 
 
-@pytest.mark.parametrize(("kind", "state"), list(product(COMMANDS, State)))
+@pytest.mark.parametrize(("kind", "state"), list(product(COMMANDS, SessionState)))
 def test_a_command_is_carried_out_exactly_where_table_and_guards_allow_it(kind, state):
     cancels = state is S.SETTING_UP and kind in ("stop", "halt")
     for situation in SITUATIONS:
@@ -292,7 +292,7 @@ def test_what_collects_is_refused_with_what_is_missing():
     assert "arm first, or stop" in bench.give("resume").reason
 
 
-@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("state", SessionState)
 def test_discarding_what_goes_on_ends_it_and_discarding_what_is_named_ends_nothing(state):
     collects = GuardFacts(mode="collect", collection=True, collecting=True, armed=True)
     named, open_one = Bench(state), Bench(state)
@@ -322,7 +322,9 @@ def test_going_to_the_first_action_is_a_set_up_of_its_own_but_within_a_run_the_r
     assert bench.session.state is S.RUNNING
 
 
-@pytest.mark.parametrize(("kind", "state"), [(k, s) for s in State for k in sorted(ALLOWED[s] - {"estop"})])
+@pytest.mark.parametrize(
+    ("kind", "state"), [(k, s) for s in SessionState for k in sorted(ALLOWED[s] - {"estop"})]
+)
 def test_an_effect_that_refuses_is_the_reason_and_nothing_changes(kind, state):
     bench = Bench(state)
     cancels = state is S.SETTING_UP and kind in ("stop", "halt")
@@ -371,14 +373,14 @@ def test_what_an_effect_tells_is_in_the_answer_beside_the_lease():
     assert Bench(S.IDLE).give("run").data == lease  # refused: nothing was told
 
 
-@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("state", SessionState)
 def test_an_unknown_command_is_refused_with_the_known_ones(state):
     ack = Bench(state).give("dance")
     assert ack.status == "refused"
     assert ack.reason.startswith("unknown command 'dance'; known: setup, run, stop")
 
 
-@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("state", SessionState)
 def test_the_estop_is_sent_on_to_its_own_socket_by_anybody(state):
     bench = Bench(state)
     ack = bench.give("estop", holder="", epoch=0, boot="", sequence=-1, valid_until=0.0)
@@ -531,7 +533,7 @@ EXPECTED_EFFECTS = {
 }
 
 
-@pytest.mark.parametrize(("happening", "state"), list(product(SessionEvent, State)))
+@pytest.mark.parametrize(("happening", "state"), list(product(SessionEvent, SessionState)))
 def test_what_happens_changes_the_state_as_the_table_says_and_in_no_other_case(happening, state):
     bench = Bench(state)
     sequence = bench.session.sequence
@@ -565,7 +567,7 @@ def test_a_run_is_closed_with_the_status_of_what_ended_it(happening, status):
     assert bench.effects.done == [("end_run", status, "because")]
 
 
-@pytest.mark.parametrize("state", [s for s in State if s is not S.FAULTED])
+@pytest.mark.parametrize("state", [s for s in SessionState if s is not S.FAULTED])
 def test_the_estop_faults_every_state_and_only_its_release_leads_out(state):
     bench = Bench(state)
     bench.session.observe(H.ESTOPPED, "e-stop by anna")
@@ -579,7 +581,7 @@ def test_the_estop_faults_every_state_and_only_its_release_leads_out(state):
 
 
 def test_nothing_that_happens_starts_a_motion():
-    for happening, state in product(SessionEvent, State):
+    for happening, state in product(SessionEvent, SessionState):
         bench = Bench(state)
         bench.session.observe(happening, "because")
         assert not {"begin_setup", "begin_run", "resume_run", "go_home"} & set(bench.names)

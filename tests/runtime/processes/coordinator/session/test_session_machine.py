@@ -16,10 +16,11 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 from runtime.core.errors import PolicyError, PolicyLostError
 from runtime.core.types import Float64
 from runtime.ipc.messages import ChunkMerged, TickDone, decode
+from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
 from runtime.processes.control.process import make_tick
 from runtime.processes.coordinator.coordinator import Coordinator
-from runtime.processes.coordinator.session.transitions import COMMANDS, State
+from runtime.processes.coordinator.session.transitions import COMMANDS
 from tests.runtime.lockstep_station import DIM, STANDS, Station, spec_of
 
 PERIOD = 1 / 30
@@ -147,8 +148,8 @@ class Machine(RuleBasedStateMachine):
             assert ack.status == "refused", (kind, before)
         if ack.status == "accepted":
             after = COMMANDS[kind].next(before) or before
-            cancelled = before is State.SETTING_UP
-            assert session.state is (State.IDLE if cancelled else after)
+            cancelled = before is SessionState.SETTING_UP
+            assert session.state is (SessionState.IDLE if cancelled else after)
             self.going = kind in SET_GOING or (self.going and kind == "tune")
         else:
             assert ack.reason
@@ -171,14 +172,14 @@ class Machine(RuleBasedStateMachine):
         robot = self.station.robot
         robot.blocked = robot.silent = False
         self.does, self.keeps_lease = "ramp", True
-        if self.station.state is State.FAULTED:
+        if self.station.state is SessionState.FAULTED:
             self.release(3)
         for kind, arguments in (("stop", {}), ("setup", {}), ("run", {"mode": mode})):
             self.tick(3)
             if kind in self.station.coordinator.session.allowed():
                 self.command((kind, arguments), 1)
             for _ in range(200):
-                if self.station.state is State.SETTING_UP:
+                if self.station.state is SessionState.SETTING_UP:
                     self.tick(1)
         self.tick(wait)
 
@@ -195,7 +196,7 @@ class Machine(RuleBasedStateMachine):
         if kind == "e-stop":
             self.station.guard.press("anna", "a test")
             self.going = False
-        elif kind == "release" and self.station.state is State.FAULTED:
+        elif kind == "release" and self.station.state is SessionState.FAULTED:
             self.release(1)
         elif kind == "lease":
             self.keeps_lease = not self.keeps_lease
@@ -301,7 +302,7 @@ class Machine(RuleBasedStateMachine):
             min(self.still, self.moved - AGREED) > 12
             and fresh
             and status["believed"]
-            and station.state is not State.FAULTED
+            and station.state is not SessionState.FAULTED
         ):
             assert np.abs(sent - measured)[arms].max() <= FAR, (station.state, station.reason)
 
@@ -320,11 +321,11 @@ class Machine(RuleBasedStateMachine):
         """Whether somebody wants the real robot to move just now."""
         main = self.station.coordinator
         run, state = main.run, main.session.state
-        if state is State.SETTING_UP:
+        if state is SessionState.SETTING_UP:
             return True
-        if state is State.RUNNING and run is not None and run.mode == "continuous":
+        if state is SessionState.RUNNING and run is not None and run.mode == "continuous":
             return True
-        return self.going and state in (State.READY, State.RUNNING, State.HOLDING)
+        return self.going and state in (SessionState.READY, SessionState.RUNNING, SessionState.HOLDING)
 
     def busy(self, status: Any) -> bool:
         """Whether what a person has set going is still under way."""

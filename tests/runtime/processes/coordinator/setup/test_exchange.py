@@ -10,7 +10,7 @@ import pytest
 
 from runtime.config import loader
 from runtime.core.errors import ConfigurationError, SetupError
-from runtime.processes.coordinator.session.transitions import State
+from runtime.ipc.session_state import SessionState
 from tests.runtime.lockstep_station import Station, on_time, spec_of
 
 OTHER = {"amplitude": 0.1}  # of the mock policy, whose default is 0.2
@@ -47,7 +47,7 @@ def test_a_policy_whose_module_cannot_be_loaded_is_refused_by_name_and_the_stati
         station.command("setup", policy={"kind": "starvla", "url": "ws://127.0.0.1:1"})
     station.command("run")
     station.go(20)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     station.close()
 
 
@@ -105,7 +105,7 @@ def test_a_refused_set_up_leaves_everything_as_it_was(
     before, calls = station.coordinator.spec, list(station.policy.calls)
     with pytest.raises(SetupError, match=sentence):
         station.command("setup", **arguments)
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     assert station.coordinator.spec is before
     assert station.coordinator.inference.policy is station.policy
     assert station.policy.calls == calls
@@ -113,7 +113,7 @@ def test_a_refused_set_up_leaves_everything_as_it_was(
     assert station.coordinator.snapshot()["checkpoint"] == {"id": 1, "name": "A"}
     station.command("run")
     station.go(10)
-    assert station.state is State.RUNNING
+    assert station.state is SessionState.RUNNING
     station.close()
 
 
@@ -132,7 +132,7 @@ def test_a_policy_whose_own_code_fails_is_refused_and_ends_nothing(tmp_path: Pat
     station.spec.built["unfit"] = ZeroDivisionError("0 / 0")
     with pytest.raises(SetupError, match="policy 'mock' cannot be made: ZeroDivisionError: 0 / 0"):
         station.command("setup", policy=OTHER)
-    assert (station.state, station.coordinator.inference.policy) == (State.READY, station.policy)
+    assert (station.state, station.coordinator.inference.policy) == (SessionState.READY, station.policy)
     station.close()
 
 
@@ -180,7 +180,7 @@ def test_figures_of_the_former_policy_are_not_the_new_ones(tmp_path: Path) -> No
 def test_a_failed_set_up_can_be_made_good_by_another_policy(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, absent="no server there: start it"))
     station.prepare(policy=OTHER)
-    assert (station.state, station.reason) == (State.IDLE, "no server there: start it")
+    assert (station.state, station.reason) == (SessionState.IDLE, "no server there: start it")
     object.__setattr__(station.spec, "absent", "")  # somebody starts it
     object.__setattr__(station.coordinator.operations._own, "absent", "")
     station.ready(policy={"amplitude": 0.3})
@@ -196,7 +196,7 @@ def test_an_open_recording_keeps_the_policy_that_its_manifest_names(tmp_path: Pa
     with pytest.raises(SetupError, match=r"a recording is open, .* record stop first"):
         station.command("setup", policy=OTHER)
     station.command("setup")  # as it is, it may be set up again
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     station.command("record_stop")
     station.ready(policy=OTHER)
     station.close()
@@ -231,7 +231,7 @@ def test_a_run_without_arguments_has_the_deployments_operator_and_limit(tmp_path
 def test_the_limit_of_a_run_is_its_own(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, run={"duration_s": 20.0})).ready()
     station.command("run", duration_s=0.5)
-    station.reach(State.READY, 1.0)
+    station.reach(SessionState.READY, 1.0)
     assert station.reason == "the run's 0.5 s are over"
     assert station.coordinator.snapshot()["run"]["duration_s"] is None
     station.close()
@@ -259,7 +259,7 @@ def test_a_recording_alone_answers_with_its_episode_too(tmp_path: Path) -> None:
 def test_the_bench_is_laid_out_after_homing_and_before_the_policy_is_asked(tmp_path: Path) -> None:
     station = simulated(tmp_path, setup={"home": True})
     station.prepare(bench=BENCH)
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     assert station.events("setup")[1:] == [
         "going to the pose",
         "resetting the bench",
@@ -273,11 +273,11 @@ def test_the_bench_is_laid_out_after_homing_and_before_the_policy_is_asked(tmp_p
 
 def test_a_bench_without_an_id_is_given_one_and_the_answer_says_which(tmp_path: Path) -> None:
     station = simulated(tmp_path)
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     first = station.command("setup", bench={"seed": 7}).data["bench"]
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     second = station.command("setup", bench={"seed": 7}).data["bench"]
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     assert first != second != ""
     assert [data["id"] for _, data in station.robot.told] == [first, second]
     station.close()
@@ -296,7 +296,7 @@ def test_a_set_up_without_a_bench_leaves_it_alone(tmp_path: Path) -> None:
     station.ready()
     assert len(station.robot.told) == 1
     station.command("home")
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     assert len(station.robot.told) == 1
     station.close()
 
@@ -305,7 +305,7 @@ def test_the_id_of_the_last_reset_is_refused_because_it_would_change_nothing(tmp
     station = simulated(tmp_path).ready(bench=BENCH)
     with pytest.raises(SetupError, match=r"bench\.id = 'reset-1': the bench was reset under this id already"):
         station.command("setup", bench=BENCH)
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     station.close()
 
 
@@ -313,7 +313,7 @@ def test_a_bench_that_is_not_reset_in_time_ends_the_set_up(tmp_path: Path) -> No
     station = simulated(tmp_path)
     station.robot.deaf = 1000
     station.prepare(bench=BENCH)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert station.reason == (
         "the bench was not reset within 3 s: the node says no truth of a bench; does it simulate one?"
     )
@@ -342,7 +342,7 @@ def test_a_sink_that_takes_no_words_ends_the_set_up_at_once(tmp_path: Path) -> N
     station.robot.wordless = True
     before = station.clock.now()
     station.prepare(bench=BENCH)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert station.reason == (
         "the bench cannot be reset: this transport takes no control words; 'scene_reset' was to be sent"
     )
@@ -353,14 +353,14 @@ def test_a_sink_that_takes_no_words_ends_the_set_up_at_once(tmp_path: Path) -> N
 def test_a_reset_can_be_cancelled(tmp_path: Path) -> None:
     station = simulated(tmp_path)
     station.robot.deaf = 1000
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     station.command("setup", bench=BENCH)
     station.go(15)
     assert station.coordinator.setup.stage.value == "resetting the bench"
     station.command("stop")
     said = len(station.robot.told)
     station.go(30)
-    assert (station.state, len(station.robot.told)) == (State.IDLE, said)
+    assert (station.state, len(station.robot.told)) == (SessionState.IDLE, said)
     station.close()
 
 
@@ -408,7 +408,7 @@ def test_when_milestones_were_first_reached_is_told_in_seconds_of_the_run(tmp_pa
 
 def test_the_snapshot_says_what_is_set_up(tmp_path: Path) -> None:
     station = simulated(tmp_path)
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     shown = station.coordinator.snapshot()
     assert (shown["task"], shown["checkpoint"], shown["truth"]) == ("stack the cups", {}, {})
     station.ready(task="fold", checkpoint={"id": "c-1", "name": "A"}, bench=BENCH)

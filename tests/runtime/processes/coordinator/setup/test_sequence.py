@@ -10,8 +10,8 @@ import pytest
 from runtime.config import loader
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.types import Observation
+from runtime.ipc.session_state import SessionState
 from runtime.policies.base import PolicyInfo
-from runtime.processes.coordinator.session.transitions import State
 from runtime.processes.coordinator.setup.sequence import Stage
 from runtime.spaces.conversion import CommandRows
 from tests.runtime.lockstep_station import MOVED, STANDS, Station, on_time, ramp, spec_of
@@ -20,7 +20,7 @@ from tests.runtime.lockstep_station import MOVED, STANDS, Station, on_time, ramp
 def failed(station: Station) -> str:
     """Set up, in vain; the reason."""
     station.prepare()
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert station.coordinator.setup.stage is Stage.IDLE
     return station.reason
 
@@ -105,7 +105,7 @@ def test_a_policy_that_answers_what_is_no_number_ends_it(tmp_path: Path, value: 
 
 def test_a_camera_that_falls_away_ends_it_with_its_name(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, setup={"observation_timeout_s": 1.0}))
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     station.robot.cameras.remove("cam_left_wrist")
     station.go(30)  # the last picture of it grows old
     reason = failed(station)
@@ -141,11 +141,11 @@ def test_a_blocked_arm_is_not_pulled_at_further_than_the_following_error(tmp_pat
 
 def test_a_node_that_falls_silent_while_it_homes_stops_the_motion(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, setup={"home": True}))
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     station.command("setup")
     station.go(15)
     station.robot.silent = True
-    station.reach(State.IDLE, 2.0)
+    station.reach(SessionState.IDLE, 2.0)
     assert "10 actions refused in a row, the last one: joints are " in station.reason
     station.go(15)  # it has come to a stand
     assert (station.robot.sent[-5:] == station.robot.sent[-1]).all()
@@ -164,14 +164,14 @@ def test_joints_that_read_exactly_0_are_named_before_anything_moves(tmp_path: Pa
 
 def test_a_set_up_waits_until_the_joints_are_believed(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, setup={"observation_timeout_s": 1.0}))
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     noise = np.random.default_rng(1)
     station.robot.blocked = True
     station.command("setup")
     for _ in range(60):
         station.robot.position = STANDS + noise.normal(0.0, 0.6, len(STANDS)) * station.spec.limits.places
         station.go(1)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert "no complete observation within 1 s: " in station.reason
     assert station.robot.commands == []
     station.close()
@@ -179,21 +179,21 @@ def test_a_set_up_waits_until_the_joints_are_believed(tmp_path: Path) -> None:
 
 def test_a_motion_that_control_never_finishes_ends_it(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, setup={"home": True}))
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     station.go(10)  # control has seen the joints
     station.command("setup")
     without_control(station, 10.0)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert "control has not come to the pose 'home' within" in station.reason
     station.close()
 
 
 def test_without_control_no_motion_is_ordered(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, setup={"home": True, "observation_timeout_s": 3.0}))
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     station.command("setup")
     without_control(station, 4.5, beating=False)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert "the process control gives no sign of life" in station.reason
     station.close()
 
@@ -202,15 +202,15 @@ def test_without_control_no_motion_is_ordered(tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["stop", "halt"])
 def test_it_can_be_cancelled_at_any_time_and_begun_again(tmp_path: Path, ticks: int, command: str) -> None:
     station = Station(spec_of(tmp_path, delay=4))
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     station.command("setup")
     station.go(ticks)
-    assert station.state is State.SETTING_UP
+    assert station.state is SessionState.SETTING_UP
     station.command(command)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     assert station.policy.calls[-1] == "close"  # what is under way is cut off
     station.go(10)
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     station.ready()
     station.close()
 
@@ -219,8 +219,8 @@ def test_homing_alone_asks_no_policy(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path)).ready()
     asked = len(station.policy.calls)
     station.command("home")
-    assert station.state is State.SETTING_UP
-    station.reach(State.READY)
+    assert station.state is SessionState.SETTING_UP
+    station.reach(SessionState.READY)
     assert station.reason == "at the pose 'home'"
     assert len(station.policy.calls) == asked
     assert np.allclose(station.robot.position, station.spec.robot.poses["home"], atol=1e-6)
@@ -232,7 +232,7 @@ def test_a_transport_that_moves_nothing_is_not_homed(tmp_path: Path) -> None:
     assert station.robot.commands == []
     with pytest.raises(SetupError, match="transport 'dataset' moves no robot"):
         station.command("home")
-    assert station.state is State.READY
+    assert station.state is SessionState.READY
     station.close()
 
 
@@ -240,7 +240,7 @@ def test_a_second_set_up_connects_and_validates_anew(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path)).ready()
     station.command("setup")
     assert station.coordinator.setup.validated == ""
-    station.reach(State.READY)
+    station.reach(SessionState.READY)
     assert station.policy.calls.count("connect") == 2
     assert station.coordinator.setup.validated != ""
     station.close()
@@ -248,12 +248,12 @@ def test_a_second_set_up_connects_and_validates_anew(tmp_path: Path) -> None:
 
 def test_the_e_stop_ends_it(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path, setup={"home": True}))
-    station.reach(State.IDLE)
+    station.reach(SessionState.IDLE)
     station.command("setup")
     station.go(15)
     station.guard.press("ada", "smoke")
     station.go(3)
-    assert station.state is State.FAULTED
+    assert station.state is SessionState.FAULTED
     assert station.coordinator.setup.stage is Stage.IDLE
     here = station.robot.position.copy()
     station.go(20)
@@ -295,7 +295,7 @@ def test_a_short_fast_chunk_is_set_up_and_moves_the_robot(
     station.policy.infer = lambda *asked: replace(infer(*asked), rate=rate)  # type: ignore[method-assign]
     station.ready().command("run")
     station.go(60)
-    assert station.state is State.RUNNING, station.reason
+    assert station.state is SessionState.RUNNING, station.reason
     assert station.robot.sent[-1, MOVED[0]] == pytest.approx(
         0.002 * station.coordinator.shared.control.read()["step"], abs=0.1
     )
@@ -375,13 +375,13 @@ def set_up_in(station: Station, **args: Any) -> float:
     """How long a set-up with these arguments lasts, on the station's clock [s]."""
     began = station.clock.now()
     station.command("setup", **args)
-    station.until(lambda: station.state is State.READY, 60.0, "set-up")
+    station.until(lambda: station.state is SessionState.READY, 60.0, "set-up")
     return station.clock.now() - began
 
 
 def test_whose_policy_is_quick_takes_as_long_as_it_is_told_to(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path))
-    station.until(lambda: station.state is State.IDLE, 5.0, "observations")
+    station.until(lambda: station.state is SessionState.IDLE, 5.0, "observations")
     quick = set_up_in(station)
     assert quick < 1.0
     assert station.coordinator.snapshot()["setup_took"].keys() == {"connect_s", "warm_up_s"}
@@ -397,13 +397,13 @@ def test_whose_policy_is_quick_takes_as_long_as_it_is_told_to(tmp_path: Path) ->
 
 def test_a_rest_can_be_cancelled_and_times_that_cannot_be_are_refused(tmp_path: Path) -> None:
     station = Station(spec_of(tmp_path))
-    station.until(lambda: station.state is State.IDLE, 5.0, "observations")
+    station.until(lambda: station.state is SessionState.IDLE, 5.0, "observations")
     station.command("setup", least={"warm_up_s": 100.0})
     station.go(90)
-    assert station.state is State.SETTING_UP
+    assert station.state is SessionState.SETTING_UP
     assert station.coordinator.setup.stage is Stage.WARM_UP
     station.command("halt")
-    assert station.state is State.IDLE
+    assert station.state is SessionState.IDLE
     with pytest.raises(
         SetupError, match=r"least\.warm_up_s = -1: Input should be greater than or equal to 0"
     ):

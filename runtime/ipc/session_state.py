@@ -1,0 +1,89 @@
+"""The states of a station's session, and what each means: one row a state, for all who read a snapshot."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any, Literal
+
+Tone = Literal["neutral", "ok", "active", "warn", "danger"]  # the colours of pages
+
+
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """What a state says: clients ask these, so that a state that they have never heard of is read right."""
+
+    label: str
+    tone: Tone
+    connected: bool = True  # complete observations arrive, or did until it was stopped
+    preparing: bool = False  # a set-up or a way home goes on, which Stop cancels
+    set_up: bool = False  # with a policy, or to collect, and where it is to begin
+    run_open: bool = False  # Stop ends it
+    moving: bool = False  # the robot may move by itself
+    latched: bool = False  # nothing moves until the e-stop is released
+
+    @property
+    def at_work(self) -> bool:
+        """Whether the policy is used, or may be in a moment."""
+        return self.preparing or self.run_open
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is set up, and nothing keeps a set-up from beginning."""
+        return self.connected and not (self.set_up or self.preparing or self.latched)
+
+    @property
+    def ready(self) -> bool:
+        """Whether it is set up and no run is open."""
+        return self.set_up and not self.run_open
+
+    @property
+    def going(self) -> bool:
+        """Whether a run goes on."""
+        return self.run_open and self.moving
+
+    @property
+    def held(self) -> bool:
+        """Whether a run waits until it is resumed or stopped."""
+        return self.run_open and not self.moving
+
+
+class SessionState(StrEnum):
+    """The session's state; one word each, the same everywhere."""
+
+    DISCONNECTED = "disconnected"
+    IDLE = "idle"
+    SETTING_UP = "setting_up"
+    READY = "ready"
+    RUNNING = "running"
+    HOLDING = "holding"
+    FAULTED = "faulted"
+
+    @property
+    def meaning(self) -> Meaning:
+        """Its row."""
+        return MEANINGS[self]
+
+    def told(self) -> dict[str, Any]:
+        """The row and what follows from it, as the snapshot has it under "state_is"."""
+        row = self.meaning
+        return asdict(row) | {
+            name: getattr(row, name) for name in ("at_work", "idle", "ready", "going", "held")
+        }
+
+    @classmethod
+    def of(cls, word: str) -> Meaning | None:
+        """What a state of that name means; None for one that there is not."""
+        return cls(word).meaning if word in cls._value2member_map_ else None
+
+
+S = SessionState
+MEANINGS: dict[SessionState, Meaning] = {
+    S.DISCONNECTED: Meaning("disconnected", "neutral", connected=False),
+    S.IDLE: Meaning("idle", "neutral"),
+    S.SETTING_UP: Meaning("setting up", "active", preparing=True, moving=True),
+    S.READY: Meaning("ready", "active", set_up=True),
+    S.RUNNING: Meaning("running", "ok", set_up=True, run_open=True, moving=True),
+    S.HOLDING: Meaning("holding", "warn", set_up=True, run_open=True),
+    S.FAULTED: Meaning("faulted", "danger", latched=True),
+}
