@@ -44,6 +44,9 @@ class Subject:
             prompt=prompt,
         )
 
+    def show_simulated(self, simulated: bool) -> None:
+        """The same robot: it stands for either."""
+
     def commanded(self) -> tuple[int, Float64] | None:
         """It was never told anything."""
         return None

@@ -37,6 +37,11 @@ class Flight:
     failure: str = ""
     over: threading.Event = field(default_factory=threading.Event)
 
+    def end(self, why: str) -> None:
+        """Kill it; `why` is what is said instead of a report."""
+        self.failure = why
+        self.child.kill()
+
     def plain(self) -> dict[str, Any]:
         """As an answer: `running`, `report` or null, and why there is none."""
         return {"running": not self.over.is_set(), "report": self.told or None, "failure": self.failure}
@@ -90,13 +95,13 @@ class Preflights:
             self._flight = None
             return flight
         if self._now() > flight.ends and not flight.failure:
-            self._end(flight, "it did not end in time")
+            flight.end("it did not end in time")
         return None
 
     def cancel(self, why: str) -> None:
         """End what is under way, if anything is."""
         if self._flight is not None and not self._flight.failure:
-            self._end(self._flight, f"cancelled: {why}")
+            self._flight.end(f"cancelled: {why}")
 
     def report(self, id: str) -> dict[str, Any]:
         """The preflight of that id, as by `Flight.plain`; RuntimeFault where it is not known (any more)."""
@@ -112,10 +117,6 @@ class Preflights:
         if flight is not None:
             self.cancel("the station ends")
             flight.over.wait(2.0)
-
-    def _end(self, flight: Flight, why: str) -> None:
-        flight.failure = why
-        flight.child.kill()
 
 
 def _patience(resolved: Resolved, asked: PreflightRequest) -> float:

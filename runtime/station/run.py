@@ -63,13 +63,39 @@ class Run:
             return {}
         return {"unbegun": {"command": self.command, "episode": self.uuid, "unopened": self.unopened}}
 
+    def open(self) -> None:
+        """Media is ready for it."""
+        self.opened = True
+
+    def fail_to_open(self) -> None:
+        """Its recording could not be opened, and it must not begin without one."""
+        self.unopened = True
+
+    def stop_recording(self, why: str) -> None:
+        """It goes on without its recording, which could not be opened or has ended."""
+        self.unrecorded = why
+
+    def wait(self) -> None:
+        """It begins when what it needs is loaded."""
+        self.waiting = True
+
+    def approach(self) -> None:
+        """The robot goes to where the chunk that is shown begins."""
+        self.approaching = True
+
+    def arrive(self) -> None:
+        """The robot is there, or does something else."""
+        self.approaching = False
+
     def begin(self, now: float) -> None:
         """Control follows: its clock starts."""
+        self.waiting = False
         self.begun, self.held_since, self.held = now, None, 0.0
         self.followed = now
 
     def hold(self, now: float) -> None:
-        """Its clock is paused."""
+        """Its clock is paused; one that waits begins when it is resumed."""
+        self.waiting = False
         if self.held_since is None:
             self.held_since = now
 

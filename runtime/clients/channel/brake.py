@@ -43,9 +43,9 @@ class Brake:
         try:
             state = self._stop(holder, kind)
         except TransportError as fault:
-            outcome.result, outcome.reason = "unknown", f"{fault}; {_ANYBODY}"
+            outcome.become("unknown", f"{fault}; {_ANYBODY}")
         except Refused as refusal:
-            outcome.result, outcome.reason = "refused", f"{refusal}; {_ANYBODY}"
+            outcome.become("refused", f"{refusal}; {_ANYBODY}")
         self._outcomes.keep(outcome)
         return answers.told(message, outcome, {}, state)
 
@@ -80,9 +80,9 @@ class EStop:
         client = self._open(holder)
         try:
             ack = client.estop(str(message.arguments["why"]))
-            outcome.result, outcome.reason = "done" if ack.status == "done" else "failed", ack.reason
+            outcome.become("done" if ack.status == "done" else "failed", ack.reason)
         except RuntimeFault as fault:
-            outcome.result, outcome.reason = "unknown", str(fault)
+            outcome.become("unknown", str(fault))
         finally:
             client.close()
         self._outcomes.keep(outcome)

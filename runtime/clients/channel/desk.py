@@ -60,8 +60,8 @@ class Desk:
         try:
             data = (self._verb if message.form == "cmd" else self._own)(script, message, outcome)
         except RuntimeFault as fault:
-            outcome.result = "unknown" if isinstance(fault, TransportError) else "refused"
-            outcome.reason = self._newest = str(fault)
+            self._newest = str(fault)
+            outcome.become("unknown" if isinstance(fault, TransportError) else "refused", self._newest)
         self._outcomes.keep(outcome)
         if message.name == "select_collect_task" and outcome.result == "done":
             return {"ok": True, **data}  # as it always was
@@ -71,8 +71,8 @@ class Desk:
     def _repeated(self, message: Message, known: Outcome, script: Script) -> dict[str, Any]:
         """What came of it the first time, as far as it has come now."""
         if known.said != message.name:
-            other = Outcome(known.id, message.name, "", "refused")
-            other.reason = f"its id was given to {known.said!r} before"
+            why = f"its id was given to {known.said!r} before"
+            other = Outcome(known.id, message.name, "", "refused", why)
             return answers.told(message, other, {}, None)
         return answers.told(message, known, {}, self._state(script, known))
 
@@ -123,7 +123,7 @@ class Desk:
             last = number == len(made.steps)
             told = self._give(script, kind, arguments, outcome if last else None) or told
         script.selection.choose(**made.chosen)
-        outcome.reason = made.note
+        outcome.explain(made.note)
         return told
 
     def _own(self, script: Script, message: Message, outcome: Outcome) -> Mapping[str, Any]:
@@ -139,9 +139,8 @@ class Desk:
             raise NotOurs(f"{kind} takes no arguments; given: {', '.join(map(str, arguments)):.200}")
         if kind == "claim":
             self._claim(script)
-        elif script.holds:
-            script.holds = False
-            script.client.give_up()
+        else:
+            script.give_up()
         return {}
 
     def _give(
@@ -153,17 +152,14 @@ class Desk:
             before = script.client.status()
         ack = script.client.give(kind, arguments, outcome.id if outcome else "")
         if outcome is not None:
-            outcome.kind, outcome.result = kind, "accepted" if lasts(kind) else "done"
-            outcome.before = before if lasts(kind) else {}
+            outcome.give(kind, before if lasts(kind) else {})
         return {key: value for key, value in ack.data.items() if key not in ("epoch", "holder")}
 
     def _claim(self, script: Script) -> None:
         try:
-            script.client.claim()
+            script.claim()
         except Refused as refusal:
-            script.holds = False
             raise Refused(f"{refusal}{_APART if 'channel:' in str(refusal) else ''}") from None
-        script.holds = True
 
     # --- questions -----------------------------------------------------------------------------------------
 

@@ -48,6 +48,18 @@ class Outcome:
     def told(self) -> dict[str, Any]:
         return {"id": self.id, "said": self.said, "result": self.result, "reason": self.reason}
 
+    def become(self, result: str, reason: str) -> None:
+        """The command came to `result`, for that reason."""
+        self.result, self.reason = result, reason
+
+    def explain(self, reason: str) -> None:
+        """What is to be said of it besides."""
+        self.reason = reason
+
+    def give(self, kind: str, before: Mapping[str, Any]) -> None:
+        """The station took the command `kind`; `before` was its status where that goes on, {} where it is done."""
+        self.kind, self.result, self.before = kind, "accepted" if before else "done", before
+
     def look(self, status: dict[str, Any], events_since: Events) -> None:
         """See whether it is over."""
         if status["boot"] != self.before["boot"]:

@@ -21,6 +21,25 @@ class Script:
     selection: Selection = field(default_factory=Selection)
     holds: bool = False
 
+    def claim(self) -> None:
+        """Claim the lease, or renew it; raises Refused where another has it."""
+        try:
+            self.client.claim()
+        except Refused:
+            self.holds = False
+            raise
+        self.holds = True
+
+    def give_up(self) -> None:
+        """Give the lease back, where it has it."""
+        if self.holds:
+            self.holds = False
+            self.client.give_up()
+
+    def lose(self) -> None:
+        """Its lease is over."""
+        self.holds = False
+
     def close(self) -> None:
         self.client.close()
 
@@ -86,7 +105,7 @@ class Scripts:
                 told.append(f"{holder}: {fault}")
             except Refused as refusal:
                 told.append(f"{holder} has the lease no longer: {refusal}")
-            script.holds = False
+            script.lose()
         return told
 
     def close(self) -> None:

@@ -104,6 +104,10 @@ class Actuator(ABC):
         self.rest_here()
         self.engaged = True
 
+    def disengage(self) -> None:
+        """Leave the robot alone: nothing is sent, and where it is told to be is not known any more."""
+        self.engaged = False
+
     def rest_here(self) -> None:
         """Count the last command as one at rest."""
         self.velocity, self._ends = np.zeros(len(self.commanded)), None

@@ -48,7 +48,12 @@ class Displacement:
         self.goal: Float64 | None = None  # where the command is being led to
         self._from = np.zeros((2, dim))  # command and reading as it began to be
         self.begins = False  # whether it has been since this tick
-        self.doubt = ""  # which joints are not followed since this tick, and why
+        self._doubt = ""  # which joints are not followed since this tick, and why
+
+    def take_doubt(self) -> str:
+        """The joints that are not followed since it was asked last, and why; "" for none."""
+        doubt, self._doubt = self._doubt, ""
+        return doubt
 
     def __call__(
         self, robot: RobotActuator, seen: LatestObservation, now: float, held: bool
@@ -66,7 +71,7 @@ class Displacement:
         if self.goal is not None:  # joints that are pushed on, past it or back, are left where they are
             on = (self.goal - robot.commanded) * (measured - robot.commanded) > 0.0
             self._off |= (along := self._along(robot, measured))
-            self.doubt = self._named(along, robot, measured)
+            self._doubt = self._named(along, robot, measured)
             self.goal = np.where((on & ~along) | ~self._angles, self.goal, robot.commanded)
             if self.distance(robot, self.goal) <= _THERE:
                 self.goal = None
@@ -98,7 +103,7 @@ class Displacement:
         off = away & self._followed
         self._off |= off
         self._followed |= away
-        self.doubt = self._named(off, robot, measured)
+        self._doubt = self._named(off, robot, measured)
 
     def _along(self, robot: RobotActuator, measured: Float64) -> np.ndarray:
         """The joints, bool [D], whose readings go along with the command that a set-up leads to them."""

@@ -145,6 +145,10 @@ class EStopped(Behaviour):
         """Where it is held from now on."""
         self._first = self.position = position
 
+    def let_go(self) -> None:
+        """Nothing is sent until it is measured anew."""
+        self.position = None
+
     @property
     def follows(self) -> bool:
         """Whether the arm may still be coming to rest."""

@@ -70,7 +70,7 @@ class CommandPipeline:
     def silence(self) -> None:
         """Send nothing any more: the robot is not ours."""
         self._standing = None
-        self.actuator.engaged = False
+        self.actuator.disengage()
         self.behaviour = Silent()
 
     def give_way(self) -> None:

@@ -103,6 +103,10 @@ class Plausibility:
         )  # were believed elsewhere, and no way was seen to there
         self.dead = ""  # the joints that have read exactly 0 since they came back from somewhere else
 
+    def trust(self) -> None:
+        """The robot is taken over anew: a joint that reads 0 stands there."""
+        self.dead = ""
+
     def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
         """`seen` with why its joints are not believed; `commanded` float64 [D] of a robot that is being moved."""
         self._unseen += 0.0 if self._judged is None else min(now - self._judged, _STALL_S)

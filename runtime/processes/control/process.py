@@ -143,7 +143,7 @@ def main() -> None:
 
 def outlive(loop: Loop, tick: Tick, shared: SharedState, clock: Clock, seconds: float) -> None:
     """Take the robot back from its node, and hold what is commanded for so long; where nothing is, nothing is held."""
-    tick.orphaned = True
+    tick.orphan()
     until = clock.now() + seconds
     loop.once()
     while tick.telling or (clock.now() < until and shared.control.read()["engaged"]):

@@ -66,7 +66,7 @@ class Tick:
         self._simulated_run = 0
         self._left_run = -1  # the run during which the robot was left alone
         self._doubted = float("-inf")
-        self.orphaned = False
+        self._orphaned = False
 
     def __call__(self, step: int, planned: float, woke: float | None = None) -> None:
         """Do the tick `step`, planned for `planned` on our clock; the loop woke for it at `woke`."""
@@ -85,6 +85,10 @@ class Tick:
         self._report.publish(self._seen, self._standing(step, sent))
         for lane in self._lanes:
             lane.actuator.ticked(planned)
+
+    def orphan(self) -> None:
+        """The supervisor is gone: whatever moves is held."""
+        self._orphaned = True
 
     @property
     def telling(self) -> bool:
@@ -277,7 +281,7 @@ class Tick:
                 )
                 self._report.say("unmeasured", f"{why}: nothing is sent to a robot unseen")
                 return False
-            self._plausibility.dead = ""
+            self._plausibility.trust()
             self._actuator.engage(measured)
         self._actuator.open_or_close()
         return True
@@ -322,7 +326,7 @@ class Tick:
             stopped.see(limits.standing(np.where(limits.grippers, actuator.commanded, measured)))
 
     def _check_family(self, now: float) -> None:
-        kind, reason = "orphaned", "the supervisor is gone" if self.orphaned else ""
+        kind, reason = "orphaned", "the supervisor is gone" if self._orphaned else ""
         if not reason:
             kind, reason = "family", silent_sibling(self._page, now, self._settings.heartbeat_timeout)
         if reason:
@@ -375,7 +379,7 @@ class Tick:
 
     def _name_followed_twice(self) -> None:
         """Say, once, which joints are not followed any more; what moves is held."""
-        doubt, self._displacement.doubt = self._displacement.doubt, ""
+        doubt = self._displacement.take_doubt()
         if doubt and self._robot.behaviour.moving:
             self._robot.hold_because("implausible", doubt)
         elif doubt:
@@ -386,8 +390,8 @@ class Tick:
         self._left_run = self._report.run
         self._tell_displaced(why)
         if isinstance(self._robot.behaviour, EStopped):
-            self._robot.behaviour.position = None
-            self._actuator.engaged = False
+            self._robot.behaviour.let_go()
+            self._actuator.disengage()
         else:
             self._robot.silence()
 

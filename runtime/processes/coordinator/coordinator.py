@@ -231,7 +231,8 @@ class Coordinator:
         settings = self.spec.deployment
         if event.kind == "motion_done":
             self.runs.arrived()
-        self.inference.metrics.starved += event.kind == "starved"
+        if event.kind == "starved":
+            self.inference.metrics.count_starved()
         if event.kind == "starvation":
             trouble = self.inference.trouble
             stops = settings.faults.starvation == "stop"

@@ -157,7 +157,7 @@ class Demonstrations:
         relay = self._relay
         if relay is not None:
             qpos = np.array(self._page.observation.read()["qpos"], np.float64)
-            self._setup.first_action = relay.aim(qpos)
+            self._setup.expect(relay.aim(qpos))
 
     # --- what the node reports ---------------------------------------------------------------------------------
 

@@ -80,8 +80,7 @@ class SessionActions(Effects):
         # Nothing is refused from here on.
         checkpoint = asked.checkpoint.model_dump() if asked.checkpoint else {}
         self.spec = spec
-        told = replace(self.runs.provenance, spec=spec, checkpoint=checkpoint, bench=reset or {})
-        self.runs.provenance = told
+        self.runs.describe(spec=spec, checkpoint=checkpoint, bench=reset or {})
         self.inference.exchange(policy, spec.deployment.task)
         self.inference.tune(strategy_of(spec), spec.deployment.task)
         self._tuned = False
@@ -206,9 +205,9 @@ class SessionActions(Effects):
         strategy = settings.strategy.model_dump()
         self._orders.tune(strategy)
         if settings.task != self.spec.deployment.task:
-            self.setup.first_action = None  # it answered another instruction
+            self.setup.expect(None)  # it answered another instruction
         self.spec, self._tuned = spec, True
-        self.runs.provenance = replace(self.runs.provenance, spec=spec)
+        self.runs.describe(spec=spec)
         self.inference.tune(strategy_of(spec), settings.task)
         data = {"strategy": strategy, "task": settings.task, "hash": spec.resolved.digest}
         text = f"strategy {settings.strategy.kind}, task {settings.task!r}"
@@ -242,8 +241,7 @@ class SessionActions(Effects):
         if self._state() is not SessionState.READY and made is not None:
             self.runs.approach(self.manual.checked("approach", made.rows[0]))
         elif first is not None:
-            self.setup.first_action = self.manual.checked("approach", first)
-            self.setup.begin_approach()
+            self.setup.begin_approach(self.manual.checked("approach", first))
 
     # --- demonstrations -----------------------------------------------------------------------------
 

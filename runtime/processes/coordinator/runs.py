@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import uuid
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -51,7 +52,7 @@ class Runs:
         self._clock = clock
         self._inference = inference
         self._orders = orders
-        self.provenance = provenance  # of the next manifest
+        self._provenance = provenance  # of the next manifest
         self._figures = figures  # of control, for the outcome
         self._prepared = prepared  # begins to load what a person needs; whether it is there
         self.open: Run | None = None
@@ -74,6 +75,15 @@ class Runs:
         """RecordingError where the disk of the episodes has too little room for another one."""
         settings = self._plan.deployment
         require_room(settings.episodes_dir, settings.recording.min_free_bytes)
+
+    @property
+    def checkpoint(self) -> Mapping[str, Any]:
+        """The checkpoint that the station was set up with, as the operator named it; {} for none."""
+        return self._provenance.checkpoint
+
+    def describe(self, **changes: Any) -> None:
+        """Another plan, checkpoint or layout of the bench, for the manifests of what follows: fields of Provenance."""
+        self._provenance = replace(self._provenance, **changes)
 
     # --- runs ----------------------------------------------------------------------------------------------
 
@@ -100,13 +110,13 @@ class Runs:
         sim_state = asked.sim_state or settings.run.sim_state
         manifest = None
         if settings.recording.enabled:
-            manifest = self.provenance.manifest(mode, info, sim_state)
+            manifest = self._provenance.manifest(mode, info, sim_state)
             manifest |= {"trial": asked.trial or {}, "duration_s": limit}
             manifest |= {} if asked.operator is None else {"operator": asked.operator}
             manifest |= more
         identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
         self._tell(BeginEpisode(self._count, manifest, self._generation))
-        self._inference.requests.policy_observation.simulated = mode == "sim" and sim_state == "simulated"
+        self._inference.show_simulated(mode == "sim" and sim_state == "simulated")
         self.open = Run(
             self._count,
             identity,
@@ -127,13 +137,13 @@ class Runs:
         if run is None or message.run != run.number or run.begun is not None:
             return ""
         if message.error and self._must_record(run.trial, run.mode):
-            run.unopened = True
+            run.fail_to_open()
             return message.error
         if message.error:
-            run.unrecorded = message.error
+            run.stop_recording(message.error)
             self._tell(BeginEpisode(run.number, None, self._generation))  # the source plays all the same
             return ""
-        run.opened = True
+        run.open()
         doubt = self._page.doubt if running and self._plan.capabilities.moves_robot else ""
         if running and not doubt:
             self._start(run)
@@ -144,7 +154,6 @@ class Runs:
         self._inference.pause()
         self._orders.give("hold", run=self.open.number if self.open else 0, reason=reason)
         if self.open:
-            self.open.waiting = False  # it begins when it is resumed
             self.open.hold(self._clock.now())
 
     def resume(self) -> None:
@@ -163,7 +172,7 @@ class Runs:
     def end(self, status: str, reason: str) -> None:
         """Decelerate, hold, close the open run."""
         self._inference.pause()
-        self._inference.requests.policy_observation.simulated = False
+        self._inference.show_simulated(False)
         self._orders.give("hold", reason=reason)
         run, self.open = self.open, None
         if run is not None:
@@ -192,14 +201,14 @@ class Runs:
 
     def _start(self, run: Run) -> None:
         """Begin it; by hand not before steps of an end effector can be answered at once."""
-        run.waiting = run.mode == "manual" and not self._prepared()
-        if run.waiting:
+        if run.mode == "manual" and not self._prepared():
+            run.wait()
             return
         run.begin(self._clock.now())
         self._follow(run, fresh=True)
 
     def _follow(self, run: Run, fresh: bool) -> None:
-        run.approaching = False
+        run.arrive()
         if run.mode == "manual":
             self._orders.give("hold", run=run.number)
         elif run.mode == "collect" and not self._inference.policy.answers:
@@ -225,7 +234,7 @@ class Runs:
     def approach(self, goal: Float64) -> None:
         """Go to where the chunk that is shown begins."""
         if self.open is not None:
-            self.open.approaching = True
+            self.open.approach()
             self.move(goal, 1.0)
 
     def arrived(self) -> None:
@@ -234,7 +243,7 @@ class Runs:
             self._stand(self.open)
 
     def _stand(self, run: Run) -> None:
-        run.approaching = False
+        run.arrive()
         if run.mode == "manual":
             self._orders.give("hold", run=run.number)
         else:
@@ -252,7 +261,7 @@ class Runs:
         if self._alone:
             raise RuntimeFault("a recording is open already")
         self._require_room()
-        manifest = self.provenance.manifest("observe", info)
+        manifest = self._provenance.manifest("observe", info)
         self._tell(BeginEpisode(0, manifest, self._generation))
         self._alone = str(manifest["uuid"])
         return self._alone
@@ -283,7 +292,7 @@ class Runs:
     def closed(self, message: EpisodeClosed) -> Event:
         """An episode is on disk, or waits for room there; the event that says so."""
         if self.open is not None and self.open.uuid == message.uuid:
-            self.open.unrecorded = message.error or message.reason
+            self.open.stop_recording(message.error or message.reason)
         if self._alone == message.uuid:
             self._alone = ""
         self.last_episode = {

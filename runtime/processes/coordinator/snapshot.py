@@ -79,7 +79,7 @@ def snapshot(view: View) -> dict[str, Any]:
         "collect": view.collecting.shown(),
         "validated": view.setup.validated,
         "task": settings.task,
-        "checkpoint": dict(view.runs.provenance.checkpoint),
+        "checkpoint": dict(view.runs.checkpoint),
         "simulated": view.spec.capabilities.resets_bench,
         "truth": dict(view.reception.truth),
         "transport": settings.transport.kind,

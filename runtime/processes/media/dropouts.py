@@ -20,6 +20,34 @@ class _Camera:
     unsaid_from: int = 0  # the row of the first of these
     spoken: float = -math.inf  # when that was
 
+    def turn(self, silent: bool, row: int) -> None:
+        """It falls silent at row `row`, or is back."""
+        self.silent, self.row = silent, row
+        if silent:
+            self.unsaid_from = self.unsaid_from if self.unsaid else row
+            self.unsaid += 1
+
+    def due(self, now: float) -> bool:
+        """Something is to be said of it."""
+        return (self.said and not self.silent) or (self.unsaid > 0 and now - self.spoken >= QUIET_S)
+
+    def say(self, name: str, now: float, age: float | None) -> Event:
+        """How it is; `age` [s] is that of its last picture."""
+        data: dict[str, object] = {"camera": name, "row": self.row}
+        if self.silent:
+            since = "gives no new picture" if age is None else f"has given no new picture for {age:.1f} s"
+            text = f"camera {name} {since}: rows from {self.row} on repeat its last one"
+        else:
+            text = f"camera {name} gives pictures again, from row {self.row} on"
+        if more := self.unsaid - self.silent:
+            often = "time" if more == 1 else "times"
+            text += f"; it had stopped {more} {often} more since row {self.unsaid_from}"
+            data |= {"more": more, "since_row": self.unsaid_from}
+        if self.unsaid:
+            self.spoken = now
+        self.said, self.unsaid = self.silent, 0
+        return Event("pictures_stopped" if self.silent else "pictures_back", text, now, data=data)
+
 
 class DropoutLog:
     """Follows the cameras of one episode row by row.
@@ -36,32 +64,11 @@ class DropoutLog:
         events = []
         for name, camera in self._cameras.items():
             if (name in silent) != camera.silent:
-                camera.silent, camera.row = name in silent, row
-                if camera.silent:
-                    camera.unsaid_from = camera.unsaid_from if camera.unsaid else row
-                    camera.unsaid += 1
-            if (camera.said and not camera.silent) or (camera.unsaid and now - camera.spoken >= QUIET_S):
-                events.append(_say(name, camera, now, silent.get(name)))
+                camera.turn(name in silent, row)
+            if camera.due(now):
+                events.append(camera.say(name, now, silent.get(name)))
         return events
 
     def rest(self, now: float) -> list[Event]:
         """What was counted and not said yet, at the end of the episode."""
-        return [_say(name, camera, now, None) for name, camera in self._cameras.items() if camera.unsaid]
-
-
-def _say(name: str, camera: _Camera, now: float, age: float | None) -> Event:
-    data: dict[str, object] = {"camera": name, "row": camera.row}
-    if camera.silent:
-        since = "gives no new picture" if age is None else f"has given no new picture for {age:.1f} s"
-        text = f"camera {name} {since}: rows from {camera.row} on repeat its last one"
-    else:
-        text = f"camera {name} gives pictures again, from row {camera.row} on"
-    if more := camera.unsaid - camera.silent:
-        text += (
-            f"; it had stopped {more} {'time' if more == 1 else 'times'} more since row {camera.unsaid_from}"
-        )
-        data |= {"more": more, "since_row": camera.unsaid_from}
-    if camera.unsaid:
-        camera.spoken = now
-    camera.said, camera.unsaid = camera.silent, 0
-    return Event("pictures_stopped" if camera.silent else "pictures_back", text, now, data=data)
+        return [camera.say(name, now, None) for name, camera in self._cameras.items() if camera.unsaid]

@@ -163,8 +163,12 @@ class Inference:
     def tune(self, strategy: Strategy, task: str) -> None:
         """Go on with another strategy, other parameters, another instruction; a request in flight stays."""
         self._strategy = strategy
-        self.requests.task = task
+        self.requests.instruct(task)
         self.rtc_warning = ""
+
+    def show_simulated(self, simulated: bool) -> None:
+        """Show the policy the joints of the simulated robot, or those of the real one."""
+        self.requests.policy_observation.show_simulated(simulated)
 
     # --- a run ---------------------------------------------------------------------------------------------
 
@@ -266,7 +270,8 @@ class Inference:
         now = self._clock.now()
         first, self.failure = self._back_off.since is None, str(error)
         self._back_off.failed(now)
-        self.metrics.lost += isinstance(error, PolicyLostError)
+        if isinstance(error, PolicyLostError):
+            self.metrics.count_lost()
         if self._back_off.lasts(now) > self._patience.lost:
             return False
         if first:

@@ -64,6 +64,14 @@ class PolicyMetrics:
         if age is not None:
             self.ages.append(age)
 
+    def count_starved(self) -> None:
+        """Control had nothing planned."""
+        self.starved += 1
+
+    def count_lost(self) -> None:
+        """The policy was lost."""
+        self.lost += 1
+
     def merged(self, merged: ChunkMerged) -> None:
         """Control has placed it, or dropped it."""
         self.delays.append(merged.delay)

@@ -21,7 +21,11 @@ class StaleObservationError(PolicyError):
 class Eyes(Protocol):
     """What shows a policy the robot; `simulated`: the joints of the simulated one."""
 
-    simulated: bool
+    @property
+    def simulated(self) -> bool: ...
+
+    def show_simulated(self, simulated: bool) -> None:
+        """Show the joints of the simulated robot in place of the real one's, or the latter again."""
 
     def now(self, prompt: str, pictures: bool = True) -> Observation:
         """The newest observation, without `pictures` of joints alone; PolicyError where there is none, or it is old."""
@@ -40,13 +44,17 @@ class SightSettings:
 
 
 class PolicyObservation:
-    """Reads the shared state; `simulated` shows the joints of the simulated robot in place of the real one's."""
+    """Reads the shared state."""
 
     def __init__(self, shared: SharedState, clock: Clock, settings: SightSettings) -> None:
         self._page = shared
         self._clock = clock
         self._settings = settings
         self.simulated = False
+
+    def show_simulated(self, simulated: bool) -> None:
+        """Show the joints of the simulated robot in place of the real one's, or the latter again."""
+        self.simulated = simulated
 
     def now(self, prompt: str, pictures: bool = True) -> Observation:
         """The newest observation, without `pictures` of joints alone; PolicyError where there is none, or it is old."""

@@ -82,6 +82,10 @@ class PolicyRequests:
             self.policy, self._fresh, self._held = policy, True, False
         self.task = task
 
+    def instruct(self, task: str) -> None:
+        """Ask with another instruction from now on."""
+        self.task = task
+
     def forget(self) -> None:
         """Let the policy forget the episode before its next inference."""
         self._fresh = True

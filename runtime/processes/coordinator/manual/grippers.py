@@ -61,6 +61,10 @@ class Grippers:
         moves = free and request.action in ("open", "close")
         return Grip(locks, goal if moves else None)
 
+    def lock(self, locks: Float64) -> None:
+        """Locks [D] are in force, NaN where a gripper is free."""
+        self.locks = locks
+
     def standing(self, commanded: Float64) -> Float64:
         """The locks float64 [D], those that a gripper is still on its way to moved to where it was told to be."""
         commanded = open_or_closed(self._switches, commanded, commanded)

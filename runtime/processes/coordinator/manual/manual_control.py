@@ -36,7 +36,7 @@ class ManualControl:
         self.grippers = Grippers(spec)
         status = shared.control.read()
         if bytes(status["behaviour"]):  # a predecessor that died may have locked some
-            self.grippers.locks = np.array(status["locked"], np.float64)
+            self.grippers.lock(np.array(status["locked"], np.float64))
 
     def prepare(self) -> None:
         """A person will move the robot: load what steps of an end effector need, beside everything else."""
@@ -99,7 +99,7 @@ class ManualControl:
     def lock(self, locks: Float64) -> None:
         """Lock grippers at these values [D], NaN for the rest."""
         self._orders.lock(locks)
-        self.grippers.locks = locks
+        self.grippers.lock(locks)
 
     def commanded(self) -> Float64:
         """Where the robot was told to be, or where it is measured as long as nothing was told."""

@@ -50,6 +50,10 @@ class Effects(ABC):
     by: str = ""
     command: str = ""
 
+    def attribute(self, by: str, command: str) -> None:
+        """What is carried out next was asked for by `by`, in the command with that uuid."""
+        self.by, self.command = by, command
+
     @property
     @abstractmethod
     def situation(self) -> GuardFacts: ...

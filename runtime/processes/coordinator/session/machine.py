@@ -177,7 +177,7 @@ class SessionMachine:
             rule = CANCEL
         takes = ARGUMENTS[command.kind]
         asked = read(command.kind, takes, command.args) if takes else None
-        self._effects.by, self._effects.command = command.user or command.holder, command.uuid
+        self._effects.attribute(command.user or command.holder, command.uuid)
         told = rule.effect(self._effects, asked)
         after = rule.next(self.state, asked)
         if after:

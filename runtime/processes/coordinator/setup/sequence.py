@@ -104,11 +104,14 @@ class SetUp:
         where = f"the pose {pose!r}"
         self._only_go(self._plan.robot.poses[pose], where, Stage.HOME)
 
-    def begin_approach(self) -> None:
-        """Only go to where the policy's first action would have the robot; RuntimeFault where that is not known."""
-        if self.first_action is None:
-            raise SetupError("approach: the policy's first action is not known: set up again")
-        self._only_go(self.first_action, "the policy's first action", Stage.APPROACH)
+    def begin_approach(self, first_action: Float64) -> None:
+        """Only go to the policy's first action [D], as it is allowed; RuntimeFault where the way there is not free."""
+        self.expect(first_action)
+        self._only_go(first_action, "the policy's first action", Stage.APPROACH)
+
+    def expect(self, first_action: Float64 | None) -> None:
+        """The first action [D] of what drives the robot is this one from now on; None where it is not known."""
+        self.first_action = first_action
 
     def _only_go(self, goal: Float64, where: str, stage: Stage) -> None:
         self._going.start(goal, where)

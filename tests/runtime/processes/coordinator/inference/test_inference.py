@@ -678,7 +678,7 @@ def test_a_pause_forgets_what_the_robot_was_committed_to() -> None:
 
 
 def test_in_simulation_the_policy_is_shown_the_joints_of_the_simulated_robot(desk: Desk) -> None:
-    desk.requests.policy_observation.simulated = True
+    desk.requests.policy_observation.show_simulated(True)
     status = desk.shared.control.read().copy()
     status["simulated"] = np.nan
     desk.shared.control.write(status)

@@ -51,20 +51,20 @@ def test_while_a_policy_drives_it_is_locked_where_it_is_wanted() -> None:
 
 def test_a_lock_keeps_it_where_it_is_told_to_be_and_unlocking_gives_it_back() -> None:
     hand = grippers()
-    hand.locks = hand.asked(GripperRequest(action="lock"), at(0.03), free=False).locks
+    hand.lock(hand.asked(GripperRequest(action="lock"), at(0.03), free=False).locks)
     assert np.allclose(hand.locks[[LEFT, RIGHT]], 0.03)
     assert hand.told(at(0.03)) == {
         "left_arm": {"locked": True, "at": pytest.approx(0.03)},
         "right_arm": {"locked": True, "at": pytest.approx(0.03)},
     }
-    hand.locks = hand.asked(GripperRequest(arm="left_arm", action="unlock"), at(), free=False).locks
+    hand.lock(hand.asked(GripperRequest(arm="left_arm", action="unlock"), at(), free=False).locks)
     assert np.isnan(hand.locks[LEFT])
     assert not np.isnan(hand.locks[RIGHT])
 
 
 def test_a_locked_gripper_that_is_opened_by_hand_stays_locked_there() -> None:
     hand = grippers()
-    hand.locks = hand.asked(GripperRequest(arm="left_arm", action="lock"), at(), free=True).locks
+    hand.lock(hand.asked(GripperRequest(arm="left_arm", action="lock"), at(), free=True).locks)
     grip = hand.asked(GripperRequest(arm="left_arm", action="open"), at(), free=True)
     assert grip.goal is not None
     assert grip.locks[LEFT] == grip.goal[LEFT]
