@@ -159,7 +159,7 @@ def _result(status: dict[str, Any], how: str, seconds: float) -> dict[str, Any]:
 
 
 def _of_episode(path: Path) -> dict[str, Any]:
-    """What its files say: how long it is, and of its ticks how many safety refused or limited."""
+    """Figures from its files: how long it is, and of its ticks how many safety refused or limited."""
     from runtime.recording.reader import open_episode
 
     episode = open_episode(path)
@@ -195,7 +195,7 @@ def _publish(spec: StationSpec, episode: Path) -> dict[str, Any]:
 
 
 def summary(result: dict[str, Any]) -> list[str]:
-    """How a run went, for a person."""
+    """Summary of a run in lines, for the operator."""
     policy, control = result["policy"], result["control"]
     rows = [("ended", f"{result['ended']}, after {result['run_seconds']:.1f} s")]
     if "duration_s" in result:

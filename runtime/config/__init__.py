@@ -1,1 +1,1 @@
-"""What a deployment file may say: schema, loader, reference."""
+"""Contents of a deployment file: schema, loader, reference."""

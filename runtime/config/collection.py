@@ -1,4 +1,4 @@
-"""What a deployment says of collecting demonstrations: who leads, and what an episode must have."""
+"""Collecting of demonstrations in a deployment: which leader, and what an episode must have."""
 
 from __future__ import annotations
 

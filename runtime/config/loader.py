@@ -97,7 +97,7 @@ def changed(resolved: Resolved, changes: Mapping[str, Any], source: str) -> Reso
 
 
 def server_of(settings: Deployment) -> str:
-    """Where the policy's server is in one spelling, host and port; "" for a policy without one.
+    """Address of the policy's server in one spelling, host and port; "" for a policy without one.
 
     Two deployments of one machine have the same server where this is the same. What is behind a tunnel is named as
     from its far end.

@@ -1,4 +1,4 @@
-"""What a deployment file may say: one declarative table per part."""
+"""Schema of a deployment file: one declarative table per part."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from runtime.strategies.base import StrategyParameters
 if TYPE_CHECKING:
 
     class Variant(Settings):
-        """What all variants have in common."""
+        """Keys that all variants have in common."""
 
         kind: str
 
@@ -58,7 +58,7 @@ _NO_PORTS = (
 
 
 def policy_tables() -> tuple[type[Settings], ...]:
-    """What a [policy] table may be: one model for each kind."""
+    """Models that a [policy] table may be: one for each kind."""
     return parts(PolicyConfig)
 
 
@@ -81,7 +81,7 @@ class ControlSettings(Settings):
 
 
 class SetupSettings(Settings):
-    """What `setup` does."""
+    """A set-up: homing, the first observation, warming up the policy."""
 
     home: bool = True
     """Drive to the pose before the policy is warmed up; skipped where the transport moves no robot."""
@@ -110,8 +110,11 @@ Answer = Literal["hold", "slow", "stop"]
 
 
 class FaultSettings(Settings):
-    """What a run does when its policy fails: "hold" at once; "slow": go on with what is planned, then decelerate,
-    hold, and go on by itself if it comes back in time; "stop": end the run."""
+    """Answers to a failing policy: "hold" at once; "slow": hold after what is planned; "stop": end the run.
+
+    "slow" goes on with what is planned, then decelerates, holds, and goes on by itself if the policy is
+    back in time.
+    """
 
     starvation: Answer = "slow"
     """Nothing is planned for a step; after control.starvation_hold_s "slow" holds."""
@@ -149,7 +152,7 @@ class PublishSettings(Settings):
 
 
 class PublicationSettings(Settings):
-    """What the robot is told: joints, or poses beside them where the transport takes such a command."""
+    """Commands to the robot: joints, or poses beside them where the transport takes such a command."""
 
     space: Space = "joint"
     """"eef" publishes the poses that the safe joint command amounts to along with the joints."""
@@ -158,14 +161,14 @@ class PublicationSettings(Settings):
 
 
 class LeaseSettings(Settings):
-    """Who may command, and for how long."""
+    """The right to command, and how long it lasts."""
 
     ttl_s: float = Field(default=5.0, gt=0)
     """Time after which a lease that is not renewed ends and the robot holds [s]."""
 
 
 class BusSettings(Settings):
-    """What the station publishes for those who watch."""
+    """Camera previews that the station publishes for clients that watch."""
 
     preview_rate: float = Field(default=15.0, ge=0, le=60)
     """JPEG previews per second and camera [Hz]; 0 for none."""
@@ -190,7 +193,7 @@ class ControlChannelSettings(Settings):
 
 
 class SecuritySettings(Settings):
-    """What a table that comes over the web, as a checkpoint's does, may name of the station's own."""
+    """Variables and files of the station that a table from the web, as a checkpoint's, may name."""
 
     variables: list[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*\*?$")]] = Field(
         default=["EVA_POLICY_*"]
@@ -210,7 +213,7 @@ class LockstepSettings(Settings):
 
 
 class GripperSettings(Settings):
-    """What a deployment says otherwise of one gripper than the robot's description."""
+    """Settings of a deployment for one gripper that differ from the robot's description."""
 
     binary: bool | None = None
     """Whether it knows only open and close."""

@@ -1,1 +1,1 @@
-"""What every layer uses: types, clock, errors, settings, plug-ins, logs; knows no robot, station or process."""
+"""Basis of every layer: types, clock, errors, settings, plug-ins, logs; knows no robot, station, process."""

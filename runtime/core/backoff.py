@@ -29,5 +29,5 @@ class BackOff:
         return max(0.0, self._due - now)
 
     def lasts(self, now: float) -> float:
-        """How long it has been failing [s]."""
+        """Time for which it has been failing [s]; 0 where it does not."""
         return 0.0 if self.since is None else now - self.since

@@ -147,19 +147,19 @@ class Steps:
         return 0.0
 
     def _jitter(self) -> float:
-        """What intervals differ by without a step [s]; inf while too little is known."""
+        """Jitter of intervals without a step [s]; inf while too little is known."""
         if len(self._noise) < _ENOUGH:
             return math.inf
         return max(_LEAST_S, 3.0 * sorted(self._noise)[len(self._noise) * 9 // 10])
 
     def _off_more(self, moved: float, waited: float) -> float:
-        """How much more the stamp is off the stream's period than the arrival [s]."""
+        """Excess of the stamp's distance from the stream's period over that of the arrival [s]."""
         period = max(sorted(self._intervals)[len(self._intervals) // 2], _LEAST_S / 10)
         return _off(moved, period) - _off(waited, period)
 
 
 def _off(interval: float, period: float) -> float:
-    """How far an interval is from one or more whole periods [s]."""
+    """Distance of an interval from one or more whole periods [s]."""
     return abs(interval - max(1, round(interval / period)) * period)
 
 

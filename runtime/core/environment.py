@@ -1,4 +1,4 @@
-"""What a station takes from the environment: nothing that is the web's, and secrets by their names alone."""
+"""Environment variables of a station: none of the web's, secrets by their names alone."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def with_still_blas(given: Mapping[str, str]) -> dict[str, str]:
 
 
 def for_ssh() -> dict[str, str]:
-    """What of ours an ssh gets: it may be told by its configuration to send on whatever it has."""
+    """Variables of ours that an ssh gets: its configuration may tell it to send on whatever it has."""
     return {
         name: value for name, value in os.environ.items() if name in _OF_SSH or name.startswith("LC_")
     } | {"SSH_ASKPASS_REQUIRE": "never"}
 
 
 def shed() -> None:
-    """Where this program was started with secrets of the web, it is started again without, as the same process.
+    """Start a program that has secrets of the web again without, as the same process.
 
     Else they could be read in /proc for as long as it lives, and every child would have them.
     """

@@ -26,7 +26,7 @@ class ActionSpaceError(ContradictionError):
 
 
 class WrongProtocolError(PolicyError):
-    """What answers at the policy's address does not speak the protocol that the deployment says."""
+    """The server at the policy's address does not speak the protocol that the deployment says."""
 
 
 class RefusedError(PolicyError):

@@ -86,7 +86,7 @@ def _allowed(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[s
 
 
 def _tables(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[type[BaseModel]]:
-    """What the table at `key` may be: one model where its kind says so, else each it could be."""
+    """Models that the table at `key` may be: one where its kind says so, else each it could be."""
     annotations: list[Any] = [root]
     at: Any = tree
     for name in key:

@@ -1,4 +1,4 @@
-"""How many files and connections a process may have open."""
+"""Number of files and connections that a process may have open."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def _counts(line: str) -> bool:
 
 
 def _git(root: Path, *arguments: str) -> str | None:
-    """What git says, None where it fails; it writes nothing and follows no variables of a hook."""
+    """Output of git, None where it fails; it writes nothing and follows no variables of a hook."""
     plain = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
         done = subprocess.run(

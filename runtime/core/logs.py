@@ -78,7 +78,7 @@ class Lines(logging.Handler):
 
 
 def _last_words(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """What ends the process goes the same way: a traceback must not wait for a terminal either."""
+    """Log the error that ends the process: a traceback must not wait for a terminal either."""
     if issubclass(kind, Exception):
         logging.getLogger(__name__).critical("this process ends", exc_info=(kind, error, trace))
     else:

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 
 class Names(Enum):
-    """What the value of such a key names."""
+    """Kinds of things that the value of such a key names."""
 
     VARIABLE = "an environment variable"
     FILE = "a file that is read"

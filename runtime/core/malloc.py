@@ -1,4 +1,4 @@
-"""What a process frees stays with it, because pictures come and go.
+"""Memory that a process frees stays with it, because pictures come and go.
 
 glibc gives large pieces of freed memory back to the kernel, and each picture then begins with a page fault for every
 4 kB of it: of a request with three small pictures that is half of the processor time. Nothing grows by this: the

@@ -114,7 +114,7 @@ def union(package: str) -> Any:
 
 
 def parts(annotation: Any) -> tuple[Any, ...]:
-    """What an annotation is made of: the models of all kinds of a table that has kinds, else its arguments."""
+    """Parts of an annotation: the models of all kinds of a table that has kinds, else its arguments."""
     if isinstance(annotation, type) and issubclass(annotation, OneOf):
         return annotation.configs()
     return get_args(annotation)

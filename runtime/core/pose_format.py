@@ -1,4 +1,4 @@
-"""How poses are written in a row of numbers, as a deployment declares it."""
+"""Format of poses in a row of numbers, as a deployment declares it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OrientationName = Literal["wxyz", "xyzw", "euler", "rotation_vector", "6d"]
 
 
 class PoseFormat(Settings):
-    """How the pose of an end effector is written: per arm x, y, z [m], an orientation, and its gripper."""
+    """Format of the pose of an end effector: per arm x, y, z [m], an orientation, and its gripper."""
 
     orientation: OrientationName = "wxyz"
     """Quaternion with the scalar first or last, Euler angles, axis times angle, or six numbers of the matrix."""

@@ -57,7 +57,7 @@ def leave_all() -> None:
 
 
 def advice(scheduling: str, priority: int) -> str:
-    """How a station whose control got `scheduling` is made punctual, in one sentence; "" where it need not be."""
+    """Advice to make a station punctual, for control that got `scheduling`; "" where it need not be."""
     if scheduling.startswith("FIFO") or scheduling == LOCKSTEP:
         return ""
     return (
@@ -77,7 +77,7 @@ def _locked_memory(libc: ctypes.CDLL, what: int) -> bool:
 
 
 def _quiet_gc() -> None:
-    """What is imported is never looked through again; the loop collects by itself, between two ticks."""
+    """Never look through again what is imported; the loop collects by itself, between two ticks."""
     gc.collect()
     gc.freeze()
     gc.disable()

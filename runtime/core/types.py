@@ -28,7 +28,7 @@ _EMPTY: Mapping[str, object] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What was known of the robot at one moment: joints, poses, and the newest picture of each camera.
+    """Knowledge of the robot at one moment: joints, poses, and the newest picture of each camera.
 
     Vectors are in the robot's group order: `qpos`, `qvel`, `effort` float32 [D] (rad, rad/s, Nm; grippers in
     the robot's own unit), `eef` float32 [8 * arms] as measured by the robot. `pictures` are RGB uint8 [H, W, 3],
@@ -82,7 +82,7 @@ class ActionChunk:
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
-    """What the robot is already committed to, for policies that continue their own last chunk (RTC).
+    """Commitments of the robot so far, for policies that continue their own last chunk (RTC).
 
     Rows are in the policy's own space and at its own rate, as the server gave them.
     """

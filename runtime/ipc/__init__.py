@@ -1,1 +1,1 @@
-"""How processes and clients of a station talk: shared state, rings, messages, the bus, the e-stop's latch."""
+"""Communication of a station's processes and clients: shared state, rings, messages, the bus, the latch."""

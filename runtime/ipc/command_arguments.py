@@ -1,4 +1,4 @@
-"""What the commands of the session take with them: checked whole before anything is done about it."""
+"""Arguments of the session's commands: checked whole before anything is done about it."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class Checkpoint(Settings):
 
 
 class Positions(Settings):
-    """Where things are wanted on the bench, in the world: x, y [m], yaw [degrees]; what is absent lies anywhere."""
+    """Positions wanted on the bench, in the world: x, y [m], yaw [degrees]; what is absent lies anywhere."""
 
     block: list[float] | None = Field(default=None, min_length=3, max_length=3)
     plate: list[float] | None = Field(default=None, min_length=2, max_length=2)
 
 
 class BenchRequest(Settings):
-    """How a simulated bench is to be laid out; `id` names this reset, one is made up where none is given."""
+    """Layout wanted of a simulated bench; `id` names this reset, one is made up where none is given."""
 
     id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     seed: int = Field(ge=0, le=_HIGHEST_SEED)
@@ -56,7 +56,7 @@ class BenchRequest(Settings):
 
 
 class LeastTimes(Settings):
-    """How long the stages of a set-up that wait for the policy last at least [s], whoever it is."""
+    """Least durations of the stages of a set-up that wait for the policy [s], whichever it is."""
 
     connect_s: float = Field(default=0.0, ge=0, le=3600)
     warm_up_s: float = Field(default=0.0, ge=0, le=3600)
@@ -107,7 +107,7 @@ class PreflightRequest(Settings):
 
     @property
     def about(self) -> str:
-        """What is looked at, for a sentence."""
+        """Name of what is looked at, for a sentence."""
         named = self.checkpoint and (self.checkpoint.name or str(self.checkpoint.id))
         return f"the checkpoint {named}" if named else "the deployment's policy"
 

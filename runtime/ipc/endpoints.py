@@ -1,6 +1,7 @@
-"""Where a station's sockets are: in a folder that this account alone can enter, and in files that say so.
+"""Sockets of a station: in a folder that this account alone can enter, and in files that say where they are.
 
-Who can enter the folder can speak to the station, so that nobody else may have made it, or have a right in it.
+An account that can enter the folder can speak to the station, so that no other may have made it, or
+have a right in it.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def socket_folder(station_dir: Path) -> Path:
 
 
 def _folders(station_dir: Path) -> Iterator[Path]:
-    """Where the sockets may be, best first; a station that starts takes the first, one that runs any."""
+    """Folders for the sockets, best first; a station that starts takes the first, one that runs any."""
     name = hashlib.sha256(os.fsencode(station_dir.resolve())).hexdigest()[:16]
     given = os.environ.get("XDG_RUNTIME_DIR", "")
     if given and not _missing(Path(given)):
@@ -113,7 +114,7 @@ def account(uid: int) -> str:
 
 
 def fresh_path(station_dir: Path, name: str) -> Path:
-    """Where the socket `name` is to be; what dead processes left of that name is removed.
+    """Path for the socket `name`; what dead processes left of that name is removed.
 
     No two have the same path, so that an end never removes the socket of a successor. Where the first folder is of no
     use, it is the next one, and the log says so: a station that runs is not lost for a folder. Raises TransportError.
@@ -166,7 +167,7 @@ def trouble(endpoint: str) -> str:
 
 
 class Endpoints:
-    """Where a station's sockets are: one small file per process in the station's folder."""
+    """Places of a station's sockets: one small file per process in the station's folder."""
 
     def __init__(self, station_dir: Path) -> None:
         self._station_dir = station_dir
@@ -177,7 +178,7 @@ class Endpoints:
         self._looked = time.monotonic()
 
     def lost(self, process: str) -> bool:
-        """Whether the file that this process wrote is gone, or says nothing; looks five times a second.
+        """True if the file that this process wrote is gone, or says nothing; looks five times a second.
 
         What a successor wrote is left as it is.
         """
@@ -251,7 +252,7 @@ class Endpoints:
         return found
 
     def listens(self, name: str) -> bool:
-        """Whether somebody listens at a socket of that name, whatever the files say; False where that is not known."""
+        """True if a process listens at a socket of that name, whatever the files say; False if unknown."""
         for folder in _folders(self._station_dir):
             with suppress(OSError):  # it is not there, or nobody can get at it
                 if any(not trouble(f"ipc://{path}") for path in folder.glob(f"{name}-*")):

@@ -73,7 +73,7 @@ def urgent(
 
 
 def _now(endpoints: Endpoints, where: tuple[str, str], before: str) -> str:
-    """Where it is now, which is where it was `before` as long as nobody says otherwise."""
+    """Endpoint of a socket now: the one `before` as long as no file names another."""
     process, name = where
     try:
         return str(endpoints.read(process)[name])

@@ -11,7 +11,7 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class Latched:
-    """Who pressed, why, when (Unix time)."""
+    """Press that is latched: by which user, why, when (Unix time)."""
 
     by: str
     why: str

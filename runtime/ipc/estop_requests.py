@@ -1,4 +1,4 @@
-"""What presses the e-stop, per wire format: a message that says so does, whatever else is wrong with it.
+"""Presses of the e-stop, per wire format: a message that says so is one, whatever else is wrong with it.
 
 Here alone that is decided, for every door. A message that can be read is of the kind that it names itself; of one that
 cannot, or that names none, the words decide. Nothing here raises, and what is looked through is looked through once.
@@ -44,7 +44,7 @@ def why_of(command: Command) -> str:
 
 
 def kind_of(payload: bytes) -> str:
-    """What a message of the bus says first that it is, read without its arguments; "" where that is not to be seen."""
+    """Kind that a message of the bus names first, read without its arguments; "" where none is seen."""
     try:
         return next((_text(value) or "" for key, value in _pairs(payload) if key == "kind"), "")
     except _UNREADABLE:
@@ -140,7 +140,7 @@ _JSON = json.JSONDecoder(object_pairs_hook=_Table)
 
 
 def in_json(said: str | bytes, *keys: str) -> dict[str, Any] | None:
-    """What a message in JSON says with a press, {} where that cannot be read; None where it is no press.
+    """Fields of a press in JSON, {} where they cannot be read; None where the message is no press.
 
     `keys` are those under which such a message names what it is: {"type": "estop"}. "web:estop" and "estop:REASON" are
     names of it too.

@@ -27,7 +27,7 @@ def _press_in(call: Call) -> Command | None:
 
 
 class Turns:
-    """What comes at a server's socket, in turns; `urgent` are the kinds for which nothing waits.
+    """Messages at a server's socket, in turns; `urgent` are the kinds that wait for nothing.
 
     A press of the e-stop is urgent everywhere. Of all else what has more than `longest` bytes is refused unread.
     """
@@ -41,7 +41,7 @@ class Turns:
 
     @property
     def waiting(self) -> bool:
-        """Whether there is something to look into, without any further message."""
+        """True if there is something to look into, without any further message."""
         return bool(self._waiting)
 
     def take(self) -> tuple[list[Asked], list[Asked]]:

@@ -1,7 +1,7 @@
-"""Who gave a command: what the web signs, the account that connects, or somebody who cannot be verified.
+"""Givers of commands: the user that the web signs, the account that connects, or one that cannot be verified.
 
-What a command says of itself is believed of nobody. The web signs the whole message, so that user and role go with this
-one command and no other.
+What a command says of itself is never believed. The web signs the whole message, so that user and role go with
+this one command and no other.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Key:
         return hmac.digest(self.secret(), _DOMAIN + payload, "sha256")
 
     def verifies(self, payload: bytes, signature: bytes) -> bool:
-        """Whether the web has signed just this; whatever is wrong with the key, it has not."""
+        """True if the web has signed just this; False whatever is wrong with the key."""
         try:
             return hmac.compare_digest(self.sign(payload), signature)
         except ConfigurationError:
@@ -141,6 +141,6 @@ def lacking(command: Command) -> str:
 
 
 def named(command: Command) -> str:
-    """Who gave the command, for the record: with the role that the web has signed."""
+    """Name of the command's giver, for the record: with the role that the web has signed."""
     name = command.user or command.holder or "unknown"
     return name if command.role in ("", LOCAL, SCRIPT, UNVERIFIED) else f"{name} ({command.role})"

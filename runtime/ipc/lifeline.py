@@ -14,6 +14,6 @@ class Lifeline:
 
     @property
     def cut(self) -> bool:
-        """Whether the supervisor is gone."""
+        """True if the supervisor is gone."""
         readable, _, _ = select.select([self._descriptor], [], [], 0)
         return bool(readable) and os.read(self._descriptor, 4096) == b""

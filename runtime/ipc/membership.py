@@ -1,4 +1,4 @@
-"""What each process of a station holds of the others."""
+"""Links of each process of a station to the others."""
 
 from __future__ import annotations
 
@@ -20,5 +20,5 @@ class Membership:
     lifeline: Lifeline
 
     def needed(self, now: float) -> bool:
-        """Whether there is still something to do for who outlives control: until then the supervisor may be gone."""
+        """True while a process that outlives control is needed: until then the supervisor may be gone."""
         return not self.lifeline.cut or self.shared.alive("control", now, _OUTLIVES_S)

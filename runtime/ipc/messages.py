@@ -34,7 +34,7 @@ Mode = Literal[PolicyMode, "collect"]
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What control is to do from its next tick on."""
+    """Order to control, from its next tick on."""
 
     number: int
     kind: OrderKind
@@ -71,7 +71,7 @@ class Tune:
 
 @dataclass(frozen=True, slots=True)
 class LockGrippers:
-    """Where grippers are to stay whatever is asked of them: float64 [D], NaN for what is not locked."""
+    """Positions at which grippers stay whatever is asked of them: float64 [D], NaN for what is not locked."""
 
     values: Float64
 
@@ -109,7 +109,7 @@ class TickDone:
 
 @dataclass(frozen=True, slots=True)
 class ChunkMerged:
-    """Where control put a chunk; fields as in strategies.base.Merged."""
+    """Place that control gave a chunk; fields as in strategies.base.Merged."""
 
     chunk_id: int
     run: int
@@ -205,7 +205,7 @@ class EpisodeClosed:
 
 @dataclass(frozen=True, slots=True)
 class MediaReport:
-    """What media writes, a few times a second."""
+    """Report of what media writes, a few times a second."""
 
     time: float
     rows: int
@@ -261,7 +261,7 @@ class EndRun:
 
 @dataclass(frozen=True, slots=True)
 class ReceptionReport:
-    """What reception sees, a few times a second."""
+    """Report of what reception sees, a few times a second."""
 
     time: float
     rates: Mapping[str, float] = field(default_factory=dict)  # measured [Hz] per stream
@@ -364,7 +364,7 @@ _ON_THE_WIRE: dict[Any, tuple[type, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class _Expected:
-    """What a field may be: one of `classes`, and where `words` are given, one of these."""
+    """Values that a field may have: one of `classes`, and where `words` are given, one of these."""
 
     classes: tuple[type, ...]
     words: tuple[str, ...] = ()

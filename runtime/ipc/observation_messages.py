@@ -28,7 +28,7 @@ class SlotPictures(Mapping[str, UInt8]):
         return picture
 
     def __contains__(self, camera: object) -> bool:
-        """Whether there was one, overwritten or not."""
+        """True if there was a picture of it, overwritten or not."""
         return camera in self._numbers
 
     def __iter__(self) -> Iterator[str]:
@@ -39,7 +39,7 @@ class SlotPictures(Mapping[str, UInt8]):
 
 
 def as_message(observation: Observation, numbers: Mapping[str, int]) -> Observed:
-    """What media is told of an observation whose pictures are in the slots of these numbers."""
+    """Message to media about an observation whose pictures are in the slots of these numbers."""
     told = {name: getattr(observation, name) for name in _SAME}
     told["captured"] = dict(observation.captured)
     return Observed(**told, pictures={camera: numbers[camera] for camera in observation.pictures})

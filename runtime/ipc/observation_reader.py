@@ -12,7 +12,7 @@ from runtime.ipc.shared_state import SharedState
 
 @dataclass(frozen=True, slots=True)
 class LatestObservation:
-    """What is known of the robot: joints [D], and when each part of it was captured on our monotonic clock [s]."""
+    """Newest state of the robot: joints [D], and when each part was captured on our monotonic clock [s]."""
 
     sequence: int  # 0 before the first observation
     qpos: Float32  # as it was measured
@@ -23,7 +23,7 @@ class LatestObservation:
     doubt: str = ""  # why these numbers cannot be true
 
     def fresh(self, now: float, allowed: float) -> bool:
-        """Whether the joints are known, believed, and not older than `allowed` seconds."""
+        """True if the joints are known, believed, and not older than `allowed` seconds."""
         return self.measured and not self.doubt and now - self.joints_captured <= allowed
 
     def picture_ages(self, now: float) -> dict[str, float]:

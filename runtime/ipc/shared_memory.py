@@ -75,7 +75,7 @@ class Record:
 
     @property
     def version(self) -> int:
-        """How often the record was written; 0 = never."""
+        """Number of times that the record was written; 0 = never."""
         return int(self._version[0])
 
     def write(self, value: np.void | np.ndarray[Any, np.dtype[np.void]]) -> None:
@@ -128,7 +128,7 @@ class Ring:
 
     @property
     def waiting(self) -> bool:
-        """Whether there is a message that nobody has taken yet."""
+        """True if there is a message that has not been taken yet."""
         return int(self._head[0]) != int(self._tail[0])
 
     def push(self, payload: bytes) -> bool:

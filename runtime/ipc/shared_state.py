@@ -1,4 +1,4 @@
-"""What the family shares: the newest observation, control's status, heartbeats, the e-stop flag, rings, pictures.
+"""Shared state of the family: newest observation, control's status, heartbeats, e-stop flag, rings, pictures.
 
 Every part has exactly one writer; the table in docs/architecture.md says which.
 """
@@ -74,7 +74,7 @@ class SharedStateLayout:
         )
 
     def control_dtype(self) -> np.dtype[np.void]:
-        """What control last did and how well it keeps time."""
+        """Fields of control's status: what it last did and how well it keeps time."""
         return np.dtype(
             [
                 ("step", "i8"),
@@ -176,7 +176,7 @@ class SharedState:
         return float(self._beats[process][0])
 
     def alive(self, process: str, now: float, within: float) -> bool:
-        """Whether `process` has said so in the last `within` seconds."""
+        """True if `process` has said so in the last `within` seconds."""
         return now - self.last_beat(process) <= within
 
     def silence(self, process: str, now: float) -> str:
@@ -185,7 +185,7 @@ class SharedState:
         return f"for {now - beat:.1f} s" if beat else "since it was restarted"
 
     def generation(self, process: str) -> int:
-        """How often the supervisor has started `process`; a change means that it died and was restarted."""
+        """Number of starts of `process` by the supervisor; a change means that it died and was restarted."""
         return int(self._generations[process][0])
 
     def set_generation(self, process: str, count: int) -> None:
@@ -194,7 +194,7 @@ class SharedState:
 
     @property
     def releases(self) -> int:
-        """How often the coordinator has asked the guard to release the latch."""
+        """Number of times that the coordinator has asked the guard to release the latch."""
         return int(self._release[0])
 
     def ask_release(self) -> None:

@@ -1,1 +1,1 @@
-"""What is executed over time: timeline and trajectories, as mathematics on arrays."""
+"""Execution over time: timeline and trajectories, as mathematics on arrays."""

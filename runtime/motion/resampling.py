@@ -13,7 +13,7 @@ from runtime.core.types import Float64
 
 
 def length(count: int, rate: float, wanted_rate: float) -> int:
-    """How many rows `count` rows of `rate` Hz are at `wanted_rate` Hz: those from the first to the last, at least 1."""
+    """Number of rows at `wanted_rate` Hz for `count` rows of `rate` Hz: first to last, at least 1."""
     return math.floor((count - 1) * wanted_rate / rate + 1e-9) + 1
 
 

@@ -1,4 +1,4 @@
-"""What is to be executed, by absolute control step, and which chunks made each step."""
+"""Timeline of what is to be executed, by absolute control step, and which chunks made each step."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Timeline:
         self.fade: Fade | None = None
 
     def at(self, step: int) -> Planned | None:
-        """What is to be executed at `step`; None where nothing is planned."""
+        """Action to be executed at `step`, with its makers; None where nothing is planned."""
         index = step - self.first
         if not 0 <= index < len(self.rows):
             return None
@@ -98,7 +98,7 @@ class Timeline:
         return plan if self.fade is None else self.fade.over(step, plan)
 
     def remaining(self, step: int) -> int:
-        """How many steps are planned from `step` on."""
+        """Number of steps planned from `step` on."""
         return max(0, self.first + len(self.rows) - max(step, self.first))
 
     def plan(self, step: int) -> tuple[Float64, list[Contributions]]:
@@ -109,7 +109,7 @@ class Timeline:
         return self.rows[index:], self.makers[index:]
 
     def span(self, step: int) -> tuple[Float64, list[Contributions]]:
-        """What is to be executed from `step` on: rows [N, D] and their makers."""
+        """Actions to be executed from `step` on: rows [N, D] and their makers."""
         rows, makers = self.plan(step)
         if self.fade is None:
             return rows, makers

@@ -56,7 +56,7 @@ class Brake(Motion):
         return position
 
     def velocity(self, elapsed: float) -> Float64:
-        """How fast each number changes then [D]: less than on average since the tick before."""
+        """Velocity of each number then [D]: less than on average since the tick before."""
         velocity = np.sign(self._velocity) * np.maximum(
             np.abs(self._velocity) - self._deceleration * elapsed, 0.0
         )

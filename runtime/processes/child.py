@@ -1,4 +1,4 @@
-"""What every process of a station starts from: its plan, the shared state, a lifeline, a log."""
+"""Start of every process of a station: its plan, the shared state, a lifeline, a log."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Whether an action may be sent: limits, workspace, collision, the last check."""
+"""Checks of an action before it is sent: limits, workspace, collision, the last check."""

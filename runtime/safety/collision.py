@@ -1,4 +1,4 @@
-"""Whether a robot would run into itself or the table: its own rule about what a step, or a way, may do."""
+"""Collisions of a robot with itself or the table: its own rule about what a step, or a way, may do."""
 
 from __future__ import annotations
 

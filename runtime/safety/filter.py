@@ -32,7 +32,7 @@ _MARGIN = 1.05
 
 @dataclass(frozen=True, slots=True)
 class RobotState:
-    """What an action is judged against: vectors float64 [D], times in seconds."""
+    """State that an action is judged against: vectors float64 [D], times in seconds."""
 
     previous: Float64  # last command sent
     velocity: Float64  # of the commands
@@ -48,7 +48,7 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What may be sent: `action` float64 [D], None where refused; `notes` say what was changed or why.
+    """Verdict: `action` float64 [D] may be sent, None where refused; `notes` say what changed or why.
 
     `most` is the note on what was changed most, and `change` by how much [rad, or a gripper's worth of them]. `near`
     are links that it brings near each other, where that is only warned of.

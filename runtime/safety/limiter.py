@@ -15,7 +15,7 @@ _TOLERANCE = 1e-6  # [rad, or what a gripper's travel is worth]
 
 
 class Limited(NamedTuple):
-    """What may be sent, float64 [D], and what was changed: a sentence each joint."""
+    """Command that may be sent, float64 [D], and what was changed: a sentence each joint."""
 
     action: Float64
     notes: tuple[str, ...] = ()
@@ -41,7 +41,7 @@ class CommandLimiter:
     def __call__(
         self, action: Float64, previous: Float64, velocity: Float64, elapsed: float, stop: bool
     ) -> Limited:
-        """What of `action` [D] may follow the command `previous`, which moved at `velocity`, `elapsed` seconds later.
+        """Part of `action` [D] that may follow `previous`, moving at `velocity`, `elapsed` seconds later.
 
         `stop`: the e-stop sends it.
         """

@@ -1,4 +1,4 @@
-"""What a robot can do: the bounds of each of its numbers, and what kind of number it is."""
+"""Limits of a robot: the bounds of each of its numbers, and what kind of number it is."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ class Limits:
         return standing
 
     def outside(self, position: Float64) -> Float64:
-        """How far `position` [..., D] is beyond its bounds, 0 within them."""
+        """Distance of `position` [..., D] beyond its bounds, 0 within them."""
         return np.maximum(np.maximum(self.lower - position, position - self.upper), 0.0)
 
     @property
     def reach(self) -> Float64:
-        """What one radian is worth in each dimension [D]: 1 for angles.
+        """Worth of one radian in each dimension [D]: 1 for angles.
 
         A gripper's accelerations are scaled so that its whole travel counts as much as GRIPPER_TRAVEL radians,
         whatever its unit: metres, 0..1, 0..100.

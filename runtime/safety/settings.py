@@ -1,4 +1,4 @@
-"""What a deployment says of safety."""
+"""Safety settings of a deployment."""
 
 from __future__ import annotations
 

@@ -30,11 +30,11 @@ class Workspace:
         return tuple(name for index, name in enumerate(self.arms) if outside[..., index].any())
 
     def outside(self, q: Float64) -> NDArray[np.bool_]:
-        """Whether each of `arms` is outside, bool [..., arms], with the joints q [..., D]."""
+        """True for each of `arms` that is outside, bool [..., arms], with the joints q [..., D]."""
         return np.asarray(self.excess(q) > 0.0)
 
     def excess(self, q: Float64) -> Float64:
-        """How far each of `arms` is outside [..., arms], in metres along the worst axis, with the joints q [..., D]."""
+        """Distance of each of `arms` outside [..., arms], on the worst axis [m], with joints q [..., D]."""
         if not self._groups:
             return np.zeros((*q.shape[:-1], 0))
         points = np.stack([arm.transform(q)[..., :3, 3] for arm in self._groups], axis=-2)

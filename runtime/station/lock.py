@@ -19,7 +19,7 @@ def hold(settings: Deployment) -> IO[str]:
 
 
 def unwritable(settings: Deployment, error: OSError) -> SetupError:
-    """What to say where the folder of a station cannot be written."""
+    """Error for a station whose folder cannot be written."""
     return SetupError(
         f"{settings.station_dir} cannot be written ({error.strerror}): make room there, or name another folder with "
         "data_dir"

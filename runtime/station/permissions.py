@@ -1,4 +1,4 @@
-"""What a command may bring along: by whom tables are written, and what of the station's own they may name.
+"""Permissions of commands: whose tables they may bring along, and what of the station's own these may name.
 
 The station's own account, which `ctl` and the control channel act for, may name whatever it can reach itself.
 """
@@ -86,7 +86,7 @@ def _recordings(own: Deployment) -> Iterable[Path]:
 
 
 def _within(value: str, allowed: Iterable[str | Path]) -> bool:
-    """Whether a path leads to one of these files or below one of these folders, links and `..` followed."""
+    """True if a path leads to one of these files or below one of these folders, links and `..` followed."""
     try:
         path = _place(value)
         return any(path.is_relative_to(_place(one)) for one in allowed)

@@ -58,7 +58,7 @@ class Preflights:
 
     @property
     def under_way(self) -> str:
-        """What is being looked at, "" where nothing is."""
+        """Name of what is being looked at, "" where nothing is."""
         return self._flight.about if self._flight else ""
 
     def start(self, asked: PreflightRequest, resolved: Resolved) -> float:
@@ -120,7 +120,7 @@ class Preflights:
 
 
 def _patience(resolved: Resolved, asked: PreflightRequest) -> float:
-    """What the policy's own deadlines come to; where it is no deployment, its process says so at once."""
+    """Sum of the policy's own deadlines [s]; where it is no deployment, its process says so at once."""
     try:
         return patience(changed(resolved, asked.changes, "preflight").deployment)
     except RuntimeFault:
@@ -190,7 +190,7 @@ def _report(said: bytes) -> dict[str, Any]:
 
 
 def patience(settings: Deployment) -> float:
-    """How long a preflight may take where nobody says so [s]: what the policy's own deadlines come to."""
+    """Time that a preflight may take where none is given [s]: what the policy's own deadlines come to."""
     policy = settings.policy.model_dump()
     return _ROOM_S + _deadlines(policy) + float(policy.get("inference_deadline", 0.0))  # it is asked twice
 

@@ -143,7 +143,7 @@ def _revisions(then: object) -> str:
 
 
 def _revision(given: object) -> str:
-    """What was changed without being committed is not known, so that it never counts as the same."""
+    """Short revision; with uncommitted changes, which are not known, it never counts as the same."""
     if not isinstance(given, Mapping) or not given.get("commit"):
         return _UNKNOWN
     return _short(str(given["commit"])) + (_DIRTY if given.get("dirty") else "")

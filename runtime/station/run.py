@@ -58,7 +58,7 @@ class Run:
 
     @property
     def unbegun(self) -> dict[str, Any]:
-        """What those who asked for it are told where it ended before control followed; {} where it began."""
+        """Data for the client of a run that ended before control followed; {} where it began."""
         if self.begun is not None:
             return {}
         return {"unbegun": {"command": self.command, "episode": self.uuid, "unopened": self.unopened}}
@@ -115,7 +115,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """What every manifest says of the station as it was last set up; `plan` is the one in force since then."""
+    """Entries of every manifest about the station as last set up; `spec` is the one in force since then."""
 
     spec: StationSpec
     boot: str

@@ -92,7 +92,7 @@ class StationSpec:
             ) from error
 
     def _teleoperation(self, clock: Clock) -> Policy:
-        """What is asked while a person drives the robot."""
+        """The policy that is asked while the operator drives the robot."""
         from runtime.teleoperators.relay import NodeLed, Relay
 
         wanted = self.deployment.collection
@@ -188,14 +188,14 @@ class StationSpec:
         return ActionSpaces(self.robot, kinematics or self.kinematics(), self.rate)
 
     def end_effectors(self) -> EndEffectors:
-        """Where joints put the robot's end effectors: all that processes need that solve nothing."""
+        """Poses of the robot's end effectors by joints: all that processes need that solve nothing."""
         from runtime.kinematics.forward import ChainForward
         from runtime.spaces.end_effectors import EndEffectors
 
         return EndEffectors(self.robot, ChainForward(self.robot))
 
     def publication(self) -> PosePublisher | None:
-        """What makes the poses that are published of a joint command; None where joints alone are."""
+        """Publisher of the poses of a joint command; None where joints alone are published."""
         wanted = self.deployment.publication
         if wanted.space == "joint":
             return None

@@ -52,7 +52,7 @@ class StrategyParameters(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """What the asking half may decide by."""
+    """Facts that the asking half may decide by."""
 
     remaining: int  # steps still planned
     in_flight: bool  # a request is out, or its answer has not been merged yet
@@ -74,7 +74,7 @@ class Arrival:
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """Where a chunk fell.
+    """Place of a chunk on the timeline.
 
     `arrival_step` is the first tick not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H]
     is the step each row was planned for, -1 where it was dropped. `mistimed` is how many steps later than meant
@@ -120,7 +120,7 @@ class Query(ABC):
 
     @abstractmethod
     def wants(self, progress: Progress) -> bool:
-        """Whether to ask now."""
+        """True if the policy is to be asked now."""
 
 
 class Paced(Query):

@@ -18,14 +18,14 @@ _ANYBODY = 'anybody may {"command": "estop"}'
 
 
 def is_stop(message: Message) -> bool:
-    """Whether it ends whatever goes on, under a lease."""
+    """True if it ends whatever goes on, under a lease."""
     if message.form == "command":
         return message.name in ("stop", "halt")
     return message.form == "cmd" and stops(message.name, message.argument)
 
 
 def is_estop(message: Message) -> bool:
-    """Whether it presses the e-stop, which needs no lease."""
+    """True if it presses the e-stop, which needs no lease."""
     return message.form != "query" and message.name == "estop"
 
 
@@ -75,7 +75,7 @@ class EStop:
         self._open, self._outcomes = open_client, outcomes
 
     def answer(self, holder: str, message: Message) -> dict[str, Any]:
-        """What the guard says; never refused for an argument."""
+        """Answer of the guard to a press; never refused for an argument."""
         outcome = Outcome(message.id or str(uuid.uuid4()), message.name, "estop", "done")
         client = self._open(holder)
         try:

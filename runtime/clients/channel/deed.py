@@ -1,4 +1,4 @@
-"""What a verb of the older channel comes to in commands of ours, and the small words its arguments are made of."""
+"""Commands of ours for a verb of the older channel, and the small words its arguments are made of."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Deed:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What a verb is read by: the message, the station's status, the script's choices, the commanded joints."""
+    """Context of a verb: the message, the station's status, the script's choices, the commanded joints."""
 
     message: Message
     status: Mapping[str, Any]

@@ -69,7 +69,7 @@ class Desk:
         return answers.told(message, outcome, data, self._state(script, outcome)) | special
 
     def _repeated(self, message: Message, known: Outcome, script: Script) -> dict[str, Any]:
-        """What came of it the first time, as far as it has come now."""
+        """Answer with what came of it the first time, as far as it has come now."""
         if known.said != message.name:
             why = f"its id was given to {known.said!r} before"
             other = Outcome(known.id, message.name, "", "refused", why)
@@ -86,7 +86,7 @@ class Desk:
             return None
 
     def keep(self) -> None:
-        """What is due beside messages: leases, and what became of commands that go on."""
+        """Do what is due beside messages: leases, and the outcomes of commands that go on."""
         for sentence in self._scripts.keep():
             log.warning("%s", sentence)
         if self._now() - self._looked >= _LOOK_S:

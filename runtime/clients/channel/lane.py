@@ -33,7 +33,7 @@ class Job:
 
 
 class Clerk(Protocol):
-    """Who answers in a lane."""
+    """Answers messages in a lane."""
 
     def answer(self, holder: str, message: Message) -> dict[str, Any]: ...
     def close(self) -> None: ...
@@ -68,7 +68,7 @@ class Lane:
         self._thread.start()
 
     def put(self, job: Job) -> bool:
-        """Whether there was room for it."""
+        """Take a job; False if there was no room for it."""
         connection = job.address[0]
         with self._lock:
             if self._waiting[connection] >= EACH:

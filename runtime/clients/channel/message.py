@@ -1,4 +1,4 @@
-"""What a script says: one frame of JSON, checked for its form before anything is done about it."""
+"""Message of a script: one frame of JSON, checked for its form before anything is done about it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Message:
 
     @property
     def echo(self) -> dict[str, Any]:
-        """What an answer repeats of it."""
+        """The part of it that an answer repeats."""
         return {} if self.form == "query" else {self.form: self.fields[self.form]}
 
 

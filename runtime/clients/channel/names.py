@@ -1,4 +1,4 @@
-"""Who a message of the channel is of, and whether it shows that the script which commands is alive."""
+"""Holders of the channel's messages, and the messages that show that the script which commands is alive."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Names:
         return f"{self.user}#{number}"
 
     def lives(self, connection: bytes, message: Message, stops: bool) -> bool:
-        """Whether its holder is alive, as far as this message shows; `stops` where it ends something.
+        """True if its holder is alive, as far as this message shows; `stops` where it ends something.
 
         Of scripts that are one holder some only look, and must not keep alive what another one began. So a question
         counts on a connection that has commanded, where it asks what became of a command, or as the first on a

@@ -1,4 +1,4 @@
-"""What became of commands that go on after they were accepted: looked at until they are over."""
+"""Outcomes of commands that go on after they were accepted: looked at until they are over."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Events = Callable[[int], list[dict[str, Any]]]
 
 
 def lasts(kind: str) -> bool:
-    """Whether a command goes on after it was accepted."""
+    """True if a command goes on after it was accepted."""
     return kind in _WHILE or kind in _WITHIN or kind == "approach"
 
 
@@ -84,7 +84,7 @@ class Outcome:
         self._end("failed" if failure else "done", failure)
 
     def _calm(self, status: dict[str, Any]) -> bool:
-        """Whether it was seen to stand twice, so far apart that what there is to tell of it was told.
+        """True if it was seen to stand twice, so far apart that what there is to tell of it was told.
 
         What is seen in the first ticks says nothing: it may not have begun.
         """

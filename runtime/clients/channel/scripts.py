@@ -66,7 +66,7 @@ class Lives:
             return self._now() - self._heard.get(holder, -float("inf"))
 
     def knows(self, holder: str) -> bool:
-        """Whether it is one of the channel's scripts."""
+        """True if it is one of the channel's scripts."""
         with self._lock:
             return holder in self._heard
 

@@ -1,4 +1,4 @@
-"""What a script has chosen and not yet used: the older channel chooses first and commands later."""
+"""Choices of a script that it has not used yet: the older channel chooses first and commands later."""
 
 from __future__ import annotations
 

@@ -22,13 +22,13 @@ class Verb:
 
 
 def stops(verb: str, argument: str | None) -> bool:
-    """Whether a verb ends a motion, whatever else waits."""
+    """True if a verb ends a motion, whatever else waits."""
     intent = (argument or "").partition(":")[0]
     return verb in STOPS or (verb == "operator_action" and intent in _STOPPING_INTENTS)
 
 
 def deed(scene: Scene) -> Deed:
-    """What a known verb comes to; raises NotOurs with the reason and what to give instead."""
+    """Commands of ours for a known verb; raises NotOurs with the reason and what to give instead."""
     return VERBS[scene.message.name].does(scene)
 
 
@@ -244,7 +244,7 @@ def _intervention(scene: Scene) -> Deed:
 
 
 def _demonstrates(scene: Scene) -> bool:
-    """Whether a person is to drive the robot, or does."""
+    """True if the operator is to drive the robot, or does."""
     collect = scene.status.get("collect")
     return collect is not None and collect["set_up"]
 

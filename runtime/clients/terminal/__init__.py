@@ -1,1 +1,1 @@
-"""What a person at a terminal sees and types: the parts of `python -m runtime.ctl`."""
+"""Input and output of the operator at a terminal: the parts of `python -m runtime.ctl`."""

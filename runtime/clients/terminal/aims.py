@@ -1,4 +1,4 @@
-"""Where the robot is to go: what was said on the command line as joints, and what a target means for a person."""
+"""Targets of the robot: joints from the command line, and what a target means for the operator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _STILL = 5e-4  # a joint that changes by less is not worth a line [rad, or the g
 
 
 def wanted(client: StationClient, given: argparse.Namespace) -> dict[str, Any]:
-    """What to aim at, as the arguments of `aim`; raises RuntimeFault for a joint that the robot has not."""
+    """Arguments of `aim`, from the command line; RuntimeFault for a joint that the robot has not."""
     arm = getattr(given, "arm", None)
     if arm is not None:
         return {"jog": _jog(given, arm)}

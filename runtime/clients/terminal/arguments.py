@@ -1,4 +1,4 @@
-"""What goes with a command over the bus, from what was said on the command line; what was not said stays out."""
+"""Arguments of a command over the bus, from the command line; what was not said stays out."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def figure(value: float) -> str:
 
 
 def report(status: Mapping[str, Any], me: str) -> list[str]:
-    """How the station is, in lines."""
+    """State of the station, in lines."""
     rows = [
         ("lease", _lease(status["lease"], me)),
         ("robot", f"{status['robot']} over {status['transport']}"),
@@ -116,7 +116,7 @@ def _mode(status: Mapping[str, Any]) -> str:
 
 
 def away(found: Mapping[str, Any], what: str) -> str:
-    """How far the robot is from an action; "" where there is none."""
+    """Distance of the robot from an action, in words; "" where there is none."""
     if not found:
         return ""
     far = ": FAR, approach it first" if found["far"] else ""

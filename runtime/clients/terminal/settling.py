@@ -63,5 +63,5 @@ def settle(client: StationClient, before: dict[str, Any], tell: Callable[[dict[s
 
 
 def busy(status: dict[str, Any]) -> bool:
-    """Whether something goes on; a gripper moves also where no run is open."""
+    """True if something goes on; a gripper moves also where no run is open."""
     return status["phase"] in _BUSY or status["control"]["behaviour"] == "motion"

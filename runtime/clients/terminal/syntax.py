@@ -1,4 +1,4 @@
-"""What can be said on the command line of `python -m runtime.ctl`: one subcommand per command."""
+"""Syntax of the command line of `python -m runtime.ctl`: one subcommand per command."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PRESSED = "pressed in a terminal"
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
-    """What was said; ends the process with exit code 2 and a sentence where it is nothing that there is.
+    """Parsed command line; ends the process with exit code 2 and a sentence if it is no valid one.
 
     A press of the e-stop with whatever else is a press: the sentence is said all the same.
     """
@@ -109,7 +109,7 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
 
 
 def _check(given: argparse.Namespace, command: argparse.ArgumentParser) -> None:
-    """What argparse cannot say of options that go together."""
+    """Check options that go together, which argparse cannot."""
     if given.command == "tune" and not (given.show or given.strategy or given.set or given.task is not None):
         command.error("tune needs --strategy, --set, --task or --show")
     if given.command == "setup" and given.cancel and _setup_says_more(given):

@@ -1,4 +1,4 @@
-"""Where commands leave: the last one a robot was told, how fast that moved, how it comes to a stand."""
+"""Actuators: the last command that a robot was told, how fast that moved, how it comes to a stand."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from runtime.transports.base import Sink
 
 @dataclass(frozen=True, slots=True)
 class TickSettings:
-    """What a tick goes by; times in seconds."""
+    """Settings of a tick; times in seconds."""
 
     period: float
     limits: Limits
@@ -44,17 +44,17 @@ class TickSettings:
 
     @property
     def guarded(self) -> bool:
-        """Whether measurements are doubted, and commands checked once more where they leave."""
+        """True if measurements are doubted, and commands checked once more where they leave."""
         return self.moves_robot and not self.safety.report_only
 
     @property
     def starvation_patience(self) -> float:
-        """How long a run may go on with nothing planned."""
+        """Time that a run may go on with nothing planned [s]."""
         return self.starvation_hold if self.starvation == "slow" else 0.0
 
 
 class Sent(NamedTuple):
-    """What became of one tick: what was wanted, and float64 [D] of what left, None where nothing did."""
+    """Result of one tick: its target, and float64 [D] of what left, None where nothing did."""
 
     time: float  # our monotonic clock [s]
     target: Target | None = None
@@ -84,7 +84,7 @@ class Actuator(ABC):
 
     @abstractmethod
     def state(self, seen: LatestObservation, planned: float, aim: Float64 | None) -> RobotState:
-        """What an action is judged against; `aim` is the action that was wanted before it."""
+        """State that an action is judged against; `aim` is the action that was wanted before it."""
 
     @abstractmethod
     def _deliver(self, step: int, action: Float64) -> float:
@@ -179,11 +179,11 @@ class Actuator(ABC):
 
     @property
     def _pressed(self) -> bool:
-        """Whether the e-stop is pressed."""
+        """True if the e-stop is pressed."""
         return False
 
     def _checked(self, action: Float64, elapsed: float, stop: bool) -> Limited:
-        """What of `action` may be sent."""
+        """The part of `action` that may be sent."""
         return Limited(action)
 
 
@@ -203,7 +203,7 @@ class RobotActuator(Actuator):
         self.commanded = np.array(before["commanded"], np.float64)
 
     def measured(self, seen: LatestObservation, now: float) -> Float64 | None:
-        """Where the robot is, None where that is not known freshly."""
+        """Measured joint positions [D]; None if they are unknown, doubted or old."""
         return self._branch(seen) if seen.fresh(now, self._settings.safety.joint_age_s) else None
 
     def state(self, seen: LatestObservation, planned: float, aim: Float64 | None) -> RobotState:

@@ -1,4 +1,4 @@
-"""What makes control hold although nobody told it to: a family that is silent, an arm that was moved."""
+"""Alarms at which control holds without an order: a sibling process that is silent, an arm that was moved."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Displacement:
     def __call__(
         self, robot: RobotActuator, seen: LatestObservation, now: float, held: bool
     ) -> Float64 | None:
-        """Where the command is to go [D], as the robot is too far from where it is `held`; None where all is well."""
+        """Goal of the command [D] if the robot is too far from where it is `held`; None where all is well."""
         self.begins = False
         measured = robot.measured(seen, now)
         self._compare(robot, measured, now)
@@ -89,7 +89,7 @@ class Displacement:
         return self.goal
 
     def distance(self, robot: RobotActuator, measured: Float64) -> float:
-        """How far the farthest joint is from its command [rad]."""
+        """Distance of the farthest joint from its command [rad]."""
         return float(np.abs(measured - robot.commanded).max(where=self._angles, initial=0.0))
 
     def trusted(self, robot: RobotActuator, measured: Float64) -> Float64:
@@ -138,7 +138,7 @@ class Displacement:
 
     @property
     def speed(self) -> Float64:
-        """How fast the command is led [D]: as joints move by hand, in a set-up as in its motions."""
+        """Velocity at which the command is led [D]: as joints move by hand, in a set-up as in its motions."""
         scale = self._settings.safety.motion_velocity_scale if self._meeting else 1.0
         return self._settings.limits.velocity * scale
 

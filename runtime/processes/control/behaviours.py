@@ -1,4 +1,4 @@
-"""What a robot does tick by tick when it follows no plan: keep silent, hold, move, obey the e-stop."""
+"""Behaviours of a robot that follows no plan, tick by tick: keep silent, hold, move, obey the e-stop."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.safety.filter import Path
 
 
 class Target(NamedTuple):
-    """What a behaviour wants sent for one tick: float64 [D], and how strictly it is to be judged.
+    """Target of a behaviour for one tick: float64 [D], and how strictly it is to be judged.
 
     `path` None is a braking or held target, which is sent as it is: refusing it would leave nothing to send.
     """
@@ -35,7 +35,7 @@ class Behaviour(ABC):
 
     @abstractmethod
     def target(self, step: int, elapsed: float) -> Target | None:
-        """What to send for tick `step`, `elapsed` seconds after the one before; None where nothing is to be sent.
+        """Target of tick `step`, `elapsed` seconds after the one before; None where nothing is to be sent.
 
         `elapsed` is what limits may use: after a stall a motion goes on where it was, it does not catch up.
         """
@@ -71,7 +71,7 @@ class Hold(Behaviour):
 
     @property
     def standing(self) -> bool:
-        """Whether it has come to a stand."""
+        """True if it has come to a stand."""
         return self._time >= self._brake.duration
 
     def target(self, step: int, elapsed: float) -> Target:
@@ -132,17 +132,17 @@ class EStopped(Behaviour):
 
     @property
     def seen(self) -> bool:
-        """Whether the robot was seen since it was pressed."""
+        """True if the robot was seen since the e-stop was pressed."""
         return self._first is not None
 
     def see(self, position: Float64) -> None:
-        """Where the robot is while it comes to rest."""
+        """Take the measured position of a robot that comes to rest, no farther than it could go."""
         self._first = position if self._first is None else self._first
         farthest = self.rest + self._SLACK
         self.position = np.clip(position, self._first - farthest, self._first + farthest)
 
     def stay(self, position: Float64) -> None:
-        """Where it is held from now on."""
+        """Hold the robot at `position` from now on."""
         self._first = self.position = position
 
     def let_go(self) -> None:
@@ -151,7 +151,7 @@ class EStopped(Behaviour):
 
     @property
     def follows(self) -> bool:
-        """Whether the arm may still be coming to rest."""
+        """True while the arm may still be coming to rest."""
         return self._time <= self._FOLLOWS_S
 
     def target(self, step: int, elapsed: float) -> Target | None:

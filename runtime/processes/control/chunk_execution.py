@@ -50,7 +50,7 @@ def strategy(section: Mapping[str, Any], dims: DimensionKinds) -> Strategy:
 
 
 class JoinResult(NamedTuple):
-    """What became of a chunk; `far` says how far from where the robot stood it began, "" where it is near.
+    """Result of joining a chunk; `far` says how far from where the robot stood it began, "" where it is near.
 
     `too_far`: it was not used for that.
     """
@@ -153,7 +153,7 @@ class ExecuteChunks(Behaviour):
         return self._away(placed.rows[0], commanded) if len(placed.rows) else (0.0, "")
 
     def _away(self, row: Float64, commanded: Float64) -> tuple[float, str]:
-        """How far from where the robot stands a run's first action is [rad], and that in words; 0 for later ones."""
+        """Distance of a run's first action from the robot [rad], and that in words; 0 for later ones."""
         settings = self._settings
         if not self._expecting or settings.safety.report_only:
             return 0.0, ""
@@ -180,7 +180,7 @@ class ExecuteChunks(Behaviour):
 
     @property
     def waits(self) -> bool:
-        """Whether an empty timeline is as it should be: a person, or the strategy, asks when it is empty."""
+        """True if an empty timeline is as it should be: the operator, or the strategy, asks when it is."""
         if self._useless:
             return False
         return self._expecting or self._one_by_one or self._strategy.merge.waits
@@ -204,6 +204,6 @@ class ExecuteChunks(Behaviour):
 
 
 def dropped(chunk: PostedChunk, step: int, why: str) -> ChunkMerged:
-    """What is told of a chunk that control has no use for."""
+    """Report of a chunk that control has no use for."""
     nowhere = np.full(len(np.atleast_1d(chunk.rows)), -1, np.int64)
     return ChunkMerged(chunk.chunk_id, chunk.run, step, step - chunk.observation_step, nowhere, 0, why)

@@ -63,7 +63,7 @@ class CommandPipeline:
 
     @property
     def stands(self) -> bool:
-        """Whether it is to stay where it is: it holds, or a run of its has come to a stand."""
+        """True if the robot is to stay where it is: it holds, or its run has come to a stand."""
         waits = self.run is not None and self._standing is not None and self._standing.standing
         return waits or isinstance(self.behaviour, Hold)
 

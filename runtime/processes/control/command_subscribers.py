@@ -1,4 +1,4 @@
-"""Whether commands reach anybody: what a transport knows of who listens, told when it changes."""
+"""Subscribers of commands, as far as a transport knows them; a change is an event."""
 
 from __future__ import annotations
 

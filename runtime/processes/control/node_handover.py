@@ -26,7 +26,7 @@ class NodeHandover:
 
     @property
     def telling(self) -> bool:
-        """Whether its word is to be said again."""
+        """True if its word is to be said again."""
         return self._left > 0
 
     def look(self, yielded: bool, now: float) -> None:

@@ -1,4 +1,4 @@
-"""Whether a measurement of the joints can be true: one bad sample must move nobody."""
+"""Plausibility of joint measurements: one bad sample must move no robot."""
 
 from __future__ import annotations
 
@@ -121,16 +121,16 @@ class Plausibility:
 
     @property
     def known(self) -> bool:
-        """Whether any sample was believed since joints were last missing."""
+        """True if any sample was believed since joints were last missing."""
         return self._chain is not None
 
     @property
     def settled(self) -> bool:
-        """Whether samples have agreed for as long as they have to, up to the newest."""
+        """True if samples have agreed for as long as they have to, up to the newest."""
         return self._chain is not None and not self._doubt and bool(self._chain.lately(self._needed))
 
     def apart(self, held: Float64, allowed: float, but: np.ndarray | bool = False) -> bool:
-        """Whether all samples, for as long as they have to agree, are farther than `allowed` [rad] from `held` [D].
+        """True if all samples that have to agree are farther than `allowed` [rad] from `held` [D].
 
         The joints `but`, bool [D], do not count.
         """
@@ -171,7 +171,7 @@ class Plausibility:
         return self._contradiction(sample)
 
     def _goes_on(self, chain: _Chain, sample: _Sample) -> bool:
-        """Whether the sample follows what is believed, rather than what contradicts it."""
+        """True if the sample follows what is believed, rather than what contradicts it."""
         if self._faster(chain.newest, sample).any() or self._dies(chain, sample):
             return False
         if self._swaps(chain, sample):
@@ -180,7 +180,7 @@ class Plausibility:
         return other is None or self._way(chain.newest, sample) <= self._way(other.newest, sample)
 
     def _way(self, before: _Sample, after: _Sample) -> float:
-        """How long the joint that is farthest would take from one sample to the other [s]."""
+        """Least time from one sample to the other, of the joint that needs longest [s]."""
         moved = np.abs(difference(after.joints, before.joints, self._wrapping)) / self._limits.velocity
         return float(moved.max(where=self._places, initial=0.0))
 
@@ -230,7 +230,7 @@ class Plausibility:
         return self._places & (moved > allowed)
 
     def _jump(self, sample: _Sample) -> str:
-        """How a sample contradicts what was known."""
+        """Contradiction of a sample to what was known, in words."""
         if self._chain is None:
             return f"joints have not been seen for {CONSISTENT_S:g} s yet"
         before = self._chain.newest
@@ -265,7 +265,7 @@ class Plausibility:
         return " and ".join(self._limits.names[i] for i in other)
 
     def _swaps(self, chain: _Chain, sample: _Sample) -> bool:
-        """Whether joints have leapt, no farther than they can but harder, to exactly each other's values."""
+        """True if joints have leapt, no farther than they can but harder, to exactly each other's values."""
         newest, before = chain.newest, chain.samples[-2 if len(chain.samples) > 1 else -1]
         passed = max(sample.captured - newest.captured, _EPSILON)
         onwards = passed / max(newest.captured - before.captured, _EPSILON)

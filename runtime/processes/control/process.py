@@ -57,7 +57,7 @@ def make_tick(spec: StationSpec, shared: SharedState, sink: Sink, now: Callable[
 
 
 class Lateness:
-    """How late ticks begin, over the last `_LATENESS_KEPT` of them."""
+    """Lateness of ticks, over the last `_LATENESS_KEPT` of them."""
 
     def __init__(self, status: StatusRecord, scheduling: str) -> None:
         self._status = status

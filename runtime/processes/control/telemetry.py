@@ -1,4 +1,4 @@
-"""What control tells of its ticks: its status to all, events to the coordinator, a record of each tick to media."""
+"""Telemetry of ticks: control's status to all, events to the coordinator, a record of each tick to media."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _QUIET_S = 1.0  # without a change by safety: its sum is told, and the next chan
 
 @dataclass(frozen=True, slots=True)
 class TickState:
-    """Where control stands at the end of a tick."""
+    """State of control at the end of a tick."""
 
     robot: Actuator
     believed: bool  # where the robot is is known
@@ -122,7 +122,7 @@ class Telemetry:
         self._outbox.append(Event(kind, text, self.planned, self._step, {"order": self.order, **data}))
 
     def merged(self, merged: ChunkMerged) -> None:
-        """Where a chunk fell, told at the end of the tick."""
+        """Tell where a chunk fell, at the end of the tick."""
         self._outbox.append(merged)
 
     def record(self, seen: LatestObservation, sent: Sent, simulated: bool) -> None:

@@ -92,7 +92,7 @@ class Tick:
 
     @property
     def telling(self) -> bool:
-        """Whether the node is still being told that the robot is its own, or is not any more."""
+        """True while the node is still being told that the robot is its own, or is not any more."""
         return self._yielding.telling
 
     @property
@@ -268,7 +268,7 @@ class Tick:
     # --- alarms --------------------------------------------------------------------------------------------
 
     def _measured(self, now: float) -> Float64 | None:
-        """Where the robot is, None where that is not known freshly."""
+        """Measured joint positions [D]; None if they are unknown, doubted or old."""
         return self._actuator.measured(self._seen, now)
 
     def _engage(self, now: float) -> bool:

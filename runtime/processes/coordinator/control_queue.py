@@ -53,7 +53,7 @@ class ControlQueue:
         return self._number
 
     def obeyed(self, number: int) -> bool:
-        """Whether control has come to order `number`."""
+        """True if control has come to order `number`."""
         return int(self._page.control.read()["order"]) >= number
 
     def next_chunk(self) -> int:

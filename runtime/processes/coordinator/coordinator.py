@@ -1,4 +1,4 @@
-"""What decides: commands, session, set-up, inference, events; it never touches 30 Hz pictures."""
+"""The coordinator decides: commands, session, set-up, inference, events; it never touches 30 Hz pictures."""
 
 from __future__ import annotations
 
@@ -288,7 +288,7 @@ class Coordinator:
             self.say(Event("state", text, self.clock.now(), data=data))
 
     def _unbegun(self, run: Run | None) -> dict[str, Any]:
-        """What an event says of `run` where that is over and never began."""
+        """Data for the event of a `run` that is over and never began; {} for any other."""
         return {} if run is None or run is self.runs.open else run.unbegun
 
     # --- what goes on ----------------------------------------------------------------------------------------
@@ -392,11 +392,11 @@ class Coordinator:
         return Ack(command.uuid, "done", boot=self.boot, data={"events": self.events.since(number)})
 
     def waits(self, command: Command) -> bool:
-        """Whether its answer needs what is still being loaded, so that it is to be handled in a moment."""
+        """True if its answer needs what is still being loaded, so that it is to be handled in a moment."""
         return command.kind == "aim" and self.manual.waits(command.args)
 
     def _aim(self, command: Command) -> Ack:
-        """Where the robot would go; nothing moves, and anybody may ask."""
+        """Preview of where the robot would go; nothing moves, and any client may ask."""
         try:
             return Ack(command.uuid, "done", boot=self.boot, data=self.manual.aim(command.args))
         except RuntimeFault as error:

@@ -81,7 +81,7 @@ class Demonstrations:
 
     @property
     def declared(self) -> bool:
-        """Whether the deployment says how to collect."""
+        """True if the deployment says how to collect."""
         return self._settings is not None
 
     @property
@@ -132,7 +132,7 @@ class Demonstrations:
         self._touched = self._clock.now()
 
     def noticed(self, happening: SessionEvent, reason: str) -> None:
-        """What happens to a station takes the arm away."""
+        """Disarm at an event of the session after which no demonstration may begin."""
         if happening in DISARMING:
             self.disarm(reason)
 
@@ -153,7 +153,7 @@ class Demonstrations:
         return None
 
     def _aim(self) -> None:
-        """Where the first action would have the robot, as the leader moves on."""
+        """Renew where the first action would have the robot, as the leader moves on."""
         relay = self._relay
         if relay is not None:
             qpos = np.array(self._page.observation.read()["qpos"], np.float64)
@@ -190,7 +190,7 @@ class Demonstrations:
     # --- episodes --------------------------------------------------------------------------------------------
 
     def manifest(self, asked: RunRequest) -> dict[str, Any]:
-        """What the manifest of a demonstration says otherwise than that of a run with a policy."""
+        """Fields of a demonstration's manifest that differ from those of a run with a policy."""
         assert self._settings is not None
         info = self._setup.info
         return {
@@ -311,7 +311,7 @@ class Demonstrations:
         }
 
     def _fingerprint(self) -> dict[str, Any] | None:
-        """What the next episode would look like, in the words of its manifest; None before every picture was seen."""
+        """The next episode's fingerprint, in its manifest's words; None before every picture was seen."""
         assert self._settings is not None
         record, robot = self._page.observation.read(), self._plan.robot
         described = self._settings.described(self._plan.cameras)

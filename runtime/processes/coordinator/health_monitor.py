@@ -1,4 +1,4 @@
-"""What the coordinator notices by itself: siblings, e-stop, lease, link, the end of a run."""
+"""Events that the coordinator notices by itself: siblings, e-stop, lease, link, the end of a run."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class HealthMonitor:
         self._pressed: float | None = None  # when the flag was seen without its latch
 
     def notice(self, state: SessionState, run: Run | None) -> Iterator[Noticed]:
-        """What there is to tell the session, which is in `state` before the first of it."""
+        """News for the session, which is in `state` before the first of it."""
         yield from self._family(state)
         yield from self._estop(state)
         yield from self._leases()

@@ -1,4 +1,4 @@
-"""Who may command: one holder at a time, by epoch and time to live."""
+"""Lease, the right to command: one holder at a time, by epoch and time to live."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands of the session make happen: set-up, runs, and what a person does within one."""
+"""Operations of the session's commands: set-up, runs, and what the operator does within one."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from runtime.station.spec import StationSpec
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """What operations are carried out with."""
+    """Parts that operations are carried out with."""
 
     shared: SharedState
     clock: Clock
@@ -100,7 +100,7 @@ class SessionActions(Effects):
         return replace(self._own, resolved=resolved, collecting=collects)
 
     def _collects(self, asked: SetUpRequest) -> bool:
-        """Whether a person is to drive the robot after this set-up; RuntimeFault where that does not fit."""
+        """True if the operator is to drive the robot after this set-up; RuntimeFault if that does not fit."""
         settings = self._own.deployment
         absent = settings.policy.kind == "none" and asked.policy is None
         collects = absent if asked.collect is None else asked.collect
@@ -163,7 +163,7 @@ class SessionActions(Effects):
         return mode
 
     def _require_comparable(self, asked: RunRequest) -> None:
-        """What a trial measures is what was set up: nothing by hand, nothing tuned, the policy on the robot."""
+        """Refuse a trial of anything but the set-up: nothing by hand or tuned, the policy on the robot."""
         mode = self._mode(asked)
         if mode != "continuous":
             raise RuntimeFault(f"a trial runs in the mode continuous, and {mode} was asked for")
@@ -290,7 +290,7 @@ class SessionActions(Effects):
         self.runs.stop_alone()
 
     def _require_family(self) -> None:
-        """What is sent to a process that is still starting would be lost."""
+        """Refuse while a process is still starting: what it is sent would be lost."""
         absent = self._absent()
         if absent:
             raise RuntimeFault(f"the process {absent} gives no sign of life yet: try again in a moment")

@@ -1,4 +1,4 @@
-"""Whether the straight way in joints from one posture to another may be gone by a motion of ours."""
+"""Check of the straight way in joints from one posture to another, before a motion of ours goes it."""
 
 from __future__ import annotations
 

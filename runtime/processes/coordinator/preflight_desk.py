@@ -1,6 +1,6 @@
-"""What a station answers about preflights: one is begun, how it went, which server its policy has.
+"""Answers of a station about preflights: one is begun, how it went, which server its policy has.
 
-Nothing moves, and nobody needs the lease; a run or a set-up is never disturbed.
+Nothing moves, and no lease is needed; a run or a set-up is never disturbed.
 """
 
 from __future__ import annotations

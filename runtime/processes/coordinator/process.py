@@ -33,7 +33,7 @@ Answered = tuple[Command, Ack, Call]
 
 
 class CommandService:
-    """What clients of the station talk to."""
+    """Service that clients of the station talk to."""
 
     def __init__(self, coordinator: Coordinator, context: zmq.Context[Any]) -> None:
         self._coordinator = coordinator
@@ -89,7 +89,7 @@ class CommandService:
         return identified(command, call.payload, call.signature, call.uid, self._key)
 
     def _stop(self, stops: list[Asked]) -> list[Answered]:
-        """Who stops a robot waits for no disk. One stop like another of this turn gets the same answer."""
+        """Answer stops without waiting for the disk; those alike in this turn get the same answer."""
         first: dict[tuple[str, str, str, int], Ack] = {}
         fresh: list[Answered] = []
         for call, command in stops:

@@ -64,11 +64,11 @@ class Runs:
 
     @property
     def _evidence(self) -> bool:
-        """Whether a run that is not recorded must not go on."""
+        """True if a run that is not recorded must not go on."""
         return self._plan.deployment.recording.on_failure == "hold"
 
     def _must_record(self, trial: bool, mode: str) -> bool:
-        """Whether a run must not begin without its recording: a trial and a demonstration are nothing without one."""
+        """True if a run must not begin without its recording: a trial or demonstration is nothing without."""
         return self._evidence or trial or mode == "collect"
 
     def _require_room(self) -> None:
@@ -253,7 +253,7 @@ class Runs:
 
     @property
     def alone(self) -> bool:
-        """Whether a recording without a run is open."""
+        """True if a recording without a run is open."""
         return bool(self._alone)
 
     def record_alone(self, info: PolicyInfo | None) -> str:

@@ -1,4 +1,4 @@
-"""What clients are shown of a station: one whole map, never differences."""
+"""Snapshot of a station for its clients: one whole map, never differences."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def snapshot(view: View) -> dict[str, Any]:
 
 
 def facts(spec: StationSpec) -> dict[str, Any]:
-    """What never changes while a station runs: names, sizes, limits [rad or the gripper's unit], rates [Hz]."""
+    """Constants of a running station: names, sizes, limits [rad or the gripper's unit], rates [Hz]."""
     robot, bus = spec.robot, spec.deployment.bus
     return {
         "robot": robot.name,
@@ -170,7 +170,7 @@ def _inference(view: View) -> dict[str, Any]:
 
 
 def _phase(view: View) -> str:
-    """What a run that goes on is doing, in one word; "" where none does, or it has not begun."""
+    """Phase of a run that goes on, in one word; "" where none does, or it has not begun."""
     run, control = view.runs.open, view.shared.control.read()
     if run is None or run.begun is None or view.session.state is not SessionState.RUNNING:
         return ""
@@ -214,7 +214,7 @@ def _stages(view: View) -> list[dict[str, Any]]:
 
 
 def _first_action(view: View) -> dict[str, Any]:
-    """How far the policy's first action is from where the robot is now; {} where it is not known."""
+    """Distance of the policy's first action from where the robot is now; {} where it is not known."""
     if view.setup.first_action is None:
         return {}
     return first_action(view.setup.first_action, _joints(view), view.spec)
@@ -235,7 +235,7 @@ def _joints(view: View) -> Float64:
 
 
 def control_figures(shared: SharedState, rate: float) -> dict[str, Any]:
-    """What control last did and how well it keeps time."""
+    """Figures of control: what it last did and how well it keeps time."""
     status = shared.control.read()
     return {
         "rate": rate,

@@ -24,7 +24,7 @@ class TimingReport:
         self._late = False
 
     def look(self, now: float) -> list[Event]:
-        """What is news; nothing before control has ticked for a while."""
+        """New events about control's timing; none before control has ticked for a while."""
         if now < self._next:
             return []
         self._next = now + _LOOK_S

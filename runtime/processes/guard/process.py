@@ -100,7 +100,7 @@ class Guard:
         self._unsaid.append((logging.WARNING, "e-stop released"))
 
     def obeyed(self, version: int) -> bool:
-        """Whether control has said since `version` of its status that it obeys.
+        """True if control has said since `version` of its status that it obeys.
 
         Waits at most max(50 ms, 2 ticks). An older word is worth nothing: control may have died after it.
         """
@@ -207,7 +207,7 @@ class Desk:
 
 
 def _arguments() -> argparse.Namespace:
-    """What the supervisor hands over: values, so that nothing that a deployment may name is loaded here."""
+    """Arguments from the supervisor: values, so that nothing that a deployment may name is loaded here."""
     parser = argparse.ArgumentParser(prog="runtime.guard", description="started by the supervisor")
     parser.add_argument("--station", required=True)
     parser.add_argument("--folder", required=True, type=Path, help="of the station: latch, key, endpoints")

@@ -37,7 +37,7 @@ _HOLDER = "lockstep"
 
 @dataclass(frozen=True, slots=True)
 class LockstepRun:
-    """How a lockstep run went: the episode as media closed it, the last state, every event."""
+    """Result of a lockstep run: the episode as media closed it, the last state, every event."""
 
     episode: dict[str, Any]
     state: SessionState
@@ -48,7 +48,7 @@ class LockstepRun:
 
 @dataclass(frozen=True, slots=True)
 class Around:
-    """What a lockstep station is in the middle of; by default it is alone."""
+    """Surroundings of a lockstep station; by default it is alone."""
 
     runner: Runner | None = None
     people: Clock | None = None  # the clock of leases and commands

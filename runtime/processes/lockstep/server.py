@@ -45,9 +45,9 @@ Over = Callable[[bool], str]
 
 
 def declared(rate: float) -> Callable[[Any], tuple[Any, int]]:
-    """What a policy's answer is handed over as, and how many ticks late: as late as it says that it took.
+    """Hand-over of a policy's answer, and how many ticks late it is: as late as it says that it took.
 
-    What is no answer, connecting for one, is there with the next tick.
+    A result that is no answer, that of connecting, is there with the next tick.
     """
 
     def told(result: Any) -> tuple[Any, int]:
@@ -155,7 +155,7 @@ class ServedLockstep(Lockstep):
         """Time comes to a tick when that begins: the policy is asked between two, and it is now until it answers."""
 
     def _stands(self) -> bool:
-        """Whether time stands still: nothing goes on that needs it, or somebody is waited for."""
+        """True if time stands still: nothing needs it, or the policy or a closing episode is waited for."""
         if self._asking.begin() or self.media.closing:
             return True
         if self.coordinator.session.state not in (SessionState.IDLE, SessionState.READY):
@@ -164,7 +164,7 @@ class ServedLockstep(Lockstep):
         return not (moving or self.coordinator.runs.alone or self.shared.rings["orders"].waiting)
 
     def _fast(self) -> bool:
-        """Whether nobody is waited for, who would want to see it as it happens."""
+        """True if ticks need no pace: no operator is waited for, to see them as they happen."""
         state, run = self.coordinator.session.state, self.coordinator.run
         if state is SessionState.RUNNING:
             return run is None or run.mode not in _ON_DEMAND

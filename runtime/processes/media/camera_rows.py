@@ -1,4 +1,4 @@
-"""What the rows of an episode show of each camera: a picture once, and how old the newest one is."""
+"""Pictures of each camera in the rows of an episode: each once, and how old the newest one is."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class CameraRows:
         )  # cameras whose picture for the newest row was there, and is gone
 
     def sizes(self, seen: Observation) -> dict[str, dict[str, int]]:
-        """How large each video is, and the pictures of its camera where they are scaled for it."""
+        """Sizes of each video, and of the pictures of its camera where they are scaled for it."""
         pictures = {camera: seen.pictures[camera] for camera in self._cameras}
         given = {camera: (picture.shape[0], picture.shape[1]) for camera, picture in pictures.items()}
         sizes = {}
@@ -63,5 +63,5 @@ class CameraRows:
         return self._silences.look(now, row, old)
 
     def rest(self, now: float) -> list[Event]:
-        """What is left to be said of the cameras when the episode ends."""
+        """Events about the cameras that are left to be said when the episode ends."""
         return self._silences.rest(now)

@@ -30,7 +30,7 @@ class RecordedChunks:
             self._write(self._answers.pop(next(iter(self._answers))), None)
 
     def merged(self, merged: ChunkMerged) -> None:
-        """Where control put a chunk."""
+        """Place that control gave a chunk."""
         answer = self._answers.pop(merged.chunk_id, None)
         if answer is not None:
             self._write(answer, merged)
@@ -71,7 +71,7 @@ class RecordedChunks:
 
 
 def _met(answer: PolicyAnswer) -> tuple[Float32 | None, Float32 | None, UInt8 | None]:
-    """How each row [H, arms] of the policy was met: the worst error [m, rad] and all flags of the steps made of it.
+    """IK errors of each row [H, arms] of the policy: the worst [m, rad] and all flags of its steps.
 
     NaN and no flag for a row that no step was made of, None for a chunk of joints.
     """

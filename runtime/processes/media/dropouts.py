@@ -1,4 +1,4 @@
-"""What is said of cameras that stop giving pictures: each time while that is seldom, else now and then how often."""
+"""Events of cameras that stop giving pictures: each while they are seldom, else now and then their number."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class DropoutLog:
         self._cameras = {name: _Camera() for name in sorted(cameras)}
 
     def look(self, now: float, row: int, silent: Mapping[str, float]) -> list[Event]:
-        """What is to be said at row `row`, made at `now` [s]; `silent` has the age [s] of each picture too old."""
+        """Events at row `row`, made at `now` [s]; `silent` has the age [s] of each picture too old."""
         events = []
         for name, camera in self._cameras.items():
             if (name in silent) != camera.silent:
@@ -70,5 +70,5 @@ class DropoutLog:
         return events
 
     def rest(self, now: float) -> list[Event]:
-        """What was counted and not said yet, at the end of the episode."""
+        """Events that were counted and not said yet, at the end of the episode."""
         return [camera.say(name, now, None) for name, camera in self._cameras.items() if camera.unsaid]

@@ -1,4 +1,4 @@
-"""How an episode is closed: here and now, or beside the work."""
+"""Closing of an episode: here and now, or beside the work."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class Media:
 
     @property
     def closing(self) -> bool:
-        """Whether the last episode is still being closed."""
+        """True if the last episode is still being closed."""
         return self._closing is not None
 
     def digest(self) -> None:
@@ -281,7 +281,7 @@ class Media:
         self._tell(MediaReport(now, *told))
 
     def _say_truth(self, reached: Mapping[str, float]) -> None:
-        """How a simulated bench is left, and when its milestones were reached: what the episode is scored by."""
+        """Report a simulated bench's end state and the times of its milestones: the episode's score."""
         truth = self._truth
         if truth:
             how = "success" if truth["success"] else "no success"

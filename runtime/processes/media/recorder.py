@@ -164,7 +164,7 @@ class Recorder:
         return partial(attempt, end_journal)
 
     def news(self) -> list[Event]:
-        """What has happened to the open episode since the last call; it is in the episode already."""
+        """Events of the open episode since the last call; they are in the episode already."""
         if not self._uuid:
             return []
         for loss in self._journal.losses():
@@ -192,7 +192,7 @@ class Recorder:
             self._chunks.answered(answer)
 
     def merged(self, merged: ChunkMerged) -> None:
-        """Where control put a chunk; may come before the chunk itself."""
+        """Place that control gave a chunk; may come before the chunk itself."""
         if self._uuid and merged.run == self._run:
             self._chunks.merged(merged)
 

@@ -25,7 +25,7 @@ class Unclosed:
 
     @property
     def why(self) -> dict[str, str]:
-        """What each of them waits for, by uuid."""
+        """Error that each of them waits for to be over, by uuid."""
         return {episode.uuid: episode.error for episode in self._episodes}
 
     def add(self, episode: ClosedEpisode) -> None:

@@ -1,4 +1,4 @@
-"""What a robot's node says of its drives, frame by frame, and what is worth a line in the event log."""
+"""Drive state that a robot's node reports, frame by frame, and what is worth a line in the event log."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class Share:
         self._since: tuple[float, float] | None = None  # when, and what had been taken by then [s]
 
     def too_much(self, now: float, taken: float) -> bool:
-        """Whether it was more than a core over the last whole stretch; `taken` since the start [s]."""
+        """True if it was more than a core over the last whole stretch; `taken` since the start [s]."""
         since = self._since or (now, taken)
         if now - since[0] < _SHARE_S:
             self._since = since
@@ -165,7 +165,7 @@ def _scheduling(spec: StationSpec) -> str:
 
 
 def _connected(source: Source) -> bool:
-    """Whether it could be; says why it could not."""
+    """Connect the source; False where it could not be, and the log says why."""
     try:
         source.connect()
     except RuntimeFault as error:

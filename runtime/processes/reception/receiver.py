@@ -1,4 +1,4 @@
-"""What reception receives: observations into shared state, with their rates, faults, ages, drives and truth."""
+"""Receiver of observations into shared state, with their rates, faults, ages, drives and truth."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ class ObservationReceiver:
 
     @property
     def drives(self) -> Mapping[str, Any]:
-        """What the node last said of its drives; {} while it does not say."""
+        """Drive state that the node last reported; {} while it does not say."""
         return self._drives.newest
 
     @property
     def cameras(self) -> Mapping[str, Any]:
-        """How each camera of the deployment's own is."""
+        """Health of each camera of the deployment's own."""
         return self._source.camera_health()
 
     def pump(self, timeout: float) -> None:
@@ -86,7 +86,7 @@ class ObservationReceiver:
         self._source.end_run()
 
     def faults(self) -> dict[str, int]:
-        """How often what went wrong; a count that has grown is an event, each fault's 5 s apart, and so is news.
+        """Counts of faults; one that has grown is an event, each fault's 5 s apart, and so is news.
 
         What a node never sends in a usable form is an event once in each run.
         """
@@ -110,14 +110,14 @@ class ObservationReceiver:
         return {stream: _rate(times, now) for stream, times in self._arrivals.items()}
 
     def age_ms(self) -> dict[str, float]:
-        """How old joints were when they came into shared state: p50, p99 and max of the newest 2000 [ms]."""
+        """Age of joints when they came into shared state: p50, p99 and max of the newest 2000 [ms]."""
         if not self._ages:
             return {}
         p50, p99, worst = (1000.0 * np.percentile(self._ages, (50, 99, 100))).tolist()
         return {"p50": p50, "p99": p99, "max": worst}
 
     def _receive(self, timeout: float) -> Observation | None:
-        """What the source has; a failure is said once, and control holds when what it sees is old."""
+        """Observation from the source; a failure is said once, and control holds when what it sees is old."""
         try:
             observation = self._source.receive(timeout)
         except TransportError as error:

@@ -1,4 +1,4 @@
-"""What several answers make together, in the numbers in which the policy gave its rows."""
+"""Mixtures of several answers, in the numbers in which the policy gave its rows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ROUND = 0.02  # [rad] by which the model's own rows, mixed as numbers, may miss
 
 
 class Parts(NamedTuple):
-    """What N rows are mixed of: numbers [P, N, W], weights [P, N] that sum to 1, and the newest of each [N, W]."""
+    """Parts of N rows: numbers [P, N, W], weights [P, N] that sum to 1, and the newest of each [N, W]."""
 
     rows: Float64
     weights: Float64
@@ -59,7 +59,7 @@ class Mixture:
         return made
 
     def agree(self, straight: Float64, meant: Float64, like: ActionChunk) -> bool:
-        """Whether rows that were mixed as numbers are what is meant: they are not where an angle goes round."""
+        """True if rows mixed as numbers are what is meant: they are not where an angle goes round."""
         if like.space == "joint":
             return bool(np.abs(straight - meant).max(initial=0.0) <= _ROUND)
         try:

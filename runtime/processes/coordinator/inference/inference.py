@@ -30,7 +30,7 @@ ON_DEMAND: tuple[Mode, ...] = ("step", "preview")  # modes that ask when a perso
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """How long a run goes on without what it needs [s]."""
+    """Times that a run goes on without what it needs [s]."""
 
     stale: float  # without a fresh observation, until waiting for one is an error
     lost: float  # without an answer, until a policy that is tried again is given up
@@ -116,7 +116,7 @@ class Inference:
 
     @property
     def asked(self) -> bool:
-        """Whether the policy is being asked, or its answer has not reached the timeline."""
+        """True if the policy is being asked, or its answer has not reached the timeline."""
         return self._wanted or self._flight is not None or bool(self._unmerged)
 
     @property
@@ -128,7 +128,7 @@ class Inference:
 
     @property
     def lost_for(self) -> float:
-        """How long the policy has not answered [s], 0 where it does."""
+        """Time for which the policy has not answered [s], 0 where it does."""
         return self._back_off.lasts(self._clock.now())
 
     @property
@@ -138,7 +138,7 @@ class Inference:
 
     @property
     def rtc(self) -> dict[str, Any]:
-        """What was last said to a policy that continues its chunks; {} for other strategies."""
+        """Last conditioning of a policy that continues its chunks; {} for other strategies."""
         if not self.continues:
             return {}
         given = self._given
@@ -150,7 +150,7 @@ class Inference:
 
     @property
     def continues(self) -> bool:
-        """Whether requests carry what the robot is committed to (RTC)."""
+        """True if requests carry what the robot is committed to (RTC)."""
         return self._strategy.query.continues
 
     def exchange(self, policy: Policy, task: str) -> None:
@@ -240,7 +240,7 @@ class Inference:
                 self._planned = self.shown
 
     def raw(self, step: int) -> Float64 | None:
-        """What the newest chunk that control has merged wants for `step` [D]; None where it says nothing of it."""
+        """Action for `step` [D] in the newest chunk that control has merged; None where it has none."""
         if self._planned is None:
             return None
         meant = np.flatnonzero(self._planned.targets == step)
@@ -266,7 +266,7 @@ class Inference:
         return None
 
     def retries(self, error: RuntimeFault) -> bool:
-        """Whether the policy will be tried again after `error`; False where patience is at its end."""
+        """Count a failure; True if the policy will be tried again, False where patience is at its end."""
         now = self._clock.now()
         first, self.failure = self._back_off.since is None, str(error)
         self._back_off.failed(now)

@@ -1,4 +1,4 @@
-"""How the policy did over a run: latencies, measured delays, what was shifted or dropped."""
+"""Figures of the policy over a run: latencies, measured delays, what was shifted or dropped."""
 
 from __future__ import annotations
 

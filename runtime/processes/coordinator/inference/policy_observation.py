@@ -19,7 +19,7 @@ class StaleObservationError(PolicyError):
 
 
 class Eyes(Protocol):
-    """What shows a policy the robot; `simulated`: the joints of the simulated one."""
+    """Source of a policy's observations; `simulated`: the joints of the simulated robot."""
 
     @property
     def simulated(self) -> bool: ...
@@ -36,7 +36,7 @@ class Eyes(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SightSettings:
-    """What may be shown: ages in seconds, the control rate in Hz."""
+    """Bounds on what may be shown: ages in seconds, the control rate in Hz."""
 
     control_rate: float
     joint_age: float

@@ -122,7 +122,7 @@ class PolicyRequests:
             return
 
     def observe(self) -> Observation:
-        """What the policy would be shown now; PolicyError where there is nothing, or it is old."""
+        """The observation to show the policy now; PolicyError where there is none, or it is old."""
         return self.policy_observation.now(self.task, self.policy.sees_pictures)
 
     def ask(
@@ -159,7 +159,7 @@ class PolicyRequests:
         return self.runner.submit(infer)
 
     def _onset(self, shown: Observation, waited: bool, rests: bool, k_max: int | None) -> Onset:
-        """Where the answer will take over, as far as that is known now: from what control was told to do last.
+        """Onset of the answer, as far as it is known now: at what control was told to do last.
 
         Its first row that can still be executed follows the newest control step. A robot that rests starts from
         where it is measured.

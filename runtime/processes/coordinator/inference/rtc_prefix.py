@@ -1,4 +1,4 @@
-"""What the robot is committed to, in the policy's own space and rate: what real-time chunking (RTC) continues."""
+"""Commitments of the robot in the policy's own space and rate: what real-time chunking (RTC) continues."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class _Commitment:
 
     @property
     def kind(self) -> tuple[object, ...]:
-        """What its numbers are."""
+        """Kind of its numbers: space, mode, format of poses, widths."""
         chunk = self.chunk
         return chunk.space, chunk.mode, chunk.pose, chunk.actions.shape[1], self.rows.shape[1]
 
@@ -136,7 +136,7 @@ class RtcPrefix:
         quantile: float,
         execution_horizon: int | None,
     ) -> Conditioning | None:
-        """What a request about `observation_step` carries; None where nothing is left, or nothing was merged.
+        """Conditioning of a request about `observation_step`; None if nothing is left, or none merged.
 
         `delays` are recent measured ones in control steps (that of the chunk itself where there are none); their
         `quantile` is predicted, in rows rounded up. `execution_horizon` is that of the answer in control steps, None
@@ -196,12 +196,12 @@ class RtcPrefix:
         return rows
 
     def _alike(self, held: _Commitment, shares: Shares) -> bool:
-        """Whether all these are chunks in the numbers of `held`."""
+        """True if all these are chunks in the numbers of `held`."""
         others = [self._merged.get(number) for number in shares]
         return all(other is not None and other.kind == held.kind for other in others)
 
     def _makers(self, at: float) -> Shares | None:
-        """What makes control step `at`, between steps what makes both; None where that is not known."""
+        """Shares of chunks in control step `at`, between steps in both; None where they are not known."""
         before = math.floor(at + _HAIR)
         part = at - before
         if part < _HAIR:
@@ -239,7 +239,7 @@ class RtcPrefix:
     def _parts(
         self, steps: Float64, made: Sequence[Shares], table: Callable[[_Commitment], tuple[Numbers, float]]
     ) -> Parts:
-        """What the rows for these steps are mixed of, out of a `table` of each chunk and its rows per step."""
+        """Parts of the rows for these steps, out of a `table` of each chunk and its rows per step."""
         numbers: list[Numbers] = []
         weights: list[Float64] = []
         newest = np.zeros(len(steps), np.int64)

@@ -1,4 +1,4 @@
-"""Where blocking calls to a policy are made: a thread beside the coordinator, or counted out in lockstep."""
+"""Runners of blocking calls to a policy: a thread beside the coordinator, or counted out in lockstep."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 
 
 class Runner(ABC):
-    """Where blocking calls to the policy are made, one after the other."""
+    """Makes blocking calls to the policy, one after the other."""
 
     @abstractmethod
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
@@ -36,7 +36,7 @@ class Runner(ABC):
     @property
     @abstractmethod
     def busy(self) -> bool:
-        """Whether an earlier call is still being made, and another would wait behind it."""
+        """True while an earlier call is still being made, and another would wait behind it."""
 
     def tick(self) -> None:  # noqa: B027  # only runners that count have something to do
         """One control period has passed."""

@@ -19,7 +19,7 @@ _REACHED = 1e-3  # of its travel: a gripper that is so near to its lock is there
 
 @dataclass(frozen=True, slots=True)
 class Grip:
-    """What a request amounts to: locks float64 [D] (NaN: free), and where to move, None for nowhere.
+    """Result of a request: locks float64 [D] (NaN: free), and the goal of a motion, None for none.
 
     A goal float64 [D] is NaN for all that stays where it is.
     """

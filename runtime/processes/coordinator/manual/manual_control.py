@@ -1,4 +1,4 @@
-"""What a person does with the robot itself: motions, grippers, and looking where one would go."""
+"""The operator's own moves of the robot: motions, grippers, and previews of where one would go."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ class ManualControl:
             raise RuntimeFault(f"{what}: transport {kind!r} moves no robot")
 
     def waits(self, arguments: Mapping[str, Any]) -> bool:
-        """Whether an aim with these arguments needs what is still being loaded; loading begins with the first aim."""
+        """True if such an aim needs what is still being loaded; loading begins with the first aim."""
         ready = self._targets.prepare()
         return not ready and arguments.get("jog") is not None
 
     def aim(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Where the robot would go; nothing moves."""
+        """Preview of where the robot would go; nothing moves."""
         start = self.commanded()
         aim = self._targets.aim(read("aim", AimRequest, arguments), start)
         away = first_action(aim.joints, start, self._plan)["distance"]
@@ -102,7 +102,7 @@ class ManualControl:
         self.grippers.lock(locks)
 
     def commanded(self) -> Float64:
-        """Where the robot was told to be, or where it is measured as long as nothing was told."""
+        """Commanded position of the robot [D], or the measured one as long as nothing was commanded."""
         status = self._page.control.read()
         known = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
         return np.array(known, np.float64)

@@ -1,4 +1,4 @@
-"""Where a person wants the robot: named poses, joints, steps of an end effector, all checked before anything moves."""
+"""Targets of the operator: named poses, joints, end effector steps, all checked before anything moves."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Targets:
         return self._kinematics.prepare()
 
     def aim(self, asked: AimRequest, commanded: Float64) -> TargetPreview:
-        """Where it would go; RuntimeFault for a pose, an arm or a number of joints that the robot has not."""
+        """Preview of a target; RuntimeFault for a pose, arm or number of joints that the robot has not."""
         start = self._wanted("aim", asked.joints, asked.pose, commanded)
         if asked.jog is None:
             return self._clipped(start)
@@ -89,7 +89,7 @@ class Targets:
         return goal
 
     def duration(self, start: Float64, goal: Float64, speed: float = 1.0) -> float:
-        """How long a motion of ours takes [s]."""
+        """Duration of a motion of ours [s]."""
         safety, limits = self._plan.deployment.safety, self._plan.limits
         velocity = limits.velocity * safety.motion_velocity_scale * speed
         return Trajectory(start, goal, velocity, safety.motion_acceleration * limits.reach).duration

@@ -1,4 +1,4 @@
-"""What a session makes happen, and what the guards of its commands look at."""
+"""Effects of a session, and the facts that the guards of its commands look at."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Told = Mapping[str, Any]  # for the data of an answer
 
 @dataclass(frozen=True, slots=True)
 class GuardFacts:
-    """What the guards of commands look at, beside the state."""
+    """Facts that the guards of commands look at, beside the state."""
 
     mode: Mode | None = None  # of the open run
     trial: bool = False  # the open run is one of a trial: nobody may change what is measured
@@ -41,10 +41,10 @@ class GuardFacts:
 
 
 class Effects(ABC):
-    """What the session makes happen; implemented by the coordinator, recorded by tests.
+    """Effects of the session; implemented by the coordinator, recorded by tests.
 
-    Each raises RuntimeFault to refuse, and has changed nothing then. What is returned goes into the answer. `by` is who
-    gave the command that is being carried out, `command` its uuid.
+    Each raises RuntimeFault to refuse, and has changed nothing then. What is returned goes into the answer.
+    `by` names the client whose command is being carried out, `command` is its uuid.
     """
 
     by: str = ""

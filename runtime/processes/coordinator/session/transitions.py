@@ -12,7 +12,7 @@ from runtime.processes.coordinator.session.effects import Effects, GuardFacts, T
 
 
 class SessionEvent(StrEnum):
-    """What the session is told of by the rest of the runtime."""
+    """Events that the rest of the runtime tells the session."""
 
     CONNECTED = "connected"  # a complete observation arrived
     INCOMPLETE = "incomplete"  # observations arrive, but not from every camera

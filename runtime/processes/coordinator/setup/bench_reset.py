@@ -30,7 +30,7 @@ class BenchReset:
         self._refused = ""
 
     def of(self, bench: BenchRequest | None) -> dict[str, Any] | None:
-        """What the node is to be told; SetupError where it has no bench, or has done that already."""
+        """Reset that the node is to be told; SetupError where it has no bench, or has done that already."""
         if bench is None:
             return None
         if not self._plan.capabilities.resets_bench:
@@ -59,7 +59,7 @@ class BenchReset:
             self._refused = event.text
 
     def done(self) -> bool:
-        """Whether what the policy is shown from now on is the new bench; SetupError where it will not be."""
+        """True if the policy is shown the new bench from now on; SetupError where it will not be."""
         if self._reception().truth.get("reset") == self._reset["id"]:
             return True
         now = self._clock.now()

@@ -43,14 +43,14 @@ class SetupMotion:
             raise SetupError(f"control has not come to {self._where} within {self._allowed:.1f} s")
 
     def done(self, event: Event) -> bool:
-        """Whether control says by `event` that it has sent the end of this motion: then the arm is waited for."""
+        """True if `event` says that control has sent the end of this motion: then the arm is waited for."""
         over = event.kind == "motion_done" and event.data.get("order") == self._order
         if over:
             self._since = self._clock.now()
         return over
 
     def arrived(self) -> bool:
-        """Whether the arm is there; SetupError, naming the joint, where it does not come."""
+        """True if the arm is there; SetupError, naming the joint, where it does not come."""
         measured = np.array(self._page.observation.read()["qpos"], np.float64)
         limits = self._plan.limits
         away = np.abs(difference(measured, self._goal, self._plan.dims.wrapping))
@@ -66,14 +66,14 @@ class SetupMotion:
         return False
 
     def _motion_time(self) -> float:
-        """How long the motion takes from where control will start it [s]."""
+        """Duration of the motion from where control will start it [s]."""
         safety, limits = self._plan.deployment.safety, self._plan.limits
         velocity = limits.velocity * safety.motion_velocity_scale
         acceleration = safety.motion_acceleration * limits.reach
         return Trajectory(self._start(), self._goal, velocity, acceleration).duration
 
     def _start(self) -> Float64:
-        """Where control will start [D]."""
+        """Position from which control will start [D]."""
         status = self._page.control.read()
         start = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
         return np.array(start, np.float64)

@@ -1,4 +1,4 @@
-"""What `setup` does, stage by stage, never blocking: connect, observe, home, reset, warm up, validate."""
+"""Stages of `setup`, none of them blocking: connect, observe, home, reset, warm up, validate."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from runtime.station.spec import StationSpec
 
 
 class Stage(StrEnum):
-    """Where set-up is."""
+    """Stage of a set-up."""
 
     IDLE = "idle"
     CONNECT = "connecting to the policy"
@@ -84,7 +84,7 @@ class SetUp:
 
     @property
     def outcome(self) -> str:
-        """What came of it, in one sentence."""
+        """Result of the set-up, in one sentence."""
         return self._motion_only or self.validated
 
     def begin(self, reset: dict[str, Any] | None, least: LeastTimes | None = None) -> None:
@@ -123,7 +123,7 @@ class SetUp:
         self.stages, self.failed = {}, None
 
     def fail(self) -> None:
-        """What it was doing has failed."""
+        """Give up the stage that it was at, and remember which failed."""
         self.failed = self.stage
         self.cancel()
 
@@ -321,7 +321,7 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
 
 
 def first_action(action: Float64, joints: Float64, spec: StationSpec) -> dict[str, Any]:
-    """How far an action [D] is from `joints` [D]: {"distance" rad, "joint", "far"}; joints count, and nothing else."""
+    """Distance of an action [D] from `joints` [D]: {"distance" rad, "joint", "far"}; of joints alone."""
     limits = spec.limits
     away = np.where(limits.places, np.abs(difference(action, joints, spec.dims.wrapping)), 0.0)
     worst = int(away.argmax())
