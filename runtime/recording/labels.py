@@ -1,4 +1,4 @@
-"""People's labels of collected episodes: DATA/labels/<uuid>.jsonl, one line each; the newest counts."""
+"""Users' labels of collected episodes: DATA/labels/<uuid>.jsonl, one line each; the newest counts."""
 
 from __future__ import annotations
 
