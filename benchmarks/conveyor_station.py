@@ -48,7 +48,7 @@ def _renderer(robot: str) -> Renderer:
 
 @cache
 def _places(robot: str) -> Places:
-    """Where the joints of a robot are for the places of the belt; the same for every station of this process."""
+    """Joints of a robot for the places of the belt; the same for every station of this process."""
     assert CONVEYOR.belt is not None
     return Places(robots.load(robot), CONVEYOR.belt)
 
@@ -81,7 +81,7 @@ class Gallery(Surroundings):
         return {key: np.ascontiguousarray(bgr[..., ::-1]) for key, bgr in drawn.items()}
 
     def truth(self) -> dict[str, object]:
-        """What rides where, and how well it is followed."""
+        """Ground truth of the belt's ride, and of how well it is followed."""
         return self.conveyor.truth()
 
     def reset(self, wish: Reset) -> None:
@@ -126,7 +126,7 @@ class ConveyorPlan(StationSpec):
 
     @property
     def conveyor(self) -> Conveyor:
-        """What is on the bench."""
+        """Conveyor on the bench."""
         return self.gallery.conveyor
 
     @property

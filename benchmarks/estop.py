@@ -1,4 +1,4 @@
-"""How long an e-stop takes while somebody is in its way, attack by attack.
+"""Time of an e-stop under attack, attack by attack.
 
 A page presses over its websocket and at the process for stops at once, and the first answer counts; beside it each of
 the two ways alone is measured.
@@ -130,7 +130,7 @@ def once(found: Bench, attack: str, seconds: float, share: float = 1.0) -> dict[
 
 
 def _warmed(found: Bench, *ways: Callable[[str], Press]) -> None:
-    """What the first of everything costs is neither late nor growth."""
+    """Do everything once: the first costs are neither lateness nor growth."""
     found.station.appeared()
     for press in ways:
         press("to begin with")
@@ -189,7 +189,7 @@ def _presses(station: Station, press: Callable[[str], Press], seconds: float) ->
 
 
 def judged(presses: Sequence[Press], lost: int) -> dict[str, Any]:
-    """What became of presses, `lost` of which the station never had."""
+    """Results of presses, `lost` of which the station never had."""
     ms = np.array([press.ms for press in presses])
     undone = [
         f"{press.status or 'unanswered'}: {press.reason}" for press in presses if press.status != "done"

@@ -38,7 +38,7 @@ class Station:
 
     @property
     def latched(self) -> bool:
-        """Whether the e-stop is, as its latch on the disk says."""
+        """True if the e-stop is latched, as its latch on the disk says."""
         return Latch(self._folder).read() is not None
 
     def pids(self) -> list[int]:
@@ -73,7 +73,7 @@ class Station:
         raise SystemExit(f"{PRESSED} does not run: {why}")
 
     def _tried(self) -> Mapping[str, Any]:
-        """How it stands after a second of a run, or wherever it came to instead."""
+        """State after a second of a run, or wherever it came to instead."""
         state = self.appeared()["state"]
         if state == "faulted":
             self.release()
@@ -100,7 +100,7 @@ class Station:
         return True
 
     def interruption(self) -> str:
-        """What ended the run before somebody pressed, "" where nothing did; raises RuntimeFault where all is mute."""
+        """Event that ended the run before the press, "" for none; raises RuntimeFault where all is mute."""
         self.appeared()
         events = self.client.events_since(self._newest_event)
         left = [event["text"] for event in events if event["kind"] in ("state", "family_died")]
@@ -111,7 +111,7 @@ class Station:
 
 
 class Beside(NamedTuple):
-    """What was seen of web and station during an attack."""
+    """Measures of web and station during an attack."""
 
     main_late_ms: float  # the longest that a snapshot was overdue
     web_growth_mb: float
@@ -139,7 +139,7 @@ class Watching:
             thread.start()
 
     def end(self) -> Beside:
-        """What there was."""
+        """End the watch and return its measures."""
         self._ended.set()
         for thread in self._threads:
             thread.join()
@@ -167,7 +167,7 @@ class Watching:
 
 
 def _memory(pids: list[int]) -> float:
-    """What processes hold in memory [bytes]; one that has ended holds nothing."""
+    """Memory of processes [bytes]; one that has ended holds nothing."""
     found = 0.0
     for pid in pids:
         try:

@@ -106,14 +106,14 @@ def _case(
 
 
 class _Call(NamedTuple):
-    """What one chunk took [s]: by the clock, and of processors."""
+    """Times of one chunk [s]: by the clock, and of processors."""
 
     took: float
     used: float
 
 
 def _enough(calls: Sequence[_Call], chunks: int, seconds: float) -> bool:
-    """Whether a backend had its time, and each chunk its calls."""
+    """True if a backend had its time, and each chunk its calls."""
     took = sum(call.took for call in calls)
     if len(calls) < _FEWEST * chunks:
         return len(calls) >= chunks and took >= _PATIENCE_S
@@ -135,10 +135,10 @@ def _timed(calls: Sequence[_Call], arms: int) -> dict[str, float]:
 
 
 def _judged(robot: Robot, chunks: Sequence[Chunk], solved: Sequence[IkResult]) -> dict[str, float]:
-    """What the solutions are worth, over all chunks; the first row's speed counts from the seed.
+    """Quality of the solutions, over all chunks; the first row's speed counts from the seed.
 
-    Errors of targets that joints have are those of frames that no wall holds back: neither a joint limit nor a
-    velocity. What share is held back, and how far off those are, stands beside them.
+    Errors of targets that joints have are those of frames that no wall holds back: neither a joint limit nor
+    a velocity. The share that is held back, and its errors, stand beside them.
     """
     dims = arm_dims(robot)
     q = np.stack([result.q for result in solved])[..., dims]
@@ -196,7 +196,7 @@ def _figures(row: Mapping[str, Any]) -> list[Figure]:
 
 
 def _postures(name: str) -> list[Figure]:
-    """What the default backend makes of loops and of long paths; shares are of arms and paths.
+    """Figures of the default backend on loops and on long paths; shares are of arms and paths.
 
     `far` paths are of one leg anywhere within the limits. In chunks a path is seen no farther than its chunk.
     """
@@ -222,7 +222,7 @@ def _postures(name: str) -> list[Figure]:
 
 
 def _compared(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
-    """How many times as much of a processor the other backends take.
+    """Processor time of the other backends, as a multiple of the default backend's.
 
     By the clock a busy machine would stretch their calls, which are long, and hardly those of the default backend.
     """
@@ -237,7 +237,7 @@ def _compared(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
 
 
 def _fk() -> list[Figure]:
-    """How far the recorded joints' poses are from the recorded poses."""
+    """Distances of the recorded joints' poses from the recorded poses."""
     folder = os.environ.get(_EPISODE)
     if not folder:
         print(f"the recorded episode is not measured: {_EPISODE} is not set", file=sys.stderr)

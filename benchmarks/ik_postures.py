@@ -1,4 +1,4 @@
-"""What becomes of postures: joints after loops of the same circle, and long paths that joints are known to have."""
+"""Drift of postures: joints after loops of the same circle, and long paths that joints are known to have."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Float64 = NDArray[np.float64]
 
 
 def redundant(robot: Robot) -> bool:
-    """Whether an arm has more joints than a pose holds."""
+    """True if an arm has more joints than a pose holds."""
     return any(len(arm.joint_dims) > 6 for arm in robot.arms)
 
 

@@ -84,7 +84,7 @@ def watch(visitor: Visitor, seconds: float, **counts: int) -> subprocess.Popen[s
 
 
 class Processors:
-    """What the processes of a lab, and all others of the machine, take of the processors from now on."""
+    """Processor time of the processes of a lab, and of all others of the machine, from now on."""
 
     def __init__(self, lab: psutil.Process) -> None:
         self._lab = lab
@@ -124,7 +124,7 @@ def _used(processes: Iterable[psutil.Process]) -> dict[str, float]:
 
 
 class Scheduling:
-    """What the kernel did to one process of a lab from now on."""
+    """The kernel's scheduling of one process of a lab from now on."""
 
     def __init__(self, lab: psutil.Process, module: str) -> None:
         (self._process,) = (p for p in lab.children(recursive=True) if _name(p.cmdline()) == module)

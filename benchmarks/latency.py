@@ -1,4 +1,4 @@
-"""How long things take from end to end while everything runs: control at 30 Hz, cameras, recording, five pages.
+"""Latency from end to end while everything runs: control at 30 Hz, cameras, recording, five pages.
 
 `command_ms`: a page presses Halt over its websocket, until it has the acknowledgement, given when the
 order is on its way to control and the answer is in its journal. `node_ms`: from the same press until control hands
@@ -168,7 +168,7 @@ def _shortest_way(endpoint: str) -> float:
 
 
 def _from(episode: Episode, presses: Sequence[float], transit: float) -> dict[str, Any]:
-    """What the recording knows [ms]: arrays, and percentiles where it keeps only these."""
+    """Figures from the recording [ms]: arrays, and percentiles where it keeps only these."""
     assert episode.outcome is not None
     muxed = episode.outcome["muxed_ms"].values()
     ages = episode.outcome["policy"]["observation_age_ms"]

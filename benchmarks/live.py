@@ -80,7 +80,7 @@ def _viewers(visitor: Visitor, seconds: float, **counts: int) -> dict[str, Any]:
 
 
 def _stalled(visitor: Visitor, web: int, seconds: float) -> float:
-    """What the web has grown by per viewer that never reads [MB], at its largest."""
+    """Growth of the web per viewer that never reads [MB], at its largest."""
     process = psutil.Process(web)
     _viewers(visitor, 3.0, reading=1)  # what the first viewer costs once is no growth
     before = process.memory_info().rss

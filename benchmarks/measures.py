@@ -1,4 +1,4 @@
-"""What each measure for a steady tick brings: `loop` at one rate, with measures of runtime.core.realtime taken away.
+"""Effects of the measures for a steady tick: `loop` at one rate, with runtime.core.realtime's taken away.
 
 The bare loop beside it does without them too.
 """

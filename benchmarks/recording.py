@@ -1,4 +1,4 @@
-"""What it takes to record, and what a kill takes: a station's recorder, LeRobot's beside it, kill -9, a long list.
+"""Costs of recording, and losses by a kill: a station's recorder, LeRobot's beside it, kill -9, a long list.
 
 One station records three cameras of 640x480 at 30 Hz, ends and publishes; others record beside busy loops. Then the
 recorder alone and LeRobot's own writer are given the same frames at the same pace, if an interpreter with LeRobot is
@@ -72,7 +72,7 @@ def figures(
     kills: Mapping[str, Any],
     listing: Mapping[str, Any],
 ) -> list[Figure]:
-    """What is wanted of the five parts, and what is only told."""
+    """Figures of the five parts: those with a bound, and those that are only told."""
     memory, disk = station["memory_mb"], station["to_disk_ms"]
     rows: Sequence[Mapping[str, Any]] = kills["rows"]
     return [
@@ -133,7 +133,7 @@ def _made(folder: Path) -> Path:
 
 
 def _timed(part: Any, *arguments: Any) -> dict[str, Any]:
-    """What a part found, how long it took, and the load of the machine when it ended."""
+    """Findings of a part, its duration, and the load of the machine when it ended."""
     begun = time.monotonic()
     print(f"recording: {part.__name__.strip('_')}", file=sys.stderr)  # minutes pass: say where it is
     found = part(*arguments)
@@ -168,7 +168,7 @@ def interpreters() -> list[str]:
 
 
 def _child(python: str, module: str, *arguments: str, **environment: str) -> dict[str, Any]:
-    """What a module of ours prints last, as JSON; the whole of what it says where it fails."""
+    """Last output of a module of ours, as JSON; the whole of its output where it fails."""
     command = [python, "-m", f"benchmarks.{module}", *arguments]
     done = subprocess.run(
         command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, check=False

@@ -89,7 +89,7 @@ def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], lis
 
 
 def pictures(episode: Episode) -> dict[str, int]:
-    """What was given and is not in the videos: flagged, and not (`silent`)."""
+    """Count of pictures that were given and are not in the videos: flagged, and not (`silent`)."""
     flagged = silent = 0
     rows = episode.rows
     for camera in episode.layout.cameras:

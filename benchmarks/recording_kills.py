@@ -47,7 +47,7 @@ RUNNING = "select key, owner from jobs_job where status = 'running'"
 
 @dataclass(frozen=True, slots=True)
 class Many:
-    """How often to kill: `most` times, or fewer but at least `least` where `seconds` are over before."""
+    """Count of kills: `most`, or fewer but at least `least` where `seconds` are over before."""
 
     most: int
     least: int
@@ -216,7 +216,7 @@ def _query(data: Path, query: str) -> list[Any]:
 
 
 def _problems(data: Path) -> list[str]:
-    """What of the datasets and episodes does not open as it is, before anybody has mended anything."""
+    """Datasets and episodes that do not open as they are, before anything has been mended."""
     datasets = [info.parents[1] for info in data.glob(f"datasets/**/{INFO}")]
     found = [f"{dataset.name}: {said}" for dataset in datasets for said in check(dataset)]
     for folder in data.glob("episodes/*"):

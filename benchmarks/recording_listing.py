@@ -59,7 +59,7 @@ def main(count: int) -> None:
 
 
 def _request(page: Any, query: str) -> tuple[float, float]:
-    """How long it takes, and how much of a processor [ms]."""
+    """Time of a request, and processor time of it [ms]."""
     begun, used = time.perf_counter(), time.process_time()
     answer = page.get(f"/replay/?{query}")
     took = (time.perf_counter() - begun) * 1000.0, (time.process_time() - used) * 1000.0

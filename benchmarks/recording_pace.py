@@ -41,7 +41,7 @@ def joints(index: int) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What one recorder took for an episode; processor times with its children's [s]."""
+    """Cost of an episode to one recorder; processor times with its children's [s]."""
 
     frames: int
     capture_cpu_s: float

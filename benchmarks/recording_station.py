@@ -87,7 +87,7 @@ class Watch:
 
 
 def resident_mb(process: psutil.Process) -> float:
-    """What a process has in memory [MB]."""
+    """Resident memory of a process [MB]."""
     return float(process.memory_info().rss) / 1e6
 
 

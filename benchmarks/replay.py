@@ -1,4 +1,4 @@
-"""How soon an episode plays: from its address to the first picture of every camera.
+"""Time until an episode plays: from its address to the first picture of every camera.
 
 The demo records a run; then the web alone serves it to Debian's Chromium, which has seen nothing of it before.
 """

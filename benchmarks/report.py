@@ -1,4 +1,4 @@
-"""What a benchmark returns, as a table for people and as JSON for programs."""
+"""Result of a benchmark, as a table for people and as JSON for programs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Figure:
 
     @property
     def holds(self) -> bool | None:
-        """Whether the value is as wanted; None where nothing is wanted."""
+        """True if the value is as wanted; None where nothing is wanted."""
         if not self.wanted:
             return None
         sign, bound = self.wanted.split()
@@ -60,7 +60,7 @@ class Report:
 
 
 def machine() -> dict[str, object]:
-    """What the figures were measured on."""
+    """Machine on which the figures were measured."""
     return {
         "cpus": os.cpu_count(),
         "load": os.getloadavg(),

@@ -60,7 +60,7 @@ def measure(seconds: float, plans: int = PLANS, trials: int = TRIALS, runs: int 
 
 
 def _measured(data: Path, environment: dict[str, str], plans: int, trials: int) -> dict[str, Any]:
-    """What a program of its own found on one database."""
+    """Findings on one database, by a program of its own."""
     data.mkdir()
     out = data / "out.json"
     words = ["-m", "benchmarks.results_pages", str(out), "--plans", str(plans), "--trials", str(trials)]
@@ -91,7 +91,7 @@ def database_figures(row: dict[str, Any]) -> Iterator[Figure]:
 
 
 def rule_figures(runs: int) -> Iterator[Figure]:
-    """How often the stopping rule, and who peeks, find a difference between equal checkpoints."""
+    """Rates at which the stopping rule, and a peeking reader, find a difference between equal checkpoints."""
     for rate in RATES:
         chance = random.Random(f"{rate}")
         found = naive = 0
@@ -104,7 +104,7 @@ def rule_figures(runs: int) -> Iterator[Figure]:
 
 
 def _peeked(pairs: list[tuple[bool, bool]]) -> bool:
-    """Whether a test for a fixed number of pairs (two proportions, pooled) is ever significant at one of the looks."""
+    """True if a fixed-size test of pairs (two proportions, pooled) is significant at any of the looks."""
     x1 = x2 = 0
     for n, (one, other) in enumerate(pairs, start=1):
         x1, x2 = x1 + one, x2 + other

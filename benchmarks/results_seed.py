@@ -17,7 +17,7 @@ _BATCH = 5000
 
 @dataclass(frozen=True, slots=True)
 class Seeded:
-    """What is there: plans whose results anybody may see, and who looks at them."""
+    """Seeded data: plans whose results every user may see, their viewer, operators, stations."""
 
     plans: Sequence[Any]
     viewer: Any
@@ -217,7 +217,7 @@ def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Ra
 
 
 def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
-    """How each trial was handed out, in the order of the schedule."""
+    """Write how each trial was handed out, in the order of the schedule."""
     from evaweb.plans.commitment import codes
     from evaweb.plans.models import Handout
 

@@ -30,7 +30,7 @@ Fuzzer = Callable[[int], list[str]]
 
 
 class Held(NamedTuple):
-    """What this process holds."""
+    """Resources that this process holds."""
 
     files: int
     threads: int
@@ -69,7 +69,7 @@ def measure(seconds: float, chosen: Mapping[str, Fuzzer] | None = None, first: i
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """What the scenarios provoke is warned of by what they provoke: only errors are shown."""
+    """Show errors only: the scenarios themselves provoke the log's warnings."""
     log = logging.getLogger("runtime")
     before = log.level
     log.setLevel(logging.ERROR)
@@ -80,7 +80,7 @@ def _quiet() -> Iterator[None]:
 
 
 def held() -> Held:
-    """What this process holds now, without what the C library only has not given back yet."""
+    """Resources that this process holds now, without what the C library only has not given back yet."""
     gc.collect()
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # musl has none
         trim(0)
@@ -90,7 +90,7 @@ def held() -> Held:
 
 
 def _grown(settled: Sequence[Held]) -> list[Figure]:
-    """What grew from round to round; memory is reported on only where the rounds are too few to tell."""
+    """Growth from round to round; memory is reported on only where the rounds are too few to tell."""
     before, after = settled[0], settled[-1]
     memory = [held.memory_mb for held in settled]
     slope = float(theilslopes(memory).slope) if len(memory) > 1 else 0.0

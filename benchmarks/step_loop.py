@@ -45,7 +45,7 @@ class _Request:
 
 @dataclass(slots=True)
 class Log:
-    """What happened so far."""
+    """Events so far."""
 
     executed: list[Executed] = field(default_factory=list)
     merged: list[Merged] = field(default_factory=list)
@@ -125,7 +125,7 @@ class StepLoop:
         return _Request(self._number, self.step, due, self._query.waits, rows)
 
     def _conditioning(self) -> Conditioning | None:
-        """What the robot is committed to, as the coordinator would tell a policy that continues its chunks."""
+        """The robot's commitment, as the coordinator would tell a policy that continues its chunks."""
         quantile, horizon = self._config.delay_quantile, self._config.execution_horizon
         return self._commitment.conditioning(self.step, self._delays, quantile, horizon)
 
@@ -162,7 +162,7 @@ class StepLoop:
 
 
 def _as_told(merged: Merged) -> ChunkMerged:
-    """What control would tell the coordinator of it."""
+    """Control's message to the coordinator about it."""
     return ChunkMerged(
         merged.chunk_id,
         1,

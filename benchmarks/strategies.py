@@ -1,4 +1,4 @@
-"""What each strategy makes of a policy whose every action is known: offset, error, jerk, reaction, starvation.
+"""Quality of strategies, each action of the policy being known: offset, error, jerk, reaction, starvation.
 
 The halves of the strategies themselves (query, merge, timeline, commitment) are driven in integer steps by
 benchmarks/step_loop.py: no process, no wire, no safety, no robot that lags. So it is deterministic and fast enough
@@ -64,7 +64,7 @@ class Cell(Case):
 
     @property
     def feasible(self) -> bool:
-        """Whether a chunk lasts until the next one can arrive."""
+        """True if a chunk lasts until the next one can arrive."""
         return self.strategy == "sync" or self.horizon >= self.delay + self.interval
 
     @property
@@ -100,7 +100,7 @@ THE_CELL = {"control_hz": 30.0, "inference_hz": 3.0, "horizon": 50, "delay": 3}
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """How the reference was followed; errors in rad, offset in steps."""
+    """Tracking of the reference; errors in rad, offset in steps."""
 
     offset: float
     rms_error: float

@@ -44,7 +44,7 @@ class Obedient(Source, Sink):
         """Nothing to open."""
 
     def receive(self, timeout: float) -> Observation | None:
-        """Where it is now, with black pictures."""
+        """Present observation, with black pictures."""
         self._sequence += 1
         now = self._clock.now()
         return Observation(
@@ -114,7 +114,7 @@ class KnownPlan(StationSpec):
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What the station and the step loop are both to do; `inference_hz` None is back to back."""
+    """Task of both the station and the step loop; `inference_hz` None is back to back."""
 
     strategy: str
     control_hz: float
@@ -130,7 +130,7 @@ class Case:
 
 
 def compare(case: Case) -> tuple[int, int]:
-    """How many actions of the policy the station planned, and how many of them the step loop has otherwise."""
+    """Count of the policy's actions planned by the station, and of those that the step loop has otherwise."""
     with tempfile.TemporaryDirectory() as folder:
         spec = _plan(Path(folder), case)
         start = spec.robot.poses["ready"].astype(np.float64)
@@ -171,7 +171,7 @@ def _run(spec: KnownPlan) -> tuple[int, Mapping[int, Float32]]:
 
 
 def _answer(start: Float64, case: Case) -> Answering:
-    """What both are to ask: chunks that disagree, around `start`, in the float32 of the wire."""
+    """Policy of both: chunks that disagree, around `start`, in the float32 of the wire."""
     steps = np.arange(_TICKS + 4 * case.horizon, dtype=float)
     reference = Reference(case.control_hz)
     meant = disagreeing(chunks_of(reference.at(steps) - reference.at(steps[:1]), case.horizon))

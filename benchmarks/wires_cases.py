@@ -1,4 +1,4 @@
-"""What is at the two ends of each transport that `benchmarks.wires_transports` measures: one function per case."""
+"""Two ends of each transport that `benchmarks.wires_transports` measures: one function per case."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MOST_DECODED_HZ = 200.0
 
 @dataclass(slots=True)
 class Stage:
-    """Where a case is played: its processes, its folder, and how it is to be sent."""
+    """Setting of a case: its processes, its folder, and its way of sending."""
 
     stack: contextlib.ExitStack
     folder: Path
@@ -72,7 +72,7 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Wired:
-    """What to receive, and how a picture's birth is found: by its number in a "strip" or a "bar", or "due"."""
+    """Transport and cameras to receive; a picture is dated by its number in a "strip" or "bar", or "due"."""
 
     transport: Mapping[str, Any]
     cameras: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

@@ -125,7 +125,7 @@ def _ours(protocol: Protocol, robot: Robot, url: str, shown: Observation) -> Ite
 
 @dataclass(slots=True)
 class Timed:
-    """What was measured of one client: round trips [s], and processor time until the next one's turn [s]."""
+    """Measurements of one client: round trips [s], and processor time until the next one's turn [s]."""
 
     round_trips: list[float] = field(default_factory=list)
     processor: list[float] = field(default_factory=list)
@@ -177,7 +177,7 @@ def observation(robot: Robot) -> Observation:
 
 
 def absent(protocol: Protocol, robot: Robot) -> str:
-    """What has to be installed before it can be measured; "" where nothing has."""
+    """Software to be installed before it can be measured; "" where nothing is missing."""
     try:
         _policy(protocol, robot)
     except ConfigurationError as error:

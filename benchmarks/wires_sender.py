@@ -1,4 +1,4 @@
-"""What is at the other end of a transport, and when it began each of its messages.
+"""Sender at the other end of a transport, and the starting times of its messages.
 
 `python -m benchmarks.wires_sender TIMES PAGE MODULE ARGUMENT...` runs the simulated robot `runtime.sim.MODULE`, or
 with MODULE "cameras" as many MJPEG cameras as the argument says: COUNT RATE WIDTH HEIGHT. When it ends, the times [s]

@@ -59,7 +59,7 @@ def _measured(case: Case, seconds: float) -> Row:
 
 
 def live(case: Case, seconds: float) -> Row:
-    """What a control loop sees of pictures that come at their usual rate, and what receiving them takes."""
+    """Pictures that a control loop sees at their usual rate, and the cost of receiving them."""
     with _staged(case, FPS, _LIVE) as (stage, shared):
         wired = case.open(stage)
         receiver = _receiving(stage, wired, fast=False)
@@ -82,7 +82,7 @@ def live(case: Case, seconds: float) -> Row:
 
 
 def idle(case: Case, seconds: float, frames: int = IDLE_FRAMES) -> Row:
-    """How much memory the receiving side takes more after so many pictures of each camera, or so long, than before."""
+    """Memory growth of the receiving side from so many pictures of each camera, or over so long."""
     with _staged(case, _FLOOD_HZ, _FLOOD, hurried=True) as (stage, shared):
         wired = case.open(stage)
         receiver = _receiving(stage, wired, fast=case.played)
@@ -122,7 +122,7 @@ def _receiving(stage: Stage, wired: Wired, fast: bool) -> subprocess.Popen[str]:
 def _await(
     shared: SharedState, receiver: subprocess.Popen[str], frames: int, seconds: float = math.inf
 ) -> int:
-    """How many pictures of every camera are in the page, once it is so many or so long; SystemExit where none come."""
+    """Count of pictures of every camera in the page after so many or so long; SystemExit where none come."""
     seen, since = 0, time.monotonic()
     latest = since + seconds
     while seen < frames and time.monotonic() < latest:
@@ -143,7 +143,7 @@ Look = list[
 
 
 def _look(shared: SharedState, seconds: float) -> tuple[list[Look], int]:
-    """What a control loop sees at each of its ticks, and how many observations came meanwhile."""
+    """Looks of a control loop at each of its ticks, and the count of observations meanwhile."""
     clock = MonotonicClock()
     first = int(shared.observation.read()["sequence"])
     looks: list[Look] = []
@@ -161,7 +161,7 @@ def _look(shared: SharedState, seconds: float) -> tuple[list[Look], int]:
 
 
 def marks(picture: UInt8) -> UInt8:
-    """What tells its number: the strip at its head and the bar at its foot."""
+    """Parts of a picture that tell its number: the strip at its head and the bar at its foot."""
     return np.concatenate([picture[:16], picture[-16:]])
 
 
@@ -176,7 +176,7 @@ def ages(looks: Sequence[Look], born: str, sent: Any) -> list[float | None]:
 
 
 def sent_hz(sent: Any, begun: float, took: float) -> float | None:
-    """What the sender kept up with; None for recordings."""
+    """Rate that the sender kept up with [Hz]; None for recordings."""
     streams = [stream for stream in (sent if sent and isinstance(sent[0], list) else [sent]) if stream]
     rates = [sum(begun <= at <= begun + took for at in stream) / took for stream in streams]
     return min(rates, default=None)

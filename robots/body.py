@@ -1,4 +1,4 @@
-"""Where every link of a robot stands, in the scene and in each other's frames."""
+"""Poses of all links of a robot, in the scene and in each other's frames."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from robots.urdf import Joint, Urdf
 
 
 class BodyTables(NamedTuple):
-    """How parts [P] hang on each other: a part's joint has the value coupling . q + offset, within bounds.
+    """Joints between parts [P]: the value of a part's joint is coupling . q + offset, within bounds.
 
     Its transform behind the part `above` it (-1: in the scene; parents come first) is the sum of its four `motions`
     [P, 4, 16], weighted by 1, the cosine and sine of that value, and the value.
@@ -93,11 +93,11 @@ class Body:
 
     @property
     def tables(self) -> BodyTables:
-        """What `poses` is computed from, for those who compute it otherwise."""
+        """Tables from which `poses` is computed, for other implementations of it."""
         return BodyTables(self._tables, self._coupling, self._offsets, self._low, self._high, self.above)
 
     def poses(self, q: Float64) -> Float64:
-        """Where the parts are, scene <- part [..., P, 4, 4], for the robot's vector q [..., D]."""
+        """Poses of the parts, scene <- part [..., P, 4, 4], for the robot's vector q [..., D]."""
         if q.shape[-1:] != (self._dim,):
             raise RobotError(
                 f"{self._name}: joints of shape {q.shape} were given; allowed: [..., {self._dim}]"

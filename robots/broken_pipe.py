@@ -68,7 +68,7 @@ def _flush() -> None:
 
 
 def _refused(error: OSError) -> bool:
-    """Whether it was standard output that raised it: what could not be written waits in it, and goes nowhere now."""
+    """True if standard output raised it: what could not be written waits in it, and goes nowhere now."""
     try:
         _flush()
     except OSError as again:
@@ -79,7 +79,7 @@ def _refused(error: OSError) -> bool:
 
 
 def _silenced() -> bool:
-    """Whether one of our streams has no reader; what waits to be written there goes nowhere from now on."""
+    """True if one of our streams has no reader; what waits to be written there goes nowhere from now on."""
     unread = [
         number for number in map(_descriptor, (sys.stdout, sys.stderr)) if number >= 0 and _unread(number)
     ]

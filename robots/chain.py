@@ -55,7 +55,7 @@ class Chain:
 
     @property
     def size(self) -> int:
-        """How many numbers drive the chain."""
+        """Count of numbers that drive the chain."""
         return len(self.joints)
 
     @property
@@ -77,7 +77,7 @@ class Chain:
 
     @property
     def tail(self) -> Float64:
-        """What lies between the last moving joint and the tip, [4, 4]."""
+        """Transform from the last moving joint to the tip, [4, 4]."""
         return self._tail
 
     def forward(self, q: Float64) -> Float64:
@@ -159,7 +159,7 @@ class Chain:
         self._plain = square and bool((self._coupling == np.eye(self.size)).all()) and not self._offsets.any()
 
     def _drive(self, urdf: Urdf, joint: Joint, pinned: Mapping[str, float]) -> tuple[Float64, float]:
-        """How the joint follows q: its value is row [n] . q + offset."""
+        """Dependence of the joint on q: its value is row [n] . q + offset."""
         row = np.zeros(self.size)
         factor, offset = 1.0, 0.0
         seen = [joint.name]

@@ -1,4 +1,4 @@
-"""How far the links of a robot are from each other and from the table: a coarse check, capsules for links."""
+"""Distances of a robot's links from each other and from the table: a coarse check, capsules for links."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Clearance:
         self._look_at(*self._telling(robot))
 
     def distances(self, q: Float64) -> Float64:
-        """How far the pairs are apart [m], [..., K], below zero where they overlap, for the robot's vector [..., D]."""
+        """Distances of the pairs [m], [..., K], below zero for overlap, for the robot's vector [..., D]."""
         if q.ndim == 1:
             return self._distances(q)
         flat = q.reshape(-1, q.shape[-1])
@@ -119,7 +119,7 @@ class Clearance:
 
 
 def _alike(pair: tuple[str, str]) -> tuple[str, ...]:
-    """What a pair has in common with the same links of another arm like it; itself, where it is of two arms."""
+    """Common part of a pair and the same links of another arm like it; the pair itself, if of two arms."""
     (group, _, link), (other_group, _, other) = (name.partition("/") for name in pair)
     return (link, other or other_group) if group == other_group or not other else pair
 
@@ -166,7 +166,7 @@ def _root(body: Body, part: np.intp) -> int:
 
 
 def problems(robot: Robot, margin: float = MARGIN) -> list[str]:
-    """What is wrong with [collision] of the robot, in sentences: pairs that touch at a named pose, or no pairs."""
+    """Faults of the robot's [collision], in sentences: pairs that touch at a named pose, or no pairs."""
     clearance = Clearance(robot)
     least = dict(zip(clearance.pairs, clearance.least(margin).tolist(), strict=True))
     if not clearance.pairs:

@@ -1,4 +1,4 @@
-"""What a robot.toml may say: one model per table, strict, every key documented."""
+"""Contents of a robot.toml: one model per table, strict, every key documented."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class GripperTable(Table):
 
 
 class PlaceTable(Table):
-    """Where something stands."""
+    """Place of an object."""
 
     xyz: Triple
     wxyz: Quadruple
@@ -99,7 +99,7 @@ Capsules = Annotated[list[CapsuleTable], BeforeValidator(_several), Field(min_le
 
 
 class CollisionTable(Table):
-    """What the coarse collision check looks at; without it, capsules from the shapes of each link."""
+    """Input of the coarse collision check; without it, capsules from the shapes of each link."""
 
     capsules: dict[str, Capsules] = {}
     """Links with a capsule of their own, or a list of some, instead of those that their shapes give."""

@@ -21,7 +21,7 @@ _HYSTERESIS = 0.05  # of the travel
 
 @dataclass(frozen=True, slots=True)
 class GripperChoice:
-    """What a deployment says otherwise of a gripper; None keeps what the robot's description says."""
+    """A deployment's changes to a gripper; None keeps what the robot's description says."""
 
     binary: bool | None = None
     threshold: float | None = None

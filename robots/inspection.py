@@ -1,4 +1,4 @@
-"""What a robot's description comes to, in sentences: `python -m robots check`."""
+"""Findings on a robot's description, in sentences: `python -m robots check`."""
 
 from __future__ import annotations
 

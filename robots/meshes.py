@@ -73,7 +73,7 @@ def bounds(path: Path) -> Bounds:
 
 
 def _places(root: Path, owner: str, filename: str) -> Iterator[Path]:
-    """Where in `root` the file may lie; a package is the folder of its name in there, or the root itself."""
+    """Paths in `root` at which the file may lie; a package is the folder of its name there, or the root."""
     scheme, separator, rest = filename.partition("://")
     if not separator:
         yield (root / filename).resolve()

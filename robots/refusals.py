@@ -1,4 +1,4 @@
-"""What is wrong with a description, said with file and key."""
+"""Faults of a description, said with file and key."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from robots.urdf import Urdf
 
 @contextmanager
 def naming(key: str) -> Iterator[None]:
-    """What is said of the URDF in here is said with the key that asked for it."""
+    """Name the key that asked for the URDF in errors about it that are raised in here."""
     try:
         yield
     except RobotError as error:

@@ -69,7 +69,7 @@ class Group:
 
     @property
     def dof(self) -> int:
-        """How many numbers the group has, its gripper included."""
+        """Count of the group's numbers, its gripper included."""
         return len(self.joints)
 
     @property
@@ -84,7 +84,7 @@ class Group:
         return dims if self.gripper is None else np.delete(dims, self.gripper.index)
 
     def carried(self, q: Float64) -> Float64:
-        """Where the chain begins, in `frame`: transforms [..., 4, 4] for the robot's vector [..., D]."""
+        """Start of the chain in `frame`: transforms [..., 4, 4] for the robot's vector [..., D]."""
         if self.carrier is None:
             return np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
         return self.carrier.forward(q[..., self.carrier_dims])

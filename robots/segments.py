@@ -11,7 +11,7 @@ _PARALLEL = 1e-12  # of the squared sine between two segments: any point of the 
 
 
 def distances(start: Float64, way: Float64, other: Float64, other_way: Float64) -> Float64:
-    """How near segments [..., 3] from `start` along `way` come to those from `other` along `other_way`, [...].
+    """Distances of segments [..., 3] from `start` along `way` to those from `other` along `other_way`, [...].
 
     The nearest points of the two lines, brought back into the segments one after the other (Ericson, Real-Time
     Collision Detection, 5.1.9); segments may be points, and parallel.

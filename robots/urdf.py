@@ -123,7 +123,7 @@ def document(path: Path) -> ET.Element:
 
 
 def _is_xacro(robot: ET.Element) -> bool:
-    """Whether macros or placeholders are left in it."""
+    """True if macros or placeholders are left in it."""
     return any(
         "xacro" in element.tag or any("${" in value or "$(" in value for value in element.attrib.values())
         for element in robot.iter()

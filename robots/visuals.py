@@ -1,4 +1,4 @@
-"""What a robot looks like, for drawing; kinematics never uses it."""
+"""Looks of a robot, for drawing; kinematics never uses them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What takes the web's event loop, each part of it allowed or cheap: pings, handshakes, pages, REST."""
+"""Loads on the web's event loop, each part of them allowed or cheap: pings, handshakes, pages, REST."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What keeps a web busy over HTTP: half requests, passwords, bodies, a file that is slow to read."""
+"""Loads on a web over HTTP: half requests, passwords, bodies, a file that is slow to read."""
 
 from __future__ import annotations
 

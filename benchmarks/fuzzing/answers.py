@@ -74,7 +74,7 @@ def once(seed: int) -> list[str]:
 
 
 def _asked(policy: Policy, values: np.ndarray[Any, Any]) -> list[str]:
-    """What was wrong, question by question."""
+    """Violations, question by question."""
     found: list[str] = []
     for value in values.tolist():
         near = np.clip(value, _ROBOT.lower, _ROBOT.upper)

@@ -19,7 +19,7 @@ _WHOLE = ("left_arm", "right_arm", "torso", "base")  # of an R1 Lite: the one ro
 
 
 class Body(NamedTuple):
-    """What a robot can do, which of its numbers do not blend, its binary grippers, and where it is ready [D]."""
+    """Limits of a robot, numbers of it that do not blend, its binary grippers, and its ready pose [D]."""
 
     name: str
     limits: Limits

@@ -29,7 +29,7 @@ def _walled(name: str) -> tuple[Workspace, Float64]:
 
 
 def once(seed: int) -> list[str]:
-    """What goes wrong in the scenario of `seed`, in words; [] where nothing does."""
+    """Violations in the scenario of `seed`, in words; [] where there are none."""
     rng = np.random.default_rng(seed)
     name = str(rng.choice(sorted(robots.names())))
     workspace, start = _walled(name)

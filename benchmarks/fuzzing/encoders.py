@@ -134,7 +134,7 @@ class Scenario(Bench):
     # --- one tick ------------------------------------------------------------------------------------------
 
     def read(self) -> Float64:
-        """What the encoders say."""
+        """Readings of the encoders."""
         sound = self._turned(self.body + self.rng.normal(0.0, _NOISE, self.dim) * self.places)
         return self._faulty(sound) if self.fault else sound
 
@@ -185,11 +185,11 @@ class Scenario(Bench):
 
     @property
     def _known(self) -> Float64:
-        """Where the robot is; that an arm is moved by others while it is not seen to cannot be known."""
+        """Known joints of the robot; moves of an arm by others that are not seen cannot be known."""
         return self.kept if self.fault == "frozen" else self.body
 
     def look(self, sent: list[Float64]) -> None:
-        """What is wrong with what was sent in this tick."""
+        """Note the violations in what was sent in this tick."""
         record = self.records()[-1]
         if len(sent) > 1 or (sent and self.behaviour == "yield"):
             self._wrong("told twice in one tick, or beside the node that leads")
@@ -276,7 +276,7 @@ class EncoderOff(Bench):
         self._rng = rng
 
     def violations(self) -> list[str]:
-        """What is wrong with what it was told, in words."""
+        """Violations in what it was told, in words."""
         self.say("motion", goal=self.body)
         self.run(10)
         if self._stopped:
@@ -300,7 +300,7 @@ class EncoderOff(Bench):
         return [f"{self.name}, encoder of {joint}: {self._fault}: {what}" for what in sorted(found)]
 
     def _read(self, since: float) -> Float64:
-        """What the encoders say [D], `since` the fault began [s]."""
+        """Readings of the encoders [D], `since` the fault began [s]."""
         read = self.body.copy()
         if self._fault == "no number":
             read[self._joint] = np.nan
@@ -313,7 +313,7 @@ class EncoderOff(Bench):
         return read
 
     def _wrong(self, read: Float64) -> set[str]:
-        """What is wrong with the tick in which the joints were `read` [D]."""
+        """Violations in the tick in which the joints were `read` [D]."""
         found, told, places = set[str](), self.sent[-1], self.limits.places
         if not np.isfinite(told).all() or (self.limits.outside(told) > 1e-5 * self.limits.reach).any():
             found.add("told beyond the limits, or no number")
@@ -331,7 +331,7 @@ class EncoderOff(Bench):
 
 
 def once(seed: int) -> list[str]:
-    """What goes wrong in the scenario of `seed`, in words; [] where nothing does."""
+    """Violations in the scenario of `seed`, in words; [] where there are none."""
     scenario = Scenario(seed)
     for _ in range(_TICKS):
         scenario.go()

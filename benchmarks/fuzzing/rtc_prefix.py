@@ -42,7 +42,7 @@ _KINDS = ("rtc", "rtc", "rtc", "async", "naive", "ensemble", "sync")
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """What a seed stands for."""
+    """Scenario of a seed."""
 
     robot: str
     control_hz: float
@@ -128,7 +128,7 @@ class Seldom(Obedient):
         self._every, self._looked = every, 0
 
     def receive(self, timeout: float) -> Observation | None:
-        """Where it is, at its own rate."""
+        """Observation of the robot, at its own rate."""
         self._looked += 1
         return super().receive(timeout) if self._looked % self._every == 0 else None
 
@@ -147,7 +147,7 @@ class SeldomPlan(KnownPlan):
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """What a request said: rows [d, W] that are fixed, the first for control step `step`."""
+    """Content of a request: rows [d, W] that are fixed, the first for control step `step`."""
 
     step: int
     rows: Float64
@@ -199,7 +199,7 @@ class Keeper(Policy):
         """Nothing to release."""
 
     def apart(self, row: Float64, at: float, planned: dict[int, Float64], missed: float) -> str:
-        """How a fixed row for control step `at` is not what was planned; "" where it is.
+        """Deviation of a fixed row for control step `at` from the plan, in words; "" where there is none.
 
         Between two steps it is compared with both, to within what the plan bends there; poses to within what inverse
         kinematics has `missed`.
@@ -222,7 +222,7 @@ class Keeper(Policy):
         return f"is {off[worst]:.2e} off in number {worst}, allowed {allowed[worst]:.2e}"
 
     def _bend(self, before: int, planned: dict[int, Float64]) -> Float64:
-        """How much the plan bends about that step: what is cut off corners between two steps."""
+        """Bend of the plan about that step: what is cut off corners between two steps."""
         rows = [self._of(planned[step]) for step in range(before - 2, before + 4) if step in planned]
         steps = [self._difference(later, sooner) for sooner, later in pairwise(rows)]
         bends = [np.abs(later - sooner) for sooner, later in pairwise(steps)]
@@ -301,7 +301,7 @@ class Planned:
         return min((at for asked, at in self.arrived.items() if asked >= step), default=self.end)
 
     def missed_before(self, step: int, horizon: int) -> float:
-        """What the answers that may make this step and those after it have missed at most."""
+        """Largest miss of the answers that may make this step and those after it."""
         return max((off for at, off in self.missed.items() if step - 2 * horizon <= at <= step), default=0.0)
 
 
@@ -342,7 +342,7 @@ def _run(spec: SeldomPlan, made: Scenario, random: np.random.Generator) -> Plann
 
 
 def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -> None:
-    """What a person might do now."""
+    """Do what the operator might do now."""
     state = station.coordinator.session.state
     if state is SessionState.READY:
         station.command("run")

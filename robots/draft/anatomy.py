@@ -89,7 +89,7 @@ class _Skeleton:
         return set(below).union(*(self.under(child) for child in below))
 
     def depth(self, name: str | None) -> int:
-        """How many joints there are from the root to this one."""
+        """Count of joints from the root to this one."""
         return 0 if name is None else 1 + self.depth(self.parent[name])
 
     def fingers(self, wheels: set[str]) -> dict[str, str | None]:
@@ -149,7 +149,7 @@ class _Skeleton:
 def _limbs(
     skeleton: _Skeleton, run: tuple[tuple[str, ...], bool], fingers: dict[str, str | None], *, alone: bool
 ) -> list[Limb]:
-    """What a run of joints is; a torso or base that leads to an arm without a branch is a limb of its own."""
+    """Limbs of a run of joints; a torso or base leading to an arm without a branch is a limb of its own."""
     joints, ends = run
     own = tuple(name for name, carrier in fingers.items() if carrier == joints[-1])
     cut = _trunk(skeleton.tree, joints) if ends else len(joints)
@@ -167,7 +167,7 @@ def _limbs(
 
 
 def _trunk(tree: Urdf, joints: tuple[str, ...]) -> int:
-    """How many joints at the beginning of a row that ends in an arm are a torso or a base."""
+    """Count of joints of a torso or a base at the beginning of a row that ends in an arm."""
     cut = next((i for i, name in enumerate(joints) if _kind_of(name) not in ("torso", "base")), 0)
     slides = any(tree.joint(name).kind == "prismatic" for name in joints[:cut])
     return cut if len(joints) - cut >= (_BEYOND_LIFT if slides else _BEYOND_TURN) else 0
@@ -188,7 +188,7 @@ def _base(tree: Urdf) -> str:
 
 
 def _one_gripper(skeleton: _Skeleton, fingers: Sequence[str]) -> bool:
-    """Whether the fingers open and close by one number; more of them, or with joints of their own, are a hand."""
+    """True if the fingers open and close by one number; more of them, or jointed ones, are a hand."""
     return 0 < len(fingers) <= _FORK and not any(skeleton.parent[name] in fingers for name in fingers)
 
 
@@ -254,7 +254,7 @@ def _kind_of(name: str) -> Kind | None:
 
 
 def _kind(joints: Sequence[str]) -> Kind | None:
-    """What at least half of the names say."""
+    """Kind that at least half of the names say."""
     kinds = [_kind_of(name) for name in joints]
     likely = max(dict.fromkeys(kinds), key=kinds.count)
     return likely if 2 * kinds.count(likely) >= len(kinds) else None

@@ -1,4 +1,4 @@
-"""Where the links of a URDF stand and how far their shapes reach, before there is a robot."""
+"""Places of a URDF's links and reach of their shapes, before there is a robot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a URDF says of a gripper: its number, which end is open, how far its fingers are apart, where their tips are."""
+"""A gripper in a URDF: its number, its open end, the distance of its fingers, the places of their tips."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class _Jaws:
     def opening(
         self, fingers: Mapping[str, tuple[float, float]], lower: float, upper: float
     ) -> tuple[float | None, dict[str, float], float]:
-        """How far they part [m], the fingers' values when closed, and the driver's value when open."""
+        """Distance that they part [m], the fingers' values when closed, and the driver's value when open."""
         partings = self._partings(fingers)
         pair = self._pairs[int(np.argmax(partings))]
         at_lower, at_upper = ({name: ends[end] for name, ends in fingers.items()} for end in (0, 1))
@@ -244,7 +244,7 @@ class _Jaws:
         return np.asarray((seen.min(axis=0) + seen.max(axis=0)) / 2)
 
     def _reach(self, at: Mapping[str, Float64]) -> float | None:
-        """How far the fingers' shapes reach along z."""
+        """Reach of the fingers' shapes along z."""
         shown = [link for branch in self._branches for link in branch if link in self._corners]
         return max((float((self._seen(link, at) @ self._z).max()) for link in shown), default=None)
 

@@ -25,7 +25,7 @@ class Placeholder:
 
 
 def placeholder(joint: Joint) -> Placeholder | None:
-    """What stands in for limits of the joint that cannot be used; None where the URDF's can."""
+    """Substitute for limits of the joint that cannot be used; None where the URDF's can."""
     reasons = [*_positions(joint), *_speeds(joint)]
     if not reasons:
         return None

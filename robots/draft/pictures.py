@@ -26,7 +26,7 @@ _COLOUR = "0.55 0.58 0.63 1"
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """What became of the shapes: `copied` are files, `missing` are meshes that were not found or cannot be read.
+    """Results for the shapes: `copied` are files, `missing` are meshes that were not found or cannot be read.
 
     `drawn` are links that stand-ins show, `plain` are links whose material was not declared.
     """
@@ -158,7 +158,7 @@ class _Work:
             yield _visual(way / 2, f"0 {pitch:.6f} {yaw:.6f}", stick)
 
     def _is_frame(self, joint: Joint) -> bool:
-        """Whether it leads to a mere name of a place, as that between fingertips."""
+        """True if the joint leads to a mere name of a place, as that between fingertips."""
         link = next(link for link in self._robot.findall("link") if link.get("name") == joint.child)
         leads_on = any(other.parent == joint.child for other in self._tree.joints.values())
         return joint.kind == "fixed" and not leads_on and link.find("visual") is None
@@ -174,7 +174,7 @@ def _visual(centre: Float64, rpy: str, shape: ET.Element) -> ET.Element:
 
 
 def _places(source: Path, named: str) -> Iterator[Path]:
-    """Where a mesh that the URDF `source` names may lie: beside it, or in its package somewhere above or beside."""
+    """Paths at which a mesh of the URDF `source` may lie: beside it, or in its package above or beside."""
     scheme, separator, rest = named.partition("://")
     folder = source.resolve().parent
     if not separator:

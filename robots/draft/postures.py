@@ -106,7 +106,7 @@ class Postures:
         return tuple(sorted(found))
 
     def _touching(self, q: Float64) -> NDArray[np.intp]:
-        """How many pairs are too near, and how many arms too low [...]."""
+        """Count of pairs that are too near, and of arms too low [...]."""
         near = (self._clearance.distances(q) < CLEAR).sum(axis=-1)
         return np.asarray(near + (self._heights(q) < _LOWEST).sum(axis=-1))
 
@@ -160,7 +160,7 @@ class Postures:
         return np.asarray(best.round(3))
 
     def _costs(self, arm: Group, q: Float64, home: Float64) -> Float64:
-        """How far from where fingertips are to be, how far from down, how near to limits, how far from home."""
+        """Cost of a posture: fingertips off their place, off down, joints near limits, distance from home."""
         at = self._tips(arm, q)
         wanted = np.array([self._side(arm) * _ASIDE, _AHEAD, _HEIGHT])
         away = np.linalg.norm(at[:, :3, 3] - wanted, axis=-1) / 0.1
@@ -173,7 +173,7 @@ class Postures:
         return np.asarray(away + 4 * upright + 4 * tight + turned)
 
     def _obstacles(self, q: Float64, home: Float64) -> Float64:
-        """How deep links would be in each other or fingertips too low, at the posture or on the way to it."""
+        """Depth of links in each other or of fingertips too low, at the posture or on the way to it."""
         way = home + _LOOKED_AT[:, None, None] * (q - home)
         deep = np.maximum(2 * CLEAR - self._apart(way), 0.0) + np.maximum(
             _LOWEST - self._heights(way), 0.0

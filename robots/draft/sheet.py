@@ -1,4 +1,4 @@
-"""What a draft declares: the tables of robot.toml as they are guessed, before they are written down."""
+"""Declarations of a draft: the tables of robot.toml as they are guessed, before they are written down."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _ends(tree: Urdf, name: str) -> tuple[float, float]:
 
 
 def _pinned(tree: Urdf, limb: Limb, limbs: Sequence[Limb]) -> dict[str, float]:
-    """Where optional groups stay in drawings while nobody moves them, as far as that is not 0; at the first arm."""
+    """Joints of optional groups in drawings while they do not move, if they are not 0; at the first arm."""
     if limb.kind != "arm" or limb is not next(other for other in limbs if other.kind == "arm"):
         return {}
     others = [other for other in limbs if other.kind in ("torso", "head", "other", "base")]
@@ -190,7 +190,7 @@ def _cameras(arms: Sequence[str]) -> dict[str, str]:
 
 
 def _stand(tree: Urdf, limbs: Sequence[Limb]) -> Place:
-    """Where the root stands such that arms reach over the table: on it, or on the floor before it."""
+    """Place of the root such that arms reach over the table: on it, or on the floor before it."""
     at = places(tree, {})
     shoulders: list[Float64] = [
         at[tree.joint(limb.joints[0]).child][:3, 3] for limb in limbs if limb.kind == "arm" and limb.joints

@@ -137,7 +137,7 @@ def _numbers(numbers: Iterable[float]) -> str:
 
 
 def readme(name: str, sheet: Sheet, pictures: Pictures) -> str:
-    """What was guessed and has to be verified, as a list to tick off."""
+    """List to tick off of what was guessed and has to be verified."""
     numbers = sum(len(group.numbers) for group in sheet.groups if not group.optional)
     lines = [
         f"# {sheet.title}",

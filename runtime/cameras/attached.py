@@ -68,7 +68,7 @@ class Attached(Source):
         return self._source.why(fault)
 
     def camera_health(self) -> dict[str, dict[str, Any]]:
-        """How each camera is: kind, where, condition, since when, why, the age of its newest picture [s]."""
+        """Health of each camera: kind, place, condition, since when, why, age of its newest picture [s]."""
         return {camera.key: self._told(camera) for camera in self._cameras}
 
     def news(self) -> list[Event]:

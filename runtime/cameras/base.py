@@ -1,4 +1,4 @@
-"""What a camera of our own is: its settings, where it is reached, its newest picture, how it is."""
+"""A camera of our own: its settings, its address, its newest picture, its health."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class CameraError(TransportError):
 
 
 class CameraSettings(Settings):
-    """What is done with the pictures of any camera, in this order: colours, crop, rotate, flip, size."""
+    """Processing of the pictures of any camera, in this order: colours, crop, rotate, flip, size."""
 
     colours: Literal["rgb", "bgr"] = "rgb"
     """"bgr" for a camera that has red and blue in each other's place."""
@@ -53,7 +53,7 @@ class CameraSettings(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where the pictures of a camera come from, as FFmpeg takes it."""
+    """Address of a camera's pictures, as FFmpeg takes it."""
 
     url: str = field(repr=False)  # may hold a password
     shown: str  # for people
@@ -72,7 +72,7 @@ class Shot:
 
 
 class Condition(StrEnum):
-    """How a camera is."""
+    """Condition of a camera."""
 
     OPENING = "opening"  # no picture yet
     LIVE = "live"
@@ -82,7 +82,7 @@ class Condition(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """How a camera is, since when on our clock [s], and why."""
+    """Condition of a camera, its beginning on our clock [s], and its reason."""
 
     condition: Condition
     since: float
@@ -108,7 +108,7 @@ class Camera(ABC):
 
     @abstractmethod
     def health(self) -> Health:
-        """How it is now."""
+        """Present health of the camera."""
 
     @abstractmethod
     def leave(self) -> None:

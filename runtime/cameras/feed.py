@@ -33,7 +33,7 @@ class Backlog:
         self._waiting = 0  # packets in a row that nobody had to wait for
 
     def passes(self, waited: float) -> bool:
-        """Whether the packet that was waited for so long [s] is to be passed over, as newer ones are there already.
+        """True if the packet waited for so long [s] is to be passed over, as newer ones are there already.
 
         The first few are not, because two may well come at once; nor is each hundredth: something is shown of a
         stream that never pauses.

@@ -1,4 +1,4 @@
-"""What was found where a camera should be, in words a person can act on."""
+"""Findings at a camera's address, in words on which the operator can act."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def found(error: Exception, address: Address, waited: float, allowed: float, ope
 
 
 def _device(error: Exception, address: Address) -> str:
-    """What is wrong with a device of this machine."""
+    """Sentence on what is wrong with a device of this machine."""
     number = getattr(error, "errno", None)
     if isinstance(error, FileNotFoundError):
         others = ", ".join(sorted(map(str, Path("/dev").glob("video*"))))
@@ -88,7 +88,7 @@ def _known(host: str) -> bool:
 
 
 def _content_type(url: str) -> str:
-    """What a server says that it sends; "" where it says nothing."""
+    """Content type that a server states; "" where it says nothing."""
     import http.client  # with these every process of a station would start later
     import urllib.error
     import urllib.request

@@ -1,4 +1,4 @@
-"""What the coordinator says of cameras that give no pictures, from media's report of them."""
+"""The coordinator's sentences on cameras that give no pictures, from media's report of them."""
 
 from __future__ import annotations
 

@@ -225,7 +225,7 @@ def _report(dataset: Path, problems: list[str]) -> int:
 
 
 def _told(info: layout.Info) -> list[str]:
-    """What training code takes for what: LeRobot goes by how names begin."""
+    """Inputs and outputs of a policy as training code takes them: LeRobot goes by how names begin."""
     names = {
         "inputs": [key for key in info["features"] if key.startswith("observation")],
         "outputs": [key for key in info["features"] if key.startswith("action")],

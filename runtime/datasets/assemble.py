@@ -95,7 +95,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Assembled:
-    """What came of it. `encoded` are videos whose pictures were coded again, `left_out` is what was not taken along."""
+    """Result. `encoded` are videos whose pictures were coded again, `left_out` is what was not taken on."""
 
     dataset: Path
     version: str
@@ -339,7 +339,7 @@ class _Assembly:
             shutil.copyfile(path, target)
 
     def _others(self) -> None:
-        """What is of no episode and not of the format: files of a single source go along, the rest is told."""
+        """Take along files of no episode and not of the format, from a single source only; report others."""
         for source in self._sources:
             root = source.dataset.root
             for path in sorted([*root.glob("*"), *(root / "meta").glob("*")]):

@@ -1,4 +1,4 @@
-"""What an imported episode has beside its joints and pictures: velocities, efforts, poses of its end effectors."""
+"""Streams of an imported episode beside joints and pictures: velocities, efforts, poses of end effectors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from runtime.datasets.reader import Dataset
 
 
 class _Kind(NamedTuple):
-    """Where a stream of a recording comes from: keys of a mapping and of an episode, and what columns are called."""
+    """Origin of a stream of a recording: keys of a mapping and of an episode, and names of columns."""
 
     mapped: str
     read: str
@@ -48,7 +48,7 @@ class Carried:
 
 
 def carried(dataset: Dataset, index: int, state: str) -> Carried:
-    """What episode `index` has beside the joints in `state`: as many numbers as these, or poses written as ours."""
+    """Streams of episode `index` beside the joints in `state`: as many numbers, or poses written as ours."""
     vectors: dict[str, Float32] = {}
     columns: dict[str, str] = {}
     names: Sequence[str] = ()
@@ -69,7 +69,7 @@ def carried(dataset: Dataset, index: int, state: str) -> Carried:
 
 
 def names_of(feature: Mapping[str, Any]) -> list[str]:
-    """What a feature calls its numbers, [] where it does not say."""
+    """A feature's names of its numbers; [] where it does not say."""
     names = feature.get("names")
     if isinstance(names, Mapping) and len(names) == 1:  # {"motors": [...]}, as some have it
         names = next(iter(names.values()))

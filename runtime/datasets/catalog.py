@@ -39,7 +39,7 @@ class Catalog:
 
     @classmethod
     def read(cls, root: Path) -> Catalog:
-        """What is committed in `root`; RecordingError where it is not whole, or of a version not written here."""
+        """Catalog committed in `root`; RecordingError if not whole, or of a version not written here."""
         if not (root / layout.INFO).exists():
             return cls(root, {}, (), (), (), ())
         info = layout.read_info(root)
@@ -89,7 +89,7 @@ class Catalog:
         return str(self.info.get("codebase_version", ""))
 
     def index_of(self, uuid: str) -> int | None:
-        """Where the episode `uuid` is published; None where it is not."""
+        """Index of the published episode `uuid`; None where it is not published."""
         return next((int(line["episode_index"]) for line in self.eva if line["uuid"] == uuid), None)
 
     def first_index(self, episode_index: int) -> int:
@@ -126,7 +126,7 @@ class Catalog:
         return replace(self, info=info_of({}, robot=robot, fps=fps, features=features, version=version))
 
     def line(self, index: int, tasks: Sequence[str], length: int) -> Line:
-        """What the list of episodes says of episode `index`: where it is, or will be, and what it holds."""
+        """Line of episode `index` in the list of episodes: where it is, or will be, and what it holds."""
         if index < len(self.episodes):
             return self.episodes[index] | {"tasks": list(tasks), "length": length}
         last = self.episodes[-1] if self.episodes else {}
@@ -181,7 +181,7 @@ class Catalog:
         return replace(changed, info={**self.info, **changed.totals()})
 
     def totals(self) -> dict[str, Any]:
-        """What info.json counts."""
+        """Counts in info.json."""
         count = len(self.episodes)
         totals = {
             "total_episodes": count,
@@ -227,7 +227,7 @@ class Catalog:
 
 
 def own_line(info: layout.Info, number: int, tasks: Sequence[str], length: int, first: int) -> Line:
-    """What the list of episodes says of episode `number`, whose files are its own; its rows begin at `first`."""
+    """Line of episode `number` in the list of episodes; its files are its own, its rows begin at `first`."""
     line: Line = {"episode_index": number, "tasks": list(tasks), "length": length}
     if info["codebase_version"] != layout.V30:
         return line

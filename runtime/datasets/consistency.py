@@ -27,7 +27,7 @@ _ROUNDING = 2.0**-24  # relative, of one sum in single precision
 
 
 class _Remark(str):
-    """What is worth saying and damages nothing."""
+    """Remark on something that damages nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ def _totals(info: layout.Info, episodes: list[Line], tasks: list[Line]) -> Itera
 
 
 def _places(info: layout.Info, episodes: list[Line]) -> Iterator[str]:
-    """What the list of episodes of v3.0 says of rows and videos that follow each other."""
+    """Contradictions in v3.0's list of episodes about rows and videos that follow each other."""
     first = 0
     for line in episodes:
         given = line["dataset_from_index"], line["dataset_to_index"]
@@ -236,7 +236,7 @@ def _column_statistic(key: str, known: np.ndarray[Any, Any], statistic: Mapping[
 def rounded(
     name: str, given: np.ndarray[Any, Any], value: np.ndarray[Any, Any], known: np.ndarray[Any, Any]
 ) -> bool:
-    """Whether single precision explains the difference: LeRobot sums float32, and its variance is E[x^2] - E[x]^2.
+    """True if single precision explains it: LeRobot sums float32, and its variance is E[x^2] - E[x]^2.
 
     Source: a sum of n numbers one after the other is off by at most n u sum|x|, u = 2^-24 (Higham, Accuracy and
     Stability of Numerical Algorithms, 2002, section 4.2); of the variance's three factors each is one such sum.

@@ -67,7 +67,7 @@ def encode(span: Span, target: Path, frames: int, fps: float) -> None:
 
 
 def _is_ready(path: Path, frames: int, fps: float) -> bool:
-    """Whether the whole file is what is wanted: these frames at these times, its index at the front."""
+    """True if the whole file is what is wanted: these frames at these times, its index at the front."""
     with Pictures(path) as whole:
         times = whole.times
     if len(times) != frames or np.abs(np.array(times) - np.arange(frames) / fps).max() > TOLERANCE:
@@ -77,7 +77,7 @@ def _is_ready(path: Path, frames: int, fps: float) -> bool:
 
 
 def _index_first(file: Any) -> bool:
-    """Whether the box `moov` comes before `mdat`."""
+    """True if the box `moov` comes before `mdat`."""
     while len(head := file.read(8)) == 8:
         size, kind = int.from_bytes(head[:4], "big"), head[4:]
         if kind in (b"moov", b"mdat"):

@@ -1,4 +1,4 @@
-"""What the metadata of a dataset list of its episodes and tasks, whichever version wrote them."""
+"""Episodes and tasks in the metadata of a dataset, whichever version wrote them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.datasets.layout import Info, Line
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Where the pictures of one episode and camera lie."""
+    """Place of the pictures of one episode and camera."""
 
     path: Path
     start: float | None = None  # time of the first one [s]; None: the file holds this episode alone
@@ -68,7 +68,7 @@ def statistic_lines(root: Path, info: Info) -> list[Line]:
 
 
 def entry(root: Path, info: Info, line: Line) -> EpisodeEntry:
-    """What a line of the list of episodes says; raises RecordingError where it lacks anything."""
+    """Entry from a line of the list of episodes; raises RecordingError where it lacks anything."""
     v30 = info["codebase_version"] == layout.V30
     try:
         index = int(line["episode_index"])

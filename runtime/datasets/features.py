@@ -1,4 +1,4 @@
-"""How a column is declared in info.json and stored in parquet, so that both always say the same."""
+"""Declaration of a column in info.json and its storage in parquet, so that both always say the same."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _hugging_face(feature: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def differences(stated: Mapping[str, Mapping[str, Any]], new: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """What distinguishes the features of a dataset from those of a new episode, one sentence each."""
+    """Differences between the features of a dataset and those of a new episode, one sentence each."""
     found = [f"the dataset has no {key!r}" for key in new if key not in stated]
     found += [f"the episode has no {key!r}" for key in stated if key not in new]
     for key in stated:

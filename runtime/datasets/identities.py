@@ -130,7 +130,7 @@ def _told(root: Path) -> list[dict[str, Any]]:
 
 
 def _names_episode(line: Mapping[str, Any]) -> bool:
-    """Whether it names an episode by a uuid: that becomes a folder, and whoever made the dataset has written it."""
+    """True if it names an episode by a uuid: that becomes a folder, and the dataset's maker wrote it."""
     try:
         return "episode_index" in line and str(UUID(line["uuid"])) == line["uuid"]
     except (AttributeError, KeyError, TypeError, ValueError):

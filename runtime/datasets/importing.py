@@ -37,7 +37,7 @@ ACTION = "action"
 
 @dataclass(frozen=True, slots=True)
 class Whose:
-    """What a dataset does not say itself: `state`, the column of measured joints; `robot`, whose numbers they are."""
+    """Facts missing in a dataset: `state`, the column of measured joints; `robot`, whose numbers they are."""
 
     state: str = ""
     robot: str = ""

@@ -54,7 +54,7 @@ class RecordedJournal:
         return self.episode.layout.cameras
 
     def has_stream(self, name: str) -> bool:
-        """Whether the vector stream `name` was recorded."""
+        """True if the vector stream `name` was recorded."""
         return name in self.episode.layout.streams
 
     def vectors(self, name: str) -> Float32:

@@ -1,4 +1,4 @@
-"""What is done to whole datasets: export to the other version, merge, split, delete episodes, repair."""
+"""Operations on whole datasets: export to the other version, merge, split, delete episodes, repair."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def delete(
 
 
 def fingerprint(dataset: Path) -> str:
-    """What changes with every episode that comes, goes or is written anew at another length; RecordingError."""
+    """Digest that changes with each episode added, deleted or rewritten at another length; RecordingError."""
     root = Path(dataset)
     info = layout.read_info(root)
     told = [

@@ -30,7 +30,7 @@ class PictureSequence(ABC):
 
     @abstractmethod
     def __len__(self) -> int:
-        """How many pictures there are."""
+        """Count of pictures."""
 
     @abstractmethod
     def __getitem__(self, index: int) -> UInt8:
@@ -200,7 +200,7 @@ class Pictures(PictureSequence):
             del self._kept[next(iter(self._kept))]
 
     def _reachable(self, index: int) -> bool:
-        """Whether decoding on is the way: the frame lies ahead and no key frame lies between."""
+        """True if decoding on is the way: the frame lies ahead and no key frame lies between."""
         if self._upcoming is None or index < self._upcoming:
             return False
         return index == self._upcoming or self._key_before(index) <= self._times[self._upcoming]
@@ -247,7 +247,7 @@ class StoredPictures(PictureSequence):
         return picture
 
     def row(self, index: int) -> dict[str, Any] | None:
-        """What is stored of picture `index`, with what lies in a file of its own read; None where there is nothing."""
+        """Stored row of picture `index`, with a file of its own read in; None where nothing is stored."""
         stored = self._rows[index]
         if stored is None:
             return None

@@ -43,7 +43,7 @@ PIXELS = "yuv420p"  # what our recorder writes
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Where an episode went."""
+    """Place of a published episode."""
 
     dataset: Path
     episode_index: int
@@ -110,7 +110,7 @@ def never_published(manifest: Mapping[str, object]) -> str:
 
 
 def _discarded(journal: RecordedJournal) -> str:
-    """Who has discarded an episode of a data folder, in a sentence; "" where nobody has."""
+    """Sentence on the discarding of an episode of a data folder, with its author; "" if not discarded."""
     label = newest(journal.folder.absolute().parent.parent, str(journal.manifest["uuid"]))
     if label is None or not label.discarded:
         return ""
@@ -179,7 +179,7 @@ def _publish(
 
 
 def _with_success(journal: RecordedJournal, catalog: Catalog, success: bool | None) -> bool:
-    """Whether the episode gets a success column: as the dataset has it, or, in a new one, if it is known."""
+    """True if the episode gets a success column: as the dataset has it, or, in a new one, if it is known."""
     if not catalog.info:
         return success is not None
     wanted = SUCCESS in catalog.features
@@ -243,7 +243,7 @@ def _eva(journal: RecordedJournal, columns: Columns, success: bool | None) -> di
 
 
 def _provenance(columns: Mapping[str, NDArray[np.generic]], flag: str, true: str, false: str) -> str | None:
-    """Where a pose column comes from, in all rows, or "mixed": then the flag column says it row by row."""
+    """Source of a pose column in all rows, or "mixed": then the flag column says it row by row."""
     if flag not in columns:
         return None
     flags = columns[flag]

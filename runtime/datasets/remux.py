@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class VideoFacts:
-    """What a video is, as its stream says."""
+    """Facts about a video, as its stream says."""
 
     height: int
     width: int

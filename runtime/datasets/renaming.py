@@ -20,7 +20,7 @@ class Names:
 
     @property
     def empty(self) -> bool:
-        """Whether everything keeps its name."""
+        """True if everything keeps its name."""
         return not self.new_by_old
 
     def new(self, old: str) -> str:

@@ -21,7 +21,7 @@ SUFFIXES = {STREAMS: ".parquet", "annotations": ".jsonl", "reviews": ".jsonl"}
 
 
 def side_file(root: Path, kind: str, uuid: str) -> Path:
-    """Where what is said of the episode `uuid` lies; RecordingError for a kind or a uuid that is none."""
+    """Path of the side file of the episode `uuid`; RecordingError for a kind or a uuid that is none."""
     if kind not in SUFFIXES:
         raise RecordingError(f"{kind!r} is no kind of side file, there are {sorted(SUFFIXES)}")
     try:
@@ -38,7 +38,7 @@ def side_files(root: Path, uuid: str) -> dict[str, Path]:
 
 
 def read_sides(given: Mapping[str, Path]) -> dict[str, bytes]:
-    """What publication is given of an episode by kind ("annotations", "reviews"); JSON Lines are checked."""
+    """Publication's side files of an episode by kind ("annotations", "reviews"); JSON Lines are checked."""
     return {kind: _content(kind, Path(path)) for kind, path in given.items()}
 
 

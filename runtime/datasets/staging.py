@@ -215,7 +215,7 @@ class Staging:
         recover(self._root)
 
     def path(self, final: Path) -> Path:
-        """Where to prepare the file that goes to `final`."""
+        """Path at which to prepare the file that goes to `final`."""
         return self._folder / str(final.relative_to(self._root)).replace("/", "|")
 
     def write(self, final: Path, content: bytes) -> None:

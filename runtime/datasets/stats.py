@@ -73,7 +73,7 @@ def picture_statistic(pictures: PictureSequence) -> Statistic:
 
 
 class _Histogram:
-    """How often each value 0 to 255 occurs, by channel: everything else follows from it exactly."""
+    """Count of each value 0 to 255, by channel: everything else follows from it exactly."""
 
     def __init__(self) -> None:
         self._pictures = 0

@@ -1,4 +1,4 @@
-"""What kinematics answers: where the end effectors are, and which joints put them somewhere."""
+"""Interface of kinematics: poses of the end effectors, and joints that put them somewhere."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class KinematicsError(RuntimeFault):
 
 
 class IkFlag(IntFlag):
-    """What is to be known of a solved frame; bits of IkResult.flags."""
+    """Findings on a solved frame; bits of IkResult.flags."""
 
     OVER_TOLERANCE = 1
     AT_LIMIT = 2  # a joint rests on its limit
@@ -33,7 +33,7 @@ class IkFlag(IntFlag):
 
 
 class KinematicsSettings(Settings):
-    """What every backend lets a deployment choose."""
+    """Settings that every backend has."""
 
     position_weight: Positive = 50.0
     """Cost of a metre beside the pose."""
@@ -75,7 +75,7 @@ class IkResult:
 
 
 class Forward(ABC):
-    """Where the end effectors of one robot are: arms in its order, poses in each arm's declared frame."""
+    """Poses of the end effectors of one robot: arms in its order, poses in each arm's declared frame."""
 
     @abstractmethod
     def forward(self, q: Float64) -> Float64:

@@ -244,7 +244,7 @@ def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: f
 
 
 def _room(arm: Record, q: Float64) -> float:
-    """How far the joint nearest to a limit is from it in joints [D], as a part of what is kept; inf without a choice.
+    """Distance of joints [D] to the nearest limit, as a part of what is kept; inf without a choice.
 
     Sides to which home itself is nearer do not count: there is no more room to go to.
     """

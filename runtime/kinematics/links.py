@@ -1,4 +1,4 @@
-"""Where all parts of a robot are, in the form that the 3D scene reads, in microseconds."""
+"""Poses of all parts of a robot, in the form that the 3D scene reads, in microseconds."""
 
 from __future__ import annotations
 

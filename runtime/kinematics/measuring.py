@@ -1,4 +1,4 @@
-"""How well solved joints meet their targets, whichever backend solved them: errors and flags of every frame."""
+"""Accuracy of solved joints, whichever backend solved them: errors and flags of every frame."""
 
 from __future__ import annotations
 

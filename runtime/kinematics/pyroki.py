@@ -135,7 +135,7 @@ class _Arm:
         return self._cut(q, asked, steps[:rows], held), low, high
 
     def _bounds(self, asked: _Asked, rows: int) -> tuple[Float64, Float64]:
-        """What is held before the anchor's row [n], and how far each row may be from the one before [rows, n]."""
+        """Joints held before the anchor's row [n], and each row's largest step from the last [rows, n]."""
         steps = np.full((rows, len(self.dims)), np.inf)
         held = (asked.seed if asked.anchor is None else np.asarray(asked.anchor, np.float64))[self.dims]
         if asked.dt is not None:
@@ -156,7 +156,7 @@ class _Arm:
 
 
 class _Libraries(NamedTuple):
-    """What PyRoki consists of, imported."""
+    """Libraries of PyRoki, imported."""
 
     jax: ModuleType
     jaxlie: ModuleType

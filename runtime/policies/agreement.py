@@ -1,4 +1,4 @@
-"""What a policy server says of itself, held against what the deployment says: no side overrides the other."""
+"""A policy server's statement of itself, held against the deployment's: no side overrides the other."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _COMPARED = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """What a deployment says of a policy: its request, and the rows of its answers (`rate` in Hz)."""
+    """A deployment's statement of a policy: its request, and the rows of its answers (`rate` in Hz)."""
 
     request: RequestSettings
     space: Space
@@ -108,7 +108,7 @@ def _pose_pairs(said: Mapping[str, Any], side: str, pose: PoseFormat) -> Iterato
 
 
 def _orientation(said: object, here: str) -> object:
-    """What a server calls an orientation, in our words; ours where its word leaves that open."""
+    """A server's name of an orientation, in our words; ours where its word leaves that open."""
     meant = _ORIENTATIONS.get(str(said).lower(), (said,))
     return here if here in meant else meant[0]
 

@@ -1,4 +1,4 @@
-"""What the rows of a policy server's answers are, where the wire leaves that open: declared in the deployment."""
+"""Meaning of a policy server's rows, where the wire leaves it open: declared in the deployment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a policy is: something that answers an observation with a chunk of actions."""
+"""Interface of a policy: it answers an observation with a chunk of actions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.policies.reach import Dial
 
 @dataclass(frozen=True, slots=True)
 class PolicyInfo:
-    """What the policy says of itself when it is reached; None where it does not say."""
+    """The policy's statement of itself when it is reached; None where it does not say."""
 
     name: str
     action_space: Space | None = None
@@ -50,7 +50,7 @@ class Policy(ABC):
         """The chunk for this observation; raises PolicyError. A connection that timed out is dropped, not reused."""
 
     def glance(self, observation: Observation) -> None:  # noqa: B027  # most see only what they are asked about
-        """What is seen now, every `glances_s` of a run; waits for nothing, least of all for a request under way."""
+        """Take in an observation, every `glances_s` of a run, without waiting even for a pending request."""
 
     @abstractmethod
     def reset(self) -> None:

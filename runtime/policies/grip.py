@@ -63,7 +63,7 @@ class Grip:
 
 
 def _columns(robot: Robot, poses: PoseRows | None) -> list[tuple[int, int]]:
-    """Where in a row a gripper is, and which of the robot's it is."""
+    """Columns of a row that are grippers, each with the index of the robot's gripper."""
     dims = list(robot.gripper_dims)
     if poses is None:
         return [(dim, gripper) for gripper, dim in enumerate(dims)]

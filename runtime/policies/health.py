@@ -1,4 +1,4 @@
-"""Whether a policy server is well: the HTTP page that some answer beside their websocket."""
+"""Health of a policy server: the HTTP page that some answer beside their websocket."""
 
 from __future__ import annotations
 

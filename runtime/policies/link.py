@@ -67,12 +67,12 @@ class WebsocketLink:
 
     @property
     def is_open(self) -> bool:
-        """Whether a connection is held; the peer may have gone since."""
+        """True if a connection is held; the peer may have gone since."""
         return self._connection is not None
 
     @property
     def was_left(self) -> bool:
-        """Whether the peer is known to have ended the connection that is held, as servers do with idle ones."""
+        """True if the peer is known to have ended the held connection, as servers do with idle ones."""
         from websockets.protocol import State
 
         return self._connection is not None and self._connection.state is not State.OPEN
@@ -108,7 +108,7 @@ class WebsocketLink:
             return self._receive(connection, deadline, "an answer", seconds)
 
     def acknowledged(self, request: bytes, seconds: float, text: str) -> bytes | None:
-        """What answers a request that some servers acknowledge with exactly `text`: None for that, else the bytes.
+        """Answer to a request: None if it is `text`, with which some servers acknowledge it, else the bytes.
 
         Any other text is the server's error; so is every text that answers an `exchange`.
         """

@@ -1,4 +1,4 @@
-"""What a deployment says of a policy's state and rows, where its server says neither: settings, and chunks of them."""
+"""Meaning of state and rows in a deployment, where the server states none: settings, and chunks of rows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class MeaningSettings(AnswerSettings):
-    """What the numbers of state and rows are, and how pictures are made."""
+    """Meaning of the numbers of state and rows, and form of pictures."""
 
     observation_space: Space = "joint"
     """What the state is: joints, or poses."""
@@ -32,7 +32,7 @@ class MeaningSettings(AnswerSettings):
 
     @property
     def sees_poses(self) -> bool:
-        """Whether the answers depend on the poses of an observation."""
+        """True if the answers depend on the poses of an observation."""
         relative = self.action_space == "eef" and self.action_mode != "absolute"
         return self.observation_space == "eef" or relative
 
@@ -50,7 +50,7 @@ class MeaningSettings(AnswerSettings):
         return RequestLayout(settings, robot)
 
     def widths(self, robot: Robot) -> tuple[int, int]:
-        """How many numbers the state and a row have; ConfigurationError where a format does not fit the robot."""
+        """Widths of the state and of a row; ConfigurationError where a format does not fit the robot."""
         state = poses_of(self.observation_space, self.observation_pose, robot, "observation_pose")
         rows = poses_of(self.action_space, self.action_pose, robot, "action_pose")
         return robot.dim if state is None else state.width, robot.dim if rows is None else rows.width

@@ -23,7 +23,7 @@ class Config(Settings):
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> NoPolicy:
-    """What refuses to be asked."""
+    """A policy that refuses to be asked."""
     return NoPolicy()
 
 

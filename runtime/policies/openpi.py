@@ -171,7 +171,7 @@ class OpenpiPolicy(WebsocketPolicy):
         )
 
     def _model_rows(self, reply: Mapping[str, Any], given: Float32) -> Float32 | None:
-        """What is given back to be continued, where that is something else than the robot's rows."""
+        """Rows that are given back to be continued, where they are not the robot's rows."""
         origin = reply.get("origin_actions") if self._dialect.continues_model_rows else None
         if origin is not None:
             return action_rows("origin_actions", origin)

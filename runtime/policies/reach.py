@@ -87,7 +87,7 @@ def _knock(
 
 
 def _addresses(host: str, port: int, seconds: float) -> list[Address]:
-    """What the host's name stands for, asked in a thread because the resolver itself knows no deadline."""
+    """Addresses of the host's name, resolved in a thread because the resolver itself knows no deadline."""
     found: queue.SimpleQueue[list[Address] | OSError] = queue.SimpleQueue()
 
     def resolve() -> None:

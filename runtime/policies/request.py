@@ -24,7 +24,7 @@ Dims = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
 
 
 class RequestSettings(Settings):
-    """How a policy server wants observations: the keys of its request, and what goes under them."""
+    """A policy server's format of observations: the keys of its request, and their contents."""
 
     observation_space: Space = "joint"
     """What is sent as state: joints, or poses."""
@@ -52,7 +52,7 @@ class RequestSettings(Settings):
 
 
 class RequestLayout:
-    """Where state, pictures and instruction go; ConfigurationError where that does not fit the robot."""
+    """Places of state, pictures and instruction; ConfigurationError where they do not fit the robot."""
 
     def __init__(self, settings: RequestSettings, robot: Robot) -> None:
         self._settings = settings

@@ -15,7 +15,7 @@ Numbers = Annotated[list[float], Field(min_length=1)]
 
 
 class Statistics(Settings):
-    """What -1 and 1 stand for, per number of a row: the minimum and maximum, or quantiles, of the training data."""
+    """Meaning of -1 and 1, per number of a row: minimum and maximum, or quantiles, of the training data."""
 
     low: Numbers
     """What -1 stands for."""

@@ -27,7 +27,7 @@ class Watchdog:
 
     @contextlib.contextmanager
     def watching(self, seconds: float) -> Iterator[Callable[[], bool]]:
-        """What is done in this context is cut after `seconds`; what is given says whether that was so."""
+        """Cut the work of this context after `seconds`; the function given returns True if that was so."""
         self._begin(time.monotonic() + seconds)
         try:
             yield lambda: self._fired

@@ -1,4 +1,4 @@
-"""What policies on a websocket share: a server with deadlines, one conversation at a time, metadata first."""
+"""Common parts of websocket policies: a server with deadlines, one conversation at a time, metadata first."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _REPEATED = "the answer is byte for byte the one before, to another question"
 
 
 class ServerSettings(Settings):
-    """Where a policy server on a websocket listens, and how long it may take."""
+    """Address and deadlines of a policy server on a websocket."""
 
     url: Annotated[str, Field(pattern=r"^wss?://.+")] = "ws://127.0.0.1:8000"
     """Where the server listens: ws or wss, with a path where it has one."""
@@ -69,7 +69,7 @@ class WebsocketPolicy(Policy):
 
     @abstractmethod
     def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
-        """What the server says of itself; PolicyError, and the connection is dropped, where it is the wrong one."""
+        """The server's statement of itself; PolicyError and a dropped connection if it is the wrong one."""
 
     def connect(self) -> PolicyInfo:
         """Reach the server and read its metadata; an open connection is replaced."""

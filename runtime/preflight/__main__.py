@@ -89,7 +89,7 @@ def _seconds(text: str) -> float:
 
 
 def _for_a_parent() -> int:
-    """What is asked is one line of JSON on standard input, the answer one on standard output; we end with the input.
+    """Answer one line of JSON on standard input with one on standard output; we end with the input.
 
     The line: "tree" (a resolved deployment) or "deployment" (a file); "changes", tables that go on top as those of a
     set-up; "deadline_s" or null.

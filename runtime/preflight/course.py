@@ -110,7 +110,7 @@ class Course:
 
     @property
     def _call(self) -> str:
-        """What was, or is, under way: "connect" until the policy is asked, "" after an answer has come back."""
+        """Call under way, or the last: "connect" until the policy is asked, "" after an answer came back."""
         policy = self._policy
         if policy is None:
             return ""

@@ -1,4 +1,4 @@
-"""What a preflight has found, for programs and for people."""
+"""Findings of a preflight, for programs and for people."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """How it ended, in which stage, and everything that was measured until then.
+    """Verdict, its stage, and everything that was measured until then.
 
     `endpoint` is the policy's address, "" for one without a server; `name` is what it calls itself. `metadata` are as
     a page can show them: long values are cut. `notes` are sentences about what works and is worth knowing.
@@ -71,17 +71,17 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """Whether a set-up could go on from here."""
+        """True if a set-up could go on from here."""
         return self.verdict is Verdict.OK
 
     @property
     def warm_up_ms(self) -> float | None:
-        """How long the first answer took, which may compile a model."""
+        """Duration of the first answer [ms], which may compile a model."""
         return self._inferred(0)
 
     @property
     def latency_ms(self) -> float | None:
-        """How long the second answer took: what a run can expect."""
+        """Duration of the second answer [ms]: what a run can expect."""
         return self._inferred(1)
 
     def _inferred(self, number: int) -> float | None:
@@ -126,7 +126,7 @@ def words(chunk: Chunk) -> str:
 
 
 def shown(value: Any, depth: int = 0) -> Any:
-    """What a server said, as JSON may carry it and a person may read it: cut where it is long or deep."""
+    """Value from a server as JSON may carry it and a person may read it: cut where it is long or deep."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int):

@@ -1,4 +1,4 @@
-"""How a preflight can end: how far it came, what it found, what to do about it."""
+"""Ends of a preflight: how far it came, what it found, what to do about it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from runtime.core.errors import (
 
 
 class Stage(StrEnum):
-    """What is looked at, in this order."""
+    """Stages of a preflight, in this order."""
 
     RESOLVE = "resolve"  # the deployment, and that its policy fits its robot
     CONNECT = "connect"  # somebody listens, with TLS where the address says so
@@ -37,7 +37,7 @@ class Stage(StrEnum):
 
 
 class Verdict(StrEnum):
-    """What was found."""
+    """Finding of a preflight."""
 
     OK = "ok"
     MISCONFIGURED = "misconfigured"
@@ -57,7 +57,7 @@ class Verdict(StrEnum):
 
     @property
     def advice(self) -> str:
-        """What to do next, in one sentence; "" where nothing is to be done."""
+        """Next step in one sentence; "" where nothing is to be done."""
         return _ADVICE[self]
 
 
@@ -107,12 +107,12 @@ _OF_WORDS = (Verdict.WRONG_ACTION_SPACE, Verdict.CONTRADICTION)
 
 
 def verdict_of(error: RuntimeFault) -> Verdict:
-    """What an error of a policy, of its set-up or of its configuration amounts to."""
+    """Verdict on an error of a policy, of its set-up or of its configuration."""
     return next((verdict for kind, verdict in _FOUND if isinstance(error, kind)), Verdict.FAILED)
 
 
 def stage_of(verdict: Verdict, call: str) -> Stage:
-    """Where that was found; `call` is the policy's call that was under way, "" after the last of them."""
+    """Stage of that verdict; `call` is the policy's call that was under way, "" after the last of them."""
     if verdict is Verdict.MISCONFIGURED:
         return Stage.RESOLVE
     if call == "connect":

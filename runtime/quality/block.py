@@ -1,4 +1,4 @@
-"""What the checks are given: an episode's facts, and its rows in blocks, whatever it is stored as."""
+"""Input of the checks: an episode's facts, and its rows in blocks, whatever it is stored as."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ BLOCK_ROWS = 64  # at most, in a block
 
 @dataclass(frozen=True, slots=True)
 class Vector:
-    """What is to be known of a column of vectors before it is read.
+    """Facts about a column of vectors that are known before it is read.
 
-    `role` says what the checks make of it: "state" and "action" are joints, "poses" 8 numbers per arm (x, y, z,
+    `role` is its use by the checks: "state" and "action" are joints, "poses" 8 numbers per arm (x, y, z,
     quaternion w, x, y, z, gripper), "other" anything else. `sparse` columns may be missing in any row.
     """
 
@@ -68,7 +68,7 @@ class VideoEnd(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joints:
-    """What is known of the robot's numbers [D]; limits and velocities are NaN where they are not."""
+    """Facts about the robot's numbers [D]; limits and velocities are NaN where they are not known."""
 
     names: tuple[str, ...]
     groups: tuple[str, ...]  # of each number

@@ -44,7 +44,7 @@ class JournalSource(Source):
         self.vectors = {name: self._vector(name) for name in ("qpos", "action", *self._layout.streams)}
 
     def _outcome(self) -> tuple[int | None, list[tuple[str, Severity, str]]]:
-        """How many rows there should be, and what is to be said of how the recording ended."""
+        """Expected count of rows, and findings on how the recording ended."""
         path = self._folder / OUTCOME
         if not path.exists():
             return None, [("unfinished", "error", "it has no outcome: it is being recorded, or wants repair")]

@@ -10,7 +10,7 @@ from runtime.quality.settings import QualitySettings
 
 
 class Losses:
-    """What one camera has lost; rows beyond the end of its video are one flag."""
+    """Losses of one camera; rows beyond the end of its video are one flag."""
 
     def __init__(
         self, camera: str, fps: float, settings: QualitySettings, flags: Flags, end: VideoEnd | None

@@ -158,7 +158,7 @@ class Motion:
 
 
 class _Following:
-    """Whether each joint comes near what was commanded within `wait` rows, and after how many it is nearest."""
+    """Nearness of each joint to its command within `wait` rows, and the delay in rows where it is nearest."""
 
     def __init__(
         self, wait: int, joints: Joints, settings: QualitySettings, flags: Flags, stream: str

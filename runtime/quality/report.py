@@ -1,4 +1,4 @@
-"""What the checks say of an episode: flags with their frames, and whether it is clean."""
+"""Report of the checks on an episode: flags with their frames, and its verdict of clean or not."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Flag:
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """How often a kind was found, and in how many frames, also beyond what a report lists."""
+    """Counts of a kind's flags and of their frames, also beyond what a report lists."""
 
     flags: int
     frames: int
@@ -56,7 +56,7 @@ class Report:
 
     @property
     def clean(self) -> bool:
-        """Whether nothing but remarks was found."""
+        """True if nothing but remarks was found."""
         return self.worst in ("", "info")
 
     @property
@@ -106,7 +106,7 @@ class Flags:
         self._counts[flag.kind] = Count(before.flags + 1, before.frames + frames)
 
     def report(self, episode: str, frames: int, fps: float, figures: Mapping[str, float | None]) -> Report:
-        """What was found, worst first within the order of the frames."""
+        """Report of the findings, worst first within the order of the frames."""
         order = sorted(
             self._kept,
             key=lambda flag: (flag.first, -SEVERITIES.index(flag.severity), flag.kind, flag.stream),

@@ -1,4 +1,4 @@
-"""What counts as a fault of a recorded episode: every bound of the checks, with its reason."""
+"""Faults of a recorded episode: every bound of the checks, with its reason."""
 
 from __future__ import annotations
 

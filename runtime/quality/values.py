@@ -66,7 +66,7 @@ class _Column:
         self._worst: dict[int, int] = {}
 
     def _allowed(self, joints: Joints | None) -> np.ndarray[tuple[int], np.dtype[np.float64]] | None:
-        """How fast each number may change [1/s]; infinite where any change is right. None: it is not judged."""
+        """Allowed change of each number [1/s]; infinite where any change is right. None: it is not judged."""
         width, settings = self._vector.width, self._settings
         if self._vector.role == "poses":
             bound = np.full(width, np.inf)

@@ -21,7 +21,7 @@ class Picture(NamedTuple):
 
 
 def codings(repeats: int) -> int:
-    """How many frames have to be coded for so many repeats in a row; the rest are copies.
+    """Count of frames to be coded for so many repeats in a row; the rest are copies.
 
     A run of copies alternates between two key frames and ends with the second, so that an odd one has a
     repeat of its own before it.
@@ -30,7 +30,7 @@ def codings(repeats: int) -> int:
 
 
 class Pace:
-    """What coding one frame takes at present [s]: slower at once, faster over some frames."""
+    """Present coding time of one frame [s]: slower at once, faster over some frames."""
 
     def __init__(self) -> None:
         self.coding_s = _GUESS_S
@@ -85,7 +85,7 @@ class PictureQueue:
             return entry
 
     def coded(self, codings: int, seconds: float) -> None:
-        """What an entry took, for the pace."""
+        """Report the coding time of an entry, for the pace."""
         with self._changed:
             self._pace.see(codings, seconds)
 

@@ -1,4 +1,4 @@
-"""What a journal is, and the records it takes: dataset rows, executed ticks, raw chunks."""
+"""A journal, and the records it takes: dataset rows, executed ticks, raw chunks."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How an episode ended."""
+    """End of an episode."""
 
     status: Status
     reason: str

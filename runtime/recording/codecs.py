@@ -43,7 +43,7 @@ CODECS: Mapping[str, Codec] = {
 
 
 def options(name: str, preset: str, crf: int, gop: int) -> dict[str, str]:
-    """What the encoder is told."""
+    """Options of the encoder."""
     chosen = {"preset": preset, "crf": str(crf), "forced-idr": "1"}
     if name == "libx264":
         return {**chosen, "x264-params": f"keyint={gop}:min-keyint=1:{_X264_AT_ONCE}"}

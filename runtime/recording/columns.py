@@ -61,7 +61,7 @@ def rows_columns(layout: Layout, records: Sequence[RecordedRow]) -> dict[str, An
 
 
 def spread(times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far apart in time the streams [S, N] of each row were captured [s]; 0 where fewer than two are known."""
+    """Spread of the capture times of the streams [S, N] in each row [s]; 0 where fewer than two are known."""
     known = np.isfinite(times)
     latest = np.where(known, times, -np.inf).max(axis=0, initial=-np.inf)
     earliest = np.where(known, times, np.inf).min(axis=0, initial=np.inf)

@@ -69,7 +69,7 @@ SCHEMA = pa.schema(
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """What an export is made of."""
+    """Sources of an export."""
 
     manifest: Mapping[str, object]
     outcome: Mapping[str, object]
@@ -101,14 +101,14 @@ def exported(folder: Path) -> bytes:
 
 
 def place(manifest: Mapping[str, object], root: Path) -> Path:
-    """Where the run of that manifest is exported to; RecordingError where it has no uuid of its own."""
+    """Path of the export of that manifest's run; RecordingError where it has no uuid of its own."""
     prompt, mode, strategy = (manifest.get(key) for key in ("task", "mode", "strategy"))
     run = Layout.of(manifest).uuid
     return root / FOLDER / slug(prompt, NO_PROMPT) / slug(mode) / slug(strategy) / f"{run}.parquet"
 
 
 def is_exported(folder: Path, path: Path) -> bool:
-    """Whether `path` was written after the episode in `folder` had ended, or was repaired."""
+    """True if `path` was written after the episode in `folder` had ended, or was repaired."""
     try:
         return path.stat().st_mtime_ns >= (folder / "outcome.json").stat().st_mtime_ns
     except FileNotFoundError:

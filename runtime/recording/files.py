@@ -153,7 +153,7 @@ def _drafted(draft: Path) -> Iterator[BinaryIO]:
 
 
 def _lies_at(file: BinaryIO, path: Path) -> bool:
-    """Whether that is still its name: another writer may have put it in place."""
+    """True if `path` is still its name: another writer may have put its own file in place."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     except FileNotFoundError:

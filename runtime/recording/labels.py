@@ -1,4 +1,4 @@
-"""What people say of collected episodes: labels/<uuid>.jsonl in the data folder, one line each; the newest counts."""
+"""Users' labels of collected episodes: DATA/labels/<uuid>.jsonl, one line each; the newest counts."""
 
 from __future__ import annotations
 

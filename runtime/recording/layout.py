@@ -1,4 +1,4 @@
-"""What a manifest promises about an episode: the widths of its vectors, its cameras, its columns."""
+"""A manifest's promises about an episode: the widths of its vectors, its cameras, its columns."""
 
 from __future__ import annotations
 

@@ -17,13 +17,13 @@ FOLDER = "quarantine"
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What was found: `damage` as in Verdict.document; `seal` of the outcome then, "" for none, None: not known."""
+    """Finding: `damage` as in Verdict.document; `seal` of the outcome then, "" for none, None: not known."""
 
     damage: list[dict[str, Any]]
     seal: str | None
 
     def resolved(self, verdict: Verdict) -> bool:
-        """Whether the same recording is whole again: not another one that was sealed since."""
+        """True if the same recording is whole again: not another one that was sealed since."""
         if verdict.state == "sound":
             return verdict.seal == self.seal if self.seal else self.seal is None or not verdict.repaired
         files = {one["file"] for one in self.damage}
@@ -73,7 +73,7 @@ def _damage(told: Mapping[str, Any]) -> Damage:
 
 
 def _is_told(one: object) -> bool:
-    """Whether it is a table of Verdict.document."""
+    """True if it is a table of Verdict.document."""
     if not isinstance(one, dict) or one.keys() != {"file", "what", "rows", "times", "text"}:
         return False
     words = all(isinstance(one[name], str) for name in ("file", "what", "text"))
@@ -81,6 +81,6 @@ def _is_told(one: object) -> bool:
 
 
 def _are_spans(value: object, kind: type) -> bool:
-    """Whether it is a list of first and last."""
+    """True if it is a list of [first, last] pairs."""
     spans = value if isinstance(value, list) else [None]
     return all(isinstance(span, list) and [type(end) for end in span] == [kind, kind] for span in spans)

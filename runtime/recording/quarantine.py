@@ -30,9 +30,9 @@ def keep(verdict: Verdict) -> None:
 
 
 def marked(data: Path, uuid: str) -> list[dict[str, Any]]:
-    """What is wrong with an episode, a table per file as in Verdict.document; [] where nothing was found.
+    """Damage of an episode, a table per file as in Verdict.document; [] where nothing was found.
 
-    A mark that is none is nothing found: the next scrub makes it anew.
+    An invalid mark counts as nothing found: the next scrub makes it anew.
     """
     mark = mark_of(data, uuid)
     return mark.damage if mark else []

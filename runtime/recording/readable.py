@@ -1,4 +1,4 @@
-"""What is wrong with a recording of which there are no digests: what cannot be read, or only in part."""
+"""Damage of a recording without digests: what cannot be read, or only in part."""
 
 from __future__ import annotations
 

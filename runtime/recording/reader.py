@@ -45,7 +45,7 @@ class Episode:
         return lost if isinstance(lost, Mapping) else {}
 
     def shown(self, camera: str) -> int:
-        """How many rows, from the first, have a frame of that camera."""
+        """Count of rows, from the first, that have a frame of that camera."""
         return min(self.frames, int(self.lost[camera]["row"])) if camera in self.lost else self.frames
 
 

@@ -41,13 +41,13 @@ UNPROVABLE = "its outcome is lost, and with it whether its files are as they wer
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a repair found and did.
+    """Findings and actions of a repair.
 
-    "complete": had an outcome, nothing done. "restored": has its outcome back from its copy; `problem` is what had
-    become of it. "damaged": had one, and `problem` is what is not as it was recorded; nothing done, nobody can mend it.
-    "repaired": has one now; `problem` is what nobody can say any more of one that had been closed before. "recording":
-    is being written right now, nothing done. "unreadable": no manifest to go by, nothing done. "failed": `problem`
-    stopped it.
+    "complete": had an outcome, nothing done. "restored": has its outcome back from its copy; `problem` is
+    what had become of it. "damaged": had one, and `problem` is what is not as it was recorded; nothing done,
+    it cannot be mended. "repaired": has one now; `problem` is what cannot be known any more of one that had
+    been closed before. "recording": is being written right now, nothing done. "unreadable": no manifest to go
+    by, nothing done. "failed": `problem` stopped it.
     """
 
     path: Path
@@ -186,7 +186,7 @@ def _measured(path: Path, layout: Layout) -> _Found:
 
 
 def _unproven(path: Path, closed: bool) -> str:
-    """What nobody can say any more of an episode that was closed once, "" where nothing tells that it was."""
+    """Facts that cannot be known any more of an episode once closed, "" where nothing tells that it was."""
     data = data_of(path)
     table = place(read_document(path / MANIFEST), data) if data else None
     if table is not None and table.exists():

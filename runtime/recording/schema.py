@@ -1,4 +1,4 @@
-"""What a demonstration must have, as its manifest's `collection` says; every other episode has all there is."""
+"""Content required of a demonstration by its manifest's `collection`; other episodes have all there is."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Schema:
         return tuple(key for key in cameras if self.cameras is None or key in self.cameras)
 
     def records(self, column: str) -> bool:
-        """Whether that vector is, where it is there."""
+        """True if that vector is recorded, where it is there."""
         return self.columns is None or column in self.columns
 
     def streams(self, *, qvel: bool, effort: bool, posed: bool) -> dict[str, bool]:

@@ -1,4 +1,4 @@
-"""Whether a recording is still what was recorded: every file against the digests in its outcome."""
+"""Comparison of a recording with what was recorded: every file against the digests in its outcome."""
 
 from __future__ import annotations
 

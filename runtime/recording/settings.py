@@ -1,4 +1,4 @@
-"""How episodes are written: the encoder and its bounds, what is flagged, and when the disk counts as full."""
+"""Settings of recordings: the encoder and its bounds, flags, and when the disk counts as full."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How durations are spread, in constant memory: a histogram whose buckets are one per cent wide."""
+"""Spread of durations, in constant memory: a histogram whose buckets are one per cent wide."""
 
 from __future__ import annotations
 

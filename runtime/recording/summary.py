@@ -1,4 +1,4 @@
-"""What an outcome says about the rows of an episode, read back from its table."""
+"""Statements of an outcome about the rows of an episode, read back from its table."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ ADDED = (
 
 
 def added(column: str) -> bool:
-    """Whether older tables may lack that column."""
+    """True if older tables may lack that column."""
     return _among(column, frozenset[str]().union(*ADDED))
 
 
@@ -200,7 +200,7 @@ def _array(values: Any, kind: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class TableRead:
-    """What could be read of a table: its whole batches, and what is wrong with the rest."""
+    """Readable part of a table: its whole batches, and what is wrong with the rest."""
 
     table: Any  # pyarrow.Table
     torn_bytes: int  # after the last whole batch, its end mark aside

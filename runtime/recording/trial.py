@@ -1,4 +1,4 @@
-"""Whether this machine has the video encoder that a deployment asks for: found out by coding a few pictures."""
+"""Trial on this machine of the video encoder that a deployment asks for: a few pictures are coded."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def require(settings: RecordingSettings) -> None:
 
 
 def works(name: str) -> bool:
-    """Whether this machine can use that encoder as it is by default."""
+    """True if this machine can use that encoder as it is by default."""
     codec = CODECS[name]
     try:
         with ordinary_threads():

@@ -1,4 +1,4 @@
-"""What a look at the files of a recording came to, in words and as JSON."""
+"""Result of a look at the files of a recording, in words and as JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ State = Literal["sound", "damaged", "unsealed", "open"]
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """What is wrong with one file of an episode, and in which rows; of events.jsonl in which lines."""
+    """Damage of one file of an episode, and its rows; of events.jsonl its lines."""
 
     file: str
     what: str

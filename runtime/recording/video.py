@@ -135,7 +135,7 @@ class FragmentedVideo:
 
 
 class _Muxed:
-    """What the muxer has put out since the last write to the file; no `seek`, so that it never goes back."""
+    """Output of the muxer since the last write to the file; no `seek`, so that it never goes back."""
 
     def __init__(self) -> None:
         self.bytes = bytearray()

@@ -67,7 +67,7 @@ class Bench:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where blocks (x, y, yaw) and plate (x, y) lie after a reset; the first block is the task's."""
+    """Places of blocks (x, y, yaw) and plate (x, y) after a reset; the first block is the task's."""
 
     blocks: tuple[tuple[float, float, float], ...]
     plate: tuple[float, float]

@@ -39,7 +39,7 @@ class Block:
 
     @property
     def level(self) -> bool:
-        """Whether it lies flat."""
+        """True if the block lies flat."""
         return bool(np.abs(self.pose[2, :3]).max() > math.cos(_LEVEL))
 
     def state(self) -> BlockState:

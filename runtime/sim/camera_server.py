@@ -1,4 +1,4 @@
-"""What stand-in cameras on the network have in common: a port, pictures at a rate, faults on demand."""
+"""Common base of stand-in cameras on the network: a port, pictures at a rate, faults on demand."""
 
 from __future__ import annotations
 

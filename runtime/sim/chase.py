@@ -91,7 +91,7 @@ class Follower:
             self._seen.append((now, block[0], block[1]))
 
     def _ahead(self, times: Float64) -> tuple[Float64, Float64]:
-        """Where it will be along the belt at these times [n], if it goes on like this, and where across."""
+        """Positions along the belt at these times [n], extrapolated from its motion, and positions across."""
         seen = np.array(self._seen)
         newest = seen[-1]
         fitted = seen[(newest[0] - seen[:, 0] <= _WINDOW) | (np.arange(len(seen)) >= len(seen) - 2)]

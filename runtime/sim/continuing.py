@@ -1,4 +1,4 @@
-"""How a stand-in policy continues the chunk before: it copies it. That is the contract of RTC, and no model of it."""
+"""A stand-in policy's continuation of the chunk before: a copy. That is RTC's contract, no model of it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _TRANSITION = 8  # rows over which its own plan takes over
 
 @dataclass(frozen=True, slots=True)
 class Prefix:
-    """What the robot is committed to: joint rows [L, D], of which the first `delay` will have been executed.
+    """The robot's commitment: joint rows [L, D], of which the first `delay` will have been executed.
 
     `end` is the row from which on nothing of it shows, at the latest.
     """

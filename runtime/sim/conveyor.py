@@ -34,7 +34,7 @@ _ON_BELT = 1e-3  # m above the belt, at most
 
 @dataclass(slots=True)
 class Escort:
-    """How well fingertips stay beside the block: their distances [m] from their place there, in order of size."""
+    """Fingertips' tracking of the block: distances [m] from their place beside it, in order of size."""
 
     distances: list[float] = field(default_factory=list)
     total: float = 0.0  # m
@@ -76,21 +76,21 @@ class Conveyor(Tabletop):
 
     @property
     def running(self) -> bool:
-        """Whether the belt has been started and still runs."""
+        """True if the belt has been started and still runs."""
         return self._reached["beside"] and not self.over
 
     @property
     def over(self) -> bool:
-        """Whether the course has been run to its end."""
+        """True if the course has been run to its end."""
         return self._elapsed >= self._course.duration
 
     @property
     def success(self) -> bool:
-        """Whether it is over, and fingertips were where they should be for long enough."""
+        """True if the course is over and fingertips were in their place for long enough."""
         return self.over and self.escort.share >= REQUIRED
 
     def truth(self) -> dict[str, object]:
-        """What the node says of its bench; `chase` is about the course since the last reset, in mm and seconds."""
+        """The node's report of its bench; `chase` covers the course since the last reset, in mm and s."""
         distance = self.distance()
         return super().truth() | {
             "milestones": {"reached": self._reached["beside"], "followed": self.success},

@@ -1,4 +1,4 @@
-"""How a belt runs: strokes to and fro of random lengths and speeds, drawn by a seed, that nobody can foresee."""
+"""Course of a belt: strokes to and fro of random lengths and speeds, drawn by a seed, not foreseeable."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Course:
         return tuple(self.knots[self.knots[:, 3] != 0.0, 0].tolist())
 
     def x(self, seconds: float) -> float:
-        """Where a block on it is [m] so long after it started."""
+        """Position of a block on the belt [m], `seconds` after its start."""
         seconds = min(max(seconds, 0.0), self.duration)
         start, x, speed, acceleration = self.knots[
             int(np.searchsorted(self.knots[:, 0], seconds, "right")) - 1

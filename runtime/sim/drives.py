@@ -24,14 +24,14 @@ _PATIENCE_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Switch:
-    """What is done to the drives: on, which clears all faults; off; off because of `fault`."""
+    """Switching of the drives: on, which clears all faults; off; off because of `fault`."""
 
     on: bool
     fault: str = ""
 
 
 def read(word: str, message: Mapping[Any, Any]) -> Switch | None:
-    """What one of WORDS says, None where its fault is none."""
+    """Switch that one of WORDS asks for; None if its fault is invalid."""
     if word != "drives_fault":
         return Switch(word == "drives_enable")
     fault = message.get("fault")
@@ -53,7 +53,7 @@ class Drives:
         self._faults = faults[-DRIVE_FAULTS_LIMIT:]
 
     def said(self) -> dict[str, object]:
-        """What the node says of them."""
+        """The node's report of its drives."""
         return {"enabled": self.enabled, "faults": list(self._faults)}
 
 

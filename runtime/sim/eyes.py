@@ -1,4 +1,4 @@
-"""Where the camera on an arm sits: beside its hand, where enough of what lies before the fingers is in view."""
+"""Place of the camera on an arm: beside its hand, where enough of what lies before the fingers is in view."""
 
 from __future__ import annotations
 

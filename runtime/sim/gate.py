@@ -1,7 +1,7 @@
-"""What a careful execution node lets through: one master, fresh finite targets within limits, a deadline.
+"""Messages that a careful execution node accepts: one master, fresh finite targets within limits, a deadline.
 
-Words that switch the drives of a simulated robot (runtime.sim.drives) are taken of anybody. A node with a bench
-also takes the word "scene_reset", with `id`, `seed` and, if wanted, `positions`.
+Words that switch the drives of a simulated robot (runtime.sim.drives) are taken from any client. A node with
+a bench also takes the word "scene_reset", with `id`, `seed` and, if wanted, `positions`.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Gate:
         return None
 
     def silent(self, now: float) -> bool:
-        """Whether no target was accepted within the deadline: the robot has to hold."""
+        """True if no target was accepted within the deadline: the robot has to hold."""
         return now - self._accepted > self._deadline
 
     def _message(self, payload: bytes) -> dict[Any, Any] | None:
@@ -146,7 +146,7 @@ class Gate:
         return Accepted(target=np.clip(np.asarray(action, np.float64), self._robot.lower, self._robot.upper))
 
     def _late(self, stamp: object, arrival: float) -> bool:
-        """Whether it was sent too long ago; never where the sender's clock says nothing."""
+        """True if the target was sent too long ago; never where the sender's clock says nothing."""
         if type(stamp) not in (int, float) or not math.isfinite(cast(float, stamp)):
             return False
         before, self._stamp = self._stamp, cast(float, stamp)

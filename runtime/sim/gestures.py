@@ -53,7 +53,7 @@ class Gesture:
         return np.asarray(np.clip(target, self._robot.lower, self._robot.upper))
 
     def phase_of(self, q: Float64) -> float:
-        """Where on the path the joints [D] are, or would be if they were moved straight onto it."""
+        """Phase of the joints [D] on the path, or of the point that they reach if moved straight onto it."""
         sine, minus_cosine = ((q - self._centre) / np.maximum(self._room, 1e-9))[self._clockwork]
         return float(np.arctan2(sine, -minus_cosine))
 
@@ -73,5 +73,5 @@ class Gesture:
         return rows.astype(np.float32)
 
     def turn(self, seconds: float) -> float:
-        """How far the phase goes on in `seconds`."""
+        """Advance of the phase in `seconds`."""
         return _TURN * seconds

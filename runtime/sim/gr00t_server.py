@@ -33,7 +33,7 @@ LANGUAGE = "annotation.human.task_description"
 
 @dataclass(frozen=True, slots=True)
 class Gr00tBehaviour:
-    """How the server answers: rows per chunk, their rate [Hz], time of an inference [s], what goes wrong.
+    """The server's answers: rows per chunk, their rate [Hz], time of an inference [s], fault.
 
     `flat` is what --use-sim-policy-wrapper makes of N1.6 and N1.7. `seen` are the steps of which it wants pictures.
     "n1.7-early" is N1.7's early access, which reads MNP alone; "starvla" StarVLA's server of this protocol, which has
@@ -137,11 +137,11 @@ class Gr00tServer:
 
     @property
     def _modern(self) -> bool:
-        """Whether it knows MNP, which it then answers in."""
+        """True if the server knows MNP, in which it then answers."""
         return self._behaviour.version.startswith("n1.7")
 
     def _spoilt_frames(self) -> list[bytes] | None:
-        """What the fault sends in place of an answer; `_RIGHT` where the answer itself is right."""
+        """Frames that the fault sends in place of an answer; `_RIGHT` where the answer itself is right."""
         fault, number = self._behaviour.fault, self._asked
         self._asked += 1
         due = number >= fault.number(0)
@@ -180,7 +180,7 @@ class Gr00tServer:
         return self._action(message["data"])
 
     def _contract(self) -> dict[str, object]:
-        """What StarVLA's says: keys with their prefix, and how many numbers each has; nothing of pictures."""
+        """StarVLA's contract: keys with their prefix, and each one's count of numbers; no pictures."""
         groups: dict[str, object] = {group.name: len(group.joints) for group in self._robot.groups}
         actions = {"poses": self._script.metadata["action_dim"]} if self._in_poses else groups
         said: dict[str, object] = {"unnorm_key": "stand_in"}

@@ -1,4 +1,4 @@
-"""What fingers do to a block: push it, turn it straight between the jaws, hold it."""
+"""Effects of fingers on a block: they push it, turn it straight between the jaws, hold it."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _straighten(hand: Hand, block: Block) -> float:
 
 
 def _overlap(block: Block, centre: Float64) -> tuple[float, Float64]:
-    """How deep a ball at `centre` [2] is in the block's outline, and the way [2] that takes it out."""
+    """Depth of a ball at `centre` [2] in the block's outline, and the way [2] that takes it out."""
     nearest = block.nearest(centre)
     away = nearest - centre
     distance = float(np.hypot(*away))

@@ -67,7 +67,7 @@ class Jaws:
 
 
 class Opening:
-    """How far the fingers of a gripper are apart [m], and its number on the wire, in proportion.
+    """Distance between the fingers of a gripper [m], and its number on the wire, in proportion.
 
     Where a description does not say it, they are taken to be 0.1 m apart when open.
     """

@@ -1,4 +1,4 @@
-"""Where block and plate lie on the simulated bench: drawn by a seed, near wished places where there are any."""
+"""Places of blocks and plate on the simulated bench: drawn by a seed, near wished places if there are any."""
 
 from __future__ import annotations
 

@@ -57,14 +57,14 @@ class SimulatedLeader:
         self._asked = now
 
     def at(self, now: float) -> Float64:
-        """Where the leader is [D]."""
+        """The leader's joints [D]."""
         if self._rows is not None:
             row = int((now - self._asked + _AHEAD_S) * self._rate)
             self._joints = self._rows[min(row, len(self._rows) - 1)]
         return self._joints
 
     def message(self, now: float) -> bytes:
-        """What it publishes."""
+        """The leader's message, packed."""
         parts = self._robot.split(self.at(now)).items()
         return msgpack_arrays.pack(
             {"t": now, "state": {name: part.astype(np.float32) for name, part in parts}}
@@ -80,7 +80,7 @@ class Publishing:
 
     @property
     def address(self) -> str:
-        """Where it really publishes."""
+        """Bound address of its publisher."""
         return address(self._socket)
 
     def tick(self, seconds: float) -> None:

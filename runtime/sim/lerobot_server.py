@@ -30,9 +30,9 @@ _KINDS = ("act", "smolvla", "diffusion", "tdmpc", "vqbet", "pi0", "pi05", "groot
 
 @dataclass(frozen=True, slots=True)
 class LerobotBehaviour:
-    """How the server answers: rows per chunk, their rate [Hz], time of an inference [s], what goes wrong.
+    """The server's answers: rows per chunk, their rate [Hz], time of an inference [s], fault.
 
-    `patience` [s] is how long it waits for an observation before it answers with nothing.
+    `patience` [s] is its wait for an observation before it answers with nothing.
     """
 
     horizon: int = 50

@@ -1,4 +1,4 @@
-"""What LeRobot's server sends and takes, made apart from the client's code.
+"""Messages that LeRobot's server sends and takes, made apart from the client's code.
 
 Messages are protobuf's own; pickles are written instruction by instruction, as torch and LeRobot would, and read
 with Python's machine and a table of names.

@@ -1,4 +1,4 @@
-"""Where a robot's arms are on the simulated bench: their frames, end effectors and fingertips in the world."""
+"""Poses of a robot's arms on the simulated bench: their frames, end effectors and fingertips in the world."""
 
 from __future__ import annotations
 

@@ -41,9 +41,9 @@ class Link(Source, Sink):
         """There is nothing to open."""
 
     def receive(self, timeout: float) -> Observation | None:
-        """What the node says now; None where no time has passed since it said something. It never waits.
+        """Present observation of the node; None if no time has passed since the last one. It never waits.
 
-        Raises MessageRefused for a message that is none: this node has no excuse.
+        Raises MessageRefused for an invalid message: this node has no excuse.
         """
         now = self._clock.now()
         if self._looked is not None and now <= self._looked:

@@ -43,7 +43,7 @@ _NO_LEADER = "the simulated node has no leader arm"
 
 
 class Ticking(Protocol):
-    """What `run` runs."""
+    """Node that `run` advances."""
 
     def tick(self, seconds: float) -> None:
         """Let `seconds` pass."""

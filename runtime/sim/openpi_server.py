@@ -22,10 +22,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Behaviour:
-    """How the server answers: rows per chunk, their rate [Hz], time of an inference [s], what goes wrong.
+    """The server's answers: rows per chunk, their rate [Hz], time of an inference [s], fault.
 
-    `rtc` is the dialect in which it is told what the robot is committed to; the flat one takes plain requests too.
-    With `declared` nobody waits for `latency`: answers say that they took so long, for who counts it in lockstep.
+    `rtc` is the dialect in which it is told what the robot is committed to; the flat one takes plain requests
+    too. With `declared` no time is spent on `latency`: answers state it, for clients that count it in
+    lockstep.
     """
 
     horizon: int = 50
@@ -102,7 +103,7 @@ class OpenpiServer(WebsocketServer):
         }
 
     def _took(self, started: float) -> float:
-        """How long an answer takes that was begun then [s], once that is over."""
+        """Duration of an answer begun at `started` [s]; returns once that is over."""
         if self._behaviour.declared:
             return self._behaviour.latency
         time.sleep(max(0.0, self._behaviour.latency - (time.monotonic() - started)))

@@ -56,7 +56,7 @@ class ScriptError(RuntimeFault):
 
 @dataclass(frozen=True, slots=True)
 class Skill:
-    """How good the policy is: `noise` [m] on the block's place in each attempt, one sigma in x and in y.
+    """Skill of the policy: `noise` [m] on the block's place in each attempt, one sigma in x and in y.
 
     A block's edge of noise is one radian of it on the block's turn. `failure_rate` is the probability that in
     an episode it lets the block go on the way or always grasps short; `seed` decides both, episode by episode.
@@ -101,7 +101,7 @@ class PickPlace(Script):
         return Pursuit(self)
 
     def luck(self) -> Luck:
-        """What the next episode has in store."""
+        """Luck of the next episode."""
         return Luck(self.skill, next(self._episodes), self.table.block_edge)
 
 
@@ -190,12 +190,12 @@ class Pursuit:
         self._take(None)
 
     def _is_over(self, pause: float) -> bool:
-        """Whether what follows the pause [s] is another episode: nothing was going on any more before it."""
+        """True if another episode follows the pause [s]: nothing was going on any more before it."""
         leaving = self._route is None or self._route.legs[self._leg].name in _LEAVING
         return leaving and pause > _PAUSED
 
     def _elsewhere(self, q: Float64, sight: Sight) -> bool:
-        """Whether robot or things are not where they should be if this were still the episode it was."""
+        """True if robot or things are not where they should be in the episode so far."""
         if self._route is None:
             return False
         return self._distances(q).min() > _LOST or (
@@ -252,7 +252,7 @@ class Pursuit:
         return bool(self._distances(q)[-1] < _THERE)
 
     def _misses(self, q: Float64) -> bool:
-        """Whether the jaws are empty on a leg on which they should hold the block."""
+        """True if the jaws are empty on a leg on which they should hold the block."""
         if self._route is None or self._route.legs[self._leg].name not in _CARRYING:
             return False
         return self._opening(q) < _EMPTY * self._policy.table.block_edge
@@ -272,7 +272,7 @@ class Pursuit:
 
 
 def joints_apart(robot: Robot) -> Apart:
-    """How far the joints are from each of the rows, at most: grippers and numbers that move no link aside [rad]."""
+    """Function for joints' largest distance [rad] to each row; grippers and numbers without a link aside."""
     moving = np.concatenate([group.joint_dims[np.array(group.urdf_joints) != ""] for group in robot.groups])
 
     def apart(arm: Group, rows: Float64, q: Float64) -> Float64:
@@ -282,7 +282,7 @@ def joints_apart(robot: Robot) -> Apart:
 
 
 def poses_apart(arm: Group, rows: Float64, q: Float64) -> Float64:
-    """How far the arm's end effector is from where it is in each of the rows, whatever its joints are [rad].
+    """Distance of the arm's end effector from its pose in each of the rows, whatever its joints are [rad].
 
     A way of _ARM metres counts as one radian.
     """
@@ -293,6 +293,6 @@ def poses_apart(arm: Group, rows: Float64, q: Float64) -> Float64:
 
 
 def _differs(sight: Sight, before: Sight) -> bool:
-    """Whether the block or the plate is seen where it was not."""
+    """True if the block or the plate is seen where it was not."""
     pairs = ((sight.block, before.block), (sight.plate, before.plate))
     return any(now and then and math.dist(now[:2], then[:2]) > _MOVED for now, then in pairs)

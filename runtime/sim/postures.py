@@ -1,4 +1,4 @@
-"""Where an arm's joints are for its fingertips over a block or a plate, pointing down.
+"""Joints of an arm for its fingertips over a block or a plate, pointing down.
 
 Four points of every vertical way are solved by inverse kinematics, from a posture of the arm with its fingers down
 that is found once: turned about an upright first joint, or led from place to place where there is none.
@@ -216,7 +216,7 @@ class Postures:
             )
 
     def _reaches(self, arm: Group, nominal: Nominal, place: Place) -> bool:
-        """Whether the fingertips go straight down on a place of the table."""
+        """True if the fingertips go straight down on a place of the table."""
         bearing = self._bearing(arm, place)
         low = _GRASP * self._table.block_edge
         above = Down(place, CLEAR, bearing + nominal.across, bearing, TILTS[0][1])
@@ -237,7 +237,7 @@ class Postures:
         ]
 
     def _ahead(self, arm: Group) -> list[Place]:
-        """Where searches begin: straight ahead of the shoulder, and in the middle of the area."""
+        """First places of searches: straight ahead of the shoulder, and in the middle of the area."""
         x_from, x_to, y_from, y_to = self._table.area
         x, y = self._shoulders[arm.name]
         ahead = (

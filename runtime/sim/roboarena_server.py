@@ -25,7 +25,7 @@ _IDLE = 30.0  # s, vLLM-Omni's own
 
 @dataclass(frozen=True, slots=True)
 class Arena:
-    """How the server is: what it wants, how it answers, what goes wrong.
+    """Behaviour of the server: its wants, its answers, its fault.
 
     `reply` is the form of an answer: a map with `actions`, the bare array, or named parts. `numbering` is the
     number of its first exterior view. `idle` [s] ends a silent connection, None never.
@@ -50,7 +50,7 @@ class Arena:
 
 @dataclass
 class Heard:
-    """What has been asked, in order: (endpoint, session) pairs, and the frames that each session has sent."""
+    """Requests so far, in order: (endpoint, session) pairs, and the frames that each session has sent."""
 
     calls: list[tuple[str, str | None]] = field(default_factory=list)
     frames: dict[str | None, int] = field(default_factory=dict)
@@ -147,7 +147,7 @@ class RoboarenaServer(WebsocketServer):
         return {"actions": rows}
 
     def _check(self, message: dict[str, Any]) -> None:
-        """What a policy would fall over, and what it would not notice."""
+        """Refuse mistakes that a policy would fall over, and those that it would not notice."""
         arena = self._arena
         names = [f"exterior_image_{arena.numbering + n}" for n in range(arena.externals)]
         names += ["wrist_image"] if arena.wrist else []

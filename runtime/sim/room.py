@@ -1,4 +1,4 @@
-"""How much room the arms of a robot leave each other, and its body, on a way."""
+"""Room that the arms of a robot leave each other, and its body, on a way."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _OWN = MARGIN + 0.001  # m that an arm leaves between its links, and to the body
 
 
 class Room:
-    """What safety would warn of, with some more distance; the table is not looked at, for hands go down to it."""
+    """Clearance that safety would warn of, with some margin; without the table, for hands go down to it."""
 
     def __init__(self, robot: Robot) -> None:
         self._clearance = Clearance(robot)
@@ -34,7 +34,7 @@ class Room:
         self._wanted = wanted[self._links]
 
     def spare(self, rows: Float64) -> float:
-        """How much more room there is on the way float64 [n, D] than there should be, at its narrowest [m]."""
+        """Room on the way float64 [n, D] beyond what there should be, at its narrowest [m]."""
         if not len(self._links):
             return np.inf
         looked_at = rows[:: max(1, len(rows) // _LOOKS)]

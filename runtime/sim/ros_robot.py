@@ -110,11 +110,11 @@ class RosRobot(ABC):
         self._sequence += 1
 
     def truth(self) -> dict[str, object] | None:
-        """What really lies on its bench."""
+        """Ground truth of its bench."""
         return self._surroundings.truth()
 
     def outlets(self) -> Iterator[Outlet]:
-        """Where it is told to go."""
+        """Outlets on which it takes commands."""
         for group in self._robot.groups:
             topic = self._groups[group.name]
             if self._options.as_simulation:

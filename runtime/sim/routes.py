@@ -1,4 +1,4 @@
-"""How an arm picks a block up and puts it down: legs of joint targets, timed, with gates for the jaws between.
+"""Pick and place of a block by an arm: legs of joint targets, timed, with gates for the jaws between.
 
 Between few postures the rows are interpolated in joint space with minimum-jerk timing (Flash and Hogan 1985), so
 that an attempt is planned once and cheaply.
@@ -57,7 +57,7 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Slip:
-    """What goes wrong on purpose: the jaws close `short` of the block [m], or let it go on the way."""
+    """Deliberate failure: the jaws close `short` of the block [m], or let it go on the way."""
 
     short: float = 0.0
     lets_go: bool = False
@@ -65,7 +65,7 @@ class Slip:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """What one arm does, leg after leg; the rest of the robot stays, or makes way first.
+    """Motion of one arm, leg after leg; the rest of the robot stays, or makes way first.
 
     `rows` [N, D] are those of all legs, `starts` the places of each leg's first one among them.
     """
@@ -146,7 +146,7 @@ class Planner:
         return [replace(self._leg(*way), others=others) for way in ways]
 
     def _low(self, arm: Group, q: Float64) -> bool:
-        """Whether the fingertips are so near to the table that they have to rise before they go elsewhere."""
+        """True if the fingertips are so near to the table that they have to rise before they go elsewhere."""
         return bool(self._postures.tip(arm, q)[2, 3] < 0.75 * CLEAR)
 
     def retreat(self, q: Float64, arm: Group) -> Route:

@@ -43,7 +43,7 @@ class Wire(ABC):
 
     @abstractmethod
     def metadata(self) -> dict[str, object]:
-        """What the server says of it on connect."""
+        """The server's metadata of the wire, sent on connect."""
 
     @abstractmethod
     def read(self, message: Any) -> Asked:
@@ -63,7 +63,7 @@ class Wire(ABC):
 
 
 class Ignorant(Wire):
-    """What most servers do: keys that they do not know are dropped, without a word."""
+    """Wire of most servers: keys that they do not know are dropped, without a word."""
 
     def metadata(self) -> dict[str, object]:
         return {}

@@ -126,7 +126,7 @@ class RtspServer(CameraServer):
 
 
 def _payloads(unit: bytes, last: bool) -> Iterator[tuple[bytes, bool]]:
-    """What carries one NAL unit, and whether it ends a picture: itself, or fragments (FU-A)."""
+    """Payloads that carry one NAL unit, itself or fragments (FU-A), each with True if it ends a picture."""
     if len(unit) <= _LARGEST:
         yield unit, last
         return

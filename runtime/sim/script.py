@@ -1,4 +1,4 @@
-"""What a stand-in policy server plays: a script that begins anew with every connection."""
+"""Script of a stand-in policy server; it begins anew with every connection."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Script(ABC):
 
     @abstractmethod
     def begin(self) -> Answer:
-        """What answers the requests of one connection, in their order."""
+        """Answers to the requests of one connection, in their order."""
 
 
 class Waving(Script):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class StandInServer(Protocol):
-    """What every stand-in server is to this command: it starts, says where it is, and ends."""
+    """Interface of every stand-in server to this command: it starts, says where it is, and ends."""
 
     def start(self) -> dict[str, object]: ...
 
@@ -219,7 +219,7 @@ _PROTOCOLS: dict[str, Callable[[Robot, float, Script, argparse.Namespace], Stand
 
 
 def _rtc(options: argparse.Namespace) -> Name:
-    """How it is told what to continue; SetupError where it could not."""
+    """RTC dialect of the server; SetupError where it could not continue a chunk."""
     if options.space == "eef" and options.rtc not in (None, "none"):
         raise SetupError(
             f"--rtc {options.rtc} with --space eef: it continues joint rows alone; allowed: none"

@@ -1,4 +1,4 @@
-"""What a scripted policy sees: the task's block and the plate, found by colour in the overhead picture.
+"""Sight of a scripted policy: the task's block and the plate, found by colour in the overhead picture.
 
 Nothing else tells it where things are. What an arm covers in part has neither the size nor the shape that it
 should have at its place, and then counts as not seen.
@@ -60,7 +60,7 @@ class Overhead:
         self._camera = bench.overhead_camera(_NATIVE_WIDTH, _NATIVE_HEIGHT)
 
     def look(self, picture: UInt8) -> Sight:
-        """What is to be seen in an RGB picture [H, W, 3] or [3, H, W] of any size, letterboxed or not."""
+        """Block and plate in an RGB picture [H, W, 3] or [3, H, W] of any size, letterboxed or not."""
         shown = _without_bars(_channels_last(picture))
         if int(shown.max(initial=0)) < _DARKEST:
             return Sight(dark=True)
@@ -146,7 +146,7 @@ def _without_bars(picture: UInt8) -> UInt8:
 
 
 def _mask(hsv: Matrix, colour: bench.Colour) -> Matrix:
-    """Where a picture has the colour, as 255, in whatever light."""
+    """Mask of a picture, 255 where it has the colour, in whatever light."""
     pixel = cv2.cvtColor(np.array([[colour]], np.uint8), cv2.COLOR_RGB2HSV)[0, 0]
     hue, saturation, _ = (int(part) for part in pixel)
     lowest = max(0, hue - _HUE), int(_SATURATION * saturation), _DARKEST
@@ -163,7 +163,7 @@ def _largest(mask: Matrix) -> Matrix | None:
 
 
 def _is_ring(mask: Matrix, outline: Matrix) -> bool:
-    """Whether most of what the outline [n, 1, 2] surrounds, or would if it were closed, is not in the mask."""
+    """True if most of what the outline [n, 1, 2] surrounds, or would if closed, is not in the mask."""
     left, top, width, height = cv2.boundingRect(outline)
     inside = np.zeros((height, width), np.uint8)
     cv2.fillConvexPoly(inside, cv2.convexHull(outline - (left, top)), 1)
@@ -172,7 +172,7 @@ def _is_ring(mask: Matrix, outline: Matrix) -> bool:
 
 
 def _area(camera: PinholeCamera, points: Float64) -> float:
-    """What the convex hull of world points [n, 3] covers in the camera's picture [pixels]."""
+    """Area of the convex hull of world points [n, 3] in the camera's picture [pixels]."""
     return float(cv2.contourArea(cv2.convexHull(camera.project(points).astype(np.float32))))
 
 

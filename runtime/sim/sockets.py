@@ -28,7 +28,7 @@ class Sockets:
 
     @property
     def addresses(self) -> dict[str, str]:
-        """Where they really are."""
+        """Bound addresses of the sockets."""
         return {"obs_endpoint": address(self._publisher), "action_endpoint": address(self._subscriber)}
 
     def received(self) -> list[bytes]:
@@ -68,7 +68,7 @@ def bound(kind: int, endpoint: str, insecure: bool) -> zmq.Socket[bytes]:
 
 
 def address(socket: zmq.Socket[bytes]) -> str:
-    """Where a socket really is."""
+    """Bound address of a socket."""
     raw = socket.getsockopt(zmq.LAST_ENDPOINT)
     assert isinstance(raw, bytes)
     return raw.rstrip(b"\0").decode()

@@ -1,4 +1,4 @@
-"""What every stand-in process does alike: say where it is, and end when it is told or left alone."""
+"""Common parts of every stand-in process: it says where it is, and ends when it is told or left alone."""
 
 from __future__ import annotations
 

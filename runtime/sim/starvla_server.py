@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Star:
-    """How the server is: `views` are the robot's cameras in the order of the request, all where None.
+    """Behaviour of the server: `views` are the robot's cameras in the order of the request, all where None.
 
-    `size` is what it says that it was trained with, `batched` whether answers are [1, T, D]. `old`: as servers were
-    until May 2026, which say next to nothing of themselves and leave statistics to the client.
+    `size` is the picture size of its training, as it states it; `batched`: answers are [1, T, D]. `old`: as
+    servers were until May 2026, which say next to nothing of themselves and leave statistics to the client.
     """
 
     horizon: int = 16
@@ -54,7 +54,7 @@ class StarvlaServer(WebsocketServer):
         self.high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
 
     def greeting(self) -> Frames | None:
-        """What a server of its age says."""
+        """Greeting of a server of its age."""
         star = self._star
         if star.old:
             return packed({"env": "simpler_env"})

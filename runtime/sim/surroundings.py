@@ -1,4 +1,4 @@
-"""What a simulated node's arms stand in: test pictures, a bench with blocks and a plate, or one with a belt."""
+"""A simulated node's surroundings: test pictures, a bench with blocks and a plate, or one with a belt."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NAMES = ("none", "tabletop", "conveyor")
 
 
 class Surroundings(ABC):
-    """What time does to everything but the node itself, and what its cameras see."""
+    """Effects of time on everything but the node itself, and the pictures of its cameras."""
 
     @abstractmethod
     def move(self, plant: Plant, seconds: float) -> None:
@@ -34,7 +34,7 @@ class Surroundings(ABC):
 
     @abstractmethod
     def truth(self) -> dict[str, object] | None:
-        """What really lies on the bench, None where there is none."""
+        """Ground truth of the bench; None where there is none."""
 
     @abstractmethod
     def reset(self, wish: Reset) -> None:
@@ -93,7 +93,7 @@ class Workbench(Surroundings):
         return dict(self._drawn[1])
 
     def truth(self) -> dict[str, object]:
-        """What lies where, and how far the task has come."""
+        """Places of things on the bench, and progress of the task."""
         return self._tabletop.truth()
 
     def reset(self, wish: Reset) -> None:

@@ -44,7 +44,7 @@ class Reset:
 
 
 class Tabletop:
-    """What lies on the bench of one robot; `advance` moves the robot's plant and everything it touches.
+    """Things on the bench of one robot; `advance` moves the robot's plant and everything it touches.
 
     Time passes in pieces of at most `step` [s].
     """
@@ -82,7 +82,7 @@ class Tabletop:
         return BenchState(tuple(block.state() for block in self._blocks), (float(x), float(y)))
 
     def truth(self) -> dict[str, object]:
-        """What the node says of its bench; milestones are those of the first block since the last reset."""
+        """The node's report of its bench; milestones are those of the first block since the last reset."""
         placed = self._on_plate(0.0)
         return {
             "reset": self._reset.id,
@@ -95,7 +95,7 @@ class Tabletop:
         }
 
     def _layout(self, wish: Reset) -> Layout:
-        """Where everything is to lie; BenchError where that cannot be, and then nothing has changed."""
+        """Layout for a reset; BenchError where it cannot be, and then nothing has changed."""
         return layout_of(wish.seed, wish.positions, self._count)
 
     def _lay(self, wish: Reset) -> None:
@@ -118,7 +118,7 @@ class Tabletop:
         self._note()
 
     def _handle(self, jaws: Jaws, q: Float64, seconds: float) -> None:
-        """What one arm's fingers do to every block within this step."""
+        """Apply one arm's fingers to every block within this step."""
         before = self._hands.get(jaws.name)
         hand = jaws.hand(q, before, seconds)
         stops = [
@@ -191,7 +191,7 @@ class Tabletop:
         return float(np.hypot(*(self._blocks[0].pose[:2, 3] - self._plate)))
 
     def _on_plate(self, margin: float) -> bool:
-        """Whether the task's block lies on the plate at rest, `margin` [m] inside its rim."""
+        """True if the task's block lies on the plate at rest, `margin` [m] inside its rim."""
         block = self._blocks[0]
         lies = block.still >= REST_S and abs(block.bottom - self.bench.plate_height) < 1e-3
         return lies and not block.held_by and self._from_plate() < self.bench.plate_radius - margin

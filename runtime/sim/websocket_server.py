@@ -1,4 +1,4 @@
-"""What stand-ins on a websocket do alike: listen on loopback, converse with each client, misbehave on demand."""
+"""Common parts of websocket stand-ins: listening on loopback, conversing with clients, faults on demand."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ class WebsocketServer(ABC):
 
     @abstractmethod
     def begin(self) -> Answering:
-        """What answers the requests of one connection."""
+        """Answers to the requests of one connection."""
 
     def admits(self, path: str) -> bool:
-        """Whether a policy is served at this path."""
+        """True if a policy is served at this path."""
         return True
 
     def start(self) -> dict[str, object]:
@@ -116,7 +116,7 @@ class WebsocketServer(ABC):
         """An answer has been sent, so long after its request."""
 
     def refusal(self) -> Frames:
-        """What is sent where nothing is served."""
+        """Frames that are sent where nothing is served."""
         return "nothing is served here"
 
     def _answer(self, connection: ServerConnection, answer: Answering, request: str | bytes) -> bool:

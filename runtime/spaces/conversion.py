@@ -27,7 +27,7 @@ _LONGEST = 2000  # rows of a chunk, given and at control rate: they are solved o
 
 @dataclass(frozen=True, slots=True)
 class Onset:
-    """Where a chunk takes over from what the robot is told now; vectors float64 [D].
+    """Point at which a chunk takes over from the present command; vectors float64 [D].
 
     `held` is what is commanded: grippers and joints of which a row says nothing stay there. `anchor` is the command
     of the step before row `row`, the first that will be executed: from it on no joint that is solved for is faster
@@ -55,7 +55,7 @@ class CommandRows:
 
     @property
     def meant(self) -> Float64:
-        """Where the policy means to begin [D], also where the robot cannot be within one step."""
+        """Joints at which the policy means to begin [D], even if the robot cannot be there in one step."""
         return self.rows[0] if self.first is None else self.first
 
 
@@ -131,7 +131,7 @@ class ActionSpaces(EndEffectors):
         return [column for _, column in found]
 
     def disagreement(self, measured: ArrayLike, q: ArrayLike) -> str:
-        """How far measured poses [8 * arms] are from those of the joints q [D], worst arm; "" where they agree."""
+        """Sentence on the gap of measured poses [8 * arms] to those of q [D], worst arm; "" if they agree."""
         joints = np.asarray(q, dtype=np.float64)
         expected = self.vectors(joints)
         given = np.asarray(measured, dtype=np.float64).reshape(self._count, EEF_WIDTH)

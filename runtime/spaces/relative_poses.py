@@ -50,7 +50,7 @@ def _after(before: Float64, turns: Float64, frame: RelativeFrame) -> Float64:
 
 
 def _running(turns: Float64, frame: RelativeFrame) -> Float64:
-    """What the turns [T, arms, 4] up to each row amount to, by doubling (Hillis and Steele, 1986): log2 T products."""
+    """Running products of the turns [T, arms, 4], by doubling (Hillis and Steele, 1986): log2 T products."""
     made, span = turns, 1
     while span < len(made):
         made = np.concatenate([made[:span], _after(made[:-span], made[span:], frame)])

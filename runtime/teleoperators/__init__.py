@@ -1,4 +1,4 @@
-"""What a person holds to drive the robot: one module per way to hear of it."""
+"""Devices that the operator holds to drive the robot: one module per way to hear of them."""
 
 # Each kind with its module, which is imported where a deployment names it.
 KINDS = {

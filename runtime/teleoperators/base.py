@@ -1,4 +1,4 @@
-"""What a leader is: a device that a person moves, and whose joints the robot is to follow."""
+"""A leader: a device that the operator moves, and whose joints the robot is to follow."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SILENT_S = 2.0  # after which there is no rate any more
 
 @dataclass(frozen=True, slots=True)
 class LeaderPose:
-    """Where the leader was: `joints` float64 [D] in the robot's order and units, NaN where it has no such joint."""
+    """Pose of the leader: `joints` float64 [D] in the robot's order and units, NaN for joints it lacks."""
 
     joints: Float64
     arrived: float  # our monotonic clock [s]
@@ -45,7 +45,7 @@ class Leader(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """What it is and where, for sentences."""
+        """Kind and place of the leader, for sentences."""
 
     @abstractmethod
     def connect(self) -> None:
@@ -57,7 +57,7 @@ class Leader(ABC):
 
     @property
     def newest(self) -> LeaderPose | None:
-        """Where it was last, None where it has not said so since it was connected."""
+        """Newest pose of the leader; None where it has given none since it was connected."""
         with self._lock:
             return self._newest
 

@@ -82,7 +82,7 @@ class Relay(Policy):
         return ActionChunk(np.tile(target, (self._rows, 1)).astype(np.float32))
 
     def aim(self, qpos: Float64) -> Float64 | None:
-        """Where the robot at `qpos` [D] would go first; None where the leader is silent, or leads from where it is."""
+        """First goal of a robot at `qpos` [D]; None if the leader is silent, or leads from where it is."""
         if self.mode == "relative" or self.silence():
             return None
         joints = self._pose().joints

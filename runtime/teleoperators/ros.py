@@ -28,7 +28,7 @@ TABLE = "collection.leader"
 
 
 class LedGroup(Settings):
-    """Where the leader of one group speaks."""
+    """Topic and joints of the leader of one group."""
 
     topic: Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$")] | None = None
     """sensor_msgs/JointState, its gripper among the numbers; the `leader` that the robot's description names for the
@@ -38,7 +38,7 @@ class LedGroup(Settings):
 
 
 class LedGroups(Settings):
-    """What both generations of ROS have in common."""
+    """Settings of a leader that both generations of ROS have in common."""
 
     groups: dict[str, LedGroup] = Field(min_length=1)
     """By the robot's groups; one that is absent is not led."""

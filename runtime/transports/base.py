@@ -1,4 +1,4 @@
-"""What a transport is: a source of observations (held by reception) and a sink for commands (held by control)."""
+"""A transport: a source of observations (held by reception) and a sink for commands (held by control)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.ipc.messages import Event
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What a transport can do; a deployment that asks for more is refused at set-up."""
+    """Abilities of a transport; a deployment that asks for more is refused at set-up."""
 
     moves_robot: bool  # commands reach something that can break: report-only safety is refused
     ends: bool = False  # the source runs out (a recording)
@@ -65,11 +65,11 @@ class Source(ABC):
         return ""
 
     def camera_health(self) -> dict[str, dict[str, Any]]:
-        """How each camera of the deployment's own is; {} where all pictures come from the transport."""
+        """Health of each camera of the deployment's own; {} where all pictures come from the transport."""
         return {}
 
     def news(self) -> list[Event]:
-        """What has happened since the last call that a person is told of."""
+        """Events since the last call of which the operator is told."""
         return []
 
 
@@ -92,9 +92,9 @@ class Sink(ABC):
         raise TransportError(f"this transport takes no control words; {word!r} was to be sent")
 
     def unheard(self) -> dict[str, str]:
-        """Where commands go that nobody takes, each with a sentence that says why, or "" where nothing is known.
+        """Places of commands that no peer takes, each with a sentence on why, or "" where nothing is known.
 
-        {} also where a transport cannot know. Asks nobody and waits for nothing; raises TransportError.
+        {} also where a transport cannot know. Asks no peer and waits for nothing; raises TransportError.
         """
         return {}
 

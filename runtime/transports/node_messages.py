@@ -1,4 +1,4 @@
-"""What an execution node says in one message: checked against the robot, or refused by name."""
+"""One message of an execution node: checked against the robot, or refused by name."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class MessageRefused(CodecError):
 
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
-    """What the node says of itself; the simulated one says all of it, older nodes the hil fields only."""
+    """The node's statement of itself; the simulated one says all of it, older nodes the hil fields only."""
 
     holding: bool | None = None  # its own command deadline has passed; it holds position
     refused: Mapping[str, int] = field(default_factory=dict)  # commands it refused, by reason
@@ -228,7 +228,7 @@ def _truth(name: str, given: object) -> Mapping[str, Any]:
 
 
 def _drives(name: str, given: object) -> Mapping[str, Any]:
-    """Whether the drives are on, and what is wrong with them; further keys are left out."""
+    """State of the drives: enabled or not, and their faults; further keys are left out."""
     if not isinstance(given, dict):
         raise MessageRefused("malformed", f"{name} is a {type(given).__name__}; expected a map")
     enabled, faults = given.get("enabled"), given.get("faults", [])

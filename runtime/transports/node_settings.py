@@ -1,4 +1,4 @@
-"""What is set of the half of an execution node's link that brings observations."""
+"""Settings of the half of an execution node's link that brings observations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Endpoint = Annotated[str, Field(pattern=r"^(tcp|ipc|inproc)://.+")]
 
 
 class NodeSettings(Settings):
-    """Where a node publishes observations, and how they are taken."""
+    """Publisher of a node's observations, and their reception."""
 
     sub_endpoint: Endpoint = "tcp://127.0.0.1:5555"
     """Where the node publishes observations."""

@@ -141,7 +141,7 @@ class NodeSource(Source):
 
     @property
     def status(self) -> NodeStatus:
-        """What the node said of itself in its newest usable message."""
+        """The node's statement of itself in its newest usable message."""
         return self._status
 
     def _forget(self) -> None:

@@ -36,7 +36,7 @@ REAL_TIME = True  # what is at its other end goes on by itself
 
 
 class Link(Settings):
-    """Where ROS 1 is, and who reaches whom."""
+    """Python and master of ROS 1, and the address of this machine."""
 
     table: ClassVar[str] = "transport"  # of a deployment, for sentences
     python: str = Field(default="/usr/bin/python3", min_length=1)

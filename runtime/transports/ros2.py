@@ -105,7 +105,7 @@ def middleware(config: Link, name: str) -> Middleware:
 
 
 def _checked(config: Config, robot: Robot) -> tuple[tuple[Part, ...], tuple[Outlet, ...]]:
-    """What is listened to and what is spoken on, the simulation's topics first."""
+    """Topics that are listened to and those that are spoken on, the simulation's first."""
     parts, outlets = config.streams(robot, 2)
     heard, told = {part.topic for part in parts}, {outlet.topic for outlet in outlets}
     unknown = sorted(set(config.qos) - heard - told)

@@ -50,7 +50,7 @@ class Config(NodeSettings):
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether an endpoint cannot be reached from another machine."""
+    """True if an endpoint cannot be reached from another machine."""
     scheme, _, rest = endpoint.partition("://")
     if scheme in {"ipc", "inproc"}:
         return True
@@ -63,7 +63,7 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def _has_port(endpoint: str) -> bool:
-    """Whether it ends in a port one can connect to; libzmq takes any number and then waits for ever."""
+    """True if it ends in a port one can connect to; libzmq takes any number and then waits for ever."""
     port = endpoint.rpartition(":")[2]
     return port.isascii() and port.isdigit() and 0 < int(port) < 65536
 

@@ -1,4 +1,4 @@
-"""Where all parts of a robot are, as a drawing wants them."""
+"""Poses of all parts of a robot, as a drawing wants them."""
 
 from __future__ import annotations
 

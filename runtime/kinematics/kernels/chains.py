@@ -1,4 +1,4 @@
-"""Where a chain's tip is, and how it moves with the joints.
+"""Pose of a chain's tip, and its motion with the joints.
 
 Chains are records of chain_type: every joint turns about, or slides along, the z of its own frame. Frames are twelve
 numbers: a rotation row by row, then the origin. `reach` is a record of reach_type, which these functions overwrite.

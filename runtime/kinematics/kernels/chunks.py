@@ -50,7 +50,7 @@ def arm_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
 
 
 def scratch_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
-    """What solving a chunk overwrites."""
+    """Type of the memory that solving a chunk overwrites."""
     return np.dtype([("frame", frame_type(moving, size)), ("carried", reach_type(carrying))])
 
 
@@ -166,7 +166,7 @@ def _wall_in(arm: Record, dt: float, frame: Record) -> None:
 
 @part
 def _set_start(going: bool, frame: Record) -> None:
-    """Where a frame is searched from, and what it rests on.
+    """Set the start of a frame's search, and the joints it rests on.
 
     Where the one before met its target, that is where its motion leads, and most of that motion: on a smooth path
     one step is then enough, and where branches meet (a singularity) it goes straight on.
@@ -208,7 +208,7 @@ def _set_goal(targets: Float64, row: int, index: int, carried: Float64, goal: Fl
 
 @part
 def _errors(costs: Costs, frame: Record) -> tuple[float, float]:
-    """How far off the joints found are, in m and rad."""
+    """Errors of the joints found, in m and rad."""
     away, astray = 0.0, 0.0
     for k in range(3):
         away += frame.error[k] ** 2
@@ -218,7 +218,7 @@ def _errors(costs: Costs, frame: Record) -> tuple[float, float]:
 
 @part
 def _flags(arm: Record, dt: float, costs: Costs, tolerances: Tolerances, frame: Record) -> int:
-    """What the joints found touch, and how free the tip is there."""
+    """Flags of the joints found: limits that they touch, and freedom of the tip there."""
     flags = 0
     if near_singular(arm.joints, tolerances.singular_below, costs, frame):
         flags |= _NEAR_SINGULAR

@@ -1,4 +1,4 @@
-"""How loops are compiled: by numba, for this processor, kept on disk so that a later process only loads them."""
+"""Compilation of loops by numba, for this processor, kept on disk so that a later process only loads them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def kernel(loop: Loop) -> Loop:
 
 
 def part(function: Loop) -> Loop:
-    """What kernels are made of, compiled with them."""
+    """Compiled function that is part of a kernel, compiled with it."""
     made = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy", forceinline=True)(function)
     return cast(Loop, made)
 
@@ -64,7 +64,7 @@ def _cache() -> Path | None:
 
 
 def is_kept() -> bool:
-    """Whether something compiled is on disk; what is not has to be compiled, for seconds."""
+    """True if something compiled is on disk; what is not has to be compiled, for seconds."""
     return CACHE is not None and any(CACHE.rglob("*.nbi"))
 
 

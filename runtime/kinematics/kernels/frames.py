@@ -21,9 +21,9 @@ _LEAST_DAMPING = 1e-8  # below it there is none
 
 
 class Costs(NamedTuple):
-    """What a solve weighs: a metre and a radian beside the pose, a radian (m) away from what a frame rests on.
+    """Costs of a solve: a metre and a radian beside the pose, a radian (m) away from what a frame rests on.
 
-    `home_rate` [1/s] is how fast what the pose leaves open goes home.
+    `home_rate` [1/s] is the rate at which what the pose leaves open goes home.
     """
 
     position: float
@@ -158,7 +158,7 @@ def _promised(box: Record) -> float:
 
 @part
 def near_singular(joints: int, below: float, costs: Costs, frame: Record) -> bool:
-    """Whether the smallest singular value of the unweighted Jacobian of so many joints lies below `below`.
+    """True if the smallest singular value of the unweighted Jacobian of so many joints lies below `below`.
 
     It does where J J^T - below^2 (J^T J with fewer than six joints) has a pivot that is not positive.
     """

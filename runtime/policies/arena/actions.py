@@ -1,4 +1,4 @@
-"""What the rows of a RoboArena answer are: joints or poses, targets or velocities, grippers as DROID counts them."""
+"""Rows of a RoboArena answer: joints or poses, targets or velocities, grippers as DROID counts them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Step = Annotated[float, Field(gt=0, le=1.0)]
 
 
 class VelocitySteps(Settings):
-    """What a velocity of 1.0 moves within one row of the answer; the defaults are DROID's, at 15 rows per second."""
+    """Motion of a row of the answer at a velocity of 1.0; the defaults are DROID's, at 15 rows per second."""
 
     joint: Step = 0.2
     """Of each joint [rad]."""
@@ -36,7 +36,7 @@ class VelocitySteps(Settings):
 
 
 class MeantSettings(Settings):
-    """What the answers of a server of the RoboArena family are."""
+    """Answers of a server of the RoboArena family."""
 
     action_space: ActionSpace = "joint_position"
     """What the rows are; a server that says otherwise is refused."""

@@ -1,4 +1,4 @@
-"""What was seen before a request: the pictures of some moments before it, those that a policy was trained to see."""
+"""History before a request: pictures of some moments before it, those that a policy was trained to see."""
 
 from __future__ import annotations
 

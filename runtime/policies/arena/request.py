@@ -29,7 +29,7 @@ _FIELD_SIZE = (288, 512)  # to which the field's client brings every picture fir
 
 
 class ShownSettings(Settings):
-    """What a server of the RoboArena family is shown."""
+    """Inputs of a server of the RoboArena family."""
 
     cameras: dict[str, Slot] = Field(default_factory=dict)
     """Observation key = slot: "first" and "second" are the exterior views, "wrist", and "first_stereo" and so on the
@@ -97,7 +97,7 @@ class Shown:
 
     @property
     def glances_s(self) -> float | None:
-        """How often what is seen is to be kept [s], None for not at all."""
+        """Interval at which pictures are kept [s]; None if none are."""
         return None if self._history is None else 1.0 / self._settings.frame_rate
 
     def glance(self, observation: Observation) -> None:
@@ -107,7 +107,7 @@ class Shown:
 
     @property
     def sees_poses(self) -> bool:
-        """Whether poses are shown."""
+        """True if poses are shown."""
         return self._poses is not None
 
     def agree(self, wants: Wants) -> None:

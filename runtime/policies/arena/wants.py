@@ -1,4 +1,4 @@
-"""What a server of the RoboArena family wants: its first frame, checked."""
+"""Wants of a server of the RoboArena family: its first frame, checked."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class Channel:
 
     @property
     def is_open(self) -> bool:
-        """Whether a channel is held; the peer may have gone since."""
+        """True if a channel is held; the peer may have gone since."""
         return self._channel is not None
 
     def open(self) -> float:
@@ -151,7 +151,7 @@ class Channel:
 
 
 def _is_foreign(details: str) -> bool:
-    """Whether gRPC was answered in another protocol."""
+    """True if gRPC was answered in another protocol."""
     return "Failed parsing HTTP/2" in details or "http1.x" in details
 
 

@@ -24,7 +24,7 @@ _PROTOCOL = 4
 
 @dataclass(frozen=True)
 class RemotePolicyConfig:
-    """What a server is to load. The order of the fields is that on the wire."""
+    """Model that a server is to load. The order of the fields is that on the wire."""
 
     policy_type: str
     pretrained_name_or_path: str
@@ -36,7 +36,7 @@ class RemotePolicyConfig:
 
 @dataclass(frozen=True)
 class TimedObservation:
-    """What the robot shows: motors as floats, pictures uint8 [H, W, 3], the task. `timestamp` is wall clock [s]."""
+    """Observation: motors as floats, pictures uint8 [H, W, 3], the task; `timestamp` is wall clock [s]."""
 
     timestamp: float
     timestep: int

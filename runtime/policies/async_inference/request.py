@@ -31,7 +31,7 @@ _NATIVE = (480, 640)  # what a picture is declared as where its size is not; the
 
 
 class RequestSettings(MeaningSettings):
-    """What the server is to load, and what its model calls what it is shown."""
+    """Model that the server is to load, and its names of what it is shown."""
 
     policy_type: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
     """LeRobot's name of the model's kind: act, smolvla, diffusion, tdmpc, vqbet, pi0, pi05, groot."""

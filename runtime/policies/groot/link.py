@@ -41,7 +41,7 @@ class ReqLink:
 
     @property
     def is_open(self) -> bool:
-        """Whether a connection is held; the peer may have gone since."""
+        """True if a connection is held; the peer may have gone since."""
         return self._socket is not None
 
     def open(self) -> float:
@@ -181,7 +181,7 @@ class ReqLink:
                 )
 
     def _heard(self, milliseconds: int = 0) -> int:
-        """What happened to the connection since the last time, as one set of ZMQ's events."""
+        """Events of the connection since the last call, as one set of ZMQ's events."""
         from zmq.utils.monitor import recv_monitor_message  # it brings asyncio along
 
         monitor, events = self._monitor, 0

@@ -1,4 +1,4 @@
-"""What a GR00T server says that it is shown and answers: its modality configuration, in the forms of three versions."""
+"""A GR00T server's modality configuration, in the forms of three versions: its inputs and its answers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PLAIN = ("state_keys", "action_keys")  # of a server without configurations
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """How N1.6 and newer write an action."""
+    """Format of an action in N1.6 and newer."""
 
     representation: str  # "ABSOLUTE", "DELTA", "RELATIVE", which it answers as absolute
     format: str  # "DEFAULT", "XYZ_ROT6D", "XYZ_ROTVEC"
@@ -89,7 +89,7 @@ def modalities(reply: object) -> Modalities:
 
 
 def _contract(given: Mapping[str, Any]) -> Modalities:
-    """What is said of keys in flat lists; where nothing is said, the deployment's are right."""
+    """Modalities from keys in flat lists; where nothing is said, the deployment's are right."""
     horizon: Any = given.get("action_horizon")
     rows = horizon if type(horizon) is int and 0 < horizon <= _MOST_ROWS else 1
     return Modalities(

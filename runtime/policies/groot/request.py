@@ -59,7 +59,7 @@ class RequestSettings(MeaningSettings):
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """What one observation shows."""
+    """Content of one observation."""
 
     step: int
     pictures: Mapping[str, UInt8]  # by video key
@@ -122,7 +122,7 @@ class Gr00tRequest:
         self._moments.clear()
 
     def moment(self, observation: Observation) -> Moment:
-        """What the observation shows; PolicyError where something is missing."""
+        """Content of the observation; PolicyError where something is missing."""
         shown = self._layout.of(self._grip.observed(observation))
         pictures = {key: shown["images"][camera] for key, camera in self._settings.video.items()}
         return Moment(observation.step, pictures, shown["state"])

@@ -1,1 +1,1 @@
-"""How policy servers are told what the robot is committed to: one file per wire dialect."""
+"""The robot's commitment on the wire to policy servers: one file per dialect."""

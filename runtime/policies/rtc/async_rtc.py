@@ -31,7 +31,7 @@ class AsyncRtc(Dialect):
         self._horizon: int | None = None
 
     def supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """What `rtc_supported` says; PolicyError where protocol, version, codec or the word itself is wrong."""
+        """Value of `rtc_supported`; PolicyError if protocol, version, codec or the word itself is wrong."""
         said = metadata.get("async_rtc")
         if not isinstance(said, Mapping):
             found = ", ".join(map(str, metadata)) or "nothing"
@@ -65,7 +65,7 @@ class AsyncRtc(Dialect):
         }
 
     def result(self, reply: Message) -> Message:
-        """What is in the envelope; PolicyError for the server's error, another version, another request's number."""
+        """Content of the envelope; PolicyError for the server's error, another version or request number."""
         _check_version(reply, "the answer")
         if reply.get("error"):
             raise ServerSaysError(f"the policy server reports an error: {headline(str(reply['error']))}")

@@ -1,4 +1,4 @@
-"""What a dialect of real-time chunking does to the messages of a policy protocol."""
+"""Dialects of real-time chunking: their changes to the messages of a policy protocol."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Dialect(ABC):
 
     @abstractmethod
     def supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """Whether the server continues a chunk that it is given, None where its metadata do not say.
+        """True if the server continues a chunk that it is given; None where its metadata do not say.
 
         Raises PolicyError where it speaks another dialect.
         """

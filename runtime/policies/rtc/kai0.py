@@ -31,7 +31,7 @@ class Kai0(Dialect):
         self._weight = max_guidance_weight
 
     def supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """What the metadata key `rtc` says, None without it."""
+        """True if the metadata key `rtc` names this dialect; None without it."""
         said = dialect_told(metadata, NAME)
         return None if said is None else bool(said["dialect"] == NAME)
 

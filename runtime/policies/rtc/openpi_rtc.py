@@ -23,7 +23,7 @@ Rows = Literal["aligned", "whole"]
 
 
 class EnvelopeKeys(Settings):
-    """What the parts of the envelope are called, and how many rows the server takes off."""
+    """Keys of the envelope's parts, and count of the rows that the server takes off."""
 
     observation: Literal["obs", "observation"] = "obs"
     """Key of the observation."""
@@ -52,7 +52,7 @@ class OpenpiRtc(Dialect):
         self._rows = rows
 
     def supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """What the metadata key `rtc` says, None without it; ContradictionError for another number of rows."""
+        """True if `rtc` names this dialect, None without the key; ContradictionError for other row counts."""
         said = dialect_told(metadata, NAME)
         if said is None:
             return None

@@ -21,7 +21,7 @@ class PrevAction(Dialect):
     """
 
     def supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """What the metadata key `rtc` says (that of our bundled server), None without it."""
+        """True if the metadata key `rtc` (that of our bundled server) names this dialect; None without it."""
         said = dialect_told(metadata, NAME)
         return None if said is None else bool(said["dialect"] == NAME)
 

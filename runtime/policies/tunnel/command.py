@@ -46,7 +46,7 @@ def far_end(url: str) -> Place:
 
 
 def command(ssh: str, settings: TunnelSettings, port: int, far: Place) -> list[str]:
-    """What to start, with the near end at `port` on the loopback and the far end leading to `far`."""
+    """Command of ssh, with the near end at `port` on the loopback and the far end leading to `far`."""
     options = [
         *_ALWAYS,
         f"StrictHostKeyChecking={'yes' if settings.host_keys == 'strict' else 'accept-new'}",

@@ -68,11 +68,11 @@ class Keeper:
         self._stop.set()
 
     def lasts(self, status: Status) -> float:
-        """How long it has been so [s]."""
+        """Duration of the status so far [s]."""
         return self._now() - status.since
 
     def holds(self, port: int) -> bool:
-        """Whether the near end at `port` is its own at this moment; a port that was its own may be anybody's."""
+        """True if the near end at `port` is its own at this moment; one that was its own may be another's."""
         ssh = self._ssh
         return ssh is not None and ssh.port == port and ssh.listens()
 

@@ -1,4 +1,4 @@
-"""Whether a process listens on a loopback port, read off the kernel's tables: nobody has to be connected to.
+"""Processes that listen on loopback ports, read off the kernel's tables: no connection has to be made.
 
 A connection would go through to the policy server, and would not tell our own process from another one on the port.
 """
@@ -15,7 +15,7 @@ _LOOPBACK = int.from_bytes(socket.inet_aton("127.0.0.1"), sys.byteorder)
 
 
 def listens(pid: int, port: int) -> bool:
-    """Whether the process `pid`, and no other, takes connections on 127.0.0.1:`port`."""
+    """True if the process `pid`, and no other, takes connections on 127.0.0.1:`port`."""
     sockets = _sockets(pid)
     return any(f"socket:[{inode}]" in sockets for inode in _listeners(pid, port)) if sockets else False
 

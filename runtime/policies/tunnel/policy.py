@@ -116,7 +116,7 @@ class TunnelledPolicy(Policy):
         return Ssh(command(self._ssh, self._settings, port, self._far), port, self._settings.session)
 
     def _near_end(self) -> Place:
-        """Where the policy connects to, looked at anew each time: nobody on a port that was ours is taken for it."""
+        """Near end that the policy connects to, looked up each time: a port once ours may be another's."""
         keeper = self._keeper
         if keeper is None:
             raise self._never()

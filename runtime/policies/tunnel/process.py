@@ -73,7 +73,7 @@ class Ssh:
         return code
 
     def listens(self) -> bool:
-        """Whether its near end takes connections, and its far end answers."""
+        """True if its near end takes connections, and its far end answers."""
         return self._echoed and listens(self.pid, self.port)
 
     def end(self) -> None:

@@ -1,4 +1,4 @@
-"""What ssh says when it ends, as one sentence, and what to do about it."""
+"""Messages of an ssh that ends, as one sentence, and advice about it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _ADVICE = (
 
 
 def is_taken(said: Sequence[str]) -> bool:
-    """Whether somebody else was quicker to take the near end's port."""
+    """True if another process was quicker to take the near end's port."""
     return any(_TAKEN.search(line) for line in said)
 
 
@@ -53,7 +53,7 @@ def unopened(refusal: str) -> str:
 
 
 def unreached(refusal: str) -> str:
-    """What to do about a connection that the far end did not make."""
+    """Advice for a connection that the far end did not make."""
     if "prohibited" in refusal:
         return "let the SSH server there forward to it (AllowTcpForwarding, PermitOpen)"
     return "start the policy server there, or correct policy.url, which is as seen from there"

@@ -1,4 +1,4 @@
-"""What a checkpoint says of the SSH tunnel through which its policy server is reached."""
+"""Settings in a checkpoint of the SSH tunnel through which its policy server is reached."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _JUMP = re.compile(rf"(?:{_USER}@)?(?P<host>{_NAME}|\[[0-9A-Fa-f:.]+\])(?::(?P<p
 
 
 def is_host(name: str) -> bool:
-    """Whether it is a name, an alias of ssh's configuration, or an address, and nothing else."""
+    """True if it is a name, an alias of ssh's configuration, or an address, and nothing else."""
     if re.fullmatch(_NAME, name):
         return True
     try:

@@ -131,7 +131,7 @@ def fill_ahead(
 
 
 def ahead(inside: Float32) -> Float32:
-    """What of a flat polygon [n, 3] in the camera's axes lies before the camera, [m, 3]; empty if nothing."""
+    """Part before the camera, [m, 3], of a flat polygon [n, 3] in the camera's axes; empty if nothing."""
     kept: list[list[float]] = []
     corners: list[list[float]] = inside.tolist()
     before = corners[-1]

@@ -16,7 +16,7 @@ _SOFT_FROM = 0.09  # m above the table from which a shadow is softer
 
 
 class Shadows:
-    """How much light the table gets, uint8 (255 = all), in a map of its own seen from above."""
+    """Light on the table, uint8 (255 = all), in a map of its own seen from above."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench

@@ -94,7 +94,7 @@ class Solids:
         return Placed(vertices, normals, boxes[:, :3, 3], boxes[:, :3, :3].transpose(0, 2, 1), seen)
 
     def above_table(self, placed: Placed) -> Placed:
-        """What of them stands out of the table, z = 0: the rest is cut off, and solids wholly under it are not seen."""
+        """Parts of solids above the table, z = 0: the rest is cut off; solids wholly under it are unseen."""
         above = np.maximum.reduceat(placed.vertices[:, 2], self.starts) > 0
         cut = placed.vertices.copy()
         np.maximum(cut[:, 2], 0, out=cut[:, 2])

@@ -78,7 +78,7 @@ def outline_of(camera: PinholeCamera) -> Float32:
 
 
 def covers(outline: Float32, camera: PinholeCamera) -> bool:
-    """Whether every corner of the picture lies inside the outline."""
+    """True if every corner of the picture lies inside the outline."""
     if len(outline) < 3:
         return False
     right, low = float(camera.width), float(camera.height)

@@ -1,1 +1,1 @@
-"""What both ROS transports share: which topics, what is read of messages, alignment, commands."""
+"""Common parts of both ROS transports: topics, reading of messages, alignment, commands."""

@@ -20,12 +20,12 @@ class RosClock:
 
     @property
     def backwards(self) -> int:
-        """How often the clock was set back."""
+        """Count of times that the clock was set back."""
         return self._map.restarts
 
     @property
     def forwards(self) -> int:
-        """How often it was set ahead."""
+        """Count of times that it was set ahead."""
         return self._map.leaps
 
     def see(self, stream: str, stamp: float, arrival: float) -> float:

@@ -246,7 +246,7 @@ class DdsMiddleware(Middleware):
         )
 
     def _otherwise_typed(self, topic: Topic, publishes: bool) -> str:
-        """Whether the other side has another type on that topic, which DDS says to nobody."""
+        """Sentence on a different type at the topic's other side, "" for none; DDS reports it to no peer."""
         from cyclonedds.builtin import (
             BuiltinDataReader,
             BuiltinTopicDcpsPublication,

@@ -35,11 +35,11 @@ class Reader(ABC):
 
     @abstractmethod
     def _gap(self, alignment: int) -> int:
-        """How many bytes are passed over before what is aligned so."""
+        """Count of bytes to skip before a value of this alignment."""
 
     @abstractmethod
     def _text(self, raw: bytes, start: int) -> bytes:
-        """What a string's bytes say."""
+        """Content of a string's bytes."""
 
     @abstractmethod
     def header(self) -> tuple[int, str]:

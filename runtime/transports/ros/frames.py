@@ -35,7 +35,7 @@ Value: TypeAlias = Joints | Float32 | Image | CompressedImage
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Received:
-    """What one message said, and when it was made, in our clock [s]."""
+    """Value of one message, and its time of making in our clock [s]."""
 
     value: Value
     captured: float

@@ -76,7 +76,7 @@ PACKAGES: dict[MessageName, str] = {
 
 
 class Wire(Protocol):
-    """How messages are bytes on one generation of ROS: the functions of a codec module.
+    """Messages as bytes on one generation of ROS: the functions of a codec module.
 
     `decode` raises CodecError. Arrays of bytes that it returns are views into what was given.
     """

@@ -1,4 +1,4 @@
-"""What a ROS transport needs of a middleware: four methods, bytes in and bytes out."""
+"""Interface of a ROS transport to a middleware: four methods, bytes in and bytes out."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """Who is at the other side of a topic: how many, and in a sentence why others are not among them, or ""."""
+    """Peers at the other side of a topic: their count, and a sentence on why others are refused, or ""."""
 
     peers: int
     refused: str = ""
@@ -63,7 +63,7 @@ class Middleware(ABC):
 
     @abstractmethod
     def advertise(self, topic: Topic) -> Publish:
-        """What publishes bytes on the topic, without waiting for anybody."""
+        """Publisher of bytes on the topic, without waiting for any peer."""
 
     @abstractmethod
     def matches(self) -> Mapping[str, Match]:

@@ -1,4 +1,4 @@
-"""What is read of a robot's messages: joints by name, pictures by encoding; anything doubtful is refused."""
+"""Content of a robot's messages: joints by name, pictures by encoding; anything doubtful is refused."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def _raw(message: Image) -> UInt8:
 
 
 def _kind_of(message: CompressedImage) -> Literal["jpeg", "png"] | None:
-    """What the first bytes say; `format` differs from driver to driver."""
+    """Kind of picture by its first bytes; `format` differs from driver to driver."""
     if "compressedDepth" in message.format:
         return None
     start = bytes(message.data[:8])

@@ -38,7 +38,7 @@ _INSTALL = (
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Where ROS 1 is: the Python that has rospy, the master, and the address under which nodes reach this machine."""
+    """ROS 1: the Python that has rospy, the master, the address under which nodes reach this machine."""
 
     python: str
     master: str

@@ -1,4 +1,4 @@
-"""What a deployment says of a robot's topics, whichever generation of ROS they are of."""
+"""A deployment's settings of a robot's topics, for either generation of ROS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class RosSettings(Settings):
-    """What both generations of ROS have in common."""
+    """Settings that both generations of ROS have in common."""
 
     topics: Topics = Topics()
     """Topics that are not those of the robot's description."""
@@ -53,7 +53,7 @@ class RosSettings(Settings):
 
     @property
     def terms(self) -> Terms:
-        """How messages are taken."""
+        """Terms on which this deployment takes messages."""
         return Terms(
             self.max_skew_s,
             self.stalled_after_s,
@@ -64,12 +64,12 @@ class RosSettings(Settings):
 
     @property
     def offers(self) -> Capabilities:
-        """What it can do: a robot hangs on it."""
+        """Capabilities of the transport: a robot is attached to it."""
         spaces = frozenset({"joint", "eef"}) if self.eef_commands else frozenset({"joint"})
         return Capabilities(moves_robot=True, measures_eef=self.eef, spaces=spaces, poses=(PoseFormat(),))
 
     def streams(self, robot: Robot, version: Literal[1, 2]) -> tuple[tuple[Part, ...], tuple[Outlet, ...]]:
-        """What is listened to and what is spoken on, the simulation's topics first."""
+        """Topics that are listened to and those that are spoken on, the simulation's first."""
         plan = TopicPlan(robot, version, self.topics, self.disabled_cameras)
         parts = plan.parts(self.eef)
         chosen: list[Target] = [target for target in ("simulation", "robot") if target in self.commands_to]

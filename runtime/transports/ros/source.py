@@ -44,7 +44,7 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """How messages are taken."""
+    """Terms on which messages are taken."""
 
     skew: float  # s, window of the alignment
     stalled: float  # s, after which a stream counts as stalled
@@ -280,7 +280,7 @@ class RosSource(Source):
         return {self._reason(name) for name in names}
 
     def _reason(self, name: str) -> str:
-        """What is said once: a stream's silence, or what is wrong with its messages."""
+        """Reason that is logged once: a stream's silence, or what is wrong with its messages."""
         return f"{name}: {self._refusals.get(name, ('', ''))[0]}"
 
     def _silence(self, name: str, age: float, match: Match) -> str:

@@ -154,7 +154,7 @@ class TcpRosMiddleware(Middleware):
             log.exception("reading %s failed", self._topics[index][0].name)
 
     def _obey(self, word: dict[str, Any]) -> None:
-        """What the child says beside messages."""
+        """Obey a word of the child that is no message."""
         if "peers" in word:
             self._take_status(word)
         elif "log" in word:

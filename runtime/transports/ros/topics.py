@@ -107,7 +107,7 @@ class TopicPlan:
         return tuple(made)
 
     def outlets(self, targets: Sequence[Target], eef: bool) -> tuple[Outlet, ...]:
-        """Where commands go, in the order of the targets, with poses where `eef`; one message per topic."""
+        """Outlets of commands, in the order of the targets, with poses where `eef`; one message per topic."""
         merged: dict[str, Outlet] = {}
         for target in targets:
             for group in self._robot.groups:

@@ -48,7 +48,7 @@ class _Bounded(xmlrpc.client.Transport):
 
 
 def ask(address: str, method: str, *arguments: Any, default: Any = None) -> Any:
-    """What the master or a node answers; `default`, where there is one, for what it does not know."""
+    """Answer of the master or a node; `default`, where there is one, for what it does not know."""
     try:
         with xmlrpc.client.ServerProxy(address, transport=_Bounded()) as proxy:
             code, said, value = getattr(proxy, method)("/eva_web", *arguments)
@@ -89,7 +89,7 @@ class Parent:
 
 
 class Sayings(logging.Handler):
-    """What rospy warns of, for the parent's log, once each."""
+    """Warnings of rospy, for the parent's log, once each."""
 
     def __init__(self, parent: Parent) -> None:
         super().__init__(logging.WARNING)
@@ -104,7 +104,7 @@ class Sayings(logging.Handler):
 
 
 class Topics:
-    """What the node listens to and speaks on, by the parent's numbers."""
+    """Topics that the node listens to and speaks on, by the parent's numbers."""
 
     def __init__(self, parent: Parent) -> None:
         self._parent = parent
@@ -142,7 +142,7 @@ class Topics:
         return index in self._counts
 
     def peers(self, index: int) -> int:
-        """How many are connected; one that has refused, or is just being called, is none."""
+        """Count of connected peers; one that has refused, or is just being called, does not count."""
         opened = self.open[index][2]
         if opened is None:
             return 0
