@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -116,6 +118,12 @@ class Clearance:
                 telling[own] = False
         count = len(self._first)
         return self._first[telling[:count]], self._second[telling[:count]], self._over[telling[count:]]
+
+
+@lru_cache(maxsize=4)
+def clearance_of(robot: Robot) -> Clearance:
+    """That of a robot, found once for all who judge it in a process."""
+    return Clearance(robot)
 
 
 def _alike(pair: tuple[str, str]) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,8 +81,7 @@ class Group:
     @property
     def joint_dims(self) -> NDArray[np.intp]:
         """The places of `urdf_joints` in the robot's vector."""
-        dims = np.arange(self.slice.start, self.slice.stop)
-        return dims if self.gripper is None else np.delete(dims, self.gripper.index)
+        return _dims(self.slice.start, self.slice.stop, -1 if self.gripper is None else self.gripper.index)
 
     def carried(self, q: Float64) -> Float64:
         """Start of the chain in `frame`: transforms [..., 4, 4] for the robot's vector [..., D]."""
@@ -100,6 +100,14 @@ class Group:
         """The same as [..., 7] = x, y, z [m], unit quaternion w, x, y, z with w >= 0."""
         transform = self.transform(q)
         return np.concatenate([transform[..., :3, 3], quaternion_of_matrix(transform[..., :3, :3])], axis=-1)
+
+
+@functools.cache
+def _dims(start: int, stop: int, without: int) -> NDArray[np.intp]:
+    """The places from `start` on without one of them; looked up at every step of every arm."""
+    dims = np.array([start + place for place in range(stop - start) if place != without], dtype=np.intp)
+    dims.flags.writeable = False
+    return dims
 
 
 @dataclass(frozen=True, slots=True)

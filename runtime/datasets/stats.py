@@ -29,13 +29,14 @@ def column_statistic(values: NDArray[Any]) -> Statistic | None:
     if not len(known):
         return None
     exact = known.astype(np.float64)
+    quantiles = np.quantile(exact, list(QUANTILES.values()), axis=0)
     return {
         "min": known.min(axis=0).tolist(),
         "max": known.max(axis=0).tolist(),
         "mean": exact.mean(axis=0).tolist(),
         "std": exact.std(axis=0).tolist(),
         "count": [len(known)],
-        **{name: np.quantile(exact, share, axis=0).tolist() for name, share in QUANTILES.items()},
+        **dict(zip(QUANTILES, quantiles.tolist(), strict=True)),
     }
 
 

@@ -5,6 +5,7 @@ Every part has exactly one writer; the table in docs/architecture.md says which.
 
 from __future__ import annotations
 
+import functools
 import mmap
 import struct
 from collections.abc import Mapping, Sequence
@@ -42,6 +43,28 @@ class EStop(IntEnum):
     LATCHED = 2
 
 
+@functools.cache  # every observation asks
+def _observation_dtype(d: int, e: int, c: int) -> np.dtype[np.void]:
+    return np.dtype(
+        [
+            ("sequence", "i8"),
+            ("arrived", "f8"),
+            ("joints_captured", "f8"),
+            ("eef_captured", "f8"),
+            ("has", "u1", 5),  # qvel, effort, eef, reported_action, reported_action_eef
+            ("last", "u1"),
+            ("qpos", "f4", d),
+            ("qvel", "f4", d),
+            ("effort", "f4", d),
+            ("eef", "f4", e),
+            ("reported_action", "f4", d),
+            ("reported_action_eef", "f4", e),
+            ("picture_captured", "f8", c),
+            ("picture_number", "i8", c),  # per camera; slot = number % PICTURE_SLOTS, 0 = none yet
+        ]
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class SharedStateLayout:
     """The sizes everything in the shared state follows from; equal in all of the family."""
@@ -53,25 +76,7 @@ class SharedStateLayout:
 
     def observation_dtype(self) -> np.dtype[np.void]:
         """The newest observation without its pictures: which slot of each camera holds them."""
-        d, e, c = self.dim, max(self.eef_dim, 1), max(len(self.cameras), 1)
-        return np.dtype(
-            [
-                ("sequence", "i8"),
-                ("arrived", "f8"),
-                ("joints_captured", "f8"),
-                ("eef_captured", "f8"),
-                ("has", "u1", 5),  # qvel, effort, eef, reported_action, reported_action_eef
-                ("last", "u1"),
-                ("qpos", "f4", d),
-                ("qvel", "f4", d),
-                ("effort", "f4", d),
-                ("eef", "f4", e),
-                ("reported_action", "f4", d),
-                ("reported_action_eef", "f4", e),
-                ("picture_captured", "f8", c),
-                ("picture_number", "i8", c),  # per camera; slot = number % PICTURE_SLOTS, 0 = none yet
-            ]
-        )
+        return _observation_dtype(self.dim, max(self.eef_dim, 1), max(len(self.cameras), 1))
 
     def control_dtype(self) -> np.dtype[np.void]:
         """Fields of control's status: what it last did and how well it keeps time."""

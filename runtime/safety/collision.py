@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robots import Robot
-from robots.clearance import Clearance
+from robots.clearance import clearance_of
 from runtime.core.types import Float64
 
 _NEARER = 1e-6  # [m] that is rounding
-_clearance = lru_cache(maxsize=4)(Clearance)  # of a robot is found once for all who judge it in a process
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +40,7 @@ class Collisions:
     """
 
     def __init__(self, robot: Robot, margin: float) -> None:
-        self._clearance = _clearance(robot)
+        self._clearance = clearance_of(robot)
         self._least = self._clearance.least(margin)
         self._grippers = np.array(robot.gripper_dims, dtype=np.intp)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robots.clearance import MARGIN, Clearance
+from robots.clearance import MARGIN, clearance_of
 from robots.description import TABLE
 from runtime.core.types import Float64
 
@@ -23,7 +23,7 @@ class Room:
     """Clearance that safety would warn of, with some margin; without the table, for hands go down to it."""
 
     def __init__(self, robot: Robot) -> None:
-        self._clearance = Clearance(robot)
+        self._clearance = clearance_of(robot)
         pairs = self._clearance.pairs
         arms = {arm.name for arm in robot.arms}
         owners = [{part.partition("/")[0] for part in pair} & arms for pair in pairs]

@@ -130,7 +130,7 @@ class Overhead:
 def _channels_last(picture: UInt8) -> UInt8:
     if picture.ndim != 3 or 3 not in (picture.shape[0], picture.shape[2]):
         raise BenchError(f"a picture of shape {picture.shape} was given; allowed: [H, W, 3] or [3, H, W]")
-    return picture if picture.shape[2] == 3 else picture.transpose(1, 2, 0)
+    return picture if picture.shape[2] == 3 else np.asarray(cv2.merge(list(picture)), np.uint8)
 
 
 def _without_bars(picture: UInt8) -> UInt8:
@@ -140,9 +140,9 @@ def _without_bars(picture: UInt8) -> UInt8:
     inner_width, inner_height = max(1, int(_NATIVE_WIDTH / ratio)), max(1, int(_NATIVE_HEIGHT / ratio))
     top, left = (height - inner_height) // 2, (width - inner_width) // 2
     inner = picture[top : top + inner_height, left : left + inner_width]
-    bars = np.ones((height, width), bool)
-    bars[top : top + inner_height, left : left + inner_width] = False
-    return inner if picture[bars].max(initial=0) <= _BLACK else picture
+    rows = picture[top : top + inner_height]
+    bars = picture[:top], picture[top + inner_height :], rows[:, :left], rows[:, left + inner_width :]
+    return inner if all(bar.max(initial=0) <= _BLACK for bar in bars) else picture
 
 
 def _mask(hsv: Matrix, colour: bench.Colour) -> Matrix:

@@ -3,6 +3,7 @@
 python read_lerobot_v21.py DATASET prints one JSON object: per episode its length, the sum of every numeric
 column, the mean brightness of every frame of every video, its task; for the dataset its totals and every
 broken promise.
+Without DATASET it answers each line of its input, which names one.
 """
 
 import json
@@ -180,4 +181,5 @@ class Reader:
 
 
 if __name__ == "__main__":
-    json.dump(Reader(Path(sys.argv[1])).read(), sys.stdout)
+    for named in sys.argv[1:] or sys.stdin:
+        print(json.dumps(Reader(Path(named.rstrip("\n"))).read()), flush=True)

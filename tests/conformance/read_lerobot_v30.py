@@ -2,6 +2,7 @@
 
 python read_lerobot_v30.py DATASET prints one JSON object: per episode its length, task, the sum of every numeric
 column and the mean brightness of every frame of every video; for the dataset its totals and every broken promise.
+Without DATASET it answers each line of its input, which names one.
 """
 
 import json
@@ -181,4 +182,5 @@ class Reader:
 
 
 if __name__ == "__main__":
-    json.dump(Reader(Path(sys.argv[1])).read(), sys.stdout)
+    for named in sys.argv[1:] or sys.stdin:
+        print(json.dumps(Reader(Path(named.rstrip("\n"))).read()), flush=True)

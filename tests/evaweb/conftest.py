@@ -9,7 +9,9 @@ from uuid import uuid4
 import pytest
 from django.conf import settings
 from django.contrib.auth.models import Group, User
-from django.db import Error
+from django.core.management.color import no_style
+from django.db import Error, connections
+from django.test import TransactionTestCase
 
 from evaweb.errors import NotFound
 from evaweb.stations import commands
@@ -41,6 +43,25 @@ def _written(row: Command) -> None:
         commands.unwritten.keep(row)
     except NotFound as fault:
         commands.log.error("%s is not written down: %s", row, fault)
+
+
+_NEVER_CHANGED = {"django_content_type", "auth_permission"}  # of every database alike
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _what_migrations_wrote_is_not_written_again() -> Iterator[None]:
+    """Django empties every table after a test with transactions, and then writes that again, which takes longer."""
+
+    def empty(case: type[TransactionTestCase]) -> None:
+        for name in case._databases_names(include_mirrors=False):
+            database = connections[name]
+            tables = database.introspection.django_table_names(only_existing=True, include_views=False)
+            statements = database.ops.sql_flush(no_style(), sorted(set(tables) - _NEVER_CHANGED))
+            database.ops.execute_sql_flush(statements)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TransactionTestCase, "_fixture_teardown", empty)
+        yield
 
 
 def person(name: str, *groups: str) -> User:

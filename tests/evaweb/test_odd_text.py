@@ -7,6 +7,7 @@ import re
 import uuid
 
 import pytest
+from django.http import QueryDict
 from django.test import Client
 from django.urls import NoReverseMatch, get_resolver, reverse
 
@@ -139,28 +140,59 @@ def test_in_addresses(request, bench, live, odd, role):
     assert asked > 10
 
 
-def asks(client, path):
-    """The parameters that are worth asking for there: REST names its own, pages take all."""
+WHOLE = ("__iter__", "items", "keys", "values", "dict", "copy", "urlencode")
+
+
+@pytest.fixture
+def looked(monkeypatch):
+    """The parameters that pages look for in their questions, whether they are there or not."""
+    found = set()
+
+    def watched(name):
+        real = getattr(QueryDict, name)
+
+        def watch(question, *given, **named):
+            found.update(QUESTIONS if name in WHOLE else [str(given[0])])
+            return real(question, *given, **named)
+
+        return watch
+
+    for name in (*WHOLE, "__getitem__", "__contains__", "getlist"):
+        monkeypatch.setattr(QueryDict, name, watched(name))
+    return found
+
+
+def asks(client, path, looked):
+    """The parameters that are asked for there, alone and together.
+
+    REST names its own. Pages take all, and one that a page does not look for changes nothing in what it does.
+    """
+    looked.clear()
     answer = client.get(f"{path}?nonsense=1", headers={"accept": "*/*"})
     if answer.status_code == 422 and b"unknown parameter; allowed: " in answer.content:
-        return answer.json()["error"].partition("allowed: ")[2].split(", ")
-    return [] if path.startswith("/api/") or answer.status_code == 405 else QUESTIONS
+        known = answer.json()["error"].partition("allowed: ")[2].split(", ")
+        return known, known
+    if path.startswith("/api/") or answer.status_code == 405:
+        return (), ()
+    return sorted(looked), sorted(looked | set(QUESTIONS))
 
 
-def test_in_questions(admin):
+def test_in_questions(admin, looked):
     """Each parameter alone with the two texts that go farthest, and all of them together with the others."""
-    faults = set()
+    faults, count = set(), 0
     for path in PATHS:
         if MARK in path or str(NUMBER) in path or path.endswith("/logout/"):
             continue
-        known = asks(admin, path)
-        alone = [f"{one}={ODD[odd]}" for one in known for odd in ("long", "number")]
+        single, known = asks(admin, path, looked)
+        alone = [f"{one}={ODD[odd]}" for one in single for odd in ("long", "number")]
         together = ["&".join(f"{one}={odd}" for one in known) for odd in ODD.values() if known]
+        count += len(alone)
         for asked in alone + together:
             answer = admin.get(f"{path}?{asked}")
             if answer.status_code >= 500:
                 faults.add(f"{path}?{asked:.40}: {answer.status_code}")
     assert faults == set()
+    assert count > 150
 
 
 TEXTS = {

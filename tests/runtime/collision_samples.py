@@ -16,6 +16,7 @@ MARGIN = 0.005
 GRIPPERS = [6, 13]
 
 
+@cache
 def robot() -> Robot:
     return robots.load("agilex_piper")
 

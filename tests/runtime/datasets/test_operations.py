@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import json
 import multiprocessing
 import os
@@ -27,11 +28,15 @@ from tests.runtime.datasets.small import record, seen
 CONFORMANCE = Path(__file__).parents[2] / "conformance"
 
 
+@functools.cache
+def _program(version: str) -> dict[str, Any]:
+    return runpy.run_path(str(CONFORMANCE / f"read_lerobot_{version.replace('.', '')}.py"))
+
+
 def stranger(dataset: Path) -> dict[str, Any]:
     """What a program that knows only the format reads."""
     version = json.loads((dataset / "meta/info.json").read_text())["codebase_version"]
-    program = runpy.run_path(str(CONFORMANCE / f"read_lerobot_{version.replace('.', '')}.py"))
-    report: dict[str, Any] = json.loads(json.dumps(program["Reader"](dataset).read()))
+    report: dict[str, Any] = json.loads(json.dumps(_program(version)["Reader"](dataset).read()))
     return report
 
 
@@ -303,13 +308,18 @@ def test_a_split_of_what_is_not_there_writes_nothing(tmp_path: Path, indices: li
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
 
-@pytest.fixture(params=["v2.1", "v3.0"])
-def ours(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """A dataset of three episodes of our own, with side files."""
+@pytest.fixture(scope="module", params=["v2.1", "v3.0"])
+def made(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    folder = tmp_path_factory.mktemp("made")
     for seed, frames in enumerate((6, 8, 5)):
-        publish(
-            record(tmp_path / "episodes", frames=frames, seed=seed), tmp_path / "set", version=request.param
-        )
+        publish(record(folder / "episodes", frames=frames, seed=seed), folder / "set", version=request.param)
+    return folder
+
+
+@pytest.fixture
+def ours(tmp_path: Path, made: Path) -> Path:
+    """A dataset of three episodes of our own, with side files."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     return tmp_path / "set"
 
 

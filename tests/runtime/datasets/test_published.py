@@ -3,10 +3,14 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
 import threading
 import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +39,35 @@ WHOLE = ColumnMapping(
 )
 
 
+_readers: dict[str, subprocess.Popen[str]] = {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _readers_end() -> Iterator[None]:
+    yield
+    for reader in _readers.values():
+        reader.communicate()
+    _readers.clear()
+
+
+def _reader(version: str) -> subprocess.Popen[str]:
+    """The program that reads that version; it waits for what to read."""
+    if version not in _readers:
+        script = CONFORMANCE / f"read_lerobot_{version.replace('.', '')}.py"
+        _readers[version] = subprocess.Popen(
+            [sys.executable, "-I", str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+    return _readers[version]
+
+
 def stranger(dataset: Path) -> dict[str, Any]:
     """What a program that knows only the format reads, in a process of its own."""
-    script = CONFORMANCE / f"read_lerobot_{info(dataset)['codebase_version'].replace('.', '')}.py"
-    done = subprocess.run(
-        [sys.executable, "-I", str(script), str(dataset)], capture_output=True, text=True, check=True
-    )
-    report: dict[str, Any] = json.loads(done.stdout)
+    reading = _reader(info(dataset)["codebase_version"])
+    assert reading.stdin is not None
+    assert reading.stdout is not None
+    reading.stdin.write(f"{dataset}\n")
+    reading.stdin.flush()
+    report: dict[str, Any] = json.loads(reading.stdout.readline())
     return report
 
 
@@ -420,30 +446,95 @@ def test_an_episode_of_another_length_is_refused_in_its_place(tmp_path: Path) ->
         publish(record(tmp_path / "b", frames=6, uuid=name), tmp_path / "set")
 
 
-def _publish_until(episode: Path, dataset: Path, steps: int, version: str | None = None) -> None:
+def _publish_until(episode: Path, dataset: Path, steps: int) -> None:
     """Publish in a process that dies, as by a power cut, at rename number `steps`."""
-    real, left = os.replace, steps
+    left = steps
+
+    def die() -> None:
+        nonlocal left
+        if left == 0:
+            os._exit(9)
+        left -= 1
+
+    with _before_each_rename(die):
+        publish(episode, dataset)
+
+
+@contextmanager
+def _before_each_rename(act: Callable[[], None]) -> Iterator[None]:
+    real = os.replace
 
     def replace(source: Any, target: Any) -> None:
-        nonlocal left
         if Path(target).name != staging.PLAN:
-            if left == 0:
-                os._exit(9)
-            left -= 1
+            act()
         real(source, target)
 
-    staging.os.replace = replace  # type: ignore[assignment]
-    publish(episode, dataset, version=version)
-    os._exit(0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "replace", replace)
+        yield
 
 
-def _die(episode: Path, dataset: Path, steps: int, version: str | None = None) -> int:
+def _die(episode: Path, dataset: Path, steps: int) -> int:
     context = multiprocessing.get_context("spawn")
-    process = context.Process(target=_publish_until, args=(episode, dataset, steps, version))
+    process = context.Process(target=_publish_until, args=(episode, dataset, steps))
     process.start()
     process.join()
     assert process.exitcode is not None
     return process.exitcode
+
+
+def cuts(episode: Path, dataset: Path, kept: Path, version: str | None = None) -> list[Path]:
+    """What a power cut leaves of the dataset at each rename, and after the last: copies in `kept` of what is there."""
+    copies: list[Path] = []
+
+    def copy() -> None:
+        copies.append(kept / str(len(copies)))
+        shutil.copytree(dataset, copies[-1])
+
+    with _before_each_rename(copy):
+        publish(episode, dataset, version=version)
+    copy()
+    return copies
+
+
+@dataclass(frozen=True)
+class Interrupted:
+    """A dataset of one episode, another one, and what cuts while that was published have left."""
+
+    old: Path
+    episode: Path
+    cuts: list[Path]
+
+    def copy(self, steps: int, to: Path) -> Path:
+        """The dataset as a cut at rename number `steps` has left it, to be recovered."""
+        return shutil.copytree(self.cuts[steps], to)
+
+
+def _interrupted(version: str, folder: Path, **changes: Any) -> Interrupted:
+    dataset, episodes = folder / "set", folder / "episodes"
+    publish(record(episodes, frames=6), dataset, version=version)
+    old = shutil.copytree(dataset, folder / "old")
+    episode = record(episodes, frames=8, seed=8, **changes)
+    return Interrupted(old, episode, cuts(episode, dataset, folder / "cuts", version))
+
+
+@pytest.fixture(scope="module")
+def interrupted_v21(tmp_path_factory: pytest.TempPathFactory) -> Interrupted:
+    return _interrupted("v2.1", tmp_path_factory.mktemp("interrupted"))
+
+
+@pytest.fixture(scope="module")
+def interrupted_of_another_task(tmp_path_factory: pytest.TempPathFactory) -> Interrupted:
+    return _interrupted("v2.1", tmp_path_factory.mktemp("interrupted"), task="another")
+
+
+@pytest.fixture(scope="module")
+def interrupted_v30(tmp_path_factory: pytest.TempPathFactory) -> Interrupted:
+    return _interrupted("v3.0", tmp_path_factory.mktemp("interrupted"), task="another")
+
+
+def contents(dataset: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(dataset)): p.read_bytes() for p in dataset.rglob("*") if p.is_file()}
 
 
 # tasks, two videos, streams, parquet, statistics twice, our lines, episodes, info (the first adds modality.json)
@@ -452,34 +543,25 @@ RENAMES = 10
 
 @pytest.mark.parametrize("steps", range(RENAMES))
 def test_a_crash_at_any_rename_leaves_the_old_contents_and_a_second_run_completes(
-    tmp_path: Path, steps: int
+    tmp_path: Path, interrupted_v21: Interrupted, steps: int
 ) -> None:
-    dataset = tmp_path / "set"
-    publish(record(tmp_path / "episodes", frames=6), dataset)
-    old = stranger(dataset)
-    episode = record(tmp_path / "episodes", frames=8, seed=8)
-    assert _die(episode, dataset, steps) == 9
-    assert stranger(dataset) == old
+    dataset = interrupted_v21.copy(steps, tmp_path / "set")
+    assert stranger(dataset) == stranger(interrupted_v21.old)
     assert [entry.length for entry in open_dataset(dataset).episodes] == [6]
-    done = publish(episode, dataset)
+    done = publish(interrupted_v21.episode, dataset)
     assert (done.episode_index, done.created) == (1, True)
     assert check(dataset) == []
     assert stranger(dataset)["broken"] == []
 
 
 @pytest.mark.parametrize("steps", range(RENAMES))
-def test_recovery_takes_back_every_trace(tmp_path: Path, steps: int) -> None:
-    dataset = tmp_path / "set"
-    publish(record(tmp_path / "episodes", frames=6), dataset)
-
-    def contents() -> dict[str, bytes]:
-        return {str(p.relative_to(dataset)): p.read_bytes() for p in dataset.rglob("*") if p.is_file()}
-
-    old = contents()
-    assert _die(record(tmp_path / "episodes", frames=8, seed=8, task="another"), dataset, steps) == 9
+def test_recovery_takes_back_every_trace(
+    tmp_path: Path, interrupted_of_another_task: Interrupted, steps: int
+) -> None:
+    dataset = interrupted_of_another_task.copy(steps, tmp_path / "set")
     with staging.locked(dataset):
         staging.recover(dataset)
-    assert contents() == old
+    assert contents(dataset) == contents(interrupted_of_another_task.old)
     assert check(dataset) == []
 
 
@@ -494,26 +576,28 @@ def test_a_refused_episode_after_a_crash_leaves_a_whole_dataset(tmp_path: Path) 
 
 def test_a_first_episode_that_was_lost_leaves_no_modalities_to_another_robot(tmp_path: Path) -> None:
     dataset = tmp_path / "set"
-    assert _die(record(tmp_path / "episodes", frames=4), dataset, 5) == 9
+    cut = cuts(record(tmp_path / "episodes", frames=4), tmp_path / "lost", tmp_path / "cuts")[5]
+    shutil.copytree(cut, dataset)
     cameras = {"top": {"width": 64, "height": 48}}
     publish(record(tmp_path / "episodes", frames=4, cameras=cameras, capture_streams=[]), dataset)
     assert list(json.loads((dataset / "meta/modality.json").read_text())["video"]) == ["top"]
 
 
-def test_one_more_rename_than_that_is_not_needed(tmp_path: Path) -> None:
-    dataset = tmp_path / "set"
-    publish(record(tmp_path / "episodes", frames=6), dataset)
-    assert _die(record(tmp_path / "episodes", frames=8), dataset, RENAMES) == 0
+def test_one_more_rename_than_that_is_not_needed(interrupted_v21: Interrupted) -> None:
+    *before, after = interrupted_v21.cuts
+    assert len(before) == RENAMES
+    assert len(open_dataset(after).episodes) == 2
 
 
-@pytest.mark.parametrize("steps", [0, 5, RENAMES])
-def test_a_crash_at_the_very_first_episode_leaves_no_dataset(tmp_path: Path, steps: int) -> None:
-    dataset = tmp_path / "set"
+def test_a_crash_at_the_very_first_episode_leaves_no_dataset(tmp_path: Path) -> None:
     episode = record(tmp_path / "episodes", frames=4)
-    assert _die(episode, dataset, steps) == 9
-    assert not (dataset / "meta/info.json").exists()
-    assert publish(episode, dataset).episode_index == 0
-    assert check(dataset) == []
+    left = cuts(episode, tmp_path / "set", tmp_path / "cuts")
+    assert len(left) == RENAMES + 2  # also that of modality.json, and the whole dataset
+    for steps in (0, 5, RENAMES):
+        dataset = left[steps]
+        assert not (dataset / "meta/info.json").exists()
+        assert publish(episode, dataset).episode_index == 0
+        assert check(dataset) == []
 
 
 def test_another_episode_after_a_crash_takes_the_index_and_leaves_no_traces(tmp_path: Path) -> None:
@@ -529,16 +613,16 @@ def test_another_episode_after_a_crash_takes_the_index_and_leaves_no_traces(tmp_
     assert stranger(dataset)["broken"] == []
 
 
-@pytest.mark.parametrize("steps", [1, 4, 8])
-def test_a_crash_while_writing_anew_leaves_a_dataset_that_opens(tmp_path: Path, steps: int) -> None:
+def test_a_crash_while_writing_anew_leaves_a_dataset_that_opens(tmp_path: Path) -> None:
     dataset = tmp_path / "set"
     episodes = [record(tmp_path / "episodes", frames=n, seed=n) for n in (6, 8)]
     for episode in episodes:
         publish(episode, dataset)
-    assert _die(episodes[0], dataset, steps) == 9
-    assert stranger(dataset)["broken"] == []
-    assert publish(episodes[0], dataset).created is False
-    assert check(dataset) == []
+    left = cuts(episodes[0], dataset, tmp_path / "cuts")
+    for steps in (1, 4, 8):
+        assert stranger(left[steps])["broken"] == []
+        assert publish(episodes[0], left[steps]).created is False
+        assert check(left[steps]) == []
 
 
 def test_two_publishers_at_once_get_two_indices(tmp_path: Path) -> None:
@@ -627,39 +711,34 @@ def test_in_v30_folders_hold_as_many_files_as_the_info_says(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("steps", [2, 5, 7, RENAMES_V30 - 1])
-def test_in_v30_a_crash_between_renames_is_taken_back_without_a_trace(tmp_path: Path, steps: int) -> None:
-    dataset = tmp_path / "set"
-    publish(record(tmp_path / "episodes", frames=6), dataset, version="v3.0")
-
-    def contents() -> dict[str, bytes]:
-        return {str(p.relative_to(dataset)): p.read_bytes() for p in dataset.rglob("*") if p.is_file()}
-
-    old = contents()
-    episode = record(tmp_path / "episodes", frames=8, seed=8, task="another")
-    assert _die(episode, dataset, steps) == 9
+def test_in_v30_a_crash_between_renames_is_taken_back_without_a_trace(
+    tmp_path: Path, interrupted_v30: Interrupted, steps: int
+) -> None:
+    dataset = interrupted_v30.copy(steps, tmp_path / "set")
     assert [entry.length for entry in open_dataset(dataset).episodes] == [6]
     with staging.locked(dataset):
         staging.recover(dataset)
-    assert contents() == old
-    done = publish(episode, dataset)
+    assert contents(dataset) == contents(interrupted_v30.old)
+    done = publish(interrupted_v30.episode, dataset)
     assert (done.episode_index, done.created) == (1, True)
     assert check(dataset) == []
     assert stranger(dataset)["broken"] == []
 
 
-def test_in_v30_one_more_rename_than_that_is_not_needed(tmp_path: Path) -> None:
-    dataset = tmp_path / "set"
-    publish(record(tmp_path / "episodes", frames=6), dataset, version="v3.0")
-    assert _die(record(tmp_path / "episodes", frames=8), dataset, RENAMES_V30) == 0
+def test_in_v30_one_more_rename_than_that_is_not_needed(interrupted_v30: Interrupted) -> None:
+    *before, after = interrupted_v30.cuts
+    assert len(before) == RENAMES_V30
+    assert len(open_dataset(after).episodes) == 2
 
 
-@pytest.mark.parametrize("steps", [5, RENAMES_V30])
-def test_in_v30_a_crash_at_the_very_first_episode_leaves_no_dataset(tmp_path: Path, steps: int) -> None:
-    dataset, episode = tmp_path / "set", record(tmp_path / "episodes", frames=4)
-    assert _die(episode, dataset, steps, "v3.0") == 9
-    assert not (dataset / "meta/info.json").exists()
-    assert publish(episode, dataset, version="v2.1").episode_index == 0
-    assert check(dataset) == []
+def test_in_v30_a_crash_at_the_very_first_episode_leaves_no_dataset(tmp_path: Path) -> None:
+    episode = record(tmp_path / "episodes", frames=4)
+    left = cuts(episode, tmp_path / "set", tmp_path / "cuts", "v3.0")
+    for steps in (5, RENAMES_V30):
+        dataset = left[steps]
+        assert not (dataset / "meta/info.json").exists()
+        assert publish(episode, dataset, version="v2.1").episode_index == 0
+        assert check(dataset) == []
 
 
 # --- a simulated robot -------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache
 
+import cv2
 import numpy as np
 
 import robots
@@ -51,7 +52,7 @@ class Outcome:
 class Trial:
     """One policy server and one bench; every `run` is another connection, unless it goes on with the last."""
 
-    def __init__(self, skill: Skill, delay: int = 3, pose: str = "ready") -> None:
+    def __init__(self, skill: Skill, delay: int = 6, pose: str = "ready") -> None:
         self.clock = VirtualClock()
         self.policy = PickPlace(ROBOT, 50, RATE, skill, clock=self.clock)
         self.delay = delay
@@ -82,8 +83,12 @@ class Trial:
 
     def picture(self) -> UInt8:
         """What the policy is sent: 224 by 224, letterboxed, channels first, RGB."""
-        shown = renderer().draw(self.plant.q, self.table.state())[CAMERA][..., ::-1]
-        whole = np.zeros_like(shown) if self.dark else np.ascontiguousarray(shown)
+        shown = renderer().draw(self.plant.q, self.table.state())[CAMERA]
+        whole = (
+            np.zeros_like(shown)
+            if self.dark
+            else np.asarray(cv2.cvtColor(shown, cv2.COLOR_BGR2RGB), np.uint8)
+        )
         return laid_out(fitted(whole, 224, 224, "pad"), "chw")
 
     def ask(self) -> Float64:

@@ -1,6 +1,6 @@
 """A station of any robot at its simulated tabletop in lockstep: node, bench and policy wire are the product's own.
 
-Only time is virtual. Of the cameras the overhead one alone is drawn, six times a second; the others show nothing.
+Only time is virtual. Of the cameras the overhead one alone is drawn, three times a second; the others show nothing.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from runtime.transports.base import Capabilities
 DEPLOYMENTS = Path(__file__).parents[3] / "deployments"
 HORIZON = 50
 _WIDTH, _HEIGHT = 640, 480
-_EVERY = 5  # ticks between two drawn pictures
+_EVERY = 10  # ticks between two drawn pictures
 _SECONDS = 40.0
 _NOISE = 0.001  # m
 
@@ -134,7 +134,7 @@ def planned(
     name: str, seed: int, data: Path, url: str | None, assignments: Sequence[str] = ()
 ) -> TabletopPlan:
     """The station of the deployment `name` with the bench laid out by `seed`; nothing is recorded."""
-    given = [f'data_dir="{data}"', "recording.enabled=false", "lockstep.delay_ticks=3", *assignments]
+    given = [f'data_dir="{data}"', "recording.enabled=false", "lockstep.delay_ticks=5", *assignments]
     given += [] if url is None else [f'policy.url="{url}"']
     made = station_spec.spec_of(loader.load(DEPLOYMENTS / f"{name}.toml", given))
     bench = SlowEye(made.robot, Tabletop(made.robot, seed))
