@@ -14,13 +14,15 @@ import hypothesis
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
+from runtime.core.environment import for_programs
+
 _ALONE = [Path(__file__).parent / folder for folder in ("e2e", "crash")]  # whole labs, and what ends them
 _OF_ONE_LAB = {  # fixtures of tests/e2e, and the files that use them: side by side each would start a lab of its own
     "patient": "story curves datasets debug_modes layout policy preflight replay_on_robot review",
     "shared": "faults stop_process lifetime",
 }
 _LABS = {f"tests/e2e/test_{name}.py": lab for lab, names in _OF_ONE_LAB.items() for name in names.split()}
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads spin where they wait
+os.environ |= for_programs(os.environ)
 _BEGAN = os.sched_getscheduler(0)
 hypothesis.settings.register_profile("eva", deadline=None)  # no test asserts timing: others share the machine
 hypothesis.settings.load_profile("eva")

@@ -19,7 +19,7 @@ from evaweb.lab.seed import station_registered
 from evaweb.listening import listen
 from evaweb.stop_port import StopPort, forget
 from runtime.config.loader import ConfigurationError, load
-from runtime.core.environment import with_still_blas
+from runtime.core.environment import for_programs
 
 _WATCH_S = 0.5
 
@@ -92,7 +92,7 @@ def a_lab(host: str, port: int, stop_port: int | None = None) -> Iterator[Lab]:
     with lifetime.only_one(settings.DATA_DIR):
         lifetime.end_on_signals()
         call_command("migrate", verbosity=0, interactive=False)
-        environment = with_still_blas(os.environ) | {
+        environment = for_programs(os.environ) | {
             "EVA_DATA_DIR": str(settings.DATA_DIR),
             "PYTHONUNBUFFERED": "1",
         }

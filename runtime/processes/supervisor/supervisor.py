@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 
-from runtime.core.environment import with_still_blas
+from runtime.core.environment import for_programs
 from runtime.ipc.bus import Endpoints, Key
 from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.shared_state import PROCESSES, SharedState
@@ -47,7 +47,7 @@ class Supervisor:
         self._lifeline = lifeline  # of our own parent, where it wants us to end with it
         self._station_dir = spec.deployment.station_dir
         self._endpoints = Endpoints(self._station_dir)
-        self._environment = with_still_blas(os.environ)
+        self._environment = for_programs(os.environ)
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._driver: subprocess.Popen[bytes] | None = None
         self._channel: OptionalChild | None = None

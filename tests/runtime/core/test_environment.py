@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from runtime.core import environment
-from runtime.core.environment import WEB_ALONE, for_ssh, secret, with_still_blas, without_secrets
+from runtime.core.environment import WEB_ALONE, for_programs, for_ssh, secret, without_secrets
 from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.policies.tunnel.process import Ssh
 from runtime.preflight.__main__ import _asked_for
@@ -115,5 +115,7 @@ def test_all_else_is_kept():
 
 @pytest.mark.parametrize("given", ["OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS"])
 def test_the_number_of_threads_that_an_administrator_names_stays(given: str) -> None:
-    assert with_still_blas({given: "3"}) == {given: "3"}
-    assert with_still_blas({"HOME": "/"}) == {"HOME": "/", "OPENBLAS_NUM_THREADS": "1"}
+    plug_ins = {"PYDANTIC_DISABLE_PLUGINS": "__all__"}
+    assert for_programs({given: "3"}) == {given: "3"} | plug_ins
+    assert for_programs({"HOME": "/"}) == {"HOME": "/", "OPENBLAS_NUM_THREADS": "1"} | plug_ins
+    assert for_programs({"PYDANTIC_DISABLE_PLUGINS": "mine"})["PYDANTIC_DISABLE_PLUGINS"] == "mine"
