@@ -12,6 +12,7 @@ from pathlib import Path
 
 import psutil
 
+from tests import migrated
 from tests.processes import alive, eventually
 
 ROOT = Path(__file__).parents[2]
@@ -42,6 +43,8 @@ class Demo:
 
     def start(self):
         """Start it and wait until it is up; returns itself."""
+        if not self.data.exists():  # tests/e2e/test_once.py begins without a database
+            migrated.copy(self.data)
         ready = self.folder / "ready.json"
         ready.unlink(missing_ok=True)
         self.output = (self.folder / "demo.log").open("a")

@@ -22,6 +22,7 @@ import pytest
 
 from evaweb.console.server import _address
 from evaweb.listening import PortTaken, listen
+from tests import migrated
 from tests.processes import eventually
 
 MANAGE = Path(__file__).parents[3] / "manage.py"
@@ -193,7 +194,7 @@ class _Template:
 def _template():
     """Made once: it takes longer than what is tried on copies of it."""
     folder = Path(os.environ["EVA_DATA_DIR"], "template")
-    folder.mkdir()
+    migrated.copy(folder)
     made = subprocess.run(
         [sys.executable, MANAGE, "shell", "-v0", "-c", _MADE],
         env=os.environ | {"EVA_DATA_DIR": str(folder), "DJANGO_SETTINGS_MODULE": "evaweb.settings"},
@@ -205,8 +206,6 @@ def _template():
 
 
 _MADE = """
-from django.core.management import call_command
-call_command("migrate", verbosity=0)
 from django.contrib.auth.models import User
 from evaweb.api.tokens import token_create
 from evaweb.stations.models import Station

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from pathlib import Path
 
 import pytest
+
+from tests import migrated
 
 ROOT = Path(__file__).parents[3]
 pytestmark = pytest.mark.slow
@@ -107,23 +107,10 @@ class Lab:
         return (str(found[0]), int(found[1]), int(found[2]))
 
 
-@pytest.fixture(scope="module")
-def migrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A database in which nothing has been asked for yet."""
-    folder = tmp_path_factory.mktemp("migrated")
-    Lab(folder).manage("migrate", "--verbosity", "0")
-    with (
-        closing(sqlite3.connect(folder / "eva.sqlite3")) as database,
-        closing(sqlite3.connect(folder / "whole.sqlite3")) as whole,
-    ):
-        database.backup(whole)  # whatever its journal still has
-    return folder / "whole.sqlite3"
-
-
 @pytest.fixture
-def lab(tmp_path: Path, migrated: Path) -> Iterator[Lab]:
+def lab(tmp_path: Path) -> Iterator[Lab]:
     made = Lab(tmp_path)
-    shutil.copy(migrated, tmp_path / "eva.sqlite3")
+    migrated.copy(tmp_path)
     yield made
     for worker in made.workers:
         if worker.poll() is None:
