@@ -1,4 +1,4 @@
-"""Who came, went and was refused, a line each in the log.
+"""Logins, logouts and refusals, a line each in the log.
 
 Names are logged as Python writes them, so that no control character reaches a terminal. A name that nobody has is not
 logged: it may be a password in the wrong field.

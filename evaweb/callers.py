@@ -1,4 +1,4 @@
-"""Where a request comes from: the other end of its connection, or what a declared proxy says it forwards."""
+"""Address of a caller: the other end of the connection, or what a declared proxy says it forwards."""
 
 from __future__ import annotations
 

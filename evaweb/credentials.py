@@ -1,4 +1,4 @@
-"""Who a session or token stands for: asked of the database, remembered for when it does not answer.
+"""Users of sessions and tokens: asked of the database, remembered for when it does not answer.
 
 What is remembered never expires by itself: stopping works with it as long as this process lives. It is forgotten when
 the database says otherwise, which is asked again whenever it is used and older than a few seconds. Who is not
@@ -77,7 +77,7 @@ _Said = Login | Unverifiable | Busy | None
 
 
 class Credentials:
-    """What this process has verified; from any thread. `wait` is asyncio's, which a test's clock may stand for."""
+    """Logins that this process has verified; from any thread. A test's clock may stand for asyncio's `wait`."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class Credentials:
         }
 
     def learn(self, kind: str, owner: Callable[[str], Any]) -> None:
-        """How the user of a credential of that kind is found in the database, None where there is none."""
+        """Register how the user of a credential of that kind is looked up, None where there is none."""
         self._owners[kind] = owner
 
     def look(self, kind: str, secret: str) -> Any:
@@ -142,12 +142,12 @@ class Credentials:
                 self._known.popitem(last=False)
 
     def recall(self, kind: str, secret: str) -> Login | None:
-        """Who it stood for when the database was last asked; without asking."""
+        """Login it stood for when the database was last asked; without asking."""
         with self._lock:
             return self._known.get((kind, digest(secret)))
 
     def counted(self, kind: str, secret: str) -> Login | None:
-        """Who it stands for as the database said within the last minute; without asking."""
+        """Login it stands for as the database said within the last minute; without asking."""
         known = self.recall(kind, secret)
         return known if known is not None and self._clock() - known.checked < COUNTS_S else None
 
@@ -203,7 +203,7 @@ class Credentials:
         return self._clock() - known.checked < _FRESH_S
 
     async def _checked(self, kind: str, secret: str, known: Login) -> Login | None:
-        """What the database says of who is remembered, or said, where it takes its time."""
+        """The database's answer on a remembered login, or that login, where the database takes its time."""
         answer = asyncio.wrap_future(self._check(kind, secret))
         await self._wait({answer}, timeout=_RECHECK_S)
         if answer.done() and answer.exception() is None:
@@ -273,7 +273,7 @@ class Credentials:
 
 
 def patience(came: float, answered: float, now: float) -> float:
-    """How long who came then still waits, where the database has last answered anybody at `answered` [s].
+    """Time that a caller since `came` still waits [s]; the database last answered at `answered` [s].
 
     Raises Unverifiable where it has answered nobody for half a second, Busy where others were before them for longer.
     """

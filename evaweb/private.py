@@ -1,4 +1,4 @@
-"""What holds passwords and sessions is its user's alone: looked at when a process starts."""
+"""Modes of the files with passwords and sessions, their user's alone: looked at when a process starts."""
 
 from __future__ import annotations
 

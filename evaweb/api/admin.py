@@ -82,7 +82,7 @@ class RoleFilter(admin.SimpleListFilter):
 
 
 class AccountAdmin(UserAdmin):
-    """Who may log in, and what they may do."""
+    """Accounts and their roles."""
 
     form, add_form = AccountForm, NewAccountForm
     list_display = ("username", "full_name", "role", "is_active", "last_login")
@@ -177,6 +177,6 @@ class AttemptAdmin(admin.ModelAdmin):
 
     @admin.display(boolean=True, description="locks the name there")
     def locks(self, attempt: AccessAttempt) -> bool:
-        """Whether it alone is enough, and still counts."""
+        """True if it alone reaches the limit of failures and still counts."""
         counts = timezone.now() - attempt.attempt_time < settings.AXES_COOLOFF_TIME
         return counts and attempt.failures_since_start >= settings.AXES_FAILURE_LIMIT

@@ -1,4 +1,4 @@
-"""Who asks: a logged-in browser, or a program with a token."""
+"""Authentication of a caller: a logged-in browser, or a program with a token."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the worker does and has done."""
+"""Jobs of the worker, current and past."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ class Back(Schema):
 
 
 class Freed(Schema):
-    """How many trials others can be handed now."""
+    """Number of trials that can now be handed to others."""
 
     freed: int
 
@@ -108,7 +108,7 @@ class Reason(Schema):
 
 
 class SeenOut(Schema):
-    """What one camera showed, its reference ("": none), and how well they match, from 1 down."""
+    """Picture of one camera, its reference ("": none), and how well they match, from 1 down."""
 
     camera: str
     picture: str
@@ -117,7 +117,7 @@ class SeenOut(Schema):
 
 
 class CamerasOut(Schema):
-    """Whether who asks has confirmed the station's cameras, with what they showed."""
+    """The caller's confirmation of the station's cameras, with the pictures they showed."""
 
     confirmed: bool
     at: datetime | None
@@ -243,7 +243,7 @@ def reveal(request: HttpRequest, name: str) -> Any:
     url_name="cameras",
 )
 def cameras(request: HttpRequest, name: str) -> Any:
-    """Whether who asks has confirmed them; it holds until the station is started anew, half a day at most."""
+    """The caller's confirmation of the cameras; valid until the station starts anew, half a day at most."""
     return CamerasOut.of(bench.cameras_confirmed(user=request.auth, station=station_get(name=name)))
 
 
@@ -266,7 +266,7 @@ def cameras_confirm(request: HttpRequest, name: str, given: CamerasIn) -> Any:
     url_name="references",
 )
 def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
-    """What the cameras show now is how the position should lie; operators."""
+    """Take the cameras' current pictures as reference of how the position should lie; operators."""
     position = None
     if given.scene is not None:
         scene = trials.scene_get(name=given.scene)

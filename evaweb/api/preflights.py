@@ -94,6 +94,6 @@ def ask(request: HttpRequest, given: PreflightIn) -> Any:
     "/{uuid:id}", response={200: PreflightOut, **FAILURES}, summary="One preflight", url_name="preflight"
 )
 def preflight(request: HttpRequest, id: UUID) -> Any:
-    """How it goes, or went."""
+    """A preflight: its progress, or its result."""
     row = services.preflight_settled(row=selectors.preflight_get(id=id, sight=sight_for(request)))
     return PreflightOut.of(row, request.auth)

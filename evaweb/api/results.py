@@ -1,4 +1,4 @@
-"""What plans found: every statistic, every attempt, comparisons, second ratings, preferences."""
+"""Results of plans: every statistic, every attempt, comparisons, second ratings, preferences."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ OutcomeOut: Any = create_model("OutcomeOut", __base__=Schema, **_FIELDS)
 
 
 class RatingOut(Schema):
-    """What a second rater said of a trial."""
+    """Second rating of a trial."""
 
     uuid: UUID
     trial: int

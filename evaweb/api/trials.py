@@ -107,7 +107,7 @@ class OutcomeOut(Schema):
 
 
 class ScoreOut(Schema):
-    """What one rater said; the newest one counts, none is ever changed."""
+    """One rater's score; the newest one counts, none is ever changed."""
 
     uuid: UUID
     rater: str

@@ -13,7 +13,7 @@ from evaweb.api.api import api
 
 @csrf_exempt  # it changes nothing, and its answer is the truer one
 def nowhere(request: HttpRequest, rest: str) -> JsonResponse:
-    """What is at no address of the interface, said as the interface says everything."""
+    """Answer at an unknown address of the interface, in the form of all its answers."""
     return JsonResponse({"error": refusals.nowhere(request.path)}, status=404)
 
 

@@ -1,4 +1,4 @@
-"""What is done with sessions: opened, closed, resumed, published. A line on the disk first, then the row."""
+"""Actions on sessions: begin, close, resume, publish. A line on the disk first, then the row."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def session_resume(*, user: Any, session: CollectSession) -> CollectSession:
 
 @transaction.atomic
 def session_target(*, user: Any, session: CollectSession, target: int | None) -> CollectSession:
-    """How many episodes are wanted, None for as many as there will be."""
+    """Set the number of episodes wanted, None for no target."""
     require(user, Role.OPERATOR)
     _check_target(target)
     held = _held(session)

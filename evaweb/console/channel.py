@@ -1,4 +1,4 @@
-"""What is refused before Django hears of it, said as Django says it: JSON, or the page of the lab."""
+"""Refusals before Django hears of a request, in Django's form: JSON, or the page of the lab."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Headers = list[tuple[bytes, bytes]]
 
 
 def is_stop(path: bytes) -> bool:
-    """Whether what is asked at that address may stop a robot."""
+    """True if a request to that address may stop a robot."""
     return _STOPS.fullmatch(path) is not None
 
 

@@ -229,7 +229,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             _go_on(self._aims.answer())
 
     def _keep_lease(self, request: Renew) -> None:
-        """Where the database has said within the last minute who is there; it may be away since."""
+        """Renew the lease if the database has named the user within the last minute; it may be away since."""
         login = self._counted
         if login is None:
             self._say({"type": "renewed", "ok": False, "lost": False, "reason": _NOT_SAID})
@@ -279,7 +279,7 @@ class StationConsumer(AsyncWebsocketConsumer):
 
 
 class NowhereConsumer(AsyncWebsocketConsumer):
-    """What is at no address of the live sockets."""
+    """Consumer at unknown addresses of the live sockets."""
 
     channel_layer_alias = ""
 
@@ -308,7 +308,7 @@ def _admitted(name: str, sessions: list[str]) -> _Admitted:
 
 
 def _as_said(message: bytes) -> str:
-    """What a binary message says, which is no page's way and may be a press."""
+    """Text of a binary message, which is no page's way and may be a press."""
     return message.decode(json.detect_encoding(message), "replace")
 
 

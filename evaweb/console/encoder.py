@@ -1,4 +1,4 @@
-"""What a station publishes as parts of frames: made once for all who watch, in the feed's own threads."""
+"""Parts of frames, encoded from what a station publishes: once for all viewers, in the feed's own threads."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ class Room:
         self.ring()
 
     def hear(self, stream: str, content: Any) -> None:
-        """What the feed has to tell, in its thread."""
+        """Encode and pass on a message of the feed, in its thread."""
         encoded = self._encoder.encode(stream, content)
         covered = encoded if stream.startswith("camera/") else self._cover(stream, content)
         if not self._loop.is_closed():
@@ -137,7 +137,7 @@ class Room:
         return self._covered if viewer.veiled else self._newest
 
     def _judge(self, viewer: Mailbox) -> None:
-        """Whether the page is shown the station as it is now; where that changes it is told, and shown anew."""
+        """Decide if the page sees the station as it is now; where that changes it is told, and shown anew."""
         veiled = viewer.sight.veils(self.station, self._state)
         viewer.covers = viewer.sight.veils_events(self.station)
         if veiled is not viewer.veiled:

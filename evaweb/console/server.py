@@ -32,7 +32,7 @@ _TURN_S = 0.001  # of the interpreter, where others wait for it: an e-stop takes
 
 
 class Beside(Protocol):
-    """What a process does as long as it serves."""
+    """Service of a process, for as long as the process serves."""
 
     def start(self) -> None:
         """It serves."""

@@ -1,4 +1,4 @@
-"""What a page stops: at once where it is known who is there, and also where the database does not say who.
+"""Stops by a page: at once where the user is known, and also where the database does not tell the user.
 
 Nothing here waits for the database, and no number of presses is too many.
 """

@@ -148,7 +148,7 @@ def reconcile_all(work: Work) -> Mapping[str, Any]:
 
 @at_start("reconcile")
 def reconcile_at_start() -> None:
-    """What happened on the disk while no worker was there."""
+    """Reconcile with what happened on the disk while no worker was there."""
     enqueue(kind="reconcile", key="reconcile", args={})
 
 

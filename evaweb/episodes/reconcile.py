@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """What the disk keeps of one run: its folder, if `recorded`, and the whole `lines` of its scores file.
+    """Data on the disk of one run: its folder, if `recorded`, and the whole `lines` of its scores file.
 
     `uuid` is the episode's; of a run that was not recorded, whatever those who wrote the lines named it by. `say` takes
     a sentence about what a person should look at.
@@ -53,7 +53,7 @@ def restores(function: Restorer) -> Restorer:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What was found. `problems` are sentences about folders that could not be read; nothing is done to those."""
+    """Findings of a reconcile. `problems` are of folders that could not be read; nothing is done to those."""
 
     episodes: int  # folders that were read
     made: int  # rows that were not there

@@ -11,7 +11,7 @@ from evaweb.stations.robot_geometry import Looks, groups_of, looks_of
 
 
 def robot_in(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What a manifest says of its robot; {} where it says nothing."""
+    """Robot of a manifest; {} where it names none."""
     robot = manifest.get("robot")
     return robot if isinstance(robot, Mapping) else {}
 

@@ -1,4 +1,4 @@
-"""What happens to the rows of episodes; their folders are the authority, and reconcile makes rows of them."""
+"""Changes to the rows of episodes; their folders are the authority, and reconcile makes rows of them."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
 
 
 def another_than(row: Episode, seal: str | None) -> str:
-    """What has become of the outcome of a row that is closed, to follow its name; "" where it is the same.
+    """Change of the outcome of a closed row, in words that follow its name; "" where it is the same.
 
     `seal` is that of the one that is there now: None where there is none, "" where it has none.
     """

@@ -1,4 +1,4 @@
-"""What a lab consists of, each part as the command line that starts it."""
+"""Programs of a lab, each as the command line that starts it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def stops(descriptor: int, web_port: str) -> Program:
 
 
 def worker(queues: Sequence[str]) -> Program:
-    """What turns finished episodes into datasets; what it was about to do is done at the next start."""
+    """Worker that turns finished episodes into datasets; what it was about to do is done at its next start."""
     return Program("worker", (_MANAGE, "worker", "--queues", ",".join(queues)), patience_s=20.0, of_web=True)
 
 

@@ -27,7 +27,7 @@ from evaweb.trials.services import trial_create
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How many trials a plan foresees, how many of them count already, and how many attempts there were."""
+    """Number of trials that a plan foresees, of those that count already, and of attempts."""
 
     total: int
     counted: int
@@ -35,7 +35,7 @@ class Progress:
 
 
 def progress(plan: Plan) -> Progress:
-    """How far a plan is; it tells nothing of any checkpoint."""
+    """Progress of a plan; it tells nothing of any checkpoint."""
     slots = _with_newest(plan.slots.all())
     counted = slots.filter(newest=TrialStatus.SCORED).count()
     return Progress(plan.slots.count(), counted, plan.handouts.count())

@@ -17,14 +17,14 @@ from runtime.recording.files import RecordingError, read_document
 
 
 def standing_of(*, episode: Episode) -> Standing:
-    """Where the episode stands; one of which nothing is known stands at the beginning."""
+    """Standing of the episode; one of which nothing is known stands at the beginning."""
     return Standing.objects.filter(episode=episode).select_related("review__reviewer").first() or Standing(
         episode=episode
     )
 
 
 def report_of(*, uuid: UUID) -> Mapping[str, Any] | None:
-    """What the checks found, as it was written down; None where they were not done. Conflict if it is damaged."""
+    """Report of the checks, as written down; None where they were not done. Conflict if it is damaged."""
     path = report_file(uuid)
     try:
         return read_document(path) if path.exists() else None

@@ -223,7 +223,7 @@ def _require_sendable(command: messages.Command) -> None:
 
 
 def _asked(row: Command, command: messages.Command, waited: float) -> Answer:
-    """What the runtime says to a command whose row took `waited` seconds to be written."""
+    """The runtime's answer to a command whose row took `waited` seconds to be written."""
     if waited > settings.EVA_COMMAND_TIMEOUT_S:
         late = f"not sent: the database took {waited:.0f} s to write it down; look at the robot, press again"
         return Answer(CommandStatus.FAILED, late)
@@ -306,7 +306,7 @@ def _first_or_own(row: Command) -> Command | None:
 
 
 def _latched_again(row: Command, first: Command) -> bool:
-    """Whether a press latched anew, and not when the first of its uuid was carried out."""
+    """True if a press latched anew, and not when the first of its uuid was carried out."""
     at = first.data.get("carried_out_at")
     return row.data.get("latched") == "anew" and at not in (None, row.data["carried_out_at"])
 
@@ -345,7 +345,7 @@ def _put(row: Command, answer: Answer) -> None:
 
 
 def _update(row: Command) -> None:
-    """Where the database refuses, `settle` asks the runtime again later."""
+    """Save the answer; where the database refuses, `settle` asks the runtime again later."""
     try:
         row.save(update_fields=_ANSWER)
     except Error as error:

@@ -30,7 +30,7 @@ class _Flight(Generic[T]):
 
 
 class Flights(Generic[T]):
-    """What is asked of stations now; from any thread, and none of its callers waits.
+    """Requests to stations under way; from any thread, and none of its callers waits.
 
     `most` is how many keys of one station may be under way at once, None for any number.
     """

@@ -204,7 +204,7 @@ def _record(station: Station, holder: str, epoch: int, boot: str, end_reason: st
 
 
 def _just_ended(lease: Lease) -> bool:
-    """What is heard of it now was said before it ended."""
+    """True if it ended so lately that what is heard of it now was said before."""
     return lease.ended_at is not None and timezone.now() - lease.ended_at < _ECHO
 
 

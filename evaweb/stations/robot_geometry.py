@@ -50,11 +50,11 @@ class Looks:
 
     @property
     def compiled(self) -> bool:
-        """Whether the kernels are there."""
+        """True if the kernels are there."""
         return self._links.done() and self._links.exception() is None
 
     def tips(self, links: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Where the fingertips are for parts at `links` [..., P, 16]: float32 [..., arms, 3], in the world [m]."""
+        """Positions of fingertips for parts at `links` [..., P, 16]: float32 [..., arms, 3], in the world [m]."""
         found = np.empty((*links.shape[:-2], len(self.robot.arms), 3), np.float32)
         for index, arm in enumerate(self.robot.arms):
             part = links[..., self.carrier(arm), :].reshape(*links.shape[:-2], 4, 4)  # its columns as rows

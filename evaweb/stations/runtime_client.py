@@ -97,7 +97,7 @@ class StationWire:
         return ack.boot, plain(ack.data.get("events", []))
 
     def address(self, process: str, key: str) -> str:
-        """Where a socket is, as its process last wrote it; raises StationGone where there is none."""
+        """Address of a socket, as its process last wrote it; raises StationGone where there is none."""
         try:
             return str(self.endpoints.read(process)[key])
         except (TransportError, KeyError):

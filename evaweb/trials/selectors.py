@@ -1,4 +1,4 @@
-"""What is known of scenes, checkpoints, evaluations, trials and their scores."""
+"""Queries on scenes, checkpoints, evaluations, trials and their scores."""
 
 from __future__ import annotations
 

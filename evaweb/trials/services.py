@@ -1,4 +1,4 @@
-"""What is done with trials: prepared, scored, voided, abandoned; what their runs do to them is in `following`."""
+"""Actions on trials: prepare, score, void, abandon; what their runs do to them is in `following`."""
 
 from __future__ import annotations
 
@@ -310,7 +310,7 @@ def _held(trial: Trial) -> Trial:
 
 
 def _says(score: Score, said: Mapping[str, Any], found: Verdict) -> bool:
-    """Whether that score is word by word what is said now."""
+    """True if that score is word by word what is said now."""
     outcomes = {outcome.milestone_id: (outcome.reached, outcome.at_s) for outcome in score.outcomes.all()}
     same = outcomes == {milestone.pk: (reached, at) for milestone, reached, at in found.reached}
     words = all(getattr(score, name) == value for name, value in said.items())

@@ -278,7 +278,7 @@ def _grouped(trials: Sequence[Outcome], key: Callable[[Outcome], str]) -> dict[s
 
 
 def _said(notes: list[str], compute: Callable[[], T]) -> T | None:
-    """What it computes, or None with the reason among the notes."""
+    """Result of `compute`, or None with the reason among the notes."""
     try:
         return compute()
     except StatisticsError as error:

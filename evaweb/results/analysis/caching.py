@@ -23,7 +23,7 @@ from evaweb.trials.models import Scene, Trial, TrialStatus
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """What was run of a plan: the trials that count, and those that were broken off."""
+    """Runs of a plan: the trials that count, and those that were broken off."""
 
     outcomes: list[Outcome]
     interruptions: list[Interruption]
@@ -62,7 +62,7 @@ def runs_of(plan: Plan, at: Hashable = None) -> Runs:
 
 
 def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> Analysis:
-    """What the plan's trials say, or those of them that are chosen."""
+    """Analysis of the plan's trials, or of those that are chosen."""
     now = at or fingerprint(plan)
     runs, which = runs_of(plan, now), only or Chosen()
 
@@ -76,7 +76,7 @@ def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> 
 
 
 def page_of(plan: Plan, name: Hashable, at: Hashable, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What the page of that name shows of the plan's trials, figures included."""
+    """Contents of the plan's page of that name, figures included."""
     return _pages.get((plan.pk, plan.digest, name), at, make)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one trial that counts.
+    """Outcome of one trial that counts.
 
     `order` is when it was run among those of its evaluation, `block` names the initial condition and its repetition:
     trials of one block met the same one. `milestones` are those of its scene in their order. `duration` is in s.
