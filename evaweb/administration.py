@@ -1,4 +1,4 @@
-"""The admin pages: for users with the role of an admin, who may do everything there."""
+"""The admin pages: for users with the role of an admin, with all rights there."""
 
 from __future__ import annotations
 

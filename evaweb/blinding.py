@@ -1,8 +1,8 @@
 """Visibility of data while a plan is blind: the one seam of pages, REST, live sockets, downloads and exports.
 
-A plan is blind for everybody who has not looked behind it, until it is revealed. Hidden are its checkpoints, and with
-them whatever tells one from another: names, addresses, figures of the policy, texts in which a server is named. Who
-hides what is declared from above (evaweb.plans.blinding_rules); without that nobody is shown anything.
+A plan is blind for every user who has not looked behind it, until it is revealed. Hidden are its checkpoints, and with
+them whatever tells one from another: names, addresses, figures of the policy, texts in which a server is named. The
+rules are declared from above (evaweb.plans.blinding_rules); without them no user is shown anything.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Sight:
         return self.told(trial.reason)
 
     def told(self, text: str) -> str:
-        """A station's sentence as somebody may read it from whom something is hidden."""
+        """A station's sentence as a user may read it from whom something is hidden."""
         return text if not text or _HARMLESS.fullmatch(text) else HIDDEN
 
     def open(self, rows: Any, checkpoint: str = "checkpoint") -> Any:

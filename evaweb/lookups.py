@@ -1,4 +1,4 @@
-"""Questions to the database that strangers can cause: each of who asks has a share, and a crowd waits behind itself."""
+"""Questions to the database that strangers can cause: each caller has a share, and a crowd waits behind itself."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Lookups(Generic[T]):
         return answer
 
     def _place_for(self, share: Hashable, answer: Future[T]) -> Future[T] | None:
-        """Look-up to drop so that one of this share may wait: None, `answer` itself, one of a longer share."""
+        """Look-up to drop so that one of this share may wait: None, `answer`, or one of a longer share."""
         if self._waiting < self._most:
             return None
         longest = max(self._shares.values(), key=len)

@@ -26,7 +26,7 @@ _NO_TEXT = re.compile("[\x00\ud800-\udfff]")
 
 
 class LoginMiddleware(LoginRequiredMiddleware):
-    """Django's own, which asks the database for the user of every address, also where nobody need be logged in."""
+    """Django's own, which asks the database for the user of every address, also where no login is needed."""
 
     def process_view(self, request: HttpRequest, view: Any, *given: Any) -> HttpResponseBase | None:
         if not getattr(view, "login_required", True):

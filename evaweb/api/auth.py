@@ -15,7 +15,7 @@ from evaweb.errors import EvaError
 
 
 class NotLoggedIn(EvaError):
-    """Nobody that we know."""
+    """An unknown user."""
 
     status = 401
 

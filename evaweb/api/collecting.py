@@ -219,7 +219,7 @@ def queue(request: HttpRequest, uuid: UUID) -> Any:
     url_name="session-open",
 )
 def opened(request: HttpRequest, name: str, given: SessionIn) -> Any:
-    """With the station's present set-up; operators, while nobody else commands it."""
+    """With the station's present set-up; operators, while no other user commands it."""
     made = services.session_begin(user=request.auth, station=station_get(name=name), **given.model_dump())
     return Status(201, SessionOut.of(made))
 

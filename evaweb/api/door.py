@@ -118,7 +118,7 @@ class StopDoor:
         return await _answered(self._as_of_here(scope), asked[1], asked[2], body)
 
     async def _ready(self, scope: dict[str, Any]) -> Answered:
-        """Whoever asks is known here from now on: their first press is not their first look-up."""
+        """Make the caller known here: their first press is not their first look-up."""
         try:
             user = (await _presser(scope)).username
         except Unverifiable:
@@ -211,7 +211,7 @@ def _told(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> dict[str,
 
 
 async def _presser(scope: dict[str, Any]) -> Login:
-    """Whoever presses, by any credential; raises Refused, Unverifiable, Busy."""
+    """The client that presses, by any credential; raises Refused, Unverifiable, Busy."""
     found = _credentials(scope)
     login = await credentials.presser(found, share_of(scope))
     if login is None:

@@ -24,7 +24,7 @@ router = Router(tags=["plans"])
 
 
 class PlanOut(Schema):
-    """One version of a plan. While it is blind for who asks, `document`, `digest` and `key` are empty.
+    """One version of a plan. While it is blind for the caller, `document`, `digest` and `key` are empty.
 
     `counted` trials of `total` have their score; `attempts` were handed out.
     """
@@ -102,7 +102,7 @@ class Freed(Schema):
 
 
 class Reason(Schema):
-    """Why, for those who read it later."""
+    """Reason, for later readers."""
 
     reason: str = ""
 
@@ -154,7 +154,7 @@ class ReferenceOut(Schema):
 
     @staticmethod
     def of(row: Reference) -> dict[str, Any]:
-        """With who took it."""
+        """With the user who took it."""
         return {"camera": row.camera, "picture": row.picture, "by": row.by.get_username(), "at": row.at}
 
 
@@ -221,7 +221,7 @@ def close(request: HttpRequest, name: str, given: Reason) -> Any:
 
 @router.post("/plans/{name}/look", response={200: PlanOut, **FAILURES}, summary="Look", url_name="plan-look")
 def looked(request: HttpRequest, name: str) -> Any:
-    """Look behind the blind before the reveal: recorded, and who has looked runs none of its trials."""
+    """Look behind the blind before the reveal: recorded, and the user runs none of its trials."""
     found = plan_get(name=name, user=request.auth)
     look(found, request.auth)
     return PlanOut.of(found, request.auth)

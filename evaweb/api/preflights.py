@@ -23,7 +23,7 @@ router = Router(tags=["preflights"])
 class PreflightOut(Schema):
     """One preflight. `report` is what `python -m runtime.preflight --json` says, null while it is under way.
 
-    `hidden` says why a part of it is kept back from who asks; `reason` why there is no report.
+    `hidden` says why a part of it is kept back from the caller; `reason` why there is no report.
     """
 
     id: UUID

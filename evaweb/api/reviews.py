@@ -121,7 +121,7 @@ class SegmentIn(Schema):
 
 
 class NextOut(Schema):
-    """An episode that nobody has passed or failed, None where there is no other; `waiting` counts all."""
+    """An episode without a pass or fail, None where there is no other; `waiting` counts all."""
 
     episode: UUID | None
     waiting: int

@@ -1,4 +1,4 @@
-"""Stations: how they stand, who has them, commands, the e-stop, new trials."""
+"""Stations: their states, lease holders, commands, the e-stop, new trials."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ HTTP_OF = {
 
 
 class RequestOut(Schema):
-    """Somebody asks for the station."""
+    """A user's request for the station."""
 
     id: int
     user: str
@@ -50,7 +50,7 @@ class RequestOut(Schema):
 
     @staticmethod
     def of(asked: LeaseRequest) -> dict[str, Any]:
-        """With the name of who asks."""
+        """With the name of the user."""
         return {"id": asked.pk, "user": asked.user.get_username(), "asked_at": asked.asked_at}
 
 
@@ -89,7 +89,7 @@ class StationOut(Schema):
 
     @staticmethod
     def of(station: Station) -> dict[str, Any]:
-        """With who has it."""
+        """With the holder of its lease."""
         plain = ("name", "title", "robot", "simulated", "active", "message")
         return {**{name: getattr(station, name) for name in plain}, "lease": LeaseOut.of(station)}
 
@@ -280,7 +280,7 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     "/{name}/estop", response={**ANSWERS, 409: CommandOut | Failure}, summary="E-stop", url_name="estop"
 )
 def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
-    """Stop the robot now; anybody who is logged in. To the wire first, and nobody waits for the row."""
+    """Stop the robot now; any logged-in user. To the wire first, without a wait for the row."""
     # A served lab answers at evaweb.api.door, also where the database does not say who is logged in.
     given, at = given or EStopIn(), timezone.now()
     identity, user = given.uuid or uuid4(), request.auth

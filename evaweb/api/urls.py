@@ -1,4 +1,4 @@
-"""Addresses of the REST interface; it says itself who may come in, and never redirects to a login page."""
+"""Addresses of the REST interface; it judges credentials itself, and never redirects to a login page."""
 
 from __future__ import annotations
 

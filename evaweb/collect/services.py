@@ -30,7 +30,7 @@ _ROLLOUTS = "rollouts"  # begins the names of datasets of policies' runs
 def session_begin(
     *, user: Any, station: Station, task: str, dataset: str = "", target: int | None = None
 ) -> CollectSession:
-    """Open a session with the station's present set-up; operators, while nobody else commands it.
+    """Open a session with the station's present set-up; operators, while no other user commands it.
 
     `dataset` "" takes the deployment's own. Conflict where one is open there, or the dataset was collected with
     another set-up: every difference is listed.
@@ -167,7 +167,7 @@ def _require_none_open(station: Station) -> None:
 
 
 def _commanded(user: Any, station: Station, *, needed: bool = True) -> dict[str, Any]:
-    """The station's snapshot; Conflict while somebody else commands it. Not `needed`: {} of a station that is away."""
+    """The station's snapshot; Conflict while another user commands it. Not `needed`: {} of a station that is away."""
     try:
         snapshot = wire_to(station.name).status()
     except EvaError:

@@ -138,7 +138,7 @@ class BoundedRequest(WebRequest):
         super().connectionLost(reason)
 
     def admitted(self) -> None:
-        """A long body of somebody who may send it: it takes its time."""
+        """A long body of a client that may send it: it takes its time."""
 
     def _too_long(self) -> None:
         if self._bound.may_press:

@@ -1,6 +1,6 @@
 """Changes of a station's rows in the database, by whichever process.
 
-Each web process looks once a second while somebody watches: the worker and other processes are heard this way
+Each web process looks once a second while a viewer watches: the worker and other processes are heard this way
 without anything between them but the database.
 """
 

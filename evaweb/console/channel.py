@@ -28,7 +28,7 @@ def is_stop(path: bytes) -> bool:
 
 
 def refusal(status: int, sentence: str, path: bytes) -> tuple[Headers, bytes]:
-    """Headers and body for who asked for `path`."""
+    """Headers and body for a request to `path`."""
     if path.startswith(_REST):
         kind, body, policy = "application/json", json.dumps({"error": sentence}), {}
     else:

@@ -1,9 +1,9 @@
 """The live socket of a page on a station.
 
 Watching needs the database once, when the socket opens. Renewing a lease and stopping never do: they have
-threads of their own, and go straight to the runtime; what stops is obeyed even before the database has said who is
-there. Beside them the login is looked at every few seconds: who has logged out, or is no operator any more, keeps no
-lease.
+threads of their own, and go straight to the runtime; what stops is obeyed even before the database has named
+the user. Beside them the login is looked at every few seconds: a user who has logged out, or is no operator any more,
+keeps no lease.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._keep(self._admit())
 
     async def _admit(self) -> None:
-        """Ask the database who is there until it answers; what stops is obeyed meanwhile."""
+        """Ask the database for the user until it answers; what stops is obeyed meanwhile."""
         admitted = None
         while admitted is None:
             try:
@@ -298,7 +298,7 @@ _Admitted = tuple[str, Any, Station | None, Role, dict[str, Any], Sight]
 
 
 def _admitted(name: str, sessions: list[str]) -> _Admitted:
-    """By which session who is there, and what they are shown of the station; nobody is shown nothing. NotFound."""
+    """The session, its user and their sight of the station; an unknown user is shown nothing. NotFound."""
     for session in sessions:
         user = credentials.look(SESSION, session)
         if user is not None:

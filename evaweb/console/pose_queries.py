@@ -1,6 +1,6 @@
 """Targets that a page asks about: where the robot would be, and whether it could go there. Nothing moves.
 
-Asked while somebody drags a slider: the newest question replaces the one that waits, and at most one of a page
+Asked while an operator drags a slider: the newest question replaces the one that waits, and at most one of a page
 is under way. They have threads and a connection to the station of their own, so that no command waits for them.
 """
 

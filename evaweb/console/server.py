@@ -127,7 +127,7 @@ def _address(listener: socket.socket) -> dict[str, Any]:
 
 
 def _watch(server: Server) -> None:
-    """Whoever started us holds the other end of our standard input."""
+    """The process that started us holds the other end of our standard input."""
     while os.read(0, 4096):
         pass
     events: Any = reactor

@@ -29,7 +29,7 @@ GoOn = Callable[[Coroutine[Any, Any, None]], None]  # to the end, also when the 
 
 
 class Stopping:
-    """The stops of one page at a station; belongs to the event loop. `login` is who is there, once that is known.
+    """The stops of one page at a station; belongs to the event loop. `login` is the user's, once that is known.
 
     `found` are the credentials that it came with, and `share` from where.
     """

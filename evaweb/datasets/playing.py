@@ -35,7 +35,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
-    """One episode of a dataset; `robot` is whose numbers are meant, "" where nobody knows.
+    """One episode of a dataset; `robot` is whose numbers are meant, "" where it is not known.
 
     `assumed`: a person says so, whatever the dataset says, and that they are in that robot's order.
     """

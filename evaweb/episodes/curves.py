@@ -85,7 +85,7 @@ def _covered(episode: Episode) -> Episode:
 
 
 def _numbers(episode: Episode) -> dict[str, Any]:
-    """The `units` of the joints and which are `grippers`; nobody knows where the robot is another one today."""
+    """The `units` of the joints and which are `grippers`; not known where the robot is another one today."""
     try:
         looks = looks_in(episode.manifest)
     except NotFound:
@@ -193,7 +193,7 @@ def _period(episode: Episode) -> float:
 
 
 def held_spans(sources: Sequence[str], fps: float) -> list[list[float]]:
-    """From when to when [s] nobody asked the robot for anything."""
+    """Spans [s] in which the robot was not asked for anything."""
     held = np.asarray([source in HELD for source in sources], np.int8)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
     return [

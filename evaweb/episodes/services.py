@@ -157,7 +157,7 @@ def export_asked(*, episode: Episode) -> Job:
 
 
 def smoothness_asked(*, most: int) -> int:
-    """Have the worker measure closed runs that nobody asked for yet, at most so many; how many."""
+    """Have the worker measure closed runs not yet asked for, at most so many; how many."""
     rows = Episode.objects.filter(
         status__in=CLOSED, kind="rollout", frames__gt=0, smoothness_detail__isnull=True
     )
@@ -183,7 +183,7 @@ def publish_asked(*, episode: Episode, version: str = "") -> Job | None:
 
 
 def catch_up() -> int:
-    """Close rows of recordings that were closed while nobody listened, as repair does; how many."""
+    """Close rows of recordings that were closed unheard, as repair does; how many."""
     closed = 0
     for uuid in Episode.objects.filter(status=EpisodeStatus.RECORDING).values_list("uuid", flat=True):
         if (journal_folder(uuid) / "outcome.json").exists():

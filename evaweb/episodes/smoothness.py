@@ -1,7 +1,7 @@
 """Smoothness of the arms in a run: SPARC of the speed of each end effector, as measured and as it was sent.
 
 The speed of the hand is what SPARC was made for (Balasubramanian et al. 2015), and it means the same for robots with
-other joints. Positions follow from the joints by the robot's description, while somebody asked for something: a robot
+other joints. Positions follow from the joints by the robot's description, while something was asked for: a robot
 that is held for its operator is not jerky. The measured one counts, at the times of its capture; the sent one,
 beside it, is free of the sensors' noise and of what the robot's own controller smooths.
 """
@@ -96,7 +96,7 @@ def _none(why: str) -> Smoothness:
 
 @dataclass(frozen=True, slots=True)
 class _Samples:
-    """Joints [N, D] at `times` [N] in s, and whether somebody asked for something then; NaN where nothing is known."""
+    """Joints [N, D] at `times` [N] in s, and whether something was asked for then; NaN where nothing is known."""
 
     times: Array
     joints: Array

@@ -15,7 +15,7 @@ from evaweb.lab.processes import LabError
 
 
 class Ended(Exception):
-    """Somebody asked the lab to end."""
+    """The lab was asked to end."""
 
 
 @contextmanager

@@ -168,7 +168,7 @@ class PlanAdmin(admin.ModelAdmin):
         return obj is not None and obj.state == PlanState.DRAFT and not obj.events.exists()
 
     def get_changeform_initial_data(self, request: HttpRequest) -> dict[str, Any]:
-        """Whoever writes it owns it."""
+        """The user who writes it owns it."""
         return {"owner": request.user.pk, **super().get_changeform_initial_data(request)}
 
     def get_urls(self) -> list[URLPattern]:

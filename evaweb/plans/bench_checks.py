@@ -97,7 +97,7 @@ def references_take(*, user: User, station: Station, position: Position | None) 
 
 
 def next_trial(*, user: User, station: Station, plan: Plan) -> Handout:
-    """The next trial of a plan, for who has looked at the cameras; see evaweb.plans.allocation."""
+    """The next trial of a plan, for a user who has looked at the cameras; see evaweb.plans.allocation."""
     require(user, Role.OPERATOR)
     if cameras_confirmed(user=user, station=station) is None:
         raise Conflict(

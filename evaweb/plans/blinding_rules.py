@@ -1,8 +1,8 @@
 """Rules of blind plans: which users may know the checkpoint of a trial.
 
-Before the reveal everybody is blind who has not looked. Its owner and administrators may look, by an act that is
-recorded, as far as they do not run its trials: whoever has been handed one of them sees nothing, whoever has looked is
-handed none. Which comes first decides, so that also somebody who is alone in a lab can do either, but not both.
+Before the reveal every user is blind who has not looked. Its owner and administrators may look, by an act that is
+recorded, as far as they do not run its trials: a user who has been handed one of them sees nothing, one who has looked
+is handed none. Which comes first decides, so that also the only user of a lab can do either, but not both.
 """
 
 from __future__ import annotations

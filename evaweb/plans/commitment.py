@@ -1,7 +1,7 @@
 """Concealment of checkpoints: a fresh code for every trial, and a commitment that nothing was changed after.
 
 Codes are of one trial each, because labels that stay are learned. The commitment is shown before the first trial; the
-reveal shows the key it was made with, from which anybody computes schedule, codes and commitment again.
+reveal shows the key it was made with, from which anyone computes schedule, codes and commitment again.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ _COPIED = (
 
 @transaction.atomic
 def plan_freeze(*, user: User, plan: Plan) -> Plan:
-    """Make a draft a document that nobody changes, with its schedule and commitment; trials can be handed out then."""
+    """Make a draft a document that never changes, with its schedule and commitment; trials can be handed out then."""
     held = _held(plan)
     _require_owner(held, user)
     if held.state != PlanState.DRAFT:

@@ -1,7 +1,7 @@
 """Parts of a preflight that a user is shown: the one place that pages and REST ask.
 
-Addresses, times, sizes and names tell which checkpoint a server has. They are for operators and administrators, and
-for nobody who is not to know what a blind plan hands out.
+Addresses, times, sizes and names tell which checkpoint a server has. They are for operators and administrators, but
+for none from whom a blind plan hides what it hands out.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ def segments_of(*, episode: Episode) -> QuerySet[Segment]:
 
 
 def unreviewed() -> QuerySet[Episode]:
-    """Closed episodes with pictures or rows to look at that nobody has passed or failed, the newest first."""
+    """Closed episodes with pictures or rows to look at and without a pass or fail, the newest first."""
     newest = (F("started_at").desc(nulls_last=True), "-created_at", "uuid")
     closed = Episode.objects.filter(status__in=CLOSED, frames__gt=0)
     return closed.filter(standing__review=None).order_by(*newest)

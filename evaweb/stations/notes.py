@@ -1,7 +1,7 @@
 """Records of stops of a robot, on their way to disk and database: no stop waits for either.
 
-A thread of its own takes each row: first into a file of `unwritten`, then into the database. Who presses again and
-again is written down once a second, with how often; until then a line of the journal has each, which a kill leaves.
+A thread of its own takes each row: first into a file of `unwritten`, then into the database. Repeated presses
+are written down once a second, with how often; until then a line of the journal has each, which a kill leaves.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Stop, halt and e-stop: straight to the station, without the database; and what a station's answer comes to.
 
-`press` and `ask` never wait: each station has threads of its own, and who comes while the same is under way shares its
+`press` and `ask` never wait: each station has threads of its own, and a call while the same is under way shares its
 answer.
 """
 
@@ -98,7 +98,7 @@ def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
 
 
 def order(*, kind: str, username: str, page: str, epoch: int, uuid: UUID | str) -> messages.Command:
-    """A stop or halt as it is sent: the runtime itself knows who has the lease."""
+    """A stop or halt as it is sent: the runtime itself knows the lease's holder."""
     holder = holder_of(username, page)
     return messages.Command(str(uuid), kind, user=username, holder=holder, epoch=epoch)
 

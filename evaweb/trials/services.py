@@ -55,12 +55,12 @@ _TRIES = 5  # to get a number that nobody else takes at the same moment
 
 
 def declare_check(check: Check) -> None:
-    """`check` is asked before a trial is "run" or "voided", with the trial and who wants it; it raises EvaError."""
+    """`check` is asked before a trial is "run" or "voided", with the trial and the user; it raises EvaError."""
     _checks.append(check)
 
 
 def checked(what: str, trial: Trial, user: Any) -> None:
-    """Ask those who were declared."""
+    """Ask the declared checks."""
     for check in _checks:
         check(what, trial, user)
 
@@ -159,7 +159,7 @@ def trial_create(
     seed: int | None = None,
     strategy: Mapping[str, Any] | None = None,
 ) -> Trial:
-    """This very trial, prepared; within a transaction, by who knows that it is the next one.
+    """This very trial, prepared; within a transaction, by a caller who knows that it is the next one.
 
     Conflict where the station has a trial that is not finished, and says what to do about it. IntegrityError where
     there is one of this number and attempt.

@@ -189,7 +189,7 @@ def _require_set_up(trial: Trial) -> None:
 
 
 def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
-    """Whoever set the station up last, a terminal included: this is the checkpoint that it would run.
+    """Require that the station would run this checkpoint, whichever client, a terminal included, set it up last.
 
     What changes after this look makes the run stale, which the station refuses by itself. How long its policy took.
     """

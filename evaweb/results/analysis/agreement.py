@@ -16,7 +16,7 @@ OUTCOMES = {"first", "second", "tie"}
 
 
 def agreement_of(plan: Plan) -> dict[str, Any] | None:
-    """Of first and second raters, on success and on each milestone; None where nobody rated again."""
+    """Of first and second raters, on success and on each milestone; None without second ratings."""
     rows = list(
         Rating.objects.filter(trial__evaluation=plan.evaluation_id, trial__status=TrialStatus.SCORED)
         .select_related("trial__verdict")

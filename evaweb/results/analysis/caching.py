@@ -1,6 +1,6 @@
 """Analyses that are kept as long as nothing they were made from has changed, in each process of the web.
 
-Nobody invalidates anything: what is kept carries a fingerprint of its rows, which is asked for again each time. A
+Nothing is invalidated: what is kept carries a fingerprint of its rows, which is asked for again each time. A
 score, a correction or a void changes it, and so does the name of a checkpoint or of a scene.
 """
 
@@ -81,7 +81,7 @@ def page_of(plan: Plan, name: Hashable, at: Hashable, make: Callable[[], dict[st
 
 
 def forget() -> None:
-    """Drop what is kept: the next who ask wait for it to be made."""
+    """Drop what is kept: the next callers wait for it to be made."""
     _runs.clear()
     _analyses.clear()
     _pages.clear()

@@ -40,7 +40,7 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Interruption:
-    """A run that somebody or something broke off, and that is not scored: `duration` [s] where it is known."""
+    """A run that was broken off and is not scored: `duration` [s] where it is known."""
 
     trial: int
     checkpoint: str

@@ -83,7 +83,7 @@ def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """The evidence so far, for who may look; with HX-Request the meter alone, to be put into the page."""
+    """The evidence so far, for users who may look; with HX-Request the meter alone, to be put into the page."""
     found = _found(name, version)
     sealed = _sealed_page(request, found)
     if sealed:

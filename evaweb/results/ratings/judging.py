@@ -104,7 +104,7 @@ def rate(
     failure: str = "",
     note: str = "",
 ) -> Rating:
-    """Keep what somebody who did not run the trial of that code saw on its video: on the disk, then as a row."""
+    """Keep what a rater, not the operator of the trial of that code, saw on its video: on the disk, then as a row."""
     require(user, Role.OPERATOR)
     handout = _handout(plan, code)
     trial = handout.trial

@@ -261,7 +261,7 @@ def _known_port(name: str) -> int:
 
 
 def free_port_of(url: str | None) -> int:
-    """The port of that address where nobody has it now, else 0."""
+    """The port of that address if it is free now, else 0."""
     port = urlsplit(url).port if url else None
     if not port:
         return 0

@@ -77,7 +77,7 @@ def series(i: int) -> str:
 
 
 def mark(i: int, x: float, y: float, r: float = 5) -> str:
-    """The mark of the i-th series: a shape of its own, because colour alone does not reach everybody."""
+    """The mark of the i-th series: a shape of its own, because colour alone does not reach every reader."""
     shapes = (
         f"M{_n(x - r)} {_n(y)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0Z",
         path([(x - r, y - r), (x + r, y - r), (x + r, y + r), (x - r, y + r)]) + "Z",

@@ -18,7 +18,7 @@ def digest(document: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A whole number is written without a point, whoever wrote it."""
+    """A whole number is written without a point, by any writer."""
     if isinstance(value, float) and value.is_integer():
         return int(value)
     if isinstance(value, dict):
