@@ -1,4 +1,4 @@
-"""The admin pages: for users with the role of an admin, who may do everything there."""
+"""The admin pages: for users with the role of an admin, with all rights there."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class LabAdminSite(AdminSite):
     login_form = AuthenticationForm  # the role decides, not is_staff
 
     def has_permission(self, request: HttpRequest) -> bool:
-        """Whether this user is an admin."""
+        """True if this user is an admin."""
         return bool(request.user.is_active and is_admin(request.user))
 
     def password_change(self, request: HttpRequest, extra_context: Any = None) -> HttpResponseRedirect:
@@ -63,7 +63,7 @@ class RoleBackend(BaseBackend):
     """Gives admins every permission; logging in is another backend's business."""
 
     def has_perm(self, user_obj: Any, perm: str, obj: Any = None) -> bool:
-        """Whether this user is an admin."""
+        """True if this user is an admin."""
         return bool(user_obj.is_active and is_admin(user_obj))
 
     def has_module_perms(self, user_obj: Any, app_label: str) -> bool:
@@ -72,7 +72,7 @@ class RoleBackend(BaseBackend):
 
 
 def is_admin(user: Any) -> bool:
-    """Whether the role is that of an admin; looked up once per request, as `user` lives as long."""
+    """True if the role is admin; looked up once per request, the lifetime of `user`."""
     if not hasattr(user, "_eva_is_admin"):
         user._eva_is_admin = role_of(user) is Role.ADMIN
     return bool(user._eva_is_admin)

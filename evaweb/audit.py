@@ -1,6 +1,6 @@
-"""Who came, went and was refused, a line each in the log.
+"""Logins, logouts and refusals, a line each in the log.
 
-Names are logged as Python writes them, so that no control character reaches a terminal. A name that nobody has is not
+Names are logged as Python writes them, so that no control character reaches a terminal. An unknown name is not
 logged: it may be a password in the wrong field.
 """
 

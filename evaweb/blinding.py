@@ -1,8 +1,8 @@
-"""What a user may see while a plan is blind: the one seam that pages, REST, live sockets, downloads and exports ask.
+"""Visibility of data while a plan is blind: the one seam of pages, REST, live sockets, downloads and exports.
 
-A plan is blind for everybody who has not looked behind it, until it is revealed. Hidden are its checkpoints, and with
-them whatever tells one from another: names, addresses, figures of the policy, texts in which a server is named. Who
-hides what is declared from above (evaweb.plans.blinding_rules); without that nobody is shown anything.
+A plan is blind for every user who has not looked behind it, until it is revealed. Hidden are its checkpoints, and with
+them whatever tells one from another: names, addresses, figures of the policy, texts in which a server is named. The
+rules are declared from above (evaweb.plans.blinding_rules); without them no user is shown anything.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _HARMLESS = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What is hidden from one user: checkpoints by id and by name, in trials, episodes and at stations.
+    """Data hidden from one user: checkpoints by id and by name, in trials, episodes and at stations.
 
     `stations` are those, by name, at which a trial of such a plan was handed out; `at_work` those at which one is not
     finished; `plans` says of which, in words, `keys` by their ids. `revealed`: evaluations of plans that were, whose
@@ -56,21 +56,21 @@ class Sight:
 
     @property
     def clear(self) -> bool:
-        """Whether nothing is hidden."""
+        """True if nothing is hidden."""
         return not self.checkpoints
 
     def hides_plan(self, plan: Any) -> bool:
-        """Whether the user is not to read what the plan says of its checkpoints: question, digest, what was amended."""
+        """True if what the plan says of its checkpoints is hidden: question, digest, what was amended."""
         return plan.pk in self.keys
 
     # --- trials and checkpoints ------------------------------------------------------------------------------
 
     def hides(self, trial: Any) -> bool:
-        """Whether the user is not to know which checkpoint this trial is of."""
+        """True if the checkpoint of this trial is hidden."""
         return trial.checkpoint_id in self.checkpoints and trial.evaluation_id not in self.revealed
 
     def label(self, trial: Any) -> str:
-        """What the user knows a trial's checkpoint by: its name; of a hidden one the code of the trial."""
+        """Shown name of a trial's checkpoint: its own; of a hidden one the code of the trial."""
         if not self.hides(trial):
             return str(trial.checkpoint.name)
         return code_of(trial) or HIDDEN
@@ -82,7 +82,7 @@ class Sight:
         return self.told(trial.reason)
 
     def told(self, text: str) -> str:
-        """A station's sentence as somebody may read it from whom something is hidden."""
+        """A station's sentence as a user may read it from whom something is hidden."""
         return text if not text or _HARMLESS.fullmatch(text) else HIDDEN
 
     def open(self, rows: Any, checkpoint: str = "checkpoint") -> Any:
@@ -94,12 +94,12 @@ class Sight:
     # --- episodes ---------------------------------------------------------------------------------------------
 
     def hides_episode(self, episode: Any) -> bool:
-        """Whether the user is not to know which policy made this recording."""
+        """True if the policy that made this recording is hidden."""
         trial = getattr(episode, "trial", None)
         return self.hides(trial) if trial is not None else episode.checkpoint in self.names
 
     def policy_of(self, episode: Any) -> str:
-        """What the user knows the policy of a recording by."""
+        """Shown name of a recording's policy."""
         trial = getattr(episode, "trial", None)
         if not self.hides_episode(episode):
             return str(trial.checkpoint.name if trial is not None else episode.checkpoint)
@@ -113,7 +113,7 @@ class Sight:
     # --- stations -----------------------------------------------------------------------------------------------
 
     def veils(self, station: str, snapshot: Mapping[str, Any] | None) -> bool:
-        """Whether the station's state is shown without what tells which checkpoint it is set up for."""
+        """True if the station's state is shown without what tells which checkpoint it is set up for."""
         if self.clear:
             return False
         loaded = (snapshot or {}).get("checkpoint") or {}
@@ -128,7 +128,7 @@ class Sight:
         return station in self.stations and not another
 
     def veils_events(self, station: str) -> bool:
-        """Whether events of the station may be about a hidden checkpoint; also those of earlier trials."""
+        """True if events of the station may be about a hidden checkpoint; also those of earlier trials."""
         return station in self.stations
 
 
@@ -144,7 +144,7 @@ def declare(find: Callable[[Any], Sight]) -> None:
 
 
 def sight_of(user: Any) -> Sight:
-    """What is hidden from this user now."""
+    """The user's sight as of now."""
     if _find is None:
         raise ImproperlyConfigured(
             "nobody has declared what is hidden from whom (evaweb.plans.blinding_rules does)"
@@ -153,7 +153,7 @@ def sight_of(user: Any) -> Sight:
 
 
 def sight_for(request: Any) -> Sight:
-    """What is hidden from who asks, by login or by token; looked up once per request."""
+    """The caller's sight, by login or by token; looked up once per request."""
     if not hasattr(request, "_eva_sight"):
         request._eva_sight = sight_of(getattr(request, "auth", None) or request.user)
     found: Sight = request._eva_sight

@@ -1,4 +1,4 @@
-"""What templates show of trials and recordings: a name, or what somebody knows it by to whom it is hidden."""
+"""Template tags for trials and recordings: their names, or the substitutes where those are hidden."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ def reason_of(context: Any, trial: Any) -> str:
 
 @register.simple_tag(takes_context=True)
 def hidden(context: Any, trial: Any) -> bool:
-    """Whether it is hidden which checkpoint a trial is of."""
+    """True if the trial's checkpoint is hidden."""
     return sight_for(context["request"]).hides(trial)
 
 
 @register.simple_tag(takes_context=True)
 def hidden_plan(context: Any, plan: Any) -> bool:
-    """Whether it is hidden what a plan says of its checkpoints."""
+    """True if what a plan says of its checkpoints is hidden."""
     return sight_for(context["request"]).hides_plan(plan)
 
 
 @register.simple_tag(takes_context=True)
 def hidden_recording(context: Any, episode: Any) -> bool:
-    """Whether it is hidden which policy made a recording."""
+    """True if the policy that made a recording is hidden."""
     return sight_for(context["request"]).hides_episode(episode)
 
 

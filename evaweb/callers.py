@@ -1,4 +1,4 @@
-"""Where a request comes from: the other end of its connection, or what a declared proxy says it forwards."""
+"""Address of a caller: the other end of the connection, or what a declared proxy says it forwards."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _ONE_SUBSCRIBER = 64  # bits of an address of IPv6: whoever has one has all that
 
 
 def address_of(request: HttpRequest) -> str | None:
-    """The address of who asks, None where there is none, as over a socket of the file system."""
+    """The address of the caller, None where there is none, as over a socket of the file system."""
     named = request.META.get("HTTP_X_FORWARDED_FOR", "").split(",")
     found = _caller(request.META.get("REMOTE_ADDR"), named, settings.EVA_PROXIES)
     return None if found is None else str(found)
@@ -33,7 +33,7 @@ def share_of(scope: dict[str, Any]) -> str:
 def _caller(
     peer: str | None, named: list[str], proxies: Iterable[IPv4Network | IPv6Network]
 ) -> Address | None:
-    """The last of those named that a proxy of ours has seen itself; what stands before it anybody can write."""
+    """The last of those named that a proxy of ours has seen itself; what stands before it any client can write."""
     here = _parsed(peer)
     while named and here is not None and any(here in network for network in proxies):
         before = _parsed(named.pop().strip())

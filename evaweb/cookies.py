@@ -18,7 +18,7 @@ MOST = 8  # of one name that are looked into; a browser has one or two
 
 
 def cookies_of(headers: Iterable[str], name: str) -> list[str]:
-    """What all cookies of that name say, in the order of the headers."""
+    """Values of all cookies of that name, in the order of the headers."""
     parts = (part for header in headers for part in header.split(";") if name in part)
     values = (parse_cookie(part).get(name) for part in parts)
     return list(dict.fromkeys(filter(None, values)))

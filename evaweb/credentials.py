@@ -1,8 +1,8 @@
-"""Who a session or token stands for: asked of the database, remembered for when it does not answer.
+"""Users of sessions and tokens: asked of the database, remembered for when it does not answer.
 
 What is remembered never expires by itself: stopping works with it as long as this process lives. It is forgotten when
-the database says otherwise, which is asked again whenever it is used and older than a few seconds. Who is not
-remembered is asked about in the share of where they come from: a crowd of made-up ones keeps nobody else waiting.
+the database says otherwise, which is asked again whenever it is used and older than a few seconds. One that is not
+remembered is asked about in the share of its origin: a crowd of made-up ones keeps no other client waiting.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ _Said = Login | Unverifiable | Busy | None
 
 
 class Credentials:
-    """What this process has verified; from any thread. `wait` is asyncio's, which a test's clock may stand for."""
+    """Logins that this process has verified; from any thread. `wait` is asyncio's; a test has its own."""
 
     def __init__(
         self,
@@ -98,11 +98,11 @@ class Credentials:
         }
 
     def learn(self, kind: str, owner: Callable[[str], Any]) -> None:
-        """How the user of a credential of that kind is found in the database, None where there is none."""
+        """Register how the user of a credential of that kind is looked up, None where there is none."""
         self._owners[kind] = owner
 
     def look(self, kind: str, secret: str) -> Any:
-        """The user as the database has them now, None where nobody's; in the caller's thread. Raises its Error."""
+        """The user as the database has them now, None where there is none; in the caller's thread. Raises its Error."""
         with connection.execute_wrapper(self._heard):
             user = self._owners[kind](secret)
         if user is None:
@@ -142,25 +142,25 @@ class Credentials:
                 self._known.popitem(last=False)
 
     def recall(self, kind: str, secret: str) -> Login | None:
-        """Who it stood for when the database was last asked; without asking."""
+        """Login it stood for when the database was last asked; without asking."""
         with self._lock:
             return self._known.get((kind, digest(secret)))
 
     def counted(self, kind: str, secret: str) -> Login | None:
-        """Who it stands for as the database said within the last minute; without asking."""
+        """Login it stands for as the database said within the last minute; without asking."""
         known = self.recall(kind, secret)
         return known if known is not None and self._clock() - known.checked < COUNTS_S else None
 
     def forget(self, kind: str, digested: str) -> None:
-        """It is nobody's any more."""
+        """Drop a credential that stands for no user any more."""
         with self._lock:
             self._known.pop((kind, digested), None)
 
     async def presser(self, found: Sequence[Credential], share: str) -> Login | None:
-        """Whose e-stop this is, by any of these credentials: at once where one is remembered, else by the database.
+        """The user of an e-stop, by any of these credentials: at once where one is remembered, else by the database.
 
         No press is lost for a date: a credential whose time is over is one here. None: the database says that they
-        are nobody's. Raises Unverifiable where it says nothing, Busy where `share` has no turn though it answers.
+        are unknown. Raises Unverifiable where it says nothing, Busy where `share` has no turn though it answers.
         """
         for kind, secret in found:
             for remembered in (kind, _of_any_age(kind)):
@@ -179,9 +179,9 @@ class Credentials:
                 one.cancel()
 
     async def stopper(self, found: Sequence[Credential], share: str) -> tuple[str, Login] | None:
-        """Whose stop or halt this is, and by which kind of credential: one that is remembered, else any other.
+        """The user of a stop or halt, and the kind of credential: one that is remembered, else any other.
 
-        As the database says, or as it said last where it does not answer. None: nobody's. Raises Unverifiable, Busy.
+        As the database says, or as it said last where it does not answer. None: unknown. Raises Unverifiable, Busy.
         """
         fault: Busy | None = None
         for kind, secret in sorted(found, key=lambda one: self.recall(*one) is None):
@@ -203,7 +203,7 @@ class Credentials:
         return self._clock() - known.checked < _FRESH_S
 
     async def _checked(self, kind: str, secret: str, known: Login) -> Login | None:
-        """What the database says of who is remembered, or said, where it takes its time."""
+        """The database's answer on a remembered login, or that login, where the database takes its time."""
         answer = asyncio.wrap_future(self._check(kind, secret))
         await self._wait({answer}, timeout=_RECHECK_S)
         if answer.done() and answer.exception() is None:
@@ -238,7 +238,7 @@ class Credentials:
             return self._nobodys.get(key, -float("inf")) > self._clock()
 
     def _check(self, kind: str, secret: str, share: str | None = None) -> Future[Login | None]:
-        """Ask the database, once for all who want to know the same; nobody waits here.
+        """Ask the database, once for all callers with the same question; it does not wait.
 
         Without a `share`, who is remembered: those stand before nobody and behind nobody else.
         """
@@ -273,9 +273,9 @@ class Credentials:
 
 
 def patience(came: float, answered: float, now: float) -> float:
-    """How long who came then still waits, where the database has last answered anybody at `answered` [s].
+    """Time that a caller since `came` still waits [s]; the database last answered at `answered` [s].
 
-    Raises Unverifiable where it has answered nobody for half a second, Busy where others were before them for longer.
+    Raises Unverifiable where it has answered no look-up for half a second, Busy where others were before it longer.
     """
     silent = max(came, answered) + _PATIENCE_S - now
     if silent <= 0:
@@ -286,7 +286,7 @@ def patience(came: float, answered: float, now: float) -> float:
 
 
 async def _first(asking: Sequence[asyncio.Task[_Said]]) -> Login | None:
-    """The first who is somebody; raises Unverifiable at once, and Busy where nothing else is known."""
+    """The first known user; raises Unverifiable at once, and Busy where nothing else is known."""
     busy: Busy | None = None
     for one in asyncio.as_completed(asking):
         answer = await one
@@ -310,7 +310,7 @@ def digest(secret: str) -> str:
 
 
 def session_user(session_key: str) -> Any:
-    """The user who is logged in with that session, as the database has them now; reads only."""
+    """The user of that session, as the database has them now; reads only."""
     if not (session_key.isascii() and session_key.isalnum()):  # one that some databases cannot even look for
         return None
     return _logged_in(import_module(settings.SESSION_ENGINE).SessionStore(session_key))
@@ -335,7 +335,7 @@ def _logged_in(session: Any) -> Any:
 
 
 def _read(answer: asyncio.Future[Login | None]) -> None:
-    """Nobody may wait for it any more: its error was logged where it arose."""
+    """No caller may wait for it any more: its error was logged where it arose."""
     if not answer.cancelled():
         answer.exception()
 

@@ -131,12 +131,12 @@ def beside(database: Path) -> list[Path]:
 
 
 def readable_by_others(path: Path) -> bool:
-    """Whether its mode lets anybody but its user read or write it."""
+    """True if its mode lets others than its user read or write it."""
     return bool(path.stat().st_mode & 0o077)
 
 
 def _take_from_others(path: Path) -> None:
-    """Where it is somebody else's file it stays; evaweb.private says so at every start."""
+    """Make the file its user's alone; one of another account stays, as evaweb.private says at every start."""
     if readable_by_others(path):
         with suppress(PermissionError):
             path.chmod(0o600)
@@ -160,7 +160,7 @@ def lab_id(folder: Path) -> str:
 
 
 def _made_once(path: Path, make: Callable[[], str]) -> str:
-    """What the file says, which only its user reads; what is made where it is absent."""
+    """Contents of the file, which only its user reads; made where it is absent."""
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:

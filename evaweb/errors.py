@@ -16,7 +16,7 @@ class NotAllowed(EvaError):
 
 
 class NotFound(EvaError):
-    """What was named does not exist."""
+    """The named thing does not exist."""
 
     status = 404
 

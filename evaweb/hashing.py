@@ -1,6 +1,6 @@
 """Passwords are hashed one after the other, behind everything else: however many log in at once, a stop is not later.
 
-A hash is half a second of a processor. Whoever comes when too many wait is asked to try again.
+A hash is half a second of a processor. A login that comes when too many wait is asked to try again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What browsers are told of every answer: where its parts may come from, and that it is not to be kept."""
+"""Headers of every answer: from where its parts may come, and that it is not to be kept."""
 
 from __future__ import annotations
 

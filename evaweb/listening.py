@@ -1,4 +1,4 @@
-"""Sockets that listen, opened by whoever serves, or by a lab that keeps one open while its server is started again."""
+"""Sockets that listen, opened by the serving process, or by a lab that keeps one open while its server restarts."""
 
 from __future__ import annotations
 

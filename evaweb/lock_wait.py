@@ -1,4 +1,4 @@
-"""How long a connection to the database waits: for what must not be kept by a row, a lock or a server that hangs."""
+"""Longest waits of a database connection, where a row, a lock or a server that hangs must not keep it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What somebody is told whose name is locked at their address, on the login pages of the lab and of administration."""
+"""Answer for a name that is locked at its address, on the login pages of the lab and of administration."""
 
 from __future__ import annotations
 

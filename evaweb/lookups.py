@@ -1,4 +1,4 @@
-"""Questions to the database that strangers can cause: each of who asks has a share, and a crowd waits behind itself."""
+"""Questions to the database that strangers can cause: each caller has a share, and a crowd waits behind itself."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Lookups(Generic[T]):
         self._threads = ThreadPoolExecutor(threads, "lookups")
 
     def ask(self, share: Hashable, work: Callable[[], T]) -> Future[T]:
-        """What `work` comes to, once it had its turn."""
+        """Result of `work`, once it had its turn."""
         answer: Future[T] = Future()
         answer.set_running_or_notify_cancel()  # who stops waiting for it ends nobody else's
         with self._lock:
@@ -53,7 +53,7 @@ class Lookups(Generic[T]):
         return answer
 
     def _place_for(self, share: Hashable, answer: Future[T]) -> Future[T] | None:
-        """Who has to go so that one of this share may wait: nobody, `answer` itself, or one of a longer share."""
+        """Look-up to drop so that one of this share may wait: None, `answer`, or one of a longer share."""
         if self._waiting < self._most:
             return None
         longest = max(self._shares.values(), key=len)

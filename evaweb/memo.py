@@ -1,4 +1,4 @@
-"""What was made of rows, kept as long as their fingerprint stays what it was; in each process of the web."""
+"""Values made of rows, kept as long as their fingerprint stays what it was; in each process of the web."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Kept(Generic[T]):
         self._lock = Lock()
 
     def get(self, key: Hashable, fingerprint: Hashable, make: Callable[[], T]) -> T:
-        """What was made of `key` at this `fingerprint`, or is made now."""
+        """Value of `key` at this `fingerprint`, made now where it is not kept."""
         with self._lock:
             found = self._rows.get(key)
             if found is not None and found[0] == fingerprint:

@@ -11,9 +11,9 @@ _PORT = re.compile(r":([0-9]{1,5})$")
 
 
 def is_ours(origin: str, host: str, web_port: int | None = None) -> bool:
-    """Whether pages of `origin` are the lab's, for who was asked as `host`.
+    """True if pages of `origin` are the lab's, for a server that was asked as `host`.
 
-    Ours are that host and port, and the trusted origins: CSRF_TRUSTED_ORIGINS, without wildcards. For who listens
+    Ours are that host and port, and the trusted origins: CSRF_TRUSTED_ORIGINS, without wildcards. For a server
     beside the web it is `web_port` of that host too, over plain HTTP: behind a proxy all have one origin.
     """
     try:

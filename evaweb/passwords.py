@@ -1,4 +1,4 @@
-"""Changing one's own password: who guesses the old one is counted, and locked, as on the login pages."""
+"""Changing one's own password: guesses of the old one are counted, and locked, as on the login pages."""
 
 from __future__ import annotations
 

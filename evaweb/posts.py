@@ -1,4 +1,4 @@
-"""What may be posted to REST, by address: by whom, how many bytes, how many values; one table for all."""
+"""Bounds of posts to REST, by address: the role, how many bytes, how many values; one table for all."""
 
 from __future__ import annotations
 
@@ -33,5 +33,5 @@ _OTHERS = tuple(
 
 
 def post_at(path: str) -> Post:
-    """What may be posted to that address of REST."""
+    """Bounds of a post to that address of REST."""
     return next((post for pattern, post in _OTHERS if pattern.fullmatch(path)), _USUAL)

@@ -1,4 +1,4 @@
-"""What holds passwords and sessions is its user's alone: looked at when a process starts."""
+"""Modes of the files with passwords and sessions, their user's alone: looked at when a process starts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def data_is_private(**options: Any) -> list[CheckMessage]:
 
 @register(Tags.security)
 def proxy_is_declared(**options: Any) -> list[CheckMessage]:
-    """Behind a proxy that nobody has declared all logins come from one address."""
+    """Behind an undeclared proxy all logins come from one address."""
     if not settings.SESSION_COOKIE_SECURE or settings.EVA_PROXIES:
         return []
     return [

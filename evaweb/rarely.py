@@ -1,4 +1,4 @@
-"""What a crowd could have the log say over and over: once in some time of each name, with how often it came since."""
+"""Limit of log lines that a crowd could repeat: one in some time of each name, with how often it came."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Rarely:
         )  # when, and how many came since
 
     def due(self, name: str, times: int = 1) -> str | None:
-        """What to say now after the line about `name`: how often it was left unsaid, or nothing. None: say no line."""
+        """Suffix of the line about `name`: how often it was left unsaid, or nothing. None: say no line."""
         now = self._clock()
         with self._lock:
             entry = name if name in self._told or self._has_room(now) else _OTHERS

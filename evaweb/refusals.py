@@ -26,7 +26,7 @@ _NO_TEXT = re.compile("[\x00\ud800-\udfff]")
 
 
 class LoginMiddleware(LoginRequiredMiddleware):
-    """Django's own, which asks the database for the user of every address, also where nobody need be logged in."""
+    """Django's own, which asks the database for the user of every address, also where no login is needed."""
 
     def process_view(self, request: HttpRequest, view: Any, *given: Any) -> HttpResponseBase | None:
         if not getattr(view, "login_required", True):
@@ -49,7 +49,7 @@ class RefusalMiddleware(MiddlewareMixin):
         return None
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
-        """What was refused without a word, or to a program in HTML, is said as everything is."""
+        """Reword a refusal without a sentence, or one to a program in HTML, as all are said."""
         status = response.status_code
         spoken = response.headers.get("Content-Type", "").startswith("application/json")
         if status < 400 or spoken or not (_of_programs(request) or status == 405):
@@ -69,7 +69,7 @@ class RefusalMiddleware(MiddlewareMixin):
 
 
 def nowhere(path: str) -> str:
-    """What is said of an address of REST that there is not."""
+    """Sentence on an unknown address of REST."""
     return f"{path} does not exist; docs/openapi.json and /api/v1/openapi.json list the addresses"
 
 
@@ -83,12 +83,12 @@ def _sentence_of(request: HttpRequest, response: HttpResponseBase) -> str:
 
 
 def _is_no_number(exception: Exception) -> bool:
-    """Whether forms have let through what is no number of the database's."""
+    """True if forms have let through what is no number of the database's."""
     return isinstance(exception, OverflowError) or "expected a number but got" in str(exception)
 
 
 def is_text(given: str) -> bool:
-    """Whether every database and every wire takes it: no NUL, no half of a character."""
+    """True if every database and every wire takes it: no NUL, no half of a character."""
     return _NO_TEXT.search(given) is None
 
 

@@ -1,4 +1,4 @@
-"""Who may do what: three groups, each with the rights of the one before it."""
+"""Roles and their rights: three groups, each with the rights of the one before it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many HTTP requests are worked on at once: each has a thread and a connection to the database."""
+"""Number of HTTP requests that are worked on at once: each has a thread and a connection to the database."""
 
 from __future__ import annotations
 

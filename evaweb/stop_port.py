@@ -1,4 +1,4 @@
-"""Where the process for stops listens: told to the web by a file, because either may be started first, or again."""
+"""Ports of the process for stops: told to the web by a file, as either may be started first, or again."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def forget() -> None:
 
 
 def told() -> StopPort | None:
-    """Where it listens, as it or its lab last said; None where there is none."""
+    """Ports of the process for stops, as it or its lab last said; None where there is none."""
     try:
         found = json.loads(_path().read_bytes())
         return StopPort(int(found["port"]), int(found["web_port"]))

@@ -1,4 +1,4 @@
-"""What a database or a disk that takes nothing means for who asked: a sentence and an HTTP status."""
+"""Faults of a database or a disk that takes nothing, for the caller: a sentence and an HTTP status."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def _text(value: object) -> str | None:
 
 
 class _Sink(io.RawIOBase):
-    """What is written to it until somebody takes it; a Parquet file is written from front to back."""
+    """Buffer of what is written until it is taken; a Parquet file is written from front to back."""
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []

@@ -1,4 +1,4 @@
-"""Who am I."""
+"""The caller's own account."""
 
 from __future__ import annotations
 
@@ -23,6 +23,6 @@ class Me(Schema):
 
 @router.get("/me", response={200: Me, **FAILURES}, summary="The user that asks", url_name="me")
 def me(request: HttpRequest) -> Any:
-    """Who is logged in, or whose token it is, and what they may do."""
+    """User of the session or the token, with name and role."""
     user = request.auth
     return {"username": user.get_username(), "name": user.get_full_name(), "role": role_of(user)}

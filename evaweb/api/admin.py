@@ -44,7 +44,7 @@ class NewAccountForm(UserCreationForm):
 
 
 class AccountForm(UserChangeForm):
-    """The same for one that there is; nobody takes their own rights away by mistake."""
+    """The same for one that there is; no administrator takes their own rights away by mistake."""
 
     role = _role_field()
     asking: User | None = None
@@ -82,7 +82,7 @@ class RoleFilter(admin.SimpleListFilter):
 
 
 class AccountAdmin(UserAdmin):
-    """Who may log in, and what they may do."""
+    """Accounts and their roles."""
 
     form, add_form = AccountForm, NewAccountForm
     list_display = ("username", "full_name", "role", "is_active", "last_login")
@@ -101,7 +101,7 @@ class AccountAdmin(UserAdmin):
     filter_horizontal = ()
 
     def get_form(self, request: HttpRequest, obj: User | None = None, **named: Any) -> Any:
-        """The form knows who asks."""
+        """The form knows the user."""
         made = super().get_form(request, obj, **named)
         return type(made.__name__, (made,), {"asking": request.user})
 
@@ -112,7 +112,7 @@ class AccountAdmin(UserAdmin):
             grant(user=obj, role=Role(form.cleaned_data["role"]))
 
     def has_delete_permission(self, request: HttpRequest, obj: User | None = None) -> bool:
-        """Nobody: accounts are switched off, records refer to them."""
+        """Never: accounts are switched off, records refer to them."""
         return False
 
     @admin.display(description="name")
@@ -140,11 +140,11 @@ class TokenAdmin(admin.ModelAdmin):
     search_fields = ("name", "user__username")
 
     def has_add_permission(self, request: HttpRequest) -> bool:
-        """Nobody: it could not be shown."""
+        """Never: it could not be shown."""
         return False
 
     def has_change_permission(self, request: HttpRequest, obj: Token | None = None) -> bool:
-        """Nobody."""
+        """Never."""
         return False
 
     def log_deletions(self, request: HttpRequest, queryset: QuerySet[Token]) -> Any:
@@ -168,15 +168,15 @@ class AttemptAdmin(admin.ModelAdmin):
     fields = ("username", "ip_address", "user_agent", "failures_since_start", "attempt_time")
 
     def has_add_permission(self, request: HttpRequest) -> bool:
-        """Nobody."""
+        """Never."""
         return False
 
     def has_change_permission(self, request: HttpRequest, obj: AccessAttempt | None = None) -> bool:
-        """Nobody."""
+        """Never."""
         return False
 
     @admin.display(boolean=True, description="locks the name there")
     def locks(self, attempt: AccessAttempt) -> bool:
-        """Whether it alone is enough, and still counts."""
+        """True if it alone reaches the limit of failures and still counts."""
         counts = timezone.now() - attempt.attempt_time < settings.AXES_COOLOFF_TIME
         return counts and attempt.failures_since_start >= settings.AXES_FAILURE_LIMIT

@@ -50,7 +50,7 @@ FAILURES = {frozenset({400, 401, 403, 404, 409, 422, 503}): Failure}
 
 
 def said_of(faults: Sequence[Mapping[str, Any]]) -> str:
-    """What is wrong with a question, as pydantic found it: each place, what stood there, and what is allowed."""
+    """Faults of a question, as pydantic found them: each place, what stood there, and what is allowed."""
     said = [_sentence(fault) for fault in faults[:_MOST_SAID]]
     more = len(faults) - len(said)
     return "; ".join(said) + (f"; and {more} more" if more > 0 else "")

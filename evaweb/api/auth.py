@@ -1,4 +1,4 @@
-"""Who asks: a logged-in browser, or a program with a token."""
+"""Authentication of a caller: a logged-in browser, or a program with a token."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evaweb.errors import EvaError
 
 
 class NotLoggedIn(EvaError):
-    """Nobody that we know."""
+    """An unknown user."""
 
     status = 401
 

@@ -45,7 +45,7 @@ class CheckpointOut(Schema):
 def checkpoints(request: HttpRequest, paging: Query[Paging], inactive: bool = False, tag: str = "") -> Any:
     """Those offered to operators; with `inactive` also the ones that are switched off, with `tag` those that have it.
 
-    None of a blind plan behind which who asks has not looked.
+    None of a blind plan behind which the caller has not looked.
     """
     rows = selectors.checkpoint_list(all_of_them=inactive, tag=tag, sight=sight_for(request))
     return paging.of(rows, CheckpointOut)

@@ -57,7 +57,7 @@ class CountsOut(Schema):
 
 
 class SessionEventOut(Schema):
-    """What happened to the session."""
+    """One event of a session."""
 
     kind: str
     text: str
@@ -126,7 +126,7 @@ class SessionDetail(SessionOut):
 
 
 class SessionIn(Schema):
-    """What is to be demonstrated; `dataset` "" takes the one that the deployment names."""
+    """Task to be demonstrated; `dataset` "" takes the one that the deployment names."""
 
     task: str
     dataset: str = ""
@@ -134,7 +134,7 @@ class SessionIn(Schema):
 
 
 class TargetIn(Schema):
-    """How many episodes are wanted."""
+    """Number of episodes wanted."""
 
     target: _Target
 
@@ -162,7 +162,7 @@ class QueuedOut(JobOut):
 
 
 class QueueOut(Schema):
-    """What failed, runs and waits for the session's episodes; `left_s` of all that runs and waits."""
+    """Failed, running and waiting work for the session's episodes; `left_s` of all that runs and waits."""
 
     done: int
     total: int
@@ -219,7 +219,7 @@ def queue(request: HttpRequest, uuid: UUID) -> Any:
     url_name="session-open",
 )
 def opened(request: HttpRequest, name: str, given: SessionIn) -> Any:
-    """With the station's present set-up; operators, while nobody else commands it."""
+    """With the station's present set-up; operators, while no other user commands it."""
     made = services.session_begin(user=request.auth, station=station_get(name=name), **given.model_dump())
     return Status(201, SessionOut.of(made))
 
@@ -253,7 +253,7 @@ def resumed(request: HttpRequest, uuid: UUID) -> Any:
     url_name="session-target",
 )
 def target(request: HttpRequest, uuid: UUID, given: TargetIn) -> Any:
-    """How many episodes are wanted."""
+    """Set the number of episodes wanted."""
     found = selectors.session_get(uuid=uuid)
     return SessionOut.of(services.session_target(user=request.auth, session=found, target=given.target))
 

@@ -20,7 +20,7 @@ router = Router(tags=["datasets"])
 
 
 class CheckOut(Schema):
-    """What the newest check found; `remarks` are no damage, `fresh` is false where the dataset has changed since."""
+    """Findings of the newest check; `remarks` are no damage; not `fresh`: the dataset has changed since."""
 
     at: datetime
     problems: list[str]

@@ -1,4 +1,4 @@
-"""What stops a robot over REST, answered before Django is asked for anything: no database, no thread of a page.
+"""Stops of a robot over REST, answered before Django is asked for anything: no database, no thread of a page.
 
 E-stop, stop and halt of a station, and whether this way to them stands. Everything else goes on to the application;
 evaweb.api.stations describes all of it. It stands before the web, and alone in the process for stops (`stops_alone`).
@@ -118,7 +118,7 @@ class StopDoor:
         return await _answered(self._as_of_here(scope), asked[1], asked[2], body)
 
     async def _ready(self, scope: dict[str, Any]) -> Answered:
-        """Whoever asks is known here from now on: their first press is not their first look-up."""
+        """Make the caller known here: their first press is not their first look-up."""
         try:
             user = (await _presser(scope)).username
         except Unverifiable:
@@ -211,7 +211,7 @@ def _told(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> dict[str,
 
 
 async def _presser(scope: dict[str, Any]) -> Login:
-    """Whoever presses, by any credential; raises Refused, Unverifiable, Busy."""
+    """The client that presses, by any credential; raises Refused, Unverifiable, Busy."""
     found = _credentials(scope)
     login = await credentials.presser(found, share_of(scope))
     if login is None:
@@ -220,7 +220,7 @@ async def _presser(scope: dict[str, Any]) -> Login:
 
 
 async def _stopper(scope: dict[str, Any]) -> tuple[str, Login]:
-    """Who stops, by which kind of credential; raises Refused, Busy."""
+    """Kind of credential and login of the client that stops; raises Refused, Busy."""
     found = _credentials(scope)
     try:
         known = await credentials.stopper(found, share_of(scope))
@@ -285,7 +285,7 @@ async def _body(receive: _Receive) -> bytes | None:
 
 
 def _again(body: bytes, receive: _Receive) -> _Receive:
-    """What gives the application the body that was read, and then what comes."""
+    """Receiver that gives the application the body that was read, and then what comes."""
     first = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def read() -> Any:

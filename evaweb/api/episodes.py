@@ -38,7 +38,7 @@ class DamageOut(Schema):
 class EpisodeOut(Schema):
     """One recorded run or demonstration; `trial` is the id of the trial that it was recorded for.
 
-    While it is hidden from who asks which checkpoint made it, the trial's code stands for the checkpoint, and what
+    While it is hidden from the caller which checkpoint made it, the trial's code stands for the checkpoint, and what
     else would tell is empty.
     """
 

@@ -1,4 +1,4 @@
-"""What the worker does and has done."""
+"""Jobs of the worker, current and past."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class JobOut(Schema):
     """One piece of work; `error` is that of the last attempt.
 
     `attempts` counts those that ended in an error, `deaths` the workers that ended or went silent over it.
-    Progress, error and result may tell which checkpoint was worked on: who has not looked behind a blind plan is
+    Progress, error and result may tell which checkpoint was worked on: a user who has not looked behind a blind plan is
     told only that there are some.
     """
 

@@ -1,4 +1,4 @@
-"""What ends with a password: a user's tokens, as Django ends the sessions."""
+"""End of a user's tokens with the password, as Django ends the sessions."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ router = Router(tags=["plans"])
 
 
 class PlanOut(Schema):
-    """One version of a plan. While it is blind for who asks, `document`, `digest` and `key` are empty.
+    """One version of a plan. While it is blind for the caller, `document`, `digest` and `key` are empty.
 
     `counted` trials of `total` have their score; `attempts` were handed out.
     """
@@ -96,19 +96,19 @@ class Back(Schema):
 
 
 class Freed(Schema):
-    """How many trials others can be handed now."""
+    """Number of trials that can now be handed to others."""
 
     freed: int
 
 
 class Reason(Schema):
-    """Why, for those who read it later."""
+    """Reason, for later readers."""
 
     reason: str = ""
 
 
 class SeenOut(Schema):
-    """What one camera showed, its reference ("": none), and how well they match, from 1 down."""
+    """Picture of one camera, its reference ("": none), and how well they match, from 1 down."""
 
     camera: str
     picture: str
@@ -117,7 +117,7 @@ class SeenOut(Schema):
 
 
 class CamerasOut(Schema):
-    """Whether who asks has confirmed the station's cameras, with what they showed."""
+    """The caller's confirmation of the station's cameras, with the pictures they showed."""
 
     confirmed: bool
     at: datetime | None
@@ -154,7 +154,7 @@ class ReferenceOut(Schema):
 
     @staticmethod
     def of(row: Reference) -> dict[str, Any]:
-        """With who took it."""
+        """With the user who took it."""
         return {"camera": row.camera, "picture": row.picture, "by": row.by.get_username(), "at": row.at}
 
 
@@ -221,7 +221,7 @@ def close(request: HttpRequest, name: str, given: Reason) -> Any:
 
 @router.post("/plans/{name}/look", response={200: PlanOut, **FAILURES}, summary="Look", url_name="plan-look")
 def looked(request: HttpRequest, name: str) -> Any:
-    """Look behind the blind before the reveal: recorded, and who has looked runs none of its trials."""
+    """Look behind the blind before the reveal: recorded, and the user runs none of its trials."""
     found = plan_get(name=name, user=request.auth)
     look(found, request.auth)
     return PlanOut.of(found, request.auth)
@@ -243,7 +243,7 @@ def reveal(request: HttpRequest, name: str) -> Any:
     url_name="cameras",
 )
 def cameras(request: HttpRequest, name: str) -> Any:
-    """Whether who asks has confirmed them; it holds until the station is started anew, half a day at most."""
+    """The caller's confirmation of the cameras; valid until the station starts anew, half a day at most."""
     return CamerasOut.of(bench.cameras_confirmed(user=request.auth, station=station_get(name=name)))
 
 
@@ -266,7 +266,7 @@ def cameras_confirm(request: HttpRequest, name: str, given: CamerasIn) -> Any:
     url_name="references",
 )
 def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
-    """What the cameras show now is how the position should lie; operators."""
+    """Take the cameras' current pictures as reference of how the position should lie; operators."""
     position = None
     if given.scene is not None:
         scene = trials.scene_get(name=given.scene)

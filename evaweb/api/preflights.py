@@ -23,7 +23,7 @@ router = Router(tags=["preflights"])
 class PreflightOut(Schema):
     """One preflight. `report` is what `python -m runtime.preflight --json` says, null while it is under way.
 
-    `hidden` says why a part of it is kept back from who asks; `reason` why there is no report.
+    `hidden` says why a part of it is kept back from the caller; `reason` why there is no report.
     """
 
     id: UUID
@@ -94,6 +94,6 @@ def ask(request: HttpRequest, given: PreflightIn) -> Any:
     "/{uuid:id}", response={200: PreflightOut, **FAILURES}, summary="One preflight", url_name="preflight"
 )
 def preflight(request: HttpRequest, id: UUID) -> Any:
-    """How it goes, or went."""
+    """A preflight: its progress, or its result."""
     row = services.preflight_settled(row=selectors.preflight_get(id=id, sight=sight_for(request)))
     return PreflightOut.of(row, request.auth)

@@ -1,7 +1,7 @@
-"""What a question may ask, and what a body may say.
+"""Validation of the parameters of a question, and of the body of a request.
 
-A parameter nobody knows is refused, because a filter that is misspelt filters nothing. A body is measured and read
-when it is known who sends it, and text that no database and no wire takes is refused before anything is done with it.
+An unknown parameter is refused, because a filter that is misspelt filters nothing. A body is measured and read
+when its sender is known, and text that no database and no wire takes is refused before anything is done with it.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ class TooLong(EvaError):
 
 
 class Bounded(Parser):
-    """Reads a body when it is known who sends it; that of a press of the e-stop may be anything."""
+    """Reads a body when its sender is known; that of a press of the e-stop may be anything."""
 
     def parse_body(self, request: Any) -> Any:
-        """What the JSON says, which is text that can be kept; NotAllowed, TooLong, Unreadable, EvaError."""
+        """Value of the JSON body, whose text can be kept; NotAllowed, TooLong, Unreadable, EvaError."""
         pressed = request.path.endswith("/estop")
         if not (request.path.endswith("/commands") and pressing.in_json(request.body, "kind")):
             require(request.auth, post_at(request.path).role)

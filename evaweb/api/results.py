@@ -1,4 +1,4 @@
-"""What plans found: every statistic, every attempt, comparisons, second ratings, preferences."""
+"""Results of plans: every statistic, every attempt, comparisons, second ratings, preferences."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ OutcomeOut: Any = create_model("OutcomeOut", __base__=Schema, **_FIELDS)
 
 
 class RatingOut(Schema):
-    """What a second rater said of a trial."""
+    """Second rating of a trial."""
 
     uuid: UUID
     trial: int
@@ -70,7 +70,7 @@ class RatingOut(Schema):
 
 
 class PreferenceOut(Schema):
-    """Which of two trials somebody preferred, and why."""
+    """A rater's preference between two trials, and the reason."""
 
     uuid: UUID
     first: int
@@ -238,7 +238,7 @@ def scores(
 def ratings(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
-    """Given by people who did not run the trial; they never change its score."""
+    """Given by users other than the trial's operator; they never change its score."""
     plan, _ = _seen(request, name, version, Only())
     rows = Rating.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
     return _rows(request, plan, "ratings", rows, RatingOut, paging, format)
@@ -253,7 +253,7 @@ def ratings(
 def preferences(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
-    """Which of two trials at the same initial condition somebody preferred."""
+    """Raters' preferences between two trials at the same initial condition."""
     plan, _ = _seen(request, name, version, Only())
     rows = plan.preferences.select_related("rater", "first__checkpoint", "second__checkpoint").order_by("pk")
     return _rows(request, plan, "preferences", rows, PreferenceOut, paging, format)

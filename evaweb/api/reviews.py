@@ -1,4 +1,4 @@
-"""What is said of episodes: quality, verdicts, annotations; and which one waits for a review."""
+"""Quality, verdicts and annotations of episodes, and the next one that waits for a review."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ class FlagOut(Schema):
 
 
 class CountOut(Schema):
-    """How often a kind was found, and in how many frames."""
+    """Number of flags of a kind, and of frames with it."""
 
     flags: int
     frames: int
 
 
 class QualityOut(Schema):
-    """What the checks found; `unchecked` says what could not be judged."""
+    """Findings of the checks; `unchecked` says what could not be judged."""
 
     episode: str
     frames: int
@@ -57,7 +57,7 @@ class QualityOut(Schema):
 
 
 class ReviewOut(Schema):
-    """What one person said; the newest pass or fail counts."""
+    """One reviewer's verdict; the newest pass or fail counts."""
 
     uuid: UUID
     verdict: str
@@ -121,7 +121,7 @@ class SegmentIn(Schema):
 
 
 class NextOut(Schema):
-    """An episode that nobody has passed or failed, None where there is no other; `waiting` counts all."""
+    """An episode without a pass or fail, None where there is no other; `waiting` counts all."""
 
     episode: UUID | None
     waiting: int

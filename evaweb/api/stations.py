@@ -1,4 +1,4 @@
-"""Stations: how they stand, who has them, commands, the e-stop, new trials."""
+"""Stations: their states, lease holders, commands, the e-stop, new trials."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ HTTP_OF = {
 
 
 class RequestOut(Schema):
-    """Somebody asks for the station."""
+    """A user's request for the station."""
 
     id: int
     user: str
@@ -50,12 +50,12 @@ class RequestOut(Schema):
 
     @staticmethod
     def of(asked: LeaseRequest) -> dict[str, Any]:
-        """With the name of who asks."""
+        """With the name of the user."""
         return {"id": asked.pk, "user": asked.user.get_username(), "asked_at": asked.asked_at}
 
 
 class LeaseOut(Schema):
-    """Who has a station, "" for nobody, and who waits for it."""
+    """Holder of a station's lease, "" for none, and the requests that wait for it."""
 
     holder: str
     user: str
@@ -89,7 +89,7 @@ class StationOut(Schema):
 
     @staticmethod
     def of(station: Station) -> dict[str, Any]:
-        """With who has it."""
+        """With the holder of its lease."""
         plain = ("name", "title", "robot", "simulated", "active", "message")
         return {**{name: getattr(station, name) for name in plain}, "lease": LeaseOut.of(station)}
 
@@ -107,7 +107,7 @@ class StationDetail(StationOut):
 
 
 class LeaseIn(Schema):
-    """What is wanted; `request` is the id of somebody's request, `reason` why an administrator takes it.
+    """Action on a lease; `request` is the id of another user's, `reason` why an administrator takes it.
 
     `move` brings one's own lease from another page to this one."""
 
@@ -118,7 +118,7 @@ class LeaseIn(Schema):
 
 
 def _no_trial(args: dict[str, Any]) -> dict[str, Any]:
-    """What goes with the run of a trial is checked first: see evaweb.trials.station_commands."""
+    """Refuse `trial` in the args: the run of a trial is checked first, see evaweb.trials.station_commands."""
     if "trial" in args:
         raise ValueError("args name a trial: name it beside them, as `trial`")
     return args
@@ -153,7 +153,7 @@ class CommandIn(Schema):
 
 
 class CommandOut(Schema):
-    """What became of a command: 200 accepted or done, 409 refused or failed, 504 nobody knows.
+    """Result of a command: 200 accepted or done, 409 refused or failed, 504 not known.
 
     Of a trial of a blind plan `reason` and `data` are without what tells which checkpoint it is of.
     """
@@ -186,7 +186,7 @@ class EStopIn(Schema):
 
 
 class TrialIn(Schema):
-    """What is tried next; scene and checkpoint by name or id, the position by its number."""
+    """Next trial; scene and checkpoint by name or id, the position by its number."""
 
     scene: str | int
     position: int
@@ -223,7 +223,7 @@ def station(request: HttpRequest, name: str) -> Any:
     "/{name}/lease", response={200: LeaseOut, **FAILURES}, summary="Take, give, ask", url_name="lease"
 )
 def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
-    """Who commands the station; answers with how it stands afterwards."""
+    """Act on the station's lease; answers with its state afterwards."""
     found, user, page = selectors.station_get(name=name), request.auth, given.page
     if given.action == "claim":
         leases.claim(user=user, station=found, page=page)
@@ -280,7 +280,7 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     "/{name}/estop", response={**ANSWERS, 409: CommandOut | Failure}, summary="E-stop", url_name="estop"
 )
 def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
-    """Stop the robot now; anybody who is logged in. To the wire first, and nobody waits for the row."""
+    """Stop the robot now; any logged-in user. To the wire first, without a wait for the row."""
     # A served lab answers at evaweb.api.door, also where the database does not say who is logged in.
     given, at = given or EStopIn(), timezone.now()
     identity, user = given.uuid or uuid4(), request.auth

@@ -1,4 +1,4 @@
-"""What the scored trials say, per scene and checkpoint."""
+"""Statistics of the scored trials, per scene and checkpoint."""
 
 from __future__ import annotations
 

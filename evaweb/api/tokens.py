@@ -53,9 +53,9 @@ def tokens_withdraw(*, user: User, why: str) -> None:
 
 
 def token_user(*, secret: str, ended: bool = False) -> User | None:
-    """Whose token this is, None where nobody's, or of somebody who may not log in.
+    """The token's user, None where it is unknown, or its user may not log in.
 
-    One whose time is over is nobody's, unless `ended`: who stops a robot is not asked for the date.
+    One whose time is over is unknown, unless `ended`: a stop of a robot is not asked for the date.
     """
     if not ended and (len(secret) != _LENGTH or not secret.startswith(PREFIX)):
         return None  # no question to the database
@@ -68,7 +68,7 @@ def token_user(*, secret: str, ended: bool = False) -> User | None:
 
 
 def _note_use(token: Token) -> None:
-    """Whoever comes may want to stop a robot: nobody is kept waiting while the database is locked."""
+    """Any caller may want to stop a robot: none is kept waiting while the database is locked."""
     now = timezone.now()
     if token.used_at is not None and now - token.used_at <= _USED_EVERY:
         return

@@ -38,7 +38,7 @@ class Filters(Schema):
 class TrialOut(Schema):
     """One attempt, flat; success, score, note and rater are those of the newest score.
 
-    `code` is what a trial of a plan was handed out under, "" for others. While it is hidden from who asks which
+    `code` is what a trial of a plan was handed out under, "" for others. While it is hidden from the caller which
     `checkpoint` it is of, the code stands there too.
     """
 
@@ -107,7 +107,7 @@ class OutcomeOut(Schema):
 
 
 class ScoreOut(Schema):
-    """What one rater said; the newest one counts, none is ever changed."""
+    """One rater's score; the newest one counts, none is ever changed."""
 
     uuid: UUID
     rater: str
@@ -154,8 +154,8 @@ class TrialDetail(TrialOut):
 class ScoreIn(Schema):
     """A score: every milestone of the scene by id; `success` only where none of them is required.
 
-    A trial that has a score takes another one as a correction, with a `reason`. Who has lost the answer sends the same
-    again: with its `uuid`, or word by word, it is the first score once more.
+    A trial that has a score takes another one as a correction, with a `reason`. After a lost answer a client sends the
+    same again: with its `uuid`, or word by word, it is the first score once more.
     """
 
     milestones: Annotated[dict[str, bool], Field(default_factory=dict)]
@@ -172,7 +172,7 @@ class ScoreIn(Schema):
 
 
 class Reason(Schema):
-    """Why, for those who read it later."""
+    """Reason, for later readers."""
 
     reason: str = ""
 

@@ -1,4 +1,4 @@
-"""Addresses of the REST interface; it says itself who may come in, and never redirects to a login page."""
+"""Addresses of the REST interface; it judges credentials itself, and never redirects to a login page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evaweb.api.api import api
 
 @csrf_exempt  # it changes nothing, and its answer is the truer one
 def nowhere(request: HttpRequest, rest: str) -> JsonResponse:
-    """What is at no address of the interface, said as the interface says everything."""
+    """Answer at an unknown address of the interface, in the form of all its answers."""
     return JsonResponse({"error": refusals.nowhere(request.path)}, status=404)
 
 

@@ -37,7 +37,7 @@ class _Events(admin.TabularInline):
 
 @admin.register(CollectSession)
 class CollectSessionAdmin(_Kept):
-    """What was, or is being, collected; opened, closed and resumed at the station's Collect page."""
+    """Sessions of collection, past and current; opened, closed and resumed at the station's Collect page."""
 
     list_display = ("task", "dataset", "station", "operator", "target", "episodes", "opened_at", "closed_at")
     list_filter = ("station", "dataset", "operator")

@@ -1,4 +1,4 @@
-"""What the Collect page of a station shows, for its two fragments."""
+"""Contents of a station's Collect page, for its two fragments."""
 
 from __future__ import annotations
 

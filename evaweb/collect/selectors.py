@@ -37,7 +37,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """Where a session's episodes go: the folder's name, and its version, "" where it does not exist yet."""
+    """Destination of a session's episodes: the folder's name, its version, "" where it does not exist yet."""
 
     name: str
     version: str
@@ -84,13 +84,13 @@ def sessions_earlier(*, station: Station) -> QuerySet[CollectSession]:
 
 
 def tasks_earlier(*, station: Station) -> list[str]:
-    """What was demonstrated there, the newest first, each once."""
+    """Tasks demonstrated at the station, the newest first, each once."""
     newest = session_list().filter(station=station).values_list("task", flat=True)
     return list(dict.fromkeys(newest[:200]))[:EARLIER]
 
 
 def counts_of(*, session: CollectSession) -> Counts:
-    """How many episodes it has, and how they went."""
+    """Number of its episodes, in all and by outcome."""
     cut = Q(discarded=False, episode__status__in=(EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED))
     wanted = {
         "saved": _saved(),
@@ -136,7 +136,7 @@ def to_publish(
 
 
 def dataset_of(*, session: CollectSession) -> Dataset:
-    """Where its episodes go; `problem` says why nothing can be put there now."""
+    """Destination of its episodes; `problem` says why nothing can be put there now."""
     name = session_dataset(session.dataset, simulated=session.station.simulated)
     folder = datasets_dir() / name
     if not folder.is_dir():

@@ -1,4 +1,4 @@
-"""What is done with sessions: opened, closed, resumed, published. A line on the disk first, then the row."""
+"""Actions on sessions: begin, close, resume, publish. A line on the disk first, then the row."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _ROLLOUTS = "rollouts"  # begins the names of datasets of policies' runs
 def session_begin(
     *, user: Any, station: Station, task: str, dataset: str = "", target: int | None = None
 ) -> CollectSession:
-    """Open a session with the station's present set-up; operators, while nobody else commands it.
+    """Open a session with the station's present set-up; operators, while no other user commands it.
 
     `dataset` "" takes the deployment's own. Conflict where one is open there, or the dataset was collected with
     another set-up: every difference is listed.
@@ -101,7 +101,7 @@ def session_resume(*, user: Any, session: CollectSession) -> CollectSession:
 
 @transaction.atomic
 def session_target(*, user: Any, session: CollectSession, target: int | None) -> CollectSession:
-    """How many episodes are wanted, None for as many as there will be."""
+    """Set the number of episodes wanted, None for no target."""
     require(user, Role.OPERATOR)
     _check_target(target)
     held = _held(session)
@@ -167,7 +167,7 @@ def _require_none_open(station: Station) -> None:
 
 
 def _commanded(user: Any, station: Station, *, needed: bool = True) -> dict[str, Any]:
-    """The station's snapshot; Conflict while somebody else commands it. Not `needed`: {} of a station that is away."""
+    """The station's snapshot; Conflict while another user commands it. Not `needed`: {} of a station that is away."""
     try:
         snapshot = wire_to(station.name).status()
     except EvaError:

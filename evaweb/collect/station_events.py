@@ -1,4 +1,4 @@
-"""What a station's events do to demonstrations: bound to their session, labelled. Any event may come twice."""
+"""Effects of a station's events on demonstrations: bound to their session, labelled. Any may come twice."""
 
 from __future__ import annotations
 

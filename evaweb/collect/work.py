@@ -1,4 +1,4 @@
-"""What the worker has to do for the episodes of a session: how far it is, and how long it takes."""
+"""Jobs of the worker for the episodes of a session: their progress, and the time they take."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Item:
 
     @property
     def fraction(self) -> float | None:
-        """How much of it is done, by the time it takes."""
+        """Share of it that is done, by the time it takes."""
         if self.left_s is None or not self.expected_s or self.job.status != JobStatus.RUNNING:
             return None
         return min(1.0, max(0.0, 1 - self.left_s / self.expected_s))
@@ -38,7 +38,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Queue:
-    """What has failed, runs and waits, in this order; `left_s` of all that runs and waits, one after the other."""
+    """Failed, running and waiting jobs, in this order; `left_s` of all that runs and waits, in succession."""
 
     items: tuple[Item, ...]
     done: int
@@ -51,12 +51,12 @@ class Queue:
 
     @property
     def active(self) -> bool:
-        """Whether something runs or waits, so that a page looks again."""
+        """True if something runs or waits, so that a page looks again."""
         return any(item.job.status != JobStatus.FAILED for item in self.items)
 
     @property
     def failed(self) -> int:
-        """How many of them a person has to look at."""
+        """Number of failed jobs, for a person to look at."""
         return sum(item.job.status == JobStatus.FAILED for item in self.items)
 
 

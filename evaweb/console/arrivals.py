@@ -1,7 +1,7 @@
 """Connections that have not sent a whole request yet, or wait for their next: so many, and not for ever.
 
-Where there are too many the oldest are closed, never the newest: whoever sends a request at once gets in, whatever
-else comes from the same address.
+Where there are too many the oldest are closed, never the newest: a client that sends its request at once gets in,
+whatever else comes from the same address.
 """
 
 from __future__ import annotations

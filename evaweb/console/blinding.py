@@ -1,4 +1,4 @@
-"""What is hidden from the people whose pages are open, as the database knows it now."""
+"""Sight of the users whose pages are open, as the database knows it now."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much of a request is read before somebody has looked at it.
+"""Bounds of a request's body, before a view has looked at the request.
 
 Twisted hands a request to daphne, and daphne to Django, when its body is here whole: a view can no longer refuse to
 read it. So what is too long is refused by its headers, or when it has become too long, and never kept.
@@ -40,7 +40,7 @@ _LINGER_S = 5.0  # for which a client that goes on sending is heard, so that it 
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """How many bytes a body may have, and what is answered to more; status 0: it is left out, the request goes on.
+    """Largest body [bytes], and the answer to a longer one; status 0: it is left out, the request goes on.
 
     What is longer than `sure` is let in only where the first session of `keys` is an administrator's. Where it
     `may_press`, the first `largest` bytes of what is longer decide whether it is a press of the e-stop, of which the
@@ -124,7 +124,7 @@ class BoundedRequest(WebRequest):
             super().requestReceived(command, path, version)
 
     def basic_error(self, status: int, status_text: bytes, body: str) -> None:
-        """What daphne itself says: of odd headers and addresses, and of faults."""
+        """Send daphne's own answers: to odd headers and addresses, and to faults."""
         headers, said = refusal(status, body, self.path or b"")
         self.handle_reply({"type": "http.response.start", "status": status, "headers": headers})
         self.handle_reply({"type": "http.response.body", "body": said})
@@ -138,7 +138,7 @@ class BoundedRequest(WebRequest):
         super().connectionLost(reason)
 
     def admitted(self) -> None:
-        """A long body of somebody who may send it: it takes its time."""
+        """A long body of a client that may send it: it takes its time."""
 
     def _too_long(self) -> None:
         if self._bound.may_press:

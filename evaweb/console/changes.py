@@ -1,6 +1,6 @@
-"""Whether something of a station has changed in the database, whoever changed it.
+"""Changes of a station's rows in the database, by whichever process.
 
-Each web process looks once a second while somebody watches: the worker and other processes are heard this way
+Each web process looks once a second while a viewer watches: the worker and other processes are heard this way
 without anything between them but the database.
 """
 
@@ -38,7 +38,7 @@ def difference(before: Marks, now: Marks) -> list[str]:
 
 
 def marks(station: str) -> Marks:
-    """What is different after every change, by what it is about."""
+    """Marks that differ after every change, by what it is about."""
     here = Q(station__name=station)
     return {
         "lease": (

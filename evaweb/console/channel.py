@@ -1,4 +1,4 @@
-"""What is refused before Django hears of it, said as Django says it: JSON, or the page of the lab."""
+"""Refusals before Django hears of a request, in Django's form: JSON, or the page of the lab."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Headers = list[tuple[bytes, bytes]]
 
 
 def is_stop(path: bytes) -> bool:
-    """Whether what is asked at that address may stop a robot."""
+    """True if a request to that address may stop a robot."""
     return _STOPS.fullmatch(path) is not None
 
 
 def refusal(status: int, sentence: str, path: bytes) -> tuple[Headers, bytes]:
-    """Headers and body for who asked for `path`."""
+    """Headers and body for a request to `path`."""
     if path.startswith(_REST):
         kind, body, policy = "application/json", json.dumps({"error": sentence}), {}
     else:

@@ -1,4 +1,4 @@
-"""What the pages need beside Python, looked for when a process starts."""
+"""Scripts that the pages need beside Python, looked for when a process starts."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """The live socket of a page on a station.
 
 Watching needs the database once, when the socket opens. Renewing a lease and stopping never do: they have
-threads of their own, and go straight to the runtime; what stops is obeyed even before the database has said who is
-there. Beside them the login is looked at every few seconds: who has logged out, or is no operator any more, keeps no
-lease.
+threads of their own, and go straight to the runtime; what stops is obeyed even before the database has named
+the user. Beside them the login is looked at every few seconds: a user who has logged out, or is no operator any more,
+keeps no lease.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._keep(self._admit())
 
     async def _admit(self) -> None:
-        """Ask the database who is there until it answers; what stops is obeyed meanwhile."""
+        """Ask the database for the user until it answers; what stops is obeyed meanwhile."""
         admitted = None
         while admitted is None:
             try:
@@ -229,7 +229,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             _go_on(self._aims.answer())
 
     def _keep_lease(self, request: Renew) -> None:
-        """Where the database has said within the last minute who is there; it may be away since."""
+        """Renew the lease if the database has named the user within the last minute; it may be away since."""
         login = self._counted
         if login is None:
             self._say({"type": "renewed", "ok": False, "lost": False, "reason": _NOT_SAID})
@@ -279,7 +279,7 @@ class StationConsumer(AsyncWebsocketConsumer):
 
 
 class NowhereConsumer(AsyncWebsocketConsumer):
-    """What is at no address of the live sockets."""
+    """Consumer at unknown addresses of the live sockets."""
 
     channel_layer_alias = ""
 
@@ -298,7 +298,7 @@ _Admitted = tuple[str, Any, Station | None, Role, dict[str, Any], Sight]
 
 
 def _admitted(name: str, sessions: list[str]) -> _Admitted:
-    """By which session who is there, and what they are shown of the station; nobody is shown nothing. NotFound."""
+    """The session, its user and their sight of the station; an unknown user is shown nothing. NotFound."""
     for session in sessions:
         user = credentials.look(SESSION, session)
         if user is not None:
@@ -308,7 +308,7 @@ def _admitted(name: str, sessions: list[str]) -> _Admitted:
 
 
 def _as_said(message: bytes) -> str:
-    """What a binary message says, which is no page's way and may be a press."""
+    """Text of a binary message, which is no page's way and may be a press."""
     return message.decode(json.detect_encoding(message), "replace")
 
 

@@ -1,4 +1,4 @@
-"""What a station publishes as parts of frames: made once for all who watch, in the feed's own threads."""
+"""Parts of frames, encoded from what a station publishes: once for all viewers, in the feed's own threads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _VECTORS = ("measured", "raw", "planned", "commanded", "simulated")  # of the jo
 class Encoder:
     """Makes parts of what a feed tells; `looks` is the robot as the station has it, None where it is not drawn.
 
-    `veiled`: for those who are not to know which policy it is; snapshots come to it covered already.
+    `veiled`: for users from whom the policy is hidden; snapshots come to it covered already.
     """
 
     def __init__(self, robot: str, *, veiled: bool = False) -> None:

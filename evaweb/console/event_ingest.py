@@ -1,4 +1,4 @@
-"""Writes down what happens at the stations, whether somebody watches or not.
+"""Writes down what happens at the stations, with viewers or without.
 
 A thread per station hears its feed and hands events to the services, in order, each at least once: the number
 of the last one is in the station's row, services take an event twice without harm, and so any number of web

@@ -1,4 +1,4 @@
-"""What a station publishes, followed by threads of this process: found anew where its runtime was restarted.
+"""Reader of what a station publishes, in threads of this process: found anew where its runtime was restarted.
 
 Knows neither pages nor database. Listeners are told in the feed's own threads and must not wait for anything.
 """
@@ -32,7 +32,7 @@ Listener = Callable[[str, Any], None]  # told of a stream ("link", "events" amon
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Whether the station's runtime is heard, and if not, what is known."""
+    """State of the link to a station's runtime; `reason` says what is known where it is not `ok`."""
 
     ok: bool
     reason: str = ""

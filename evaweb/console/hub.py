@@ -25,7 +25,7 @@ _CHANGES_S = 1.0
 class Room:
     """The pages that watch one station; all but `hear` belongs to the event loop.
 
-    Who is not to know which checkpoint the station is set up for is shown other parts than the others. What is hidden
+    A user from whom the station's checkpoint is hidden is shown other parts than the others. What is hidden
     from whom is looked up each second; a page that has just come is shown nothing before that, and events wait for it,
     because a trial may have been handed out since.
     """
@@ -93,7 +93,7 @@ class Room:
         self.ring()
 
     def hear(self, stream: str, content: Any) -> None:
-        """What the feed has to tell, in its thread."""
+        """Encode and pass on a message of the feed, in its thread."""
         encoded = self._encoder.encode(stream, content)
         covered = encoded if stream.startswith("camera/") else self._cover(stream, content)
         if not self._loop.is_closed():
@@ -137,7 +137,7 @@ class Room:
         return self._covered if viewer.veiled else self._newest
 
     def _judge(self, viewer: Mailbox) -> None:
-        """Whether the page is shown the station as it is now; where that changes it is told, and shown anew."""
+        """Decide if the page sees the station as it is now; where that changes it is told, and shown anew."""
         veiled = viewer.sight.veils(self.station, self._state)
         viewer.covers = viewer.sight.veils_events(self.station)
         if veiled is not viewer.veiled:
@@ -147,7 +147,7 @@ class Room:
             viewer.watch(viewer.watched, self._shown_to(viewer).values())
 
     def _count_covered(self) -> None:
-        """Covered parts are made while somebody is shown them; what is left of before is old."""
+        """Covered parts are made while a viewer is shown them; what is left of before is old."""
         before, self._covers = self._covers, any(viewer.veiled for viewer in self._viewers)
         if self._covers and not before:
             self._covered.clear()
@@ -191,7 +191,7 @@ class Room:
             viewer.flush(self._history, make_frame)
 
     async def _follow_changes(self) -> None:
-        """Tell the pages what has changed in the database, whoever changed it."""
+        """Tell the pages what has changed in the database, by any process."""
         known = None
         while True:
             self._look()

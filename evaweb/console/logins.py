@@ -1,4 +1,4 @@
-"""Whether a page's login still holds: its socket outlives the request that opened it."""
+"""Check that a page's login still holds: its socket outlives the request that opened it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one page has not been sent yet: the newest of each stream, events, a few words.
+"""Messages that one page has not been sent yet: the newest of each stream, events, a few words.
 
 A page pays for each frame with a credit and gets the credit back when it has drawn; at most two frames are
 ever under way to it. A page that does not answer is sent nothing more, and costs what it has not read.
@@ -48,7 +48,7 @@ class Mailbox:
         return self._watched
 
     def watch(self, streams: Iterable[str], newest: Iterable[Part]) -> None:
-        """What the page shows from now on, and what there is of it already."""
+        """Set the streams that the page shows from now on, with what there is of them already."""
         self._watched = frozenset(streams)
         self._pending = {part.stream: part for part in newest if part.stream in self._watched}
 

@@ -1,6 +1,6 @@
 """Targets that a page asks about: where the robot would be, and whether it could go there. Nothing moves.
 
-Asked while somebody drags a slider: the newest question replaces the one that waits, and at most one of a page
+Asked while an operator drags a slider: the newest question replaces the one that waits, and at most one of a page
 is under way. They have threads and a connection to the station of their own, so that no command waits for them.
 """
 
@@ -72,7 +72,7 @@ class Aims:
 
 
 def aimed(station: str, username: str, args: Mapping[str, Any], looks: Looks | None) -> dict[str, Any]:
-    """What the station says of a target, and `links`, where its parts would be, one after the other [P * 16]."""
+    """The station's answer on a target, and `links`, the poses of its parts there [P * 16]."""
     command = messages.Command(str(uuid4()), "aim", args, user=username, holder=username)
     try:
         messages.encode(command)  # what cannot be sent is no fault of the station

@@ -1,4 +1,4 @@
-"""How much a page may say: as much as it needs, and no flood. What stops a robot is never counted."""
+"""Quota of a page's messages: as much as it needs, and no flood. What stops a robot is never counted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Quota:
         self._left, self._at = AT_ONCE, clock()
 
     def take(self, messages: int = 1) -> bool:
-        """Whether so many more are within it."""
+        """Take so many messages from the quota; False if they are not within it."""
         now = self._clock()
         self._left = min(AT_ONCE, self._left + PER_SECOND * (now - self._at))
         self._at = now

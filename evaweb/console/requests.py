@@ -1,4 +1,4 @@
-"""What a page may say over the live socket, checked before anything is done with it."""
+"""Requests of a page over the live socket, checked before anything is done with them."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Events:
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """Where the robot would go with these arguments of the runtime's `aim`; the answer has the page's own `id`."""
+    """Question where these arguments of the runtime's `aim` lead; the answer has the page's own `id`."""
 
     id: int
     args: Mapping[str, Any]
@@ -79,7 +79,7 @@ Request = Watch | Credit | Renew | EStop | Stop | Events | Aim
 
 
 def may_stop(text: str) -> bool:
-    """Whether a message that nobody has the time to read may be one that stops a robot."""
+    """True if a message that there is no time to read may be one that stops a robot."""
     if pressing.in_json(text, "type") is not None:
         return True
     return len(text) <= _LONGEST_STOP and any(f'"{kind}"' in text for kind in ("stop", "halt"))

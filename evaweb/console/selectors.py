@@ -1,4 +1,4 @@
-"""What the pages of the console show."""
+"""Contents of the console's pages."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class StationRow:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """What the four steps of an evaluation show, as one user may see it.
+    """Contents of the four steps of an evaluation, as one user may see them.
 
     `trial` is the unfinished one, with the `milestones` of its scene; `implied` says whether they decide on
     success, `set_up` whether the station was last set up for it. Without one, `scene`, `position` and
@@ -66,7 +66,7 @@ class Panel:
 
     @property
     def unseen(self) -> bool:
-        """Whether a camera has no reference yet."""
+        """True if a camera has no reference yet."""
         return any(row is None for _, row in self.views)
 
     @property
@@ -80,18 +80,18 @@ class Panel:
 
     @property
     def implied(self) -> bool:
-        """Whether the milestones decide on success: at least one of them is required."""
+        """True if the milestones decide on success: at least one of them is required."""
         return any(milestone.required for milestone in self.milestones)
 
     @property
     def layout(self) -> str:
-        """How to lay out the bench, in words."""
+        """Layout of the bench, in words."""
         scene = self.trial.scene if self.trial else self.scene
         return scene.layout if scene else ""
 
     @property
     def last_address(self) -> str:
-        """Where the last trial is shown."""
+        """Address of the last trial's page."""
         return f"/result/trials/{self.last.pk}/" if self.last else ""
 
 
@@ -194,7 +194,7 @@ def _next_position(positions: tuple[Position, ...], last: Trial | None) -> Posit
 
 
 def _is_set_up(trial: Trial) -> bool:
-    """Whether the last set-up of the station that may have been carried out was for this trial."""
+    """True if the last set-up of the station that may have been carried out was for this trial."""
     last = last_set_up(station=trial.station)
     return last is not None and last == trial.setup
 

@@ -32,7 +32,7 @@ _TURN_S = 0.001  # of the interpreter, where others wait for it: an e-stop takes
 
 
 class Beside(Protocol):
-    """What a process does as long as it serves."""
+    """Service of a process, for as long as the process serves."""
 
     def start(self) -> None:
         """It serves."""
@@ -127,7 +127,7 @@ def _address(listener: socket.socket) -> dict[str, Any]:
 
 
 def _watch(server: Server) -> None:
-    """Whoever started us holds the other end of our standard input."""
+    """The process that started us holds the other end of our standard input."""
     while os.read(0, 4096):
         pass
     events: Any = reactor

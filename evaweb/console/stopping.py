@@ -1,4 +1,4 @@
-"""What a page stops: at once where it is known who is there, and also where the database does not say who.
+"""Stops by a page: at once where the user is known, and also where the database does not tell the user.
 
 Nothing here waits for the database, and no number of presses is too many.
 """
@@ -29,7 +29,7 @@ GoOn = Callable[[Coroutine[Any, Any, None]], None]  # to the end, also when the 
 
 
 class Stopping:
-    """The stops of one page at a station; belongs to the event loop. `login` is who is there, once that is known.
+    """The stops of one page at a station; belongs to the event loop. `login` is the user's, once that is known.
 
     `found` are the credentials that it came with, and `share` from where.
     """

@@ -1,4 +1,4 @@
-"""Requests take turns of the event loop: what many ask at once keeps nobody who is connected from being heard."""
+"""Requests take turns of the event loop: a crowd keeps no connected client from being heard."""
 
 from __future__ import annotations
 

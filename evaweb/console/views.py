@@ -90,7 +90,7 @@ def collect_progress(request: HttpRequest, name: str) -> HttpResponse:
 
 
 def lease(request: HttpRequest, name: str) -> HttpResponse:
-    """Who commands and who waits for it, to be put into the page."""
+    """Holder of the lease and those that wait for it, to be put into the page."""
     return render(request, "console/lease.html", _lease(request, _station(name)))
 
 
@@ -118,7 +118,7 @@ def _page(request: HttpRequest, station: Station, page: str, extra: dict[str, An
 
 
 def _remember(request: HttpRequest, station: Station) -> None:
-    """Where the tabs of this browser lead; the page is shown also where the database does not take it."""
+    """Remember the station that this browser's tabs lead to; a database that refuses changes nothing else."""
     if request.session.get(selectors.SESSION_KEY) == station.name:
         return
     request.session[selectors.SESSION_KEY] = station.name
@@ -133,7 +133,7 @@ def _remember(request: HttpRequest, station: Station) -> None:
 
 
 def _config(request: HttpRequest, station: Station, page: str, robot: dict[str, Any]) -> dict[str, Any]:
-    """What the page's modules have to know before the socket is open."""
+    """Settings that the page's modules need before the socket is open."""
     api = f"/api/v1/stations/{station.name}"
     return {
         "page": page,

@@ -38,7 +38,7 @@ _OWN = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """What info.json says; where that cannot be read, `problem` does, and the rest is empty."""
+    """Contents of info.json; where that cannot be read, `problem` says why, and the rest is empty."""
 
     name: str  # its folder, relative to the data folder
     version: str = ""
@@ -53,7 +53,7 @@ class Overview:
 
     @property
     def lasts(self) -> str:
-        """How long all of it is, in words."""
+        """Duration of all of it, in words."""
         seconds = self.frames / self.fps if self.fps else 0.0
         if seconds < 120:
             return f"{seconds:.1f} s"
@@ -115,7 +115,7 @@ def dataset_found(name: str) -> Path:
 
 
 def overview(name: str) -> Overview:
-    """What the dataset of that name says of itself."""
+    """Overview of the dataset of that name."""
     folder = dataset_found(name)
     try:
         info = layout.read_info(folder)

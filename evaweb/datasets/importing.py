@@ -20,7 +20,7 @@ from runtime.datasets.reader import open_dataset
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What was brought: the dataset's name, its episodes in order, and how many of them were new."""
+    """Result of an import: the dataset's name, its episodes in order, and how many of them were new."""
 
     dataset: str
     episodes: tuple[UUID, ...]
@@ -61,7 +61,7 @@ def imported(
 
 
 def _target(dataset: Path, to: str) -> Path:
-    """Where it is already, or the folder below datasets/ of that name; by default of its own."""
+    """Folder it is in already, or the folder below datasets/ of that name; by default of its own."""
     here, root = dataset.resolve(), datasets_dir().resolve()
     if not to and here.parent == root:
         return datasets_dir() / here.name

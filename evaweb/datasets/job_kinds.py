@@ -124,7 +124,7 @@ def _source(work: Work) -> Path:
 
 
 def _made(name: str, made: Any) -> Found:
-    """What came of an operation that wrote a dataset."""
+    """Result of an operation that wrote a dataset."""
     return {
         "dataset": name,
         "version": made.version,

@@ -33,7 +33,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """pass, fail, or "" where nobody has decided."""
+        """pass, fail, or "" where it is undecided."""
         review = getattr(getattr(self.recording, "standing", None), "review", None)
         return str(review.verdict) if review else ""
 

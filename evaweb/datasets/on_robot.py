@@ -55,7 +55,7 @@ class Recorded:
 
     @property
     def page(self) -> str:
-        """Where it is played without a robot."""
+        """Address of its replay without a robot."""
         if not self.columns:
             return reverse("replay", args=[self.source])
         name, _, index = self.source.rpartition(":")
@@ -66,7 +66,7 @@ class Recorded:
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """What one station would do with it in one space; `differences` say why it does not."""
+    """Replay of it at one station in one space; `differences` say why it is not possible."""
 
     recorded: Recorded
     station: Station
@@ -76,7 +76,7 @@ class Offer:
 
     @property
     def sent(self) -> str:
-        """What is sent, in words."""
+        """Description of the values that are sent."""
         return SPACES[self.space]
 
     @property
@@ -86,7 +86,7 @@ class Offer:
 
     @property
     def asked(self) -> str:
-        """How the page asks for the set-up, as JSON."""
+        """Arguments of the page's request for the set-up, as JSON."""
         recorded = self.recorded
         return json.dumps({"episode": recorded.source, "space": self.space, **_assumed(recorded)})
 
@@ -114,12 +114,12 @@ class Offer:
 
     @property
     def address(self) -> str:
-        """Where it is set up and run: the station's own page."""
+        """Address of the station's own page, where it is set up and run."""
         return f"{reverse('station-debug', args=[self.station.name])}?{query(self.recorded, self.space)}"
 
 
 def query(recorded: Recorded, space: str) -> str:
-    """What an address says of it."""
+    """Query string for it."""
     return urlencode({"replay": recorded.source, "space": space, **_assumed(recorded)})
 
 
@@ -225,7 +225,7 @@ def _of_dataset(shown: Played) -> Recorded:
 
 
 def offer(recorded: Recorded, station: Station, space: str) -> Offer:
-    """What the station would do with the episode; EvaError for a space that is none."""
+    """Offer of the station for the episode; EvaError for an unknown space."""
     if space not in SPACES:
         raise EvaError(f"space = {space!r:.40}; allowed: {', '.join(SPACES)}")
     facts, running = _facts(station)
@@ -233,7 +233,7 @@ def offer(recorded: Recorded, station: Station, space: str) -> Offer:
 
 
 def _facts(station: Station) -> tuple[Mapping[str, Any], bool]:
-    """What the station says of its robot; where it does not answer, what is known of such a robot."""
+    """Facts of the station's robot, and if it answers; where it does not, what is known of such a robot."""
     try:
         return wire_to(station.name).status()["facts"], True
     except (StationGone, KeyError):

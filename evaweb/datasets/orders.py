@@ -1,4 +1,4 @@
-"""What can be asked for about datasets: checked here, done by the worker, one kind of job for all."""
+"""Orders for datasets: checked here, done by the worker, one kind of job for all."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def asked(*, user: Any, given: Mapping[str, Any]) -> Job:
 
 
 def key_of(what: str, name: str, args: Mapping[str, Any]) -> str:
-    """What the job is about: one check of a dataset at a time, while two exports of it are two things."""
+    """Key of the job's subject: one check of a dataset at a time, while two exports of it are two things."""
     if what in ("check", "repair"):
         return f"dataset:{what}:{_short(name)}"
     rest = hashlib.sha256(json.dumps(dict(args), sort_keys=True).encode()).hexdigest()[:12]

@@ -35,7 +35,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Played:
-    """One episode of a dataset; `robot` is whose numbers are meant, "" where nobody knows.
+    """One episode of a dataset; `robot` is whose numbers are meant, "" where it is not known.
 
     `assumed`: a person says so, whatever the dataset says, and that they are in that robot's order.
     """
@@ -74,7 +74,7 @@ class Played:
         return camera_keys(dict(self.dataset.features))
 
     def video(self, camera: str) -> Span | None:
-        """Where the video of a camera is; None where its pictures are in a column. NotFound for no camera of it."""
+        """Span of a camera's video; None where its pictures are in a column. NotFound for no camera of it."""
         key = self.cameras.get(camera)
         if key is None:
             raise NotFound(

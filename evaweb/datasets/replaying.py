@@ -123,7 +123,7 @@ def curves(request: HttpRequest, name: str, index: int) -> HttpResponse:
 
 @require_GET
 def shapes(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """What the 3D scene needs of the robot, as JSON."""
+    """Geometry of the robot for the 3D scene, as JSON."""
     episode = _episode(request, name, index)
     found = _readable(lambda: as_recording(episode))
     robot = looks_in(found.manifest).robot
@@ -132,7 +132,7 @@ def shapes(request: HttpRequest, name: str, index: int) -> HttpResponse:
 
 @require_GET
 def poses(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """Where the robot's parts were from row ?first= on, as one message of evaweb.binary_frames."""
+    """Poses of the robot's parts from row ?first= on, as one message of evaweb.binary_frames."""
     episode = _episode(request, name, index)
     first = _number(request, "first")
     return _message(lambda: poses_of(as_recording(episode), first))

@@ -33,7 +33,7 @@ class Shown:
 
 
 def shown(request: Any, name: str) -> Shown:
-    """What is meant by a name; NotFound, Conflict where it cannot be played."""
+    """Episode of that name; NotFound, Conflict where it cannot be played."""
     try:
         uuid = UUID(name)
     except ValueError:
@@ -87,7 +87,7 @@ def dataset_address(route: str, episode: Played, *more: Any) -> str:
 
 
 def dataset_config(episode: Played) -> dict[str, Any]:
-    """What the page's modules have to know, as evaweb.episodes.views says of a recording."""
+    """Settings of the page's modules, as evaweb.episodes.views has them for a recording."""
     known = episode.robot in robots.names()
     videos = []
     for camera in episode.cameras:

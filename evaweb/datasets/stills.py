@@ -38,7 +38,7 @@ def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
 
 
 def _stored(episode: Played, key: str, row: int) -> bytes:
-    """What the column has in one row, without reading those of other episodes into Python."""
+    """Picture in one row of the column, without reading those of other episodes into Python."""
     path = episode.entry.data
     try:
         columns = [key, *(["episode_index"] if episode.entry.shared else [])]

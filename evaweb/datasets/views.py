@@ -130,7 +130,7 @@ def _indices(text: str) -> list[int]:
 
 
 def _require_confirmed(form: QueryDict) -> None:
-    """Who takes episodes away says from which dataset."""
+    """Refuse to delete episodes unless the form names their dataset."""
     name = form.get("dataset", "").removeprefix("datasets/")
     if form.get("confirm", "").strip() != name:
         raise Conflict(f"nothing was deleted: write the name of the dataset, {name}, to confirm it")

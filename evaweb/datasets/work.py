@@ -39,13 +39,13 @@ class Told:
 
     @property
     def passing(self) -> bool:
-        """Whether it changes by itself, so that a page looks again."""
+        """True if it changes by itself, so that a page looks again."""
         return self.state in ("waiting", "running")
 
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What the newest check found; `fresh` is false where the dataset has changed since."""
+    """Findings of the newest check; `fresh` is false where the dataset has changed since."""
 
     at: datetime
     problems: tuple[str, ...]
@@ -64,7 +64,7 @@ def jobs_of(name: str = "") -> list[Told]:
 
 
 def told(job: Job) -> Told:
-    """How a job stands."""
+    """State of a job, in words."""
     args, result = job.args, job.result
     title = f"{_VERBS.get(args['what'], args['what'])} {_about(args)}"
     if job.status == JobStatus.DONE and not result.get("done"):
@@ -115,7 +115,7 @@ def _counted(count: int, thing: str) -> str:
 
 
 def checked(name: str) -> Checked | None:
-    """What the newest finished check of the dataset found; None where there is none."""
+    """Findings of the newest finished check of the dataset; None where there is none."""
     key = key_of("check", name, {})
     repaired = key_of("repair", name, {})
     job = Job.objects.filter(key__in=(key, repaired), status=JobStatus.DONE, result__done=True).first()

@@ -1,4 +1,4 @@
-"""What the policy answered, chunk by chunk: when, how late, which of its rows were planned."""
+"""Chunks that the policy answered: when, how late, which of their rows were planned."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def _covered(episode: Episode) -> Episode:
 
 
 def _numbers(episode: Episode) -> dict[str, Any]:
-    """The `units` of the joints and which are `grippers`; nobody knows where the robot is another one today."""
+    """The `units` of the joints and which are `grippers`; not known where the robot is another one today."""
     try:
         looks = looks_in(episode.manifest)
     except NotFound:
@@ -121,7 +121,7 @@ def _asked(episode: Episode) -> tuple[Array, Array]:
 
 
 def _makers(episode: Episode) -> tuple[Array, Stream]:
-    """Where the makers of each tick begin and end (int32 [M + 1]), and all of them, tick by tick."""
+    """Places where the makers of each tick begin and end (int32 [M + 1]), and all makers, tick by tick."""
     places, known = _asked(episode)
     table = episode.smoothed.filter(known)
     chunk_ids, weights = (table.column(name).combine_chunks() for name in ("chunk_ids", "weights"))
@@ -155,7 +155,7 @@ def _ticks(episode: Episode, start: float, made: Array) -> Stream:
 
 
 def _raw(episode: Episode, start: float) -> Stream:
-    """What the policy meant for each step; dropped rows and chunks in another space have no place here."""
+    """The policy's raw actions for each step; dropped rows and chunks in another space have no place here."""
     raw, dim = episode.raw, episode.layout.dim
     spaces = sorted(set(raw.column("space").to_pylist()))
     lengths = raw.column("action").combine_chunks().value_lengths().to_numpy(zero_copy_only=False)
@@ -193,7 +193,7 @@ def _period(episode: Episode) -> float:
 
 
 def held_spans(sources: Sequence[str], fps: float) -> list[list[float]]:
-    """From when to when [s] nobody asked the robot for anything."""
+    """Spans [s] in which the robot was not asked for anything."""
     held = np.asarray([source in HELD for source in sources], np.int8)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
     return [

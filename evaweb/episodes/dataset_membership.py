@@ -21,7 +21,7 @@ from runtime.recording.files import RecordingError
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where an episode lies in one dataset, and what that says of it."""
+    """Place of an episode in one dataset, and what that says of it."""
 
     dataset: str  # relative to the data folder
     index: int

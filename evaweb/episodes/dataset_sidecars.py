@@ -1,4 +1,4 @@
-"""What goes beside an episode into its dataset; apps above this one have it."""
+"""Side files of an episode for its dataset; apps above this one have them."""
 
 from __future__ import annotations
 
@@ -22,5 +22,5 @@ def gives_sides(function: SideGiver) -> SideGiver:
 
 
 def sides_of(uuid: UUID, folder: Path) -> dict[str, Path]:
-    """What goes beside the episode, written into `folder`."""
+    """Side files of the episode, written into `folder`."""
     return {kind: path for give in _givers for kind, path in give(uuid, folder).items()}

@@ -19,7 +19,7 @@ CONTENT_TYPE = "application/vnd.apache.parquet"
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """How far the table of an episode is: ready, preparing, failed, absent or none; `size` in bytes."""
+    """State of an episode's table: ready, preparing, failed, absent or none; `size` in bytes."""
 
     name: str
     sentence: str = ""
@@ -50,7 +50,7 @@ def table_file(uuid: UUID) -> Path:
 
 
 def table_of(*, episode: Episode) -> Table:
-    """How far it is, from the disk and its newest job; there is none of what is still being written."""
+    """State of the table, from the disk and its newest job; none of what is still being written."""
     if episode.status in (EpisodeStatus.RECORDING, EpisodeStatus.MISSING):
         return Table("none")
     try:

@@ -1,4 +1,4 @@
-"""Where what belongs to an episode lies in the data folder; names come from the database, never from a client."""
+"""Places of an episode's files in the data folder; names come from the database, never from a client."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def journal_folder(uuid: UUID) -> Path:
 
 
 def preview_folder(uuid: UUID) -> Path:
-    """What a browser plays of an episode."""
+    """Folder of the preview of an episode that a browser plays."""
     return data_dir() / "previews" / str(uuid)
 
 
@@ -41,10 +41,10 @@ def datasets_dir() -> Path:
 
 
 def scores_dir() -> Path:
-    """What raters said, a file per episode."""
+    """Folder of the raters' scores, a file per episode."""
     return data_dir() / "scores"
 
 
 def scores_file(uuid: UUID) -> Path:
-    """What raters said of an episode, a line each."""
+    """File of the raters' scores of an episode, a line each."""
     return scores_dir() / f"{uuid}.jsonl"

@@ -68,7 +68,7 @@ def measure_smoothness(work: Work) -> Mapping[str, Any]:
 def publish_episode(work: Work) -> Mapping[str, Any]:
     """Write the episode into its dataset with the success of its newest score; args: uuid, and a new one's version.
 
-    An interrupted one goes there only where somebody has scored it, one that was discarded never.
+    An interrupted one goes there only where it was scored, one that was discarded never.
     """
     episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
     folder = journal_folder(episode.uuid)
@@ -148,7 +148,7 @@ def reconcile_all(work: Work) -> Mapping[str, Any]:
 
 @at_start("reconcile")
 def reconcile_at_start() -> None:
-    """What happened on the disk while no worker was there."""
+    """Reconcile with what happened on the disk while no worker was there."""
     enqueue(kind="reconcile", key="reconcile", args={})
 
 
@@ -160,7 +160,7 @@ def look_for_closed() -> int:
 
 @chore("recordings to be verified")
 def look_for_unverified() -> bool:
-    """Recordings that nobody has verified for long, while the worker has nothing else to do."""
+    """Recordings not verified for long, while the worker has nothing else to do."""
     return verifying.scrub_asked() is not None
 
 

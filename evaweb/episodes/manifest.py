@@ -1,4 +1,4 @@
-"""What an episode's folder says about it: manifest and outcome, in the words of the database."""
+"""Manifest and outcome in an episode's folder, in the words of the database."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Recorded:
 
     @property
     def closed(self) -> bool:
-        """Whether the recorder, or repair, has finished it."""
+        """True if the recorder, or repair, has finished it."""
         return self.facts["status"] in CLOSED
 
 

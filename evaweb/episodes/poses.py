@@ -1,4 +1,4 @@
-"""Where every part of the robot stood, row by row, for the 3D scene."""
+"""Poses of every part of the robot, row by row, for the 3D scene."""
 
 from __future__ import annotations
 

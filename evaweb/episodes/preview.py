@@ -54,7 +54,7 @@ def _draft_prefix(target: Path) -> str:
 
 
 def _remove_drafts(target: Path) -> None:
-    """What a killed worker left."""
+    """Remove the drafts that a killed worker left."""
     for left in target.parent.glob(f"{_draft_prefix(target)}*"):
         shutil.rmtree(left, ignore_errors=True)
 

@@ -46,7 +46,7 @@ def _line(line: bytes) -> Mapping[str, Any] | None:
 
 
 def success_of(path: Path) -> bool | None:
-    """What the newest score says; None where nobody has scored it. To void a trial changes no score."""
+    """Success by the newest score; None without a score. To void a trial changes no score."""
     success = None
     for line in read_scores(path).lines:
         if line.get("kind", "score") == "score" and isinstance(line.get("success"), bool):

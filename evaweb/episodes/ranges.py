@@ -13,7 +13,7 @@ _DIGITS = 18  # enough for any file; int() of a longer header would only cost ti
 
 @dataclass(frozen=True, slots=True)
 class Validators:
-    """What tells one version of a file from another."""
+    """Validators of one version of a file, which tell it from another."""
 
     etag: str
     last_modified: str
@@ -64,12 +64,12 @@ def span_asked(header: str | None, size: int) -> Span | None:
 
 
 def range_holds(if_range: str | None, validators: Validators) -> bool:
-    """Whether If-Range lets the range be answered: same strong tag, or exactly the same date."""
+    """True if If-Range lets the range be answered: same strong tag, or exactly the same date."""
     return if_range is None or if_range in (validators.etag, validators.last_modified)
 
 
 def not_modified(if_none_match: str | None, if_modified_since: str | None, validators: Validators) -> bool:
-    """Whether the client has this version already; the tag decides where one was sent."""
+    """True if the client has this version already; the tag decides where one was sent."""
     if if_none_match is not None:
         tags = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]
         return "*" in tags or validators.etag in tags

@@ -23,9 +23,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """What the disk keeps of one run: its folder, if `recorded`, and the whole `lines` of its scores file.
+    """Data on the disk of one run: its folder, if `recorded`, and the whole `lines` of its scores file.
 
-    `uuid` is the episode's; of a run that was not recorded, whatever those who wrote the lines named it by. `say` takes
+    `uuid` is the episode's; of a run that was not recorded, whatever the writers of its lines named it by. `say` takes
     a sentence about what a person should look at.
     """
 
@@ -41,7 +41,7 @@ _restorers: list[Restorer] = []
 
 
 def restores(function: Restorer) -> Restorer:
-    """Declare who understands scores and the `trial` of a manifest: an app above this one, from its `ready`.
+    """Declare the reader of scores and the `trial` of a manifest: an app above this one, from its `ready`.
 
     It is given every run once, makes the rows that are not there, and returns how many. EvaError says what
     could not be restored.
@@ -53,7 +53,7 @@ def restores(function: Restorer) -> Restorer:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What was found. `problems` are sentences about folders that could not be read; nothing is done to those."""
+    """Findings of a reconcile. `problems` are of folders that could not be read; nothing is done to those."""
 
     episodes: int  # folders that were read
     made: int  # rows that were not there
@@ -108,7 +108,7 @@ def _folders() -> tuple[list[UUID], list[str]]:
 
 
 def _restored(read: Sequence[UUID], problems: list[str]) -> int:
-    """Give every run to who understands it; what cannot be restored is added to `problems`."""
+    """Give every run to its readers; what cannot be restored is added to `problems`."""
     recorded = set(read)
     in_order = Episode.objects.order_by("started_at").values_list("uuid", flat=True)
     scored = _scored(problems)

@@ -11,7 +11,7 @@ from evaweb.stations.robot_geometry import Looks, groups_of, looks_of
 
 
 def robot_in(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What a manifest says of its robot; {} where it says nothing."""
+    """Robot of a manifest; {} where it names none."""
     robot = manifest.get("robot")
     return robot if isinstance(robot, Mapping) else {}
 
@@ -30,7 +30,7 @@ def looks_in(manifest: Mapping[str, Any]) -> Looks:
 
 
 def described_in(manifest: Mapping[str, Any]) -> robots.Robot:
-    """The same without its looks, for who draws nothing."""
+    """The same without its looks, where nothing is drawn."""
     name, groups = str(robot_in(manifest).get("name", "")), groups_in(manifest)
     if name not in robots.names():
         raise NotFound(f"robot {name!r:.80} does not exist; there are: {', '.join(robots.names())}")

@@ -48,14 +48,14 @@ REVIEW = {
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """How far an episode is on its way to be played: recording, preparing, ready, failed, empty or missing."""
+    """Stage of an episode on its way to be played: recording, preparing, ready, failed, empty or missing."""
 
     name: str
     sentence: str = ""
 
     @property
     def passing(self) -> bool:
-        """Whether it changes by itself, so that a page looks again."""
+        """True if it changes by itself, so that a page looks again."""
         return self.name in ("recording", "preparing")
 
 
@@ -106,7 +106,7 @@ def episode_list(
 
 
 def stage_of(*, episode: Episode) -> Stage:
-    """Where the episode stands, from its row, the disk and its newest job."""
+    """Stage of the episode, from its row, the disk and its newest job."""
     if preview_folder(episode.uuid).is_dir() and episode.status != EpisodeStatus.RECORDING:
         return Stage("ready")
     if episode.status == EpisodeStatus.RECORDING:

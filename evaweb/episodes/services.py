@@ -1,4 +1,4 @@
-"""What happens to the rows of episodes; their folders are the authority, and reconcile makes rows of them."""
+"""Changes to the rows of episodes; their folders are the authority, and reconcile makes rows of them."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
 
 
 def another_than(row: Episode, seal: str | None) -> str:
-    """What has become of the outcome of a row that is closed, to follow its name; "" where it is the same.
+    """Change of the outcome of a closed row, in words that follow its name; "" where it is the same.
 
     `seal` is that of the one that is there now: None where there is none, "" where it has none.
     """
@@ -157,7 +157,7 @@ def export_asked(*, episode: Episode) -> Job:
 
 
 def smoothness_asked(*, most: int) -> int:
-    """Have the worker measure closed runs that nobody asked for yet, at most so many; how many."""
+    """Have the worker measure closed runs not yet asked for, at most so many; how many."""
     rows = Episode.objects.filter(
         status__in=CLOSED, kind="rollout", frames__gt=0, smoothness_detail__isnull=True
     )
@@ -183,7 +183,7 @@ def publish_asked(*, episode: Episode, version: str = "") -> Job | None:
 
 
 def catch_up() -> int:
-    """Close rows of recordings that were closed while nobody listened, as repair does; how many."""
+    """Close rows of recordings that were closed unheard, as repair does; how many."""
     closed = 0
     for uuid in Episode.objects.filter(status=EpisodeStatus.RECORDING).values_list("uuid", flat=True):
         if (journal_folder(uuid) / "outcome.json").exists():

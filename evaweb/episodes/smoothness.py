@@ -1,7 +1,7 @@
-"""How smoothly the arms of a run moved: SPARC of the speed of each end effector, as measured and as it was sent.
+"""Smoothness of the arms in a run: SPARC of the speed of each end effector, as measured and as it was sent.
 
 The speed of the hand is what SPARC was made for (Balasubramanian et al. 2015), and it means the same for robots with
-other joints. Positions follow from the joints by the robot's description, while somebody asked for something: a robot
+other joints. Positions follow from the joints by the robot's description, while something was asked for: a robot
 that is held for its operator is not jerky. The measured one counts, at the times of its capture; the sent one,
 beside it, is free of the sensors' noise and of what the robot's own controller smooths.
 """
@@ -96,7 +96,7 @@ def _none(why: str) -> Smoothness:
 
 @dataclass(frozen=True, slots=True)
 class _Samples:
-    """Joints [N, D] at `times` [N] in s, and whether somebody asked for something then; NaN where nothing is known."""
+    """Joints [N, D] at `times` [N] in s, and whether something was asked for then; NaN where nothing is known."""
 
     times: Array
     joints: Array
@@ -115,7 +115,7 @@ class _Track:
 
 
 def _measured(episode: Episode) -> _Samples:
-    """What the robot said of its joints, when they were captured: a tick sees the newest, of whatever age that is."""
+    """Joint positions from the robot, at their capture: a tick sees the newest, of whatever age that is."""
     rows, name = episode.rows, "capture_time.joints"
     ticked = rows.column("tick_time").to_numpy()
     told = rows.column(name).to_numpy(zero_copy_only=False) if name in rows.column_names else ticked
@@ -126,7 +126,7 @@ def _measured(episode: Episode) -> _Samples:
 
 
 def _commanded(episode: Episode, rate: float) -> _Samples:
-    """What was sent, at the control steps that it was sent for."""
+    """Joint positions as they were sent, at the control steps that they were sent for."""
     ticks = episode.ticks
     joints = vectors(ticks, "executed", episode.layout.dim).T.astype(np.float64)
     return _Samples(ticks.column("step").to_numpy() / rate, joints, _asked(ticks))
@@ -156,7 +156,7 @@ def _tracked(samples: _Samples, rate: float, forward: ChainForward) -> _Track:
 
 
 def _way(spans: Sequence[Array], arm: int) -> Array:
-    """How far the arm's end effector went in each step [m]; empty where it did not move."""
+    """Distance that the arm's end effector went in each step [m]; empty where it did not move."""
     if not spans:
         return np.empty(0)
     places = np.concatenate([span[:, arm] for span in spans])

@@ -80,7 +80,7 @@ def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 @require_GET
 def stage(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """How far an episode is; tells a page that it can be played now."""
+    """Stage of an episode; tells a page that it can be played now."""
     episode = episode_get(uuid=uuid)
     found = stage_of(episode=episode)
     answer = render(request, "episodes/stage.html", {"episode": episode, "stage": found})
@@ -106,7 +106,7 @@ def _export_asked(request: HttpRequest, episode: Episode) -> HttpResponse:
 
 
 def table(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """How far the table is, as a part of the episode's page that looks again by itself."""
+    """State of the table, as a part of the episode's page that looks again by itself."""
     episode = episode_get(uuid=uuid)
     context = {"episode": episode, "table": table_of(episode=episode)}
     return render(request, "episodes/table.html", context)
@@ -121,12 +121,12 @@ def preview(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 
 def player() -> dict[str, Any]:
-    """What every page that plays needs, whatever it plays."""
+    """Scripts that every page with a player needs, whatever it plays."""
     return {"viewer": static("meshcat/main.min.js"), "uplot": static("uplot/uPlot.esm.js")}
 
 
 def replay_config(episode: Episode) -> dict[str, Any]:
-    """What the page's modules have to know of an episode; the first picture of a video is shown at its `start` [s]."""
+    """Settings of an episode for the page's modules; a video's first picture is shown at its `start` [s]."""
     address = {
         name: reverse(f"episode-{name}", args=[episode.uuid]) for name in ("curves", "geometry", "poses")
     }
@@ -173,7 +173,7 @@ def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 @require_GET
 def episode_geometry(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """What the 3D scene needs of the robot as it was then, as JSON."""
+    """Geometry of the robot as it was then, for the 3D scene, as JSON."""
     episode_get(uuid=uuid)
     try:
         manifest = read_document(journal_folder(uuid) / "manifest.json")
@@ -186,7 +186,7 @@ def episode_geometry(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 @require_GET
 def episode_poses(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Where the robot's parts were from row ?first= on, as one message of evaweb.binary_frames."""
+    """Poses of the robot's parts from row ?first= on, as one message of evaweb.binary_frames."""
     episode_get(uuid=uuid)
     first = request.GET.get("first", "0")
     if not (first.isascii() and first.isdecimal()) or len(first) > 9:

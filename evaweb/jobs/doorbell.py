@@ -13,7 +13,7 @@ TASK = "evaweb.jobs.work"  # by name: what it does asks for jobs itself
 
 
 def ring(queue: str) -> bool:
-    """Whether the broker took it; where it did not, a worker finds the row when it next looks."""
+    """Tell the broker; False where it did not take it: a worker finds the row when it next looks."""
     from evaweb.celery import app  # here, for it makes the broker's folders
 
     try:

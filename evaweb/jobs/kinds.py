@@ -1,4 +1,4 @@
-"""What kinds of jobs there are; apps declare theirs in a module `job_kinds`, this one knows none of them."""
+"""Kinds of jobs; apps declare theirs in a module `job_kinds`, this one knows none of them."""
 
 from __future__ import annotations
 

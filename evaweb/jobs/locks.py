@@ -23,7 +23,7 @@ _TRIES, _AGAIN_S = 20, 0.05  # a sweep looks at a lock for a moment
 
 
 class Worker(Enum):
-    """What the lock of a job says of the worker that claimed it."""
+    """State of the worker that claimed a job, by the job's lock."""
 
     ALIVE = "at work"
     ENDED = "ended without a word"
@@ -49,7 +49,7 @@ def alone(key: str, owner: UUID | None) -> Iterator[bool]:
 
 
 def worker_of(key: str, owner: UUID | None) -> Worker:
-    """Whether `owner`, which has claimed the job of that key, is at work on it."""
+    """State of `owner`, which has claimed the job of that key."""
     try:
         descriptor = os.open(_path(key), os.O_RDWR | os.O_CLOEXEC)
     except OSError:
@@ -67,7 +67,7 @@ def _path(key: str) -> Path:
 
 
 def _mark(owner: UUID | None) -> bytes:
-    """Who keeps it, on which kernel: locks of another machine may not reach this one."""
+    """Owner of the lock, and its kernel: locks of another machine may not reach this one."""
     return f"{owner} {_BOOT_ID.read_text().strip()}".encode()
 
 

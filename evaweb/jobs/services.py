@@ -1,6 +1,6 @@
-"""Jobs: asked for, claimed, done, tried again, swept. The row is the truth; whoever updates it first has it.
+"""Jobs: asked for, claimed, done, tried again, swept. The row is the truth; the process that updates it first has it.
 
-Who has it is a process, by a uuid of its own. Times are the database's, in the statements that write and compare them:
+Its owner is a process, by a uuid of its own. Times are the database's, in the statements that write and compare them:
 no clock of a worker decides about another one.
 """
 
@@ -114,7 +114,7 @@ def work(queue: str) -> int:
 
 
 def _perform(job: Job) -> None:
-    """Do it and write down what came of it, while nobody else on this disk does the same."""
+    """Do it and write down what came of it, while no other process on this disk does the same."""
     log.info("job %s begins after %d errors and %d deaths", job.key, job.attempts, job.deaths)
     with ExitStack() as stack:
         ended: Callable[[], object]
@@ -148,7 +148,7 @@ def seen(*, job: Job) -> bool:
 
 
 def job_done(*, job: Job, result: Args) -> bool:
-    """Keep the result; False where the job was swept meanwhile, and whoever has it now says how it ends."""
+    """Keep the result; False where the job was swept meanwhile, and its new owner says how it ends."""
     done = _finish(job, status=JobStatus.DONE, result=dict(result), error="", progress="")
     if done:
         log.info("job %s is done: %s", job.key, dict(result))

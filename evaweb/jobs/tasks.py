@@ -1,4 +1,4 @@
-"""What celery calls; a task is one line."""
+"""Tasks that celery calls; each is one line."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Bench:
 
 
 class Lab:
-    """The processes of one machine; `up` starts them, `watch` stays until somebody ends it."""
+    """The processes of one machine; `up` starts them, `watch` stays until it is ended."""
 
     def __init__(self, processes: Processes, host: str, port: int, listener: socket.socket) -> None:
         """`listener` is that of stops: open as long as the lab, so that presses wait in it for a restarted process."""

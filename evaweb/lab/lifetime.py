@@ -1,4 +1,4 @@
-"""What there is once per lab: the lock on its data folder, the port, the signals that end it."""
+"""Resources of which a lab has one: the lock on its data folder, the port, the signals that end it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evaweb.lab.processes import LabError
 
 
 class Ended(Exception):
-    """Somebody asked the lab to end."""
+    """The lab was asked to end."""
 
 
 @contextmanager

@@ -19,7 +19,7 @@ _OVER_S = 30.0  # of the station's own time, after which a run should have ended
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What is run."""
+    """Station, trial and checkpoint of the one run."""
 
     station: str
     scene: str
@@ -87,14 +87,14 @@ def take(page: LivePage) -> None:
 
 
 def went_on(state: Mapping[str, Any]) -> object:
-    """What changes of a station whenever something goes on; the clock alone is no progress."""
+    """Facts of a station that change whenever something goes on; the clock alone is no progress."""
     stages = [stage["state"] for stage in state.get("stages", ())]
     facts = [state.get(name) for name in ("boot", "sequence", "state", "reason", "phase", "stage")]
     return facts, stages, state.get("lease", {}).get("epoch"), state.get("run", {}).get("number")
 
 
 def _elapsed(state: Mapping[str, Any]) -> float:
-    """How long the run has gone on, on its own clock [s]."""
+    """Time that the run has gone on, on its own clock [s]."""
     return float(state.get("run", {}).get("elapsed", 0.0))
 
 

@@ -45,7 +45,7 @@ def until(
     what: str,
     mark: Callable[[Found], Any] = lambda found: found,
 ) -> Found:
-    """What `ask` says once it is `reached`; one that gives no reply is asked again. VisitFailed without progress."""
+    """Result of `ask` once it is `reached`; without a reply it asks again. VisitFailed without progress."""
     patience = Patience(what)
     while True:
         try:

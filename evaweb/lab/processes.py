@@ -184,7 +184,7 @@ class Processes:
 
 
 def processor_s(pid: int) -> float:
-    """How long that process, and what it has waited for, has had a processor [s]; 0 of one that has ended."""
+    """Processor time of that process, and of those it has waited for [s]; 0 of one that has ended."""
     try:
         told = Path(f"/proc/{pid}/stat").read_text("ascii", "replace")
     except OSError:

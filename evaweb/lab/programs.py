@@ -1,4 +1,4 @@
-"""What a lab consists of, each part as the command line that starts it."""
+"""Programs of a lab, each as the command line that starts it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def stops(descriptor: int, web_port: str) -> Program:
 
 
 def worker(queues: Sequence[str]) -> Program:
-    """What turns finished episodes into datasets; what it was about to do is done at the next start."""
+    """Worker that makes datasets of finished episodes; what it was about to do is done at the next start."""
     return Program("worker", (_MANAGE, "worker", "--queues", ",".join(queues)), patience_s=20.0, of_web=True)
 
 
@@ -70,7 +70,7 @@ def tabletop(robot: str, seed: int) -> Program:
 
 
 def leader(robot: str, observations: str, seed: int) -> Program:
-    """Somebody who shows the simulated bench's task with a leader arm, on a free port that it keeps."""
+    """A demonstrator of the simulated bench's task with a leader arm, on a free port that it keeps."""
 
     def arguments(endpoint: str) -> tuple[str, ...]:
         watching = ("-m", "runtime.sim.leader", "--robot", robot, "--obs-endpoint", observations)

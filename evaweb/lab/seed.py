@@ -1,4 +1,4 @@
-"""What a lab finds in its database when it starts, and what the demo has besides."""
+"""Rows of a lab's database when it starts, and those that the demo has besides."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def demo_login(*, username: str, role: Role) -> Login:
 
 
 def nobody_can_log_in() -> bool:
-    """Whether there is no account yet, or none that is switched on."""
+    """True if there is no account yet, or none that is switched on."""
     return not User.objects.filter(is_active=True).exists()
 
 

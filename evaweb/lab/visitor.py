@@ -92,7 +92,7 @@ class Visitor:
 
     @property
     def csrf_token(self) -> str:
-        """What goes with whatever changes something, "" where there is none."""
+        """Token that goes with whatever changes something, "" where there is none."""
         found = (cookie.value for cookie in self._cookies if cookie.name.startswith("eva_csrf_"))
         return next(found, None) or ""
 
@@ -123,7 +123,7 @@ class Visitor:
 
 
 def _sentence(body: str) -> str:
-    """What an error's body says to a person."""
+    """Sentence of an error's body for a person."""
     try:
         found = json.loads(body)
     except ValueError:

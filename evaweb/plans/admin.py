@@ -65,7 +65,7 @@ class Conditions(forms.ModelMultipleChoiceField):
 
 
 class EventInline(ReadOnly, admin.TabularInline):
-    """What was done with it."""
+    """Events of a plan."""
 
     model = PlanEvent
     extra = 0
@@ -94,7 +94,7 @@ class FileForm(forms.Form):
 
 @admin.register(Plan)
 class PlanAdmin(admin.ModelAdmin):
-    """What is to be found out, with what trials."""
+    """Plans: a question, and the trials that answer it."""
 
     form = PlanForm
     list_display = ("title", "name", "version", "state", "owner", "blind", "trials", "frozen_at")
@@ -133,7 +133,7 @@ class PlanAdmin(admin.ModelAdmin):
         return super().formfield_for_manytomany(db_field, request, **kwargs)
 
     def get_readonly_fields(self, request: HttpRequest, obj: Plan | None = None) -> tuple[str, ...]:
-        """What was frozen is only read; the name is that of all versions."""
+        """Names of fields that are only read: those that were frozen; the name is that of all versions."""
         if obj is None:
             return ()
         frozen = tuple("conditions" if name == "positions" else name for name in _FROZEN)
@@ -168,7 +168,7 @@ class PlanAdmin(admin.ModelAdmin):
         return obj is not None and obj.state == PlanState.DRAFT and not obj.events.exists()
 
     def get_changeform_initial_data(self, request: HttpRequest) -> dict[str, Any]:
-        """Whoever writes it owns it."""
+        """The user who writes it owns it."""
         return {"owner": request.user.pk, **super().get_changeform_initial_data(request)}
 
     def get_urls(self) -> list[URLPattern]:
@@ -227,7 +227,7 @@ class PlanAdmin(admin.ModelAdmin):
 
     @admin.display(description="trials")
     def trials(self, plan: Plan) -> str:
-        """How many are foreseen."""
+        """Number of trials that are foreseen."""
         n = plan.slots.count() or plan.positions.count() * plan.checkpoints.count() * plan.repetitions
         return str(n)
 

@@ -27,7 +27,7 @@ from evaweb.trials.services import trial_create
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How many trials a plan foresees, how many of them count already, and how many attempts there were."""
+    """Number of trials that a plan foresees, of those that count already, and of attempts."""
 
     total: int
     counted: int
@@ -35,7 +35,7 @@ class Progress:
 
 
 def progress(plan: Plan) -> Progress:
-    """How far a plan is; it tells nothing of any checkpoint."""
+    """Progress of a plan; it tells nothing of any checkpoint."""
     slots = _with_newest(plan.slots.all())
     counted = slots.filter(newest=TrialStatus.SCORED).count()
     return Progress(plan.slots.count(), counted, plan.handouts.count())
@@ -46,7 +46,7 @@ def hand_out(*, user: User, station: Station, plan: Plan) -> Handout:
     """Prepare the next trial of `plan` on `station`.
 
     Conflict where nothing is left for it, its last trial is not finished, or scene or checkpoint are not as frozen;
-    NotAllowed for who has looked behind the blind.
+    NotAllowed for a user who has looked behind the blind.
     """
     require(user, Role.OPERATOR)
     held = Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
@@ -139,7 +139,7 @@ def _why_again(before: Trial) -> str:
 
 
 def _check_unchanged(plan: Plan, slot: Slot) -> None:
-    """The scene and the checkpoint are those that were frozen: who edits them meanwhile must amend the plan."""
+    """The scene and the checkpoint are those that were frozen: an edit meanwhile needs an amended plan."""
     document = plan.document or {}
     frozen = {scene["name"]: scene for scene in document["scenes"]}[slot.scene.name]
     numbers = [position["number"] for position in frozen["positions"]]

@@ -1,4 +1,4 @@
-"""What is looked at before a trial of a plan runs: that each camera is the one it should be, and that the bench is laid
+"""Checks before a trial of a plan runs: that each camera is the one it should be, and that the bench is laid
 out as its reference picture shows.
 """
 
@@ -97,7 +97,7 @@ def references_take(*, user: User, station: Station, position: Position | None) 
 
 
 def next_trial(*, user: User, station: Station, plan: Plan) -> Handout:
-    """The next trial of a plan, for who has looked at the cameras; see evaweb.plans.allocation."""
+    """The next trial of a plan, for a user who has looked at the cameras; see evaweb.plans.allocation."""
     require(user, Role.OPERATOR)
     if cameras_confirmed(user=user, station=station) is None:
         raise Conflict(
@@ -153,7 +153,7 @@ def _require_match(trial: Trial, matches: Mapping[str, float], why: str) -> None
 
 
 def _before(what: str, trial: Trial, user: Any) -> None:
-    """What is asked of trials of plans before they run, or are taken out of the count."""
+    """Check trials of plans before they run, or are taken out of the count."""
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     if handout is None:
         return

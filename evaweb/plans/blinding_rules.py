@@ -1,8 +1,8 @@
-"""Who may know which checkpoint a trial of a blind plan is of.
+"""Rules of blind plans: which users may know the checkpoint of a trial.
 
-Before the reveal everybody is blind who has not looked. Its owner and administrators may look, by an act that is
-recorded, as far as they do not run its trials: whoever has been handed one of them sees nothing, whoever has looked is
-handed none. Which comes first decides, so that also somebody who is alone in a lab can do either, but not both.
+Before the reveal every user is blind who has not looked. Its owner and administrators may look, by an act that is
+recorded, as far as they do not run its trials: a user who has been handed one of them sees nothing, one who has looked
+is handed none. Which comes first decides, so that also the only user of a lab can do either, but not both.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from evaweb.trials.selectors import UNFINISHED
 
 
 def sealed_for(plan: Plan, user: Any) -> bool:
-    """Whether this user is not to know; looking is not recorded by asking."""
+    """True if the plan is sealed for this user; looking is not recorded by asking."""
     return plan.sealed and not has_looked(plan, user)
 
 
@@ -41,17 +41,17 @@ def look(plan: Plan, user: Any) -> None:
 
 
 def has_looked(plan: Plan, user: Any) -> bool:
-    """Whether this user has seen what is sealed."""
+    """True if this user has seen what is sealed."""
     return Look.objects.filter(plan=plan, user=user).exists()
 
 
 def may_look(plan: Plan, user: Any) -> bool:
-    """Whether `look` would be granted, or was."""
+    """True if `look` would be granted, or was."""
     return not plan.sealed or _why_not(plan, user) == ""
 
 
 def hidden_from(user: Any) -> Sight:
-    """What plans hide from this user now; see evaweb.blinding."""
+    """Sight of this user under the plans of now; see evaweb.blinding."""
     plans = Plan.objects.filter(blind=True, state__in=(PlanState.FROZEN, PlanState.CLOSED))
     if user.pk is not None:
         plans = plans.exclude(looks__user=user)

@@ -30,7 +30,7 @@ def digest(document: Mapping[str, Any]) -> str:
 
 
 def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """What makes `new` of `old`, a line each: where, what it was, what it is."""
+    """Differences from `old` to `new`, a line each: where, what it was, what it is."""
     return list(_differences(_plain(old, ""), _plain(new, ""), ""))
 
 

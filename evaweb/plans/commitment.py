@@ -1,7 +1,7 @@
-"""What hides which checkpoint runs: a fresh code for every trial, and a commitment that nothing was changed after.
+"""Concealment of checkpoints: a fresh code for every trial, and a commitment that nothing was changed after.
 
 Codes are of one trial each, because labels that stay are learned. The commitment is shown before the first trial; the
-reveal shows the key it was made with, from which anybody computes schedule, codes and commitment again.
+reveal shows the key it was made with, from which anyone computes schedule, codes and commitment again.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def codes(key: bytes, count: int) -> list[str]:
 
 
 def commitment(plan: str, units: Sequence[Unit], key: bytes) -> str:
-    """What is shown before: HMAC-SHA-256 by the key of the plan's digest and of that of its schedule, in hexadecimal.
+    """Commitment shown before: HMAC-SHA-256 by the key of the plan's and its schedule's digests, in hex.
 
     With a key of 256 bits it tells nothing of the schedule, and no second schedule has it.
     """
@@ -52,5 +52,5 @@ def schedule_digest(units: Sequence[Unit]) -> str:
 
 
 def verified(plan: str, units: Sequence[Unit], key: bytes, committed: str) -> bool:
-    """Whether plan, schedule and key are those that were committed to."""
+    """True if plan, schedule and key are those that were committed to."""
     return hmac.compare_digest(commitment(plan, units, key), committed)

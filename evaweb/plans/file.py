@@ -1,4 +1,4 @@
-"""What a file of scenes, checkpoints, plans and references may have; see .exchange for what is done with it."""
+"""Format of a file of scenes, checkpoints, plans and references; see .exchange for what is done with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What cameras of a station show now, how well two pictures match, and the pictures that are kept.
+"""Current pictures of a station's cameras, the match of two pictures, and the pictures that are kept.
 
 A picture is kept in DATA/pictures under the SHA-256 of its bytes: it is never changed, and the same one is there once.
 """
@@ -52,7 +52,7 @@ def now(station: Station, cameras: Iterable[str], patience_s: float = 3.0) -> di
 
 
 def match(one: bytes, other: bytes) -> float:
-    """How well two JPEGs match: the correlation of their grey values at 64 x 48, from 1, the same, to 0, and below 0.
+    """Match of two JPEGs: correlation of their grey values at 64 x 48, from 1, the same, to 0, and below 0.
 
     Brightness and contrast as a whole do not count. 0 where one of them is of one grey.
     """
@@ -85,7 +85,7 @@ def kept(name: str) -> bytes:
 
 
 def is_kept(name: str) -> bool:
-    """Whether the picture of that name is on this disk."""
+    """True if the picture of that name is on this disk."""
     return _path(name).is_file()
 
 

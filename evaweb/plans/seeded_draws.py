@@ -1,4 +1,4 @@
-"""Draws that anybody can repeat: HMAC-SHA-256 of a secret key and the name of what is drawn.
+"""Draws that anyone can repeat: HMAC-SHA-256 of a secret key and the name of what is drawn.
 
 Not a library's generator, because a schedule has to come out the same after years, in another version, and in the
 reviewer's own program.

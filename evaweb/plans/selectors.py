@@ -41,5 +41,5 @@ def plans_open(*, station: Station) -> list[Plan]:
 
 
 def handout_of(*, trial: Trial) -> Handout | None:
-    """How a trial was handed out, None for one of no plan."""
+    """Handout of a trial, None for one of no plan."""
     return Handout.objects.select_related("plan", "slot").filter(trial=trial).first()

@@ -1,4 +1,4 @@
-"""What is done with plans: frozen, amended, closed, revealed."""
+"""Actions on plans: freeze, amend, close, reveal."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _COPIED = (
 
 @transaction.atomic
 def plan_freeze(*, user: User, plan: Plan) -> Plan:
-    """Make a draft a document that nobody changes, with its schedule and commitment; trials can be handed out then."""
+    """Make a draft a document that never changes, with its schedule and commitment; trials can be handed out then."""
     held = _held(plan)
     _require_owner(held, user)
     if held.state != PlanState.DRAFT:
@@ -137,7 +137,7 @@ def _close(plan: Plan, user: User, why: str) -> None:
 
 
 def _check(plan: Plan) -> None:
-    """What must hold before it is frozen; EvaError says what is missing."""
+    """Check a plan before it is frozen; EvaError says what is missing."""
     chosen = set(plan.checkpoints.values_list("pk", flat=True))
     if not plan.positions.exists():
         raise EvaError(f"{plan} has no position: choose initial conditions")

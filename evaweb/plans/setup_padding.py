@@ -1,4 +1,4 @@
-"""How long a blind trial's set-up lasts at least, so that a watch does not tell which checkpoint it is of.
+"""Least duration of a blind trial's set-up, so that a watch does not tell which checkpoint it is of.
 
 The stages that wait for the policy last as long as they lately did with the slowest of the plan's checkpoints at this
 station, and up to a quarter longer, drawn by the plan's key: the slowest is not the one that overruns.

@@ -69,9 +69,9 @@ class PreflightAdmin(admin.ModelAdmin):
     date_hierarchy = "asked_at"
 
     def has_add_permission(self, request: HttpRequest) -> bool:
-        """Nobody: they are asked for."""
+        """Never: they are asked for."""
         return False
 
     def has_change_permission(self, request: HttpRequest, obj: Preflight | None = None) -> bool:
-        """Nobody: what was found was found."""
+        """Never: what was found was found."""
         return False

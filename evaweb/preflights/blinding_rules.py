@@ -1,7 +1,7 @@
-"""What of a preflight somebody is shown: the one place that pages and REST ask.
+"""Parts of a preflight that a user is shown: the one place that pages and REST ask.
 
-Addresses, times, sizes and names tell which checkpoint a server has. They are for operators and administrators, and
-for nobody who is not to know what a blind plan hands out.
+Addresses, times, sizes and names tell which checkpoint a server has. They are for operators and administrators, but
+for none from whom a blind plan hides what it hands out.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Shown:
 
 
 def shown(row: Preflight, user: Any) -> Shown:
-    """What this user may see of it."""
+    """The preflight as this user may see it."""
     why = hidden_from(row.checkpoint, user)
     if not why:
         return Shown(row, row.report, row.reason, "")

@@ -22,7 +22,7 @@ class StageRow:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What stands on the page; empty texts and lists are left out there."""
+    """Texts of the page; empty texts and lists are left out there."""
 
     ok: bool
     stages: tuple[StageRow, ...]
@@ -37,7 +37,7 @@ class Reading:
 
 
 def ago(moment: datetime, now: datetime) -> str:
-    """How long ago, in its largest unit."""
+    """Time since `moment`, in its largest unit."""
     seconds = max(0.0, (now - moment).total_seconds())
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= length:

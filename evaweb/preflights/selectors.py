@@ -27,5 +27,5 @@ def preflight_get(*, id: UUID | str, sight: Sight = EVERYTHING) -> Preflight:
 
 
 def preflight_newest(*, checkpoint: Checkpoint) -> Preflight | None:
-    """What is known of a checkpoint now, None where it was never asked."""
+    """Newest preflight of a checkpoint, None where it was never asked."""
     return preflight_list(checkpoint=checkpoint).first()

@@ -56,7 +56,7 @@ def preflight_ask(*, user: Any, checkpoint: Checkpoint, station: Station | None 
 
 
 def preflight_settled(*, row: Preflight) -> Preflight:
-    """Find out how it went, where nobody has; leaves it as it is while it is under way, or nobody can know."""
+    """Find out how it went, if not yet known; leaves it as it is while it is under way, or cannot be known."""
     if row.status != PreflightStatus.RUNNING:
         return row
     if row.by == Preflight.By.WORKER:
@@ -78,7 +78,7 @@ def preflight_settled(*, row: Preflight) -> Preflight:
 
 
 def preflights_settled(*, station: Station) -> int:
-    """Find out how those of a station went that nobody looked at; how many are over now."""
+    """Find out how those of a station went that were not looked at; how many are over now."""
     rows = Preflight.objects.filter(station=station, status=PreflightStatus.RUNNING)
     settled = [preflight_settled(row=row) for row in rows.select_related("station", "checkpoint")]
     return sum(row.status != PreflightStatus.RUNNING for row in settled)
@@ -124,7 +124,7 @@ def _server_of_station(station: Station, checkpoint: Checkpoint) -> str:
 
 
 def _require_free(server: str, besides: Station) -> None:
-    """No other station may be at work with the same server: its answers would come late, or be somebody else's."""
+    """No other station may be at work with the same server: its answers would come late, or be another's."""
     if not server:
         return
     for other in station_list(all_of_them=True).exclude(pk=besides.pk):

@@ -21,7 +21,7 @@ from evaweb.trials.selectors import checkpoint_get
 
 @require_GET
 def preflight(request: HttpRequest, id: UUID) -> HttpResponse:
-    """How it goes, or went."""
+    """A preflight: its progress, or its result."""
     row = services.preflight_settled(row=preflight_get(id=id, sight=sight_for(request)))
     fragment = request.headers.get("HX-Request")
     return render(request, f"preflights/{'result' if fragment else 'page'}.html", context(row, request.user))
@@ -29,7 +29,7 @@ def preflight(request: HttpRequest, id: UUID) -> HttpResponse:
 
 @require_GET
 def newest(request: HttpRequest) -> HttpResponse:
-    """What is known of the checkpoint that the address names; nothing where it was never asked."""
+    """Newest preflight of the checkpoint that the address names, or a page that says there is none."""
     checkpoint = checkpoint_get(name=request.GET.get("checkpoint", ""), sight=sight_for(request))
     row = preflight_newest(checkpoint=checkpoint)
     if row is None:
@@ -39,7 +39,7 @@ def newest(request: HttpRequest) -> HttpResponse:
 
 
 def context(row: Preflight, user: Any) -> dict[str, Any]:
-    """What the template of a result needs."""
+    """Context of the template of a result."""
     seen = shown(row, user)
     return {
         "preflight": row,

@@ -1,1 +1,1 @@
-"""What the trials of an evaluation say: tables, comparisons, plots, reports."""
+"""Results of an evaluation's trials: tables, comparisons, plots, reports."""

@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class ResultsConfig(AppConfig):
-    """What trials of plans say, what second raters say of them, and which of two people prefer."""
+    """Results of the trials of plans, second ratings, and preferences between two trials."""
 
     name = "evaweb.results"
     default_auto_field = "django.db.models.BigAutoField"

@@ -1,4 +1,4 @@
-"""What the result pages list: plans with their progress, trials of a plan, what goes on in the lab."""
+"""Lists of the result pages: plans with their progress, trials of a plan, what goes on in the lab."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class _Kept(admin.ModelAdmin):
 
 @admin.register(Review)
 class ReviewAdmin(_Kept):
-    """What people said of episodes."""
+    """Verdicts of people on episodes."""
 
     list_display = ("episode", "verdict", "note", "reviewer", "at")
     list_filter = ("verdict", "reviewer")
@@ -43,7 +43,7 @@ class SegmentAdmin(_Kept):
 
 @admin.register(Standing)
 class StandingAdmin(_Kept):
-    """What the checks found, and which verdict counts."""
+    """Findings of the checks, and the verdict that counts."""
 
     list_display = ("episode", "worst", "flags", "checked_at", "review")
     list_filter = ("worst", "clean")

@@ -1,4 +1,4 @@
-"""What goes beside an episode into its dataset: verdicts and annotations, a line each."""
+"""Side files of an episode for its dataset: verdicts and annotations, a line each."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from evaweb.reviews.kept import KeptReview, Line, kept_lines, segments_of
 
 
 def said_of(uuid: UUID) -> dict[str, Sequence[Line]]:
-    """What is said of the episode, by kind of side file."""
+    """Verdicts and annotations of the episode, by kind of side file."""
     lines = kept_lines(uuid)
     return {
         "reviews": [line for line in lines if isinstance(line, KeptReview)],

@@ -1,4 +1,4 @@
-"""Where what is said of an episode lies in the data folder."""
+"""Places of an episode's report and reviews in the data folder."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from evaweb.episodes.folders import data_dir
 
 
 def report_file(uuid: UUID) -> Path:
-    """What the checks found in an episode."""
+    """File of the checks' report on an episode."""
     return data_dir() / "quality" / f"{uuid}.json"
 
 
 def reviews_file(uuid: UUID) -> Path:
-    """What people said of an episode and of its parts, a line each."""
+    """File of people's words on an episode and its parts, a line each."""
     return data_dir() / "reviews" / f"{uuid}.jsonl"
 
 

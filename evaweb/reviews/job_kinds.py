@@ -1,4 +1,4 @@
-"""The jobs of reviews: checks of episodes, what is said of them beside the dataset; and who looks for both."""
+"""The jobs of reviews: checks of episodes, what is said of them beside the dataset; and the search for both."""
 
 from __future__ import annotations
 

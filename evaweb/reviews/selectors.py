@@ -17,14 +17,14 @@ from runtime.recording.files import RecordingError, read_document
 
 
 def standing_of(*, episode: Episode) -> Standing:
-    """Where the episode stands; one of which nothing is known stands at the beginning."""
+    """Standing of the episode; one of which nothing is known stands at the beginning."""
     return Standing.objects.filter(episode=episode).select_related("review__reviewer").first() or Standing(
         episode=episode
     )
 
 
 def report_of(*, uuid: UUID) -> Mapping[str, Any] | None:
-    """What the checks found, as it was written down; None where they were not done. Conflict if it is damaged."""
+    """Report of the checks, as written down; None where they were not done. Conflict if it is damaged."""
     path = report_file(uuid)
     try:
         return read_document(path) if path.exists() else None
@@ -51,7 +51,7 @@ def segments_of(*, episode: Episode) -> QuerySet[Segment]:
 
 
 def unreviewed() -> QuerySet[Episode]:
-    """Closed episodes with pictures or rows to look at that nobody has passed or failed, the newest first."""
+    """Closed episodes with pictures or rows to look at and without a pass or fail, the newest first."""
     newest = (F("started_at").desc(nulls_last=True), "-created_at", "uuid")
     closed = Episode.objects.filter(status__in=CLOSED, frames__gt=0)
     return closed.filter(standing__review=None).order_by(*newest)

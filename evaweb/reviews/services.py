@@ -1,4 +1,4 @@
-"""What happens to verdicts, annotations and reports: a line on the disk first, then the row."""
+"""Changes to verdicts, annotations and reports: a line on the disk first, then the row."""
 
 from __future__ import annotations
 

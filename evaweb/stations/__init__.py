@@ -1,1 +1,1 @@
-"""Robots on the bench: where they are, who may command them, what was commanded."""
+"""Robots on the bench: their sites, leases and commands."""

@@ -41,7 +41,7 @@ class StationAdmin(admin.ModelAdmin):
 
 
 class RecordAdmin(admin.ModelAdmin):
-    """What happened is not edited."""
+    """Records of what happened, which are not edited."""
 
     def has_add_permission(self, request: HttpRequest) -> bool:
         return False
@@ -55,7 +55,7 @@ class RecordAdmin(admin.ModelAdmin):
 
 @admin.register(Lease)
 class LeaseAdmin(RecordAdmin):
-    """Who had which station."""
+    """Leases of stations."""
 
     list_display = ("station", "holder", "epoch", "granted_at", "ended_at", "end_reason")
     list_filter = ("station",)
@@ -66,7 +66,7 @@ class LeaseAdmin(RecordAdmin):
 
 @admin.register(LeaseRequest)
 class LeaseRequestAdmin(RecordAdmin):
-    """Who asked for which station."""
+    """Requests for stations."""
 
     list_display = ("station", "user", "asked_at", "answer", "answered_at")
     list_filter = ("station", "answer")
@@ -75,7 +75,7 @@ class LeaseRequestAdmin(RecordAdmin):
 
 @admin.register(Command)
 class CommandAdmin(RecordAdmin):
-    """What was commanded and what became of it."""
+    """Commands and their results."""
 
     list_display = ("issued_at", "station", "kind", "user", "status", "reason")
     list_filter = ("station", "kind", "status")

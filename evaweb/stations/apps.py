@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class StationsConfig(AppConfig):
-    """Robots on the bench: where they are, who may command them, what was commanded."""
+    """Robots on the bench: their sites, leases and commands."""
 
     name = "evaweb.stations"
     default_auto_field = "django.db.models.BigAutoField"

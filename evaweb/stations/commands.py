@@ -1,4 +1,4 @@
-"""Commands: who gave which, and what became of it.
+"""Commands: their users, their kinds, and their results.
 
 A row first, then the wire, then the answer. The stopping commands go to the wire first and wait for no database.
 """
@@ -78,7 +78,7 @@ def issue(
 
     `boot` and `sequence` are those of the snapshot that the page showed. `vouched` names arguments that were not taken
     from the user, but from what an administrator wrote, or the lab recorded. Never call it within a transaction:
-    nobody else could write until the station has answered. Raises NotAllowed, Conflict for a uuid that is
+    no other process could write until the station has answered. Raises NotAllowed, Conflict for a uuid that is
     another command's, NotSent where the database does not take the row.
     """
     row = Command(
@@ -125,7 +125,7 @@ def estop_noted(
 ) -> Command:
     """The row of an e-stop that was pressed `at` a time, written down soon, whenever the database takes it.
 
-    Of `station` and `user` the names are enough. `unverified` is why it is not known who pressed.
+    Of `station` and `user` the names are enough. `unverified` is why the user is not known.
     """
     args = {"why": spoken(why)} | ({"unverified": unverified} if unverified else {})
     row = Command(uuid=identity_of(uuid), station=station, user=user, kind="estop", args=args, issued_at=at)
@@ -152,7 +152,7 @@ def stop_noted(
 
 
 def settle(*, row: Command) -> Command:
-    """Find out what became of a command whose answer was lost; leaves it as it is where nobody can know yet.
+    """Find out what became of a command whose answer was lost; leaves it as it is where that cannot be known yet.
 
     The runtime answers a uuid that it knows as it did the first time. One that it does not know comes too
     late now, is refused, and is remembered as refused: it can never be carried out any more. A stopping
@@ -223,7 +223,7 @@ def _require_sendable(command: messages.Command) -> None:
 
 
 def _asked(row: Command, command: messages.Command, waited: float) -> Answer:
-    """What the runtime says to a command whose row took `waited` seconds to be written."""
+    """The runtime's answer to a command whose row took `waited` seconds to be written."""
     if waited > settings.EVA_COMMAND_TIMEOUT_S:
         late = f"not sent: the database took {waited:.0f} s to write it down; look at the robot, press again"
         return Answer(CommandStatus.FAILED, late)
@@ -287,7 +287,7 @@ def _better(row: Command, first: Command) -> list[str]:
 def _first_or_own(row: Command) -> Command | None:
     """The row that has this uuid already, where it is this command; a press otherwise gets a uuid of its own.
 
-    That follows from what was pressed: whoever writes it, and however often, it is one row.
+    That follows from what was pressed: by any writer, and however often, it is one row.
     """
     try:
         first = _first(row)
@@ -306,7 +306,7 @@ def _first_or_own(row: Command) -> Command | None:
 
 
 def _latched_again(row: Command, first: Command) -> bool:
-    """Whether a press latched anew, and not when the first of its uuid was carried out."""
+    """True if a press latched anew, and not when the first of its uuid was carried out."""
     at = first.data.get("carried_out_at")
     return row.data.get("latched") == "anew" and at not in (None, row.data["carried_out_at"])
 
@@ -345,7 +345,7 @@ def _put(row: Command, answer: Answer) -> None:
 
 
 def _update(row: Command) -> None:
-    """Where the database refuses, `settle` asks the runtime again later."""
+    """Save the answer; where the database refuses, `settle` asks the runtime again later."""
     try:
         row.save(update_fields=_ANSWER)
     except Error as error:
@@ -374,5 +374,5 @@ def _message(
 
 
 def _patience_s() -> float:
-    """After this time nobody waits for an answer any more [s]."""
+    """Time after which no caller waits for an answer any more [s]."""
     return settings.EVA_COMMAND_TIMEOUT_S + 1.0

@@ -30,7 +30,7 @@ class _Flight(Generic[T]):
 
 
 class Flights(Generic[T]):
-    """What is asked of stations now; from any thread, and none of its callers waits.
+    """Requests to stations under way; from any thread, and none of its callers waits.
 
     `most` is how many keys of one station may be under way at once, None for any number.
     """
@@ -89,7 +89,7 @@ class Flights(Generic[T]):
                 done.answer.set_result(answer)
 
     def _next(self, place: tuple[str, Hashable]) -> _Flight[T] | None:
-        """The one that waited, which flies now; nobody joins the one that is over."""
+        """The one that waited, which flies now; no caller joins the one that is over."""
         with self._lock:
             flights = self._under_way[place]
             flights.pop(0)

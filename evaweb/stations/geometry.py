@@ -1,4 +1,4 @@
-"""What the 3D scene is given once: a robot's parts and shapes, its frames, what it stands on, and the bench."""
+"""Static data of the 3D scene: a robot's parts and shapes, its frames, what it stands on, and the bench."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _link(looks: Looks, arm: Group, link: str) -> str:
 
 
 def _capsules(looks: Looks) -> list[dict[str, Any]]:
-    """What stands for the links where it is looked at whether they run into each other or into the table."""
+    """Capsules that stand for the links in checks of collision with each other or with the table."""
     return [
         {"part": part, "start": one.start.tolist(), "end": one.end.tolist(), "radius": one.radius}
         for link, made in capsules(looks.robot).items()

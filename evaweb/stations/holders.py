@@ -1,4 +1,4 @@
-"""Names of those who hold a lease: web:USER:PAGE for a page, any other for a terminal or a script."""
+"""Names of lease holders: web:USER:PAGE for a page, any other for a terminal or a script."""
 
 from __future__ import annotations
 

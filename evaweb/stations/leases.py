@@ -1,4 +1,4 @@
-"""Leases: the web says who may command a station, its runtime enforces it.
+"""Leases: the web grants the command of a station, its runtime enforces it.
 
 A lease begins where the runtime has accepted it, and ends where the runtime says so; rows are the record of it.
 Renewing is a stream from the holder's page and touches no row.
@@ -27,7 +27,7 @@ _ECHO = timedelta(seconds=3)  # for which an old snapshot may still be under way
 
 
 def claim(*, user: Any, station: Station, page: str) -> Lease:
-    """Take a station that nobody holds, or keep one's own; raises Conflict with who holds it."""
+    """Take a free station, or keep one's own; raises Conflict that names the holder."""
     require(user, Role.OPERATOR)
     _require_active(station)
     holder = holder_of(user.get_username(), page)
@@ -97,7 +97,7 @@ def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
 def move(*, user: Any, station: Station, page: str) -> Lease:
     """Bring one's own lease from another page to this one; a run goes on without a pause.
 
-    Raises Conflict where nobody or somebody else has the station.
+    Raises Conflict where the station is free or another user's.
     """
     require(user, Role.OPERATOR)
     _require_active(station)
@@ -110,7 +110,7 @@ def move(*, user: Any, station: Station, page: str) -> Lease:
 
 
 def take(*, user: Any, station: Station, page: str, reason: str) -> Lease:
-    """An administrator takes the station from whoever has it, and says why."""
+    """An administrator takes the station from its holder, and says why."""
     require(user, Role.ADMIN)
     if not reason.strip():
         raise EvaError("taking a station from somebody needs a reason; it is written down and shown")
@@ -141,7 +141,7 @@ def _why_over(lease: Lease, boot: str) -> str:
 
 
 def _require_commander(user: Any) -> None:
-    """Somebody who was switched off, or became a viewer, after asking gets no station any more."""
+    """A user who was switched off, or became a viewer, after asking gets no station any more."""
     if not user.is_active:
         raise NotAllowed(f"{user.get_username()} is switched off: decline the request")
     require(user, Role.OPERATOR)
@@ -164,16 +164,16 @@ def _next_epoch(station: Station, held: Mapping[str, Any]) -> int:
 
 
 def _tell(station: str, kind: str, holder: str, epoch: int, role: str = "") -> messages.Ack:
-    """A lease command to the runtime; who keeps or ends a lease needs no role for it."""
+    """A lease command to the runtime; to keep or end a lease needs no role."""
     user = who(holder)
     command = messages.Command(str(uuid4()), kind, user=user, holder=holder, epoch=epoch, role=role)
     return wire_to(station).request(command)
 
 
 def _grant(user: Any, station: Station, holder: str, epoch: int, end_reason: str) -> Lease:
-    """Have the runtime accept the lease of `user`, then write it down; raises Conflict where somebody was faster.
+    """Have the runtime accept the lease of `user`, then write it down; raises Conflict where another was faster.
 
-    Whoever gets the station has got what they asked for.
+    The request of the new holder is answered with it.
     """
     ack = _tell(station.name, "lease_claim", holder, epoch, role_of(user))
     if ack.status == "refused":
@@ -204,7 +204,7 @@ def _record(station: Station, holder: str, epoch: int, boot: str, end_reason: st
 
 
 def _just_ended(lease: Lease) -> bool:
-    """What is heard of it now was said before it ended."""
+    """True if it ended so lately that what is heard of it now was said before."""
     return lease.ended_at is not None and timezone.now() - lease.ended_at < _ECHO
 
 

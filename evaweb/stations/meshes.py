@@ -20,7 +20,7 @@ class Mesh:
 
 
 def mesh_in(file: Path) -> Mesh:
-    """What is in the file now; NotFound where it cannot be read."""
+    """Mesh in the file as it is now; NotFound where it cannot be read."""
     return Mesh(_digest(file), file.suffix.lower().removeprefix("."))
 
 

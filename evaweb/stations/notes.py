@@ -1,7 +1,7 @@
-"""What was done to stop a robot, on its way into the records: nobody who stops waits for disk or database.
+"""Records of stops of a robot, on their way to disk and database: no stop waits for either.
 
-A thread of its own takes each row: first into a file of `unwritten`, then into the database. Who presses again and
-again is written down once a second, with how often; until then a line of the journal has each, which a kill leaves.
+A thread of its own takes each row: first into a file of `unwritten`, then into the database. Repeated presses
+are written down once a second, with how often; until then a line of the journal has each, which a kill leaves.
 """
 
 from __future__ import annotations
@@ -147,14 +147,14 @@ class Notes:
 
 
 def key_of(row: Command) -> _Key:
-    """What those of a second have in common that are one row."""
+    """Key of the presses of one second that are one row."""
     user = row.user.get_username() if row.user else ""
     latched_at = str(row.data["carried_out_at"]) if row.data.get("latched") == "anew" else ""
     return (row.station.name, row.kind, user, str(row.status), latched_at)
 
 
 def _has_station(row: Command) -> bool:
-    """Where the disk does not say, there is one: a stop too many in the record is better than one that it lacks."""
+    """True also where the disk does not say: a stop too many in the record is better than one too few."""
     if row.station.pk is not None:
         return True
     try:

@@ -1,4 +1,4 @@
-"""What a station says, without what tells which checkpoint it is set up for: pure functions on its messages.
+"""Messages of a station without what tells which checkpoint it is set up for: pure functions on them.
 
 What is shown is listed, so that whatever a runtime says besides is covered by itself.
 """
@@ -90,7 +90,7 @@ def joints(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def answer(data: Mapping[str, Any]) -> dict[str, Any]:
-    """What comes back with the answer to a command."""
+    """Data of the answer to a command."""
     return {key: data[key] for key in ("episode", "bench") if key in data}
 
 

@@ -24,7 +24,7 @@ _kernels = ThreadPoolExecutor(1, "links")
 class Looks:
     """A robot as it is drawn: its description and its scene.
 
-    Kernels are compiled, or loaded from disk, in a thread of their own: nobody waits for them, who asks before they
+    Kernels are compiled, or loaded from disk, in a thread of their own: no caller waits for them, and one before they
     are there is answered by numpy.
     """
 
@@ -50,11 +50,11 @@ class Looks:
 
     @property
     def compiled(self) -> bool:
-        """Whether the kernels are there."""
+        """True if the kernels are there."""
         return self._links.done() and self._links.exception() is None
 
     def tips(self, links: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Where the fingertips are for parts at `links` [..., P, 16]: float32 [..., arms, 3], in the world [m]."""
+        """Fingertips for parts at `links` [..., P, 16]: float32 [..., arms, 3], in the world [m]."""
         found = np.empty((*links.shape[:-2], len(self.robot.arms), 3), np.float32)
         for index, arm in enumerate(self.robot.arms):
             part = links[..., self.carrier(arm), :].reshape(*links.shape[:-2], 4, 4)  # its columns as rows

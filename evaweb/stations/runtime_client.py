@@ -1,6 +1,6 @@
 """The connection of this process to a station's runtime: requests with a deadline, from any thread.
 
-Knows the bus and no rules: who may ask for what is decided in leases and commands. Nothing here touches the
+Knows the bus and no rules: rights are decided in leases and commands. Nothing here touches the
 database, so that stopping works without it.
 """
 
@@ -29,7 +29,7 @@ _CLOCK_KNOWN_S = 60.0  # how long the difference of two computers' clocks is bel
 
 
 class NoAnswer(StationGone):
-    """The request may have arrived and may have been carried out: nobody knows."""
+    """The request may have arrived and may have been carried out: it is not known."""
 
     status = 504
 
@@ -54,8 +54,8 @@ class StationWire:
         """The answer of the coordinator; one request at a time over a connection that is kept.
 
         With `expires` the command is void once we have given up waiting for its answer: it can never be
-        carried out behind the back of somebody who was told that it was lost. Raises StationGone where it was
-        not sent, NoAnswer where nobody knows.
+        carried out behind the back of a user who was told that it was lost. Raises StationGone where it was
+        not sent, NoAnswer where that is not known.
         """
         deadline = time.monotonic() + (timeout or settings.EVA_COMMAND_TIMEOUT_S)
         if not self._lock.acquire(timeout=max(0.0, deadline - time.monotonic())):
@@ -97,7 +97,7 @@ class StationWire:
         return ack.boot, plain(ack.data.get("events", []))
 
     def address(self, process: str, key: str) -> str:
-        """Where a socket is, as its process last wrote it; raises StationGone where there is none."""
+        """Address of a socket, as its process last wrote it; raises StationGone where there is none."""
         try:
             return str(self.endpoints.read(process)[key])
         except (TransportError, KeyError):

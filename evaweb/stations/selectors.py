@@ -1,4 +1,4 @@
-"""What is known of stations."""
+"""Queries on stations, leases and commands."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def station_get(*, name: str) -> Station:
 
 
 def lease_open(*, station: Station) -> Lease | None:
-    """Who has the station, as far as the database knows."""
+    """Open lease of the station, as far as the database knows."""
     return station.leases.filter(ended_at=None).select_related("user").first()
 
 
 def leases_open() -> dict[int, Lease]:
-    """Who has which station, by the station's id, as far as the database knows."""
+    """Open leases by the station's id, as far as the database knows."""
     return {lease.station_id: lease for lease in Lease.objects.filter(ended_at=None).select_related("user")}
 
 
 def request_list(*, station: Station) -> QuerySet[LeaseRequest]:
-    """Who asks for the station and waits, the first who asked first."""
+    """Open requests for the station, the oldest first."""
     return station.lease_requests.filter(answer=LeaseRequest.Answer.OPEN).select_related("user")
 
 

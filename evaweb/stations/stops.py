@@ -1,6 +1,6 @@
 """Stop, halt and e-stop: straight to the station, without the database; and what a station's answer comes to.
 
-`press` and `ask` never wait: each station has threads of its own, and who comes while the same is under way shares its
+`press` and `ask` never wait: each station has threads of its own, and a call while the same is under way shares its
 answer.
 """
 
@@ -30,7 +30,7 @@ _MOST_STOPS = 32  # of different leases that one station is asked at once
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of a command; `allowed` names the commands that would be accepted now.
+    """Answer to a command; `allowed` names the commands that would be accepted now.
 
     `uuid` is that of the press that was answered, which may be another one that was under way.
     """
@@ -57,13 +57,13 @@ _stops: Flights[Answer] = Flights("stop", _MOST_STOPS)
 
 
 def press(*, station: str, username: str, why: str, uuid: UUID | str) -> Future[Answer]:
-    """What comes of pressing the e-stop; a press that is under way answers it, and one more is made all the same."""
+    """Answer to a press of the e-stop: that of a press under way, and one more is made all the same."""
     work = partial(estop, station=station, username=username, why=why, uuid=uuid)
     return _presses.ask(station, work, identity=str(uuid), shared=True)
 
 
 def ask(command: messages.Command, station: str) -> Future[Answer]:
-    """What comes of a stop or halt; those of one lease that come while one is under way are one more."""
+    """Answer to a stop or halt; those of one lease that come while one is under way are one more."""
     key = (command.kind, command.holder, command.epoch)
     try:
         return _stops.ask(station, partial(stopped, command, station), key=key, identity=command.uuid)
@@ -98,13 +98,13 @@ def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
 
 
 def order(*, kind: str, username: str, page: str, epoch: int, uuid: UUID | str) -> messages.Command:
-    """A stop or halt as it is sent: the runtime itself knows who has the lease."""
+    """A stop or halt as it is sent: the runtime itself knows the lease's holder."""
     holder = holder_of(username, page)
     return messages.Command(str(uuid), kind, user=username, holder=holder, epoch=epoch)
 
 
 def stopped(command: messages.Command, station: str) -> Answer:
-    """What the station says to a stop or halt; nothing that hangs stands before it."""
+    """The station's answer to a stop or halt; nothing that hangs stands before it."""
     try:
         timeout = settings.EVA_COMMAND_TIMEOUT_S
         return answer_of(wire_to(station).urgent(command, "coordinator", "commands", timeout))

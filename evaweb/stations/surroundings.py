@@ -1,4 +1,4 @@
-"""What stands around a robot in the scene: table, floor, mounts, and from where the robot looks at the table.
+"""Surroundings of a robot in the scene: table, floor, mounts, and from where the robot looks at the table.
 
 The scene is that of the simulated bench: z = 0 is the table's surface, things lie within BENCH's `area`. A robot
 whose body reaches below the table stands on a floor, and the table keeps clear of it.
@@ -80,7 +80,7 @@ def bounds(visual: Visual, part: Float64) -> Box:
 
 
 def _at_poses(looks: Looks) -> list[list[Box]]:
-    """What the robot's shapes fill in each of its named poses, home first."""
+    """Boxes that the robot's shapes fill in each of its named poses, home first."""
     named = looks.robot.poses
     found = []
     for name in sorted(named, key=lambda name: name != "home"):
@@ -90,14 +90,14 @@ def _at_poses(looks: Looks) -> list[list[Box]]:
 
 
 def _roots(looks: Looks) -> list[Float64]:
-    """Where the copies of the robot's tree stand, [3] each."""
+    """Positions of the copies of the robot's tree, [3] each."""
     root = urdf.read(looks.robot.urdf).root
     poses = looks.scene.poses(looks.robot.poses["home"])
     return [poses[part, :3, 3] for part in looks.scene.parts_of(root)]
 
 
 def _floor(looks: Looks, home: Sequence[Box]) -> float | None:
-    """How high the floor is that it stands on; None for a robot on a table."""
+    """Height of the floor that it stands on; None for a robot on a table."""
     lowest = min([*(box.low[2] for box in home), *(root[2] for root in _roots(looks))], default=0.0)
     return float(lowest) if lowest < _BELOW else None
 
@@ -178,7 +178,7 @@ def _ahead(looks: Looks) -> list[float]:
 
 
 def _view(boxes: Sequence[Box]) -> dict[str, list[float]]:
-    """What has to be seen: the robot in each of its named poses and the area where things lie."""
+    """Volume to be seen: the robot in each of its named poses and the area where things lie."""
     x_from, x_to, y_from, y_to = AREA
     low = [np.array([x_from, y_from, 0.0]), *(box.low for box in boxes)]
     high = [np.array([x_to, y_to, 0.0]), *(box.high for box in boxes)]

@@ -55,7 +55,7 @@ class Unwritten:
         self._failed = Rarely(_EVERY_S, 1)
 
     def foresee(self, rows: Sequence[Command]) -> None:
-        """Those that will be kept soon: whoever looks finds them where this process is killed before; OSError.
+        """Those that will be kept soon: the next reader finds them where this process is killed before; OSError.
 
         With none, all that were foreseen have been kept.
         """

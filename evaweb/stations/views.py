@@ -1,4 +1,4 @@
-"""What pages draw of a station and of a robot."""
+"""Data of a station and of a robot that pages draw."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all methods share: an interval, what counts may be, and the error that says so."""
+"""Common parts of all methods: an interval, the allowed counts, and the error that says so."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Interval:
     level: float = LEVEL
 
     def holds(self, value: float) -> bool:
-        """Whether `value` lies in it."""
+        """True if `value` lies in it."""
         return self.low <= value <= self.high
 
 
 def z_of(level: float) -> float:
-    """How many standard deviations to each side hold `level` of a normal distribution."""
+    """Number of standard deviations to each side that hold `level` of a normal distribution."""
     return NormalDist().inv_cdf(0.5 + level / 2)
 
 

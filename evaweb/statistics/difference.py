@@ -1,4 +1,4 @@
-"""Whether one of two arms succeeds more often, each with trials of its own: interval, posterior, exact test.
+"""Comparison of two arms' success rates, each with trials of its own: interval, posterior, exact test.
 
 Formulae: Newcombe (1998), method 10, for the interval of a difference; Barnard (1945), pooled statistic, for the exact
 unconditional test; the closed form for integer counts of the probability that one Beta variable exceeds another.
@@ -28,7 +28,7 @@ _ZOOMS = 4
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """How much more often the first arm succeeds than the second, in shares (-1 to 1), with its interval."""
+    """Difference of success rates, the first arm's less the second's (-1 to 1), with its interval."""
 
     value: float
     interval: Interval

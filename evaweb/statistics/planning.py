@@ -1,4 +1,4 @@
-"""How many trials a wanted difference needs, and what cannot be seen with those that there is time for.
+"""Number of trials that a wanted difference needs, and what cannot be seen with those that there is time for.
 
 Formulae: the normal approximation for two proportions, checked by the exact power of Barnard's test, whose
 probabilities are taken over all tables at once.

@@ -48,7 +48,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """How much better the first policy is: difference of log-worths, and as probability to win where no tie is."""
+    """Advantage of the first policy: difference of log-worths, and as probability to win where no tie is."""
 
     difference: float
     error: float

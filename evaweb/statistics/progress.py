@@ -1,4 +1,4 @@
-"""How far trials came: the funnel of milestones, and what scores between 0 and 1 say.
+"""Progress within trials: the funnel of milestones, and what scores between 0 and 1 say.
 
 Formula: the posterior of a Dirichlet(1, ..., 1) prior over the levels that a score can have.
 """
@@ -47,7 +47,7 @@ def funnel(reached: Sequence[Sequence[bool]]) -> list[Step]:
 
 @dataclass(frozen=True, slots=True)
 class ScorePosterior:
-    """What is believed of a mean score: its expectation, standard deviation and interval."""
+    """Posterior of a mean score: its expectation, standard deviation and interval."""
 
     mean: float
     deviation: float

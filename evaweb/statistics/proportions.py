@@ -1,4 +1,4 @@
-"""How often something succeeds: the rate of `successes` out of `n`, its intervals and its posterior.
+"""Success rate: `successes` out of `n`, its intervals and its posterior.
 
 Formulae: Wilson (1927) for the interval of a proportion; Clopper and Pearson (1934) where a guarantee is wanted;
 the Beta posterior of a uniform prior (Bayes, Laplace) where a distribution is drawn.
@@ -29,7 +29,7 @@ class Proportion:
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """What is believed of a success rate after x of n, all equally likely before: Beta(1 + x, 1 + n - x)."""
+    """Posterior of a success rate after x of n, all equally likely before: Beta(1 + x, 1 + n - x)."""
 
     a: float
     b: float
@@ -58,7 +58,7 @@ class Posterior:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a set of scored trials says; the figures are None where there is nothing they could be made from."""
+    """Statistics of a set of scored trials; None where there is nothing they could be made from."""
 
     success: Proportion
     mean_score: float | None
@@ -103,7 +103,7 @@ def clopper_pearson(successes: int, n: int, level: float = LEVEL) -> Interval:
 
 
 def posterior(successes: int, n: int) -> Posterior:
-    """What `successes` out of `n` leave to believe; n may be 0."""
+    """Posterior of the rate after `successes` out of `n`; n may be 0."""
     if n != 0 or successes != 0:
         check_counts(successes, n)
     return Posterior(1.0 + successes, 1.0 + n - successes)

@@ -1,4 +1,4 @@
-"""Whether two people who scored the same trials agree beyond what chance would do.
+"""Agreement of two people who scored the same trials, beyond what chance would do.
 
 Formulae: Cohen (1960; weighted 1968), Gwet's AC1 (2008) beside it because kappa collapses where nearly all trials end
 the same way, Krippendorff's alpha (2004) where ratings are missing.

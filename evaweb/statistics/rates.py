@@ -35,7 +35,7 @@ class Rate:
 
 
 def rate(events: int, exposure: float, level: float = LEVEL) -> Rate:
-    """How often something happens, of `events` in `exposure` [s] of running."""
+    """Rate of `events` in `exposure` [s] of running."""
     check_level(level)
     if events < 0:
         raise StatisticsError(f"{events} events; allowed: 0 or more")

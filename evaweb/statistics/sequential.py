@@ -20,7 +20,7 @@ _CAUTION = 0.5  # of what could be lost with one pair, how much is ever bet
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a sequence of pairs shows, for both directions, after each pair.
+    """Evidence of a sequence of pairs, for both directions, after each pair.
 
     `first` and `second` [pairs] are log e-values that the first, and the second, arm is the better; `p_first` and
     `p_second` [pairs] the anytime-valid probabilities min over time of 1/e. `stop` is the number of pairs after which
@@ -37,7 +37,7 @@ class Evidence:
 
     @property
     def pairs(self) -> int:
-        """How many were looked at."""
+        """Number of pairs that were looked at."""
         return len(self.first)
 
     @property
@@ -67,7 +67,7 @@ def success_evidence(pairs: Iterable[tuple[bool, bool]], alpha: float = ALPHA) -
 
 
 def _factor(p: float, q: float, worse: bool, better: bool) -> float:
-    """What log e gains by the outcome of one pair, with the rates that were predicted before it."""
+    """Gain of log e by the outcome of one pair, with the rates that were predicted before it."""
     if p >= q:
         return 0.0
     m = (p + q) / 2

@@ -1,4 +1,4 @@
-"""How smoothly something moved: SPARC, the spectral arc length (Balasubramanian et al. 2015)."""
+"""Smoothness of a movement: SPARC, the spectral arc length (Balasubramanian et al. 2015)."""
 
 from __future__ import annotations
 

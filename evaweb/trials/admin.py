@@ -47,7 +47,7 @@ class Table(forms.JSONField):
         return super().to_python(value)
 
     def bound_data(self, data: Any, initial: Any) -> Any:
-        """What is shown again: as it was given, where it cannot be read."""
+        """Value that is shown again: as it was given, where it cannot be read."""
         if data is None:
             return None
         try:
@@ -71,7 +71,7 @@ class PositionForm(forms.ModelForm):
 
 
 class PositionInline(admin.StackedInline):
-    """Where things stand at the beginning."""
+    """Initial positions of a scene."""
 
     model = Position
     form = PositionForm
@@ -85,7 +85,7 @@ class PositionInline(admin.StackedInline):
 
 
 class MilestoneInline(admin.TabularInline):
-    """What is reached on the way."""
+    """Milestones of a scene."""
 
     model = Milestone
     extra = 0
@@ -163,17 +163,17 @@ class SceneAdmin(ActiveActions, admin.ModelAdmin):
 
     @admin.display(description="positions", ordering="n_positions")
     def positions_n(self, scene: Scene) -> int:
-        """How many positions."""
+        """Number of positions."""
         return scene.n_positions  # type: ignore[attr-defined, no-any-return]
 
     @admin.display(description="milestones", ordering="n_milestones")
     def milestones_n(self, scene: Scene) -> int:
-        """How many milestones."""
+        """Number of milestones."""
         return scene.n_milestones  # type: ignore[attr-defined, no-any-return]
 
     @admin.display(description="trials", ordering="n_trials")
     def trials_n(self, scene: Scene) -> int:
-        """How many trials."""
+        """Number of trials."""
         return scene.n_trials  # type: ignore[attr-defined, no-any-return]
 
 
@@ -256,29 +256,29 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
 
     @admin.display(description="trials", ordering="n_trials")
     def trials_n(self, checkpoint: Checkpoint) -> int:
-        """How many trials."""
+        """Number of trials."""
         return checkpoint.n_trials  # type: ignore[attr-defined, no-any-return]
 
 
 class ReadOnly:
-    """What happened is not edited."""
+    """Records of what happened, which are not edited."""
 
     def has_add_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Nobody."""
+        """Never."""
         return False
 
     def has_change_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Nobody."""
+        """Never."""
         return False
 
     def has_delete_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Nobody."""
+        """Never."""
         return False
 
 
 @admin.register(Evaluation)
 class EvaluationAdmin(ReadOnly, admin.ModelAdmin):
-    """What trials belong to; the open bench of a station is made by itself."""
+    """Evaluations that trials belong to; the open bench of a station is made by itself."""
 
     list_display = ("name", "version", "kind", "station", "created_at")
     list_filter = ("kind", "station")

@@ -1,4 +1,4 @@
-"""What the result pages draw, computed here so that templates only place it."""
+"""Figures of the result pages, computed here so that templates only place them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Bar:
 
     @property
     def span(self) -> float:
-        """How wide the interval is."""
+        """Width of the interval."""
         return round(self.high - self.low, 2)
 
     @property
     def mark(self) -> float:
-        """Where the mark of the rate begins, which is 3 units wide."""
+        """Left edge of the rate's mark, which is 3 units wide."""
         return round(self.rate - 1.5, 2)
 
 

@@ -9,7 +9,7 @@ from evaweb.trials.models import Trial, TrialStatus
 
 
 class Move(StrEnum):
-    """What can happen to a trial; the value is how a sentence says it."""
+    """Moves of a trial; the value is the word for it in a sentence."""
 
     RUN = "run"
     PAUSE = "paused"
@@ -63,12 +63,12 @@ _ADVICE = {
 
 
 def advice(status: str) -> str:
-    """What a person can do about a trial in this status."""
+    """Advice to a person on a trial in this status."""
     return _ADVICE[TrialStatus(status)]
 
 
 def allows(trial: Trial, move: Move) -> bool:
-    """Whether `move` is in the table for this trial as it stands."""
+    """True if `move` is in the table for this trial as it stands."""
     return (TrialStatus(trial.status), move) in MOVES
 
 

@@ -1,4 +1,4 @@
-"""What restored trials refer to: found by name; what is gone is made by name, switched off, and says so."""
+"""Placeholders for what restored trials refer to: found by name, or made by name, switched off and marked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known of scenes, checkpoints, evaluations, trials and their scores."""
+"""Queries on scenes, checkpoints, evaluations, trials and their scores."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class TrialFilters:
     def apply(self, trials: QuerySet[Trial], sight: Sight = EVERYTHING) -> QuerySet[Trial]:
         """The trials that fit; raises NotFound or EvaError that names what is allowed.
 
-        A checkpoint that is hidden from `sight` does not exist: whoever may ask which trials are of it knows it.
+        A checkpoint that is hidden from `sight` does not exist: a user who may ask which trials are of it knows it.
         """
         if self.evaluation:
             trials = trials.filter(evaluation=evaluation_get(name=self.evaluation))

@@ -1,4 +1,4 @@
-"""What is done with trials: prepared, scored, voided, abandoned; what their runs do to them is in `following`."""
+"""Actions on trials: prepare, score, void, abandon; what their runs do to them is in `following`."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ _TRIES = 5  # to get a number that nobody else takes at the same moment
 
 
 def declare_check(check: Check) -> None:
-    """`check` is asked before a trial is "run" or "voided", with the trial and who wants it; it raises EvaError."""
+    """`check` is asked before a trial is "run" or "voided", with the trial and the user; it raises EvaError."""
     _checks.append(check)
 
 
 def checked(what: str, trial: Trial, user: Any) -> None:
-    """Ask those who were declared."""
+    """Ask the declared checks."""
     for check in _checks:
         check(what, trial, user)
 
@@ -159,7 +159,7 @@ def trial_create(
     seed: int | None = None,
     strategy: Mapping[str, Any] | None = None,
 ) -> Trial:
-    """This very trial, prepared; within a transaction, by who knows that it is the next one.
+    """This very trial, prepared; within a transaction, by a caller who knows that it is the next one.
 
     Conflict where the station has a trial that is not finished, and says what to do about it. IntegrityError where
     there is one of this number and attempt.
@@ -310,7 +310,7 @@ def _held(trial: Trial) -> Trial:
 
 
 def _says(score: Score, said: Mapping[str, Any], found: Verdict) -> bool:
-    """Whether that score is word by word what is said now."""
+    """True if that score is word by word what is said now."""
     outcomes = {outcome.milestone_id: (outcome.reached, outcome.at_s) for outcome in score.outcomes.all()}
     same = outcomes == {milestone.pk: (reached, at) for milestone, reached, at in found.reached}
     words = all(getattr(score, name) == value for name, value in said.items())

@@ -93,7 +93,7 @@ def declare_least(find: Least) -> None:
 
 
 def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
-    """What the station needs to know for this trial; `reset` names this laying out of a simulated bench.
+    """Arguments of the station's set-up for this trial; `reset` names this laying out of a simulated bench.
 
     It connects, warms up and asks the policy each time, also where the same checkpoint comes twice.
     """
@@ -108,7 +108,7 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
 
 
 def run_args(trial: Trial, user: User) -> dict[str, Any]:
-    """What goes into the manifest of the episode, and when the run ends by itself; never simulated or by steps."""
+    """Facts for the episode's manifest, and when the run ends by itself; never simulated or by steps."""
     args: dict[str, Any] = {
         "trial": trial_facts(trial),
         "operator": user.get_username(),
@@ -139,7 +139,7 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
 
 
 def _asked(args: Mapping[str, Any]) -> dict[str, Any]:
-    """What a set-up is about; how long it lasts at least is drawn anew each time."""
+    """Subject of a set-up; how long it lasts at least is drawn anew each time."""
     return {key: value for key, value in args.items() if key != "least"}
 
 
@@ -189,7 +189,7 @@ def _require_set_up(trial: Trial) -> None:
 
 
 def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
-    """Whoever set the station up last, a terminal included: this is the checkpoint that it would run.
+    """Require that the station would run this checkpoint, whichever client, a terminal included, set it up last.
 
     What changes after this look makes the run stale, which the station refuses by itself. How long its policy took.
     """

@@ -1,4 +1,4 @@
-"""What a station's events do to its trial: begun, paused, resumed, ended, given back, its recording closed.
+"""Effects of a station's events on its trial: begun, paused, resumed, ended, given back, recording closed.
 
 Every event may come more than once, from several web processes, and after a gap: a trial knows the number of
 the newest event that it has taken, and takes none before that again.
@@ -183,7 +183,7 @@ def _moved(trial: Trial, move: Move, reason: str, time: float | None) -> None:
 
 
 def _truth_told(station: Station, event: Mapping[str, Any]) -> Trial | None:
-    """How the simulated bench was left at the end of an episode."""
+    """Note the state of the simulated bench at the end of an episode."""
     data = dict(event.get("data") or {})
     trial = _held(station=station, episode_id=_uuid(data.get("episode")))
     if trial is None or trial.truth == data:

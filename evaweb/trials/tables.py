@@ -70,7 +70,7 @@ def _is_number(value: object) -> bool:
 
 
 def _problems(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> list[str]:
-    """What is wrong with it as a table of that kind; what is missing comes from the deployment."""
+    """Errors of it as a table of that kind; what is missing comes from the deployment."""
     kind = config.model_fields["kind"].default
     try:
         config.model_validate({**given, "kind": kind})
@@ -81,7 +81,7 @@ def _problems(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> lis
 
 
 def _likeness(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tuple[int, int]:
-    """How many keys are, or nearly are, those of this kind; of two alike, the kind with more keys."""
+    """Number of keys that are, or nearly are, those of this kind; of two alike, the kind with more keys."""
     near = [key for key in given if get_close_matches(str(key), config.model_fields, n=1)]
     return len(near), len(config.model_fields)
 

@@ -1,4 +1,4 @@
-"""What a rater's ticks come to: pure arithmetic on the milestones of a scene."""
+"""Verdict of a rater's ticks: pure arithmetic on the milestones of a scene."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def _trial_page(
 
 
 def laid_out(trial: Trial) -> list[Any]:
-    """What the cameras showed before the run, as the newest look at each has it; bound to trials by evaweb.plans."""
+    """Pictures of the cameras before the run, the newest look at each; bound to trials by evaweb.plans."""
     newest: dict[str, Any] = {}
     for row in trial.achieved.select_related("reference", "by").order_by("pk"):
         newest[row.camera] = row
@@ -129,7 +129,7 @@ def laid_out(trial: Trial) -> list[Any]:
 
 
 def _ticked(trial: Trial, milestone: int, typed: Mapping[str, Any] | None) -> bool:
-    """Whether its box is ticked: as it was typed, else as it was last scored."""
+    """True if its box is ticked: as it was typed, else as it was last scored."""
     if typed and "milestones" in typed:
         return bool(typed["milestones"].get(milestone))
     outcomes = trial.scores.all()[0].outcomes.all() if trial.verdict_id else ()

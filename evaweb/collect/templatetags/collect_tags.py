@@ -1,4 +1,4 @@
-"""How times are written on the Collect page."""
+"""Formats of times on the Collect page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _MINUTE = 60
 
 @register.filter
 def left(seconds: float | str | None) -> str:
-    """How long something still takes, roughly as a person would say it; templates say "" for what is not known."""
+    """Time left, roughly as a person would say it; templates say "" for what is not known."""
     if not isinstance(seconds, float | int):
         return "time left not known yet"
     if seconds < 1:

@@ -1,4 +1,4 @@
-"""What every page's bar shows: the tabs, and the role of who is logged in."""
+"""Parts of every page's bar: the tabs, and the role of the user."""
 
 from __future__ import annotations
 

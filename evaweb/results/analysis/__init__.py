@@ -1,1 +1,1 @@
-"""What a plan's trials show, in numbers."""
+"""Numbers of a plan's trials."""

@@ -1,4 +1,4 @@
-"""Whether raters agree, and which checkpoint people prefer, as JSON; what cannot be said is null with its reason."""
+"""Agreement of raters and preferred checkpoint, as JSON; what cannot be said is null with its reason."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OUTCOMES = {"first", "second", "tie"}
 
 
 def agreement_of(plan: Plan) -> dict[str, Any] | None:
-    """Of first and second raters, on success and on each milestone; None where nobody rated again."""
+    """Of first and second raters, on success and on each milestone; None without second ratings."""
     rows = list(
         Rating.objects.filter(trial__evaluation=plan.evaluation_id, trial__status=TrialStatus.SCORED)
         .select_related("trial__verdict")
@@ -67,7 +67,7 @@ def _alpha(units: list[list[float]]) -> float | None:
 
 
 def comparisons_of(plan: Plan) -> list[Comparison]:
-    """What people preferred, by checkpoint."""
+    """Preferences of people, by checkpoint."""
     rows = Preference.objects.filter(plan=plan).order_by("pk")
     named = rows.values_list("first__checkpoint__name", "second__checkpoint__name", "outcome")
     return [Comparison(first, second, outcome) for first, second, outcome in named]

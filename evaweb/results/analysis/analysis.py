@@ -118,7 +118,7 @@ def analyse(
 ) -> Analysis:
     """All of it; `primary` is compared in this direction, others the better one first.
 
-    `interruptions` count for how often a checkpoint needs somebody, and for nothing else.
+    `interruptions` count for how often a checkpoint needs an operator, and for nothing else.
     """
     arms = by_checkpoint(outcomes)
     ranked = sorted(arms, key=lambda name: (-sum(o.success for o in arms[name]) / len(arms[name]), name))
@@ -278,7 +278,7 @@ def _grouped(trials: Sequence[Outcome], key: Callable[[Outcome], str]) -> dict[s
 
 
 def _said(notes: list[str], compute: Callable[[], T]) -> T | None:
-    """What it computes, or None with the reason among the notes."""
+    """Result of `compute`, or None with the reason among the notes."""
     try:
         return compute()
     except StatisticsError as error:

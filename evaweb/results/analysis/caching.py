@@ -1,6 +1,6 @@
 """Analyses that are kept as long as nothing they were made from has changed, in each process of the web.
 
-Nobody invalidates anything: what is kept carries a fingerprint of its rows, which is asked for again each time. A
+Nothing is invalidated: what is kept carries a fingerprint of its rows, which is asked for again each time. A
 score, a correction or a void changes it, and so does the name of a checkpoint or of a scene.
 """
 
@@ -23,7 +23,7 @@ from evaweb.trials.models import Scene, Trial, TrialStatus
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """What was run of a plan: the trials that count, and those that were broken off."""
+    """Runs of a plan: the trials that count, and those that were broken off."""
 
     outcomes: list[Outcome]
     interruptions: list[Interruption]
@@ -62,7 +62,7 @@ def runs_of(plan: Plan, at: Hashable = None) -> Runs:
 
 
 def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> Analysis:
-    """What the plan's trials say, or those of them that are chosen."""
+    """Analysis of the plan's trials, or of those that are chosen."""
     now = at or fingerprint(plan)
     runs, which = runs_of(plan, now), only or Chosen()
 
@@ -76,12 +76,12 @@ def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> 
 
 
 def page_of(plan: Plan, name: Hashable, at: Hashable, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What the page of that name shows of the plan's trials, figures included."""
+    """Contents of the plan's page of that name, figures included."""
     return _pages.get((plan.pk, plan.digest, name), at, make)
 
 
 def forget() -> None:
-    """Drop what is kept: the next who ask wait for it to be made."""
+    """Drop what is kept: the next callers wait for it to be made."""
     _runs.clear()
     _analyses.clear()
     _pages.clear()

@@ -52,7 +52,7 @@ def chosen(given: Mapping[str, str], runs: Iterable[Outcome]) -> Chosen:
 
 
 def choices(runs: Iterable[Outcome]) -> dict[str, list[str]]:
-    """What can be chosen of each."""
+    """Values that can be chosen of each field."""
     given = list(runs)
     positions = sorted({run.position for run in given})
     return {

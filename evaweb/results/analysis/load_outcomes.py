@@ -47,7 +47,7 @@ def interruptions_of_plan(plan: Plan) -> list[Interruption]:
 def outcomes_of(trials: QuerySet[Trial]) -> list[Outcome]:
     """Those of any trials that count, in the order in which they were started.
 
-    Trials of the same number at the same position met the same conditions as far as anybody meant to.
+    Trials of the same number at the same position met the same conditions as far as was meant.
     """
     return _outcomes(trials, {}, {})
 

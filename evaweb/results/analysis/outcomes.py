@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one trial that counts.
+    """Outcome of one trial that counts.
 
     `order` is when it was run among those of its evaluation, `block` names the initial condition and its repetition:
     trials of one block met the same one. `milestones` are those of its scene in their order. `duration` is in s.
@@ -40,7 +40,7 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Interruption:
-    """A run that somebody or something broke off, and that is not scored: `duration` [s] where it is known."""
+    """A run that was broken off and is not scored: `duration` [s] where it is known."""
 
     trial: int
     checkpoint: str

@@ -1,4 +1,4 @@
-"""How many trials, and how many hours at the robots, a difference needs; what the trials there is time for miss."""
+"""Trials and robot hours that a difference needs; what the trials there is time for miss."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def question_of(given: Mapping[str, str]) -> Question:
 
 
 def table_of(q: Question) -> dict[str, Any]:
-    """What the question comes to, by the normal law, and by Barnard's own power where that can be computed."""
+    """Numbers of the question, by the normal law, and by Barnard's own power where that can be computed."""
     n = trials_needed(q.rate, q.better, q.power, q.alpha)
     affordable = int(q.hours * 3600 * q.stations / q.cycle_s / q.checkpoints)
     return {

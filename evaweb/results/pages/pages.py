@@ -1,4 +1,4 @@
-"""What the pages of a plan show, computed here so that templates only place it."""
+"""Contents of a plan's pages, computed here so that templates only place them."""
 
 from __future__ import annotations
 

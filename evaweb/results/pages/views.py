@@ -60,7 +60,7 @@ def plans(request: HttpRequest) -> HttpResponse:
 
 @require_GET
 def plan(request: HttpRequest, name: str, version: int | None = None) -> HttpResponse:
-    """What the plan found; where that is sealed, or is not there yet, how far it is."""
+    """Results of the plan; where they are sealed, or not there yet, its progress."""
     return _plan_page(request, _found(name, version))
 
 
@@ -83,7 +83,7 @@ def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """The evidence so far, for who may look; with HX-Request the meter alone, to be put into the page."""
+    """The evidence so far, for users who may look; with HX-Request the meter alone, to be put into the page."""
     found = _found(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -186,7 +186,7 @@ def _plan_page(
 def _sealed_page(
     request: HttpRequest, found: Plan, fault: EvaError | None = None, typed: str = ""
 ) -> HttpResponse | None:
-    """What is shown in place of results that this user does not see, or that there cannot be; None where they do."""
+    """Page in place of results that this user does not see, or that there cannot be; None where they do."""
     why = why_sealed(found, request.user, sight_for(request)) if has_results(found) else ""
     if has_results(found) and not why:
         return None

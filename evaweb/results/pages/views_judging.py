@@ -1,4 +1,4 @@
-"""Pages of those who look at videos without knowing what they see: a trial rated again, one of two preferred."""
+"""Pages of raters, who do not know what they see in a video: a trial rated again, one of two preferred."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _version(request: HttpRequest) -> int:
 
 
 def _view(handout: Handout | None) -> dict[str, Any] | None:
-    """A recording as it is shown to somebody who must not know what it is of."""
+    """A recording as it is shown to a rater, who must not know what it is of."""
     episode: Episode | None = handout.trial.episode if handout else None
     if handout is None or episode is None:
         return None

@@ -1,1 +1,1 @@
-"""How results are worded, listed and drawn, on pages and in reports."""
+"""Words, lists and drawings of results, on pages and in reports."""

@@ -1,4 +1,4 @@
-"""Where the trials behind a figure, a comparison and two recordings are found."""
+"""Addresses of the trials behind a figure, of a comparison and of two recordings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evaweb.results.selectors import Question
 
 
 def trials_address(plan: Plan, only: Chosen, **more: str) -> str:
-    """Where those trials are listed."""
+    """Address of the list of those trials."""
     question = Question(
         scene=only.scene, position=only.position, station=only.station, operator=only.operator
     )
@@ -24,14 +24,14 @@ def trials_address(plan: Plan, only: Chosen, **more: str) -> str:
 
 
 def compare_address(plan: Plan, found: Comparison, only: Chosen) -> str:
-    """Where both are side by side."""
+    """Address of the page with both side by side."""
     query = urlencode({"first": found.first, "second": found.second})
     address = reverse("result-compare", args=[plan.name, plan.version])
     return f"{address}?{query}" + (f"&{only.query}" if only.query else "")
 
 
 def beside_address(episodes: Sequence[object]) -> str:
-    """Where recordings are played on one clock; "" where there are not two."""
+    """Address that plays recordings on one clock; "" where there are not two."""
     if len(episodes) < 2:
         return ""
     return reverse("side-by-side") + "?" + urlencode([("show", str(uuid)) for uuid in episodes])

@@ -99,7 +99,7 @@ def trial_row(trial: Trial) -> dict[str, Any]:
 
 
 def trial_choices(plan: Plan) -> dict[str, list[str]]:
-    """What the list of trials can be narrowed to."""
+    """Values that the list of trials can be narrowed to."""
     runs = caching.runs_of(plan).outcomes
     return {
         **choices(runs),

@@ -1,4 +1,4 @@
-"""How results are said: a percentage with its n and interval, a comparison in one sentence."""
+"""Wording of results: a percentage with its n and interval, a comparison in one sentence."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def verdict(found: Comparison, one: Proportion, other: Proportion, alpha: float)
 
 
 def missed(n: int, rate: float | None, alpha: float) -> str:
-    """What so many trials of each arm could not have detected, from that rate."""
+    """Sentence on the gain that so many trials of each arm could not have detected, from that rate."""
     if rate is None or n < 1:
         return "Without trials nothing could be detected."
     gain = detectable(n, min(rate, 0.999), POWER, alpha)
@@ -60,7 +60,7 @@ def missed(n: int, rate: float | None, alpha: float) -> str:
 
 
 def evidence_words(found: Evidence) -> str:
-    """How far the evidence is, and whether it suffices."""
+    """State of the evidence, and if it suffices, in words."""
     if found.stop is not None:
         return f"suffices since pair {found.stop}"
     if not found.pairs:

@@ -1,4 +1,4 @@
-"""Who rates which trial again, and which of two trials somebody is asked to prefer: never knowing the checkpoint."""
+"""Choice of the trial to rate again, and of two to compare, for each rater: never knowing the checkpoint."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _NAMED = 500  # ids in one question to the database
 
 
 class Offer(NamedTuple, Generic[T]):
-    """What somebody is asked about next, None for nothing; `left` for them in all.
+    """Next item for one rater, None for nothing; `left` for this rater in all.
 
     `passed`: codes of trials that come before it, of which there are no pictures on this machine.
     """
@@ -104,7 +104,7 @@ def rate(
     failure: str = "",
     note: str = "",
 ) -> Rating:
-    """Keep what somebody who did not run the trial of that code saw on its video: on the disk, then as a row."""
+    """Keep what a rater, not the operator of the trial of that code, saw on its video: on the disk, then as a row."""
     require(user, Role.OPERATOR)
     handout = _handout(plan, code)
     trial = handout.trial
@@ -203,7 +203,7 @@ def _handout(plan: Plan, code: str) -> Handout:
 
 
 def _once_more(before: T, said: Mapping[str, Any], twice: str) -> T:
-    """What was said before, where it is said again word by word because the answer was lost; else Conflict."""
+    """The earlier answer, where it is given again word by word because the reply was lost; else Conflict."""
     if any(getattr(before, name) != value for name, value in said.items()):
         raise Conflict(f"{twice}, and otherwise: what was said stands")
     return before

@@ -1,4 +1,4 @@
-"""Whether somebody sees what a plan found: the one place that all results ask."""
+"""Visibility of a plan's results for a user: the one place that all results ask."""
 
 from __future__ import annotations
 
@@ -41,5 +41,5 @@ def require_seen(plan: Plan, user: Any) -> None:
 
 
 def has_results(plan: Plan) -> bool:
-    """Whether trials of it can have been made at all."""
+    """True if trials of it can have been made at all."""
     return plan.state != PlanState.DRAFT

@@ -1,4 +1,4 @@
-"""Whether there are pictures of a trial on this machine: without them nobody can judge it."""
+"""Availability of a trial's pictures on this machine: without them the trial cannot be judged."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from evaweb.plans.models import Handout
 
 
 def seen(episode: Episode | None) -> bool:
-    """Whether somebody can watch it now."""
+    """True if it can be watched now."""
     return (
         episode is not None
         and bool(episode.cameras)
@@ -20,7 +20,7 @@ def seen(episode: Episode | None) -> bool:
 
 
 def coming(episode: Episode | None) -> bool:
-    """Whether pictures of it may be made yet: its folder is on this disk."""
+    """True if pictures of it may be made yet: its folder is on this disk."""
     return (
         episode is not None
         and bool(episode.cameras and episode.frames)

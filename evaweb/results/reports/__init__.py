@@ -1,1 +1,1 @@
-"""What of a plan's results leaves the lab: documents, tables, the program that recomputes them."""
+"""Exports of a plan's results: documents, tables, the program that recomputes them."""

@@ -1,4 +1,4 @@
-"""How the benches of a plan's trials were laid out, for its report: what each camera showed, and the reference then."""
+"""Bench layouts of a plan's trials, for its report: what each camera showed, and the reference then."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reviewer asks of an evaluation, answered from the record: no answer is anybody's claim."""
+"""Reviewer's checklist of an evaluation, answered from the record: no answer is a person's claim."""
 
 from __future__ import annotations
 

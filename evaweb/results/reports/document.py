@@ -1,6 +1,6 @@
 """An analysis as plain JSON: what REST answers, what a report holds, and what its script computes again.
 
-Intervals are [low, high]; those that a bootstrap drew stand under `bootstrap`, because whoever draws anew gets them
+Intervals are [low, high]; those that a bootstrap drew stand under `bootstrap`, because a new draw gets them
 only nearly. A list of curve points is [time, share, low, high, at risk].
 """
 

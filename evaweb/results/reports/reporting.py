@@ -96,7 +96,7 @@ def seal_of(plan: Plan) -> dict[str, str]:
 
 
 def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
-    """What the report's page shows; its figures lead nowhere, because there is nothing behind them."""
+    """Context of the report's page; its figures lead nowhere, because there is nothing behind them."""
     arms = analysis.arms
     order = {arm.checkpoint: i for i, arm in enumerate(arms)}
     primary = facts.primary_of(plan, analysis)

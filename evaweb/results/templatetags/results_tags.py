@@ -1,4 +1,4 @@
-"""How results are written on their pages."""
+"""Formats of results on their pages."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def twice_over(alpha: float) -> str:
 
 @register.filter
 def chosen_items(only: Chosen) -> list[tuple[str, str]]:
-    """What is chosen, name and value."""
+    """Chosen filters, name and value."""
     return [(name, value) for name, value in asdict(only).items() if value]
 
 
@@ -96,7 +96,7 @@ def points(share: float) -> str:
 
 @register.filter
 def same_words(found: dict[str, Any]) -> str:
-    """How often two raters said the same, with n and interval."""
+    """Agreement of two raters: how often they said the same, with n and interval."""
     low, high = found["wilson"]
     share = 100 * found["same"] / found["n"]
     return f"{found['same']}/{found['n']}, {share:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"

@@ -1,4 +1,4 @@
-"""How numbers are written on the result pages."""
+"""Formats of numbers on the result pages."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def averaged(found: Average | None, of: int) -> str:
 
 @register.filter
 def control_figures(control: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """How well the control loop kept time: label, and value with its unit; those that the episode has."""
+    """Timing figures of the control loop: label, and value with its unit; those that the episode has."""
     found = ((label, unit, control.get(key)) for key, (label, unit) in _CONTROL.items())
     return [(label, f"{_short(value)} {unit}".strip()) for label, unit, value in found if value is not None]
 
@@ -77,5 +77,5 @@ def tone(status: str) -> str:
 
 @register.filter
 def what_next(status: str) -> str:
-    """What a person can do about a trial in this status."""
+    """Advice to a person on a trial in this status."""
     return advice(status)

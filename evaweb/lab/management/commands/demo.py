@@ -224,7 +224,7 @@ def told(found: Analysis) -> Iterator[str]:
 
 
 def _evidence(one: Comparison) -> str:
-    """What the test says that holds however often one looks."""
+    """Sentence of the test that holds however often one looks."""
     found = one.evidence
     if found.winner is not None:
         winner = one.first if found.winner == "first" else one.second
@@ -256,12 +256,12 @@ def _skill(name: str, options: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _known_port(name: str) -> int:
-    """Where the policy of that checkpoint was served before, if nobody is there: a plan that is frozen names it."""
+    """Port of the checkpoint's earlier policy server, if it is free: a plan that is frozen names it."""
     return free_port_of(Checkpoint.objects.filter(name=name).values_list("policy__url", flat=True).first())
 
 
 def free_port_of(url: str | None) -> int:
-    """The port of that address where nobody has it now, else 0."""
+    """The port of that address if it is free now, else 0."""
     port = urlsplit(url).port if url else None
     if not port:
         return 0

@@ -1,4 +1,4 @@
-"""Where trials fail and why: a grid of initial conditions and checkpoints, a Pareto chart of failures."""
+"""Plots of failures: a grid of initial conditions and checkpoints, a Pareto chart of reasons."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How trials went: milestones as a funnel, time to success as a curve, evidence pair by pair."""
+"""Plots of the course of trials: milestones as a funnel, time to success as a curve, evidence by pairs."""
 
 from __future__ import annotations
 

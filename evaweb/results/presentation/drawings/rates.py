@@ -1,4 +1,4 @@
-"""How often checkpoints succeed: intervals in rows, posteriors as violins, one difference on its axis."""
+"""Plots of success rates: intervals in rows, posteriors as violins, one difference on its axis."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def intervals(title: str, rows: Sequence[tuple[str, Proportion, str]], order: Ma
 
 
 def violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
-    """What is believed of each checkpoint's rate: the Beta posterior of a uniform prior, all of the same area."""
+    """Violins of each checkpoint's rate: the Beta posterior of a uniform prior, all of the same area."""
     row = 64
     height = row * len(arms) + 40
     scale = Scale(0, 1, _NAMES, WIDTH - 60)

@@ -61,12 +61,12 @@ def line(points: Sequence[tuple[float, float]], class_: str) -> str:
 
 
 def path(points: Sequence[tuple[float, float]]) -> str:
-    """What a path's `d` says."""
+    """Attribute `d` of a path."""
     return "".join(f"{'L' if i else 'M'}{_n(x)} {_n(y)}" for i, (x, y) in enumerate(points))
 
 
 def link(address: str, title: str, content: str) -> str:
-    """What leads to where its number was made from; without an address only the content, with its title."""
+    """Link to where its number was made from; without an address only the content, with its title."""
     inner = element("title", escape(title)) + content
     return element("a", inner, href=address) if address else element("g", inner)
 
@@ -77,7 +77,7 @@ def series(i: int) -> str:
 
 
 def mark(i: int, x: float, y: float, r: float = 5) -> str:
-    """The mark of the i-th series: a shape of its own, because colour alone does not reach everybody."""
+    """The mark of the i-th series: a shape of its own, because colour alone does not reach every reader."""
     shapes = (
         f"M{_n(x - r)} {_n(y)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0Z",
         path([(x - r, y - r), (x + r, y - r), (x + r, y + r), (x - r, y + r)]) + "Z",

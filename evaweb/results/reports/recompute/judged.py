@@ -1,4 +1,4 @@
-"""What raters and those who prefer come to: agreement beyond chance, and Bradley-Terry with ties by Newton's method."""
+"""Statistics of ratings and preferences: agreement beyond chance, Bradley-Terry with ties by Newton."""
 
 from __future__ import annotations
 

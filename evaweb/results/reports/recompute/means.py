@@ -10,7 +10,7 @@ from .methods import solve
 
 
 def student(values: Sequence[float]) -> dict[str, Any] | None:
-    """How many, their mean and its interval; no interval where none of them differs."""
+    """Count of values, their mean and its interval; no interval where none of them differs."""
     n = len(values)
     if not n:
         return None

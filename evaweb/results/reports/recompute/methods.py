@@ -13,7 +13,7 @@ Ends = list[float]
 
 
 def solve(rises: Callable[[float], float], wanted: float, low: float, high: float) -> float:
-    """Where a function that rises from `low` to `high` has the `wanted` value."""
+    """Argument, from `low` to `high`, at which a rising function has the `wanted` value."""
     for _ in range(200):
         middle = (low + high) / 2
         low, high = (middle, high) if rises(middle) < wanted else (low, middle)

@@ -41,7 +41,7 @@ class Trial:
 
 
 class Drawn(list[float]):
-    """What a bootstrap drew, to be held against an interval that another one drew."""
+    """Values that a bootstrap drew, to be held against an interval that another one drew."""
 
 
 Trials = Sequence[Trial]

@@ -18,7 +18,7 @@ def digest(document: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A whole number is written without a point, whoever wrote it."""
+    """A whole number is written without a point, by any writer."""
     if isinstance(value, float) and value.is_integer():
         return int(value)
     if isinstance(value, dict):
@@ -74,7 +74,7 @@ def codes(key: bytes, count: int) -> list[str]:
 
 
 def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> list[str]:
-    """What does not fit together of plan, commitment, key and trials; nothing where all does."""
+    """Contradictions of plan, commitment, key and trials; none where all fit together."""
     found = []
     if digest(plan) != seal["digest"]:
         found.append(f"plan.json has the digest {digest(plan)}, the plan that was frozen {seal['digest']}")
