@@ -3,7 +3,7 @@
 import { badge } from "./badge.js";
 import { advice, age, duration, figure, words } from "./words.js";
 
-const TITLES = { mine: "This page commands", elsewhere: "You command on another page", free: "Nobody commands" };
+const TITLES = { mine: "This page commands", elsewhere: "You command on another page", free: "The station is free" };
 const shown = (name) => document.querySelectorAll(`[data-show="${name}"]`);
 
 function write(name, text) {
