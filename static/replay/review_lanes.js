@@ -47,7 +47,7 @@ export function list(element, items, none) {
     const item = document.createElement("li");
     const line = document.createElement(go ? "button" : "p");
     if (go) line.type = "button";
-    if (mark) line.dataset.mark = mark;
+    if (mark) Object.assign(line, { className: "chip" }).dataset.mark = mark;
     line.append(words);
     if (detail) line.append(" ", Object.assign(document.createElement("span"), { className: "muted small", textContent: detail }));
     if (go) line.addEventListener("click", go);

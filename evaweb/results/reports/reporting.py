@@ -29,7 +29,10 @@ from evaweb.results.reports.tables import COLUMNS, outcome_pages
 from evaweb.tabular_export import csv_lines
 from evaweb.trials.models import Score
 
-_STYLES = ("css/tokens.css", "css/base.css", "result/result.css", "result/figures.css", "result/plans.css")
+_STYLES = (
+    *("css/tokens.css", "css/base.css", "css/card.css", "css/table.css", "css/chip.css"),
+    *("result/result.css", "result/figures.css", "result/plans.css"),
+)
 _PROGRAM = Path(__file__).parent / "recompute"
 _RATINGS = ("trial", "rater", "success", "score", "milestones", "failure", "note", "blind", "at")
 _PREFERENCES = (

@@ -47,7 +47,7 @@ export class Distribution {
     this.element.className = "distribution";
     this.#picture.setAttribute("preserveAspectRatio", "none");
     this.#picture.setAttribute("aria-hidden", "true");
-    this.#ends.className = "distribution-ends";
+    this.#ends.className = "row spread muted";
     this.#ends.append(document.createElement("span"), document.createElement("span"));
     this.element.append(this.#words, this.#picture, this.#ends);
   }

@@ -59,7 +59,7 @@ export class Events {
     time.textContent = clock(wall);
     time.title = `event ${number}`;
     const name = document.createElement("span");
-    name.className = "event-kind";
+    name.className = "event-kind clip";
     name.textContent = kindWords(kind);
     name.title = kindWords(kind);
     const words = document.createElement("span");

@@ -6,7 +6,7 @@ export class Tags {
 
   /** A list of class `name` in `element`. */
   constructor(element, name) {
-    this.#list.className = `tags ${name}`;
+    this.#list.className = `tags stack ${name}`;
     element.append(this.#list);
   }
 
