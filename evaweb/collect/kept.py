@@ -10,8 +10,8 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationErro
 
 from evaweb.collect.models import SessionEvent, SessionEventKind
 from evaweb.episodes.folders import data_dir
-from evaweb.episodes.publishing import read_scores
 from evaweb.errors import EvaError
+from evaweb.journal import read_lines
 
 _Count = Annotated[int, Field(ge=1, lt=2**31)]
 
@@ -61,7 +61,7 @@ def event_line(event: SessionEvent) -> dict[str, Any]:
 def kept_events(uuid: UUID) -> list[KeptEvent]:
     """What the file of a session says, oldest first; a torn line never counted. EvaError names one that is wrong."""
     found = []
-    for number, line in enumerate(read_scores(session_file(uuid)).lines, start=1):
+    for number, line in enumerate(read_lines(session_file(uuid)).lines, start=1):
         try:
             found.append(KeptEvent.model_validate(line))
         except ValidationError as error:

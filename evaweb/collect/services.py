@@ -12,11 +12,11 @@ from evaweb.collect import selectors
 from evaweb.collect.kept import event_line, session_file
 from evaweb.collect.models import CollectSession, Result, SessionEvent, SessionEventKind
 from evaweb.collect.setups import require_same, setup_of
-from evaweb.episodes.jsonl import append_line, text
 from evaweb.episodes.publishing import DATASET_NAME
 from evaweb.episodes.services import publish_asked
 from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job
+from evaweb.journal import append_line, text
 from evaweb.roles import Role, require
 from evaweb.stations.holders import who
 from evaweb.stations.models import Station

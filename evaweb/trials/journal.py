@@ -9,7 +9,7 @@ from uuid import UUID
 
 from django.conf import settings
 
-from evaweb.episodes.jsonl import append_line
+from evaweb.journal import append_line
 from evaweb.trials.facts import trial_course
 from evaweb.trials.models import MilestoneOutcome, Score, Trial
 

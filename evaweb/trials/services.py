@@ -13,10 +13,10 @@ from django.db import IntegrityError, transaction
 from django.db.models import Max
 from django.utils import timezone
 
-from evaweb.episodes.jsonl import text
 from evaweb.episodes.selectors import unrecorded_because
 from evaweb.episodes.services import publish_asked
 from evaweb.errors import Conflict, EvaError, NotFound
+from evaweb.journal import text
 from evaweb.roles import Role, require
 from evaweb.stations.commands import identity_of
 from evaweb.stations.models import Station

@@ -13,9 +13,9 @@ from django.contrib.auth.models import User
 from django.db import IntegrityError, transaction
 from django.db.models import Exists, OuterRef, QuerySet
 
-from evaweb.episodes.jsonl import text
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
+from evaweb.journal import text
 from evaweb.plans.blinding_rules import has_looked
 from evaweb.plans.models import Handout, Plan, PlanState
 from evaweb.plans.seeded_draws import Chance

@@ -6,7 +6,7 @@ import pytest
 from django.db import IntegrityError, connection, transaction
 from django.db.models import ProtectedError
 
-from evaweb.episodes import jsonl as disk
+from evaweb import journal as disk
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import unrecorded_because
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
