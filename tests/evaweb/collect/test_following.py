@@ -10,8 +10,8 @@ from django.contrib.auth.models import User
 
 from evaweb.collect import services
 from evaweb.collect import station_events as following
-from evaweb.collect.kept import session_file
 from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
+from evaweb.collect.record import SESSIONS
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
 from tests.evaweb.collect.conftest import SETUP, Demonstrate, labelled
@@ -68,7 +68,7 @@ def test_without_its_own_file_a_session_is_what_its_episodes_say(
     session: CollectSession, demonstrate: Demonstrate
 ) -> None:
     made = demonstrate("partial")
-    session_file(session.pk).unlink()
+    SESSIONS.path(session.pk).unlink()
     lost()
     assert reconcile().problems == ()
     again = CollectSession.objects.get()

@@ -15,6 +15,7 @@ from uuid import UUID
 import pytest
 
 from evaweb.collect import services as collecting
+from evaweb.collect.record import SESSIONS
 from evaweb.episodes import services as episodes
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.plans.allocation import hand_out
@@ -187,7 +188,7 @@ def _collected(lab, recorded):  # noqa: F811
         collecting.session_close(user=ann, session=session)
         without = collecting.session_begin(user=ann, station=station, task="pour", dataset="tea")
         collecting.session_close(user=ann, session=without)
-    collecting.session_file(without.pk).unlink()
+    SESSIONS.path(without.pk).unlink()
     for number, (of, result) in enumerate(((session, "success"), (session, None), (without, "partial"))):
         uuid = str(UUID(int=number + 1))
         folder = recorded.parent / uuid
