@@ -48,7 +48,7 @@ def text(name: str, given: str, longest: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class From:
-    """Where a row has what a field of its line says, as queries name it: `rater__username`."""
+    """Where a row has what a field of its line says, as queries name it: `rater__username`; "" under its own name."""
 
     path: str
 
@@ -63,7 +63,7 @@ class Line(BaseModel):
     def path_of(cls, name: str) -> str:
         """Where the row has it."""
         found = (each.path for each in cls.model_fields[name].metadata if isinstance(each, From))
-        return next(found, name)
+        return next(found, "") or name
 
     @classmethod
     def names(cls) -> Iterable[str]:
@@ -198,12 +198,12 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
     """
     text = json.dumps(line, allow_nan=False, separators=(",", ":"))  # ASCII: no character in it ends a line
     try:
-        _append(path, text.encode() + b"\n")
+        _written(path, text.encode() + b"\n")
     except OSError as error:
         raise NotKept(f"not kept: {error.strerror} ({path}); nothing was changed") from error
 
 
-def _append(path: Path, payload: bytes) -> None:
+def _written(path: Path, payload: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab+") as file:
         new = file.tell() == 0
