@@ -43,14 +43,17 @@ def _in_order(lines):
     return sorted(json.dumps(line, sort_keys=True) for line in lines)
 
 
+_TRIALS = ("trial", "first", "second")
+
+
 def _then(line):
     """What was known of its trials then; without the reason, another one when it was written, and how a station is."""
     known = before("scores", "score")[0]["trial"].keys() - {"reason", "simulated"}
-    return {
-        name: {key: said for key, said in value.items() if key in known} if isinstance(value, dict) else value
-        for name, value in line.items()
-        if name != "setup"
-    }
+    return {name: _only(known, value) if name in _TRIALS else value for name, value in line.items()}
+
+
+def _only(known, said):
+    return {name: value for name, value in said.items() if name in known}
 
 
 @pytest.mark.parametrize(
