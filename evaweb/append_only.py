@@ -1,6 +1,7 @@
 """Rows that the database itself refuses to change or remove, whatever program asks it to.
 
-Installed after every migration, because SQLite loses a table's triggers when a migration rebuilds it.
+A model says so by `append_only = AppendOnly(...)`. Triggers are installed after every migration, because SQLite loses a
+table's when a migration rebuilds it.
 """
 
 from __future__ import annotations
@@ -11,7 +12,33 @@ from typing import Any
 
 from django.apps import AppConfig
 from django.db import connections
+from django.db.models import AutoField, Model
 from django.db.models.signals import post_migrate
+
+
+@dataclass(frozen=True, slots=True)
+class AppendOnly:
+    """What of a model's rows is never changed: all columns `but` some, or `columns` alone; nor is a row removed.
+
+    `message` is what whoever tries is told. `only`: SQL about OLD, which rows that holds for; all where it is empty.
+    """
+
+    message: str
+    columns: tuple[str, ...] = ()
+    but: tuple[str, ...] = ()
+    only: str = ""
+
+    def guard(self, model: type[Model]) -> Guard:
+        """The same as the database knows it."""
+        for name in (*self.columns, *self.but):
+            model._meta.get_field(name)  # or FieldDoesNotExist
+        columns = tuple(
+            field.column
+            for field in model._meta.concrete_fields
+            if (field.name in self.columns if self.columns else field.name not in self.but)
+            and not isinstance(field, AutoField)
+        )
+        return Guard(model._meta.db_table, columns, self.message, self.only)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +67,20 @@ def install(connection: Any, guards: Iterable[Guard]) -> None:
                 cursor.execute(statement)
 
 
-def keep(app: AppConfig, guards: Iterable[Guard]) -> None:
-    """Have `guards` installed whenever the tables of `app` were migrated."""
+def protect(app: AppConfig) -> None:
+    """Have what the models of `app` declare installed whenever its tables were migrated."""
 
-    def guard(sender: AppConfig, using: str, **named: Any) -> None:
-        install(connections[using], guards)
+    def install_guards(sender: AppConfig, using: str, **named: Any) -> None:
+        install(connections[using], guards(app))
 
-    post_migrate.connect(guard, sender=app, weak=False, dispatch_uid=f"guards of {app.name}")
+    post_migrate.connect(install_guards, sender=app, weak=False, dispatch_uid=f"guards of {app.name}")
+
+
+def guards(app: AppConfig) -> tuple[Guard, ...]:
+    """What the models of `app` declare."""
+    return tuple(
+        model.append_only.guard(model) for model in app.get_models() if hasattr(model, "append_only")
+    )
 
 
 def removal(connection: Any, guard: Guard) -> list[str]:

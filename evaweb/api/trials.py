@@ -9,12 +9,14 @@ from uuid import UUID
 
 from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema
+from pydantic import create_model
 
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.tables import Format, table_answer
-from evaweb.blinding import Sight, code_of, sight_for
+from evaweb.blinding import Sight, sight_for
 from evaweb.trials import selectors, services
 from evaweb.trials.models import Score, Trial, TrialStatus
+from evaweb.trials.record import api_columns, shown
 from evaweb.trials.selectors import TrialFilters
 
 router = Router(tags=["trials"])
@@ -35,64 +37,23 @@ class Filters(Schema):
         return TrialFilters(**self.model_dump())
 
 
-class TrialOut(Schema):
+_LIST, _DETAIL = api_columns("list"), api_columns("detail")
+_Columns: Any = create_model(
+    "_Columns", __base__=Schema, **{name: (hint, ...) for name, hint in _LIST.items()}
+)
+
+
+class TrialOut(_Columns):
     """One attempt, flat; success, score, note and rater are those of the newest score.
 
     `code` is what a trial of a plan was handed out under, "" for others. While it is hidden from the caller which
     `checkpoint` it is of, the code stands there too.
     """
 
-    id: int
-    uuid: UUID
-    evaluation: str
-    version: int
-    station: str
-    scene: str
-    position: int
-    checkpoint: str
-    code: str
-    number: int
-    attempt: int
-    status: TrialStatus
-    reason: str
-    success: bool | None
-    score: float | None
-    duration_s: float | None
-    note: str | None
-    failure: str | None
-    rater: str | None
-    source: str | None
-    scored_at: datetime | None
-    operator: str
-    instruction: str
-    seed: int | None
-    time_limit_s: float | None
-    prepared_at: datetime
-    started_at: datetime | None
-    ended_at: datetime | None
-    episode: UUID | None
-
     @staticmethod
     def of(trial: Trial, sight: Sight) -> dict[str, Any]:
         """Flat, the same for JSON and CSV."""
-        plain = ("id", "uuid", "number", "attempt", "status", "duration_s", "instruction", "seed")
-        times = ("time_limit_s", "prepared_at", "started_at", "ended_at")
-        newest = ("success", "score", "note", "failure", "source", "scored_at")
-        return {
-            **{name: getattr(trial, name) for name in (*plain, *times)},
-            **{name: getattr(trial.verdict, name, None) for name in newest},
-            "evaluation": trial.evaluation.name,
-            "version": trial.evaluation_version,
-            "station": trial.station.name,
-            "scene": trial.scene.name,
-            "position": trial.position.number,
-            "checkpoint": sight.label(trial),
-            "code": code_of(trial),
-            "reason": sight.reason(trial),
-            "operator": trial.operator.get_username(),
-            "rater": trial.verdict.rater.get_username() if trial.verdict else None,
-            "episode": trial.episode_id,
-        }
+        return shown(trial, sight, _LIST)
 
 
 class OutcomeOut(Schema):
@@ -131,24 +92,22 @@ class ScoreOut(Schema):
         }
 
 
-class TrialDetail(TrialOut):
-    """A trial with all its scores, the newest first, and what a simulated bench says of its end."""
+_Detail: Any = create_model(
+    "_Detail",
+    __base__=TrialOut,
+    scores=(list[ScoreOut], ...),
+    **{name: (hint, ...) for name, hint in _DETAIL.items()},
+)
 
-    scores: list[ScoreOut]
-    truth: dict[str, Any] | None
-    voided_by: str | None
-    voided_at: datetime | None
+
+class TrialDetail(_Detail):
+    """A trial with all its scores, the newest first, and what a simulated bench says of its end."""
 
     @staticmethod
     def of(trial: Trial, sight: Sight) -> dict[str, Any]:
         """With all that is known of it."""
-        return {
-            **TrialOut.of(trial, sight),
-            "scores": [ScoreOut.of(score) for score in trial.scores.all()],
-            "truth": trial.truth,
-            "voided_by": trial.voided_by.get_username() if trial.voided_by else None,
-            "voided_at": trial.voided_at,
-        }
+        scores = [ScoreOut.of(score) for score in trial.scores.all()]
+        return {**shown(trial, sight, (*_LIST, *_DETAIL)), "scores": scores}
 
 
 class ScoreIn(Schema):
@@ -177,11 +136,7 @@ class Reason(Schema):
     reason: str = ""
 
 
-COLUMNS: dict[str, Any] = {
-    **{name: field.annotation for name, field in TrialOut.model_fields.items()},
-    "milestones_reached": str,
-    "milestones_missed": str,
-}
+COLUMNS: dict[str, Any] = {**_LIST, "milestones_reached": str, "milestones_missed": str}
 
 
 @router.get("", response={200: Page[TrialOut], **FAILURES}, summary="Trials", url_name="trials")

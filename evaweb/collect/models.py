@@ -8,6 +8,7 @@ from django.conf import settings
 from django.db import models
 from django.utils import timezone
 
+from evaweb.append_only import AppendOnly
 from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
 
@@ -28,6 +29,10 @@ class CollectSession(models.Model):
     setup = models.JSONField(help_text="Robot, groups, joints, cameras with sizes, rate, streams.")
     opened_at = models.DateTimeField(default=timezone.now)
     closed_at = models.DateTimeField(null=True, blank=True)
+
+    append_only = AppendOnly(
+        "a session keeps its task, dataset and set-up: open another one", but=("target", "closed_at")
+    )
 
     class Meta:
         ordering = ("-opened_at",)

@@ -9,8 +9,8 @@ from uuid import UUID
 from django.db import transaction
 from django.utils import timezone
 
-from evaweb.collect.kept import KeptEvent, kept_events, opening
 from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
+from evaweb.collect.record import SESSIONS, EventLine
 from evaweb.collect.setups import setup_in
 from evaweb.collect.station_events import demonstration_bound, label_read
 from evaweb.episodes.folders import journal_folder
@@ -50,8 +50,8 @@ def restore(kept: Kept) -> int:
 
 def _session(uuid: UUID, episode: Episode) -> CollectSession:
     """From its own file, else from the manifest of the first episode that is met: without target and history then."""
-    events = kept_events(uuid)
-    first = opening(events)
+    events = SESSIONS.read(uuid)
+    first = next((event for event in events if event.kind == "opened"), None)
     if first is None:
         return _from_manifest(uuid, episode)
     station = station_known(
@@ -70,13 +70,11 @@ def _session(uuid: UUID, episode: Episode) -> CollectSession:
         closed_at=_closed_at(events),
     )
     for event in events:
-        SessionEvent.objects.create(
-            session=session, kind=event.kind, text=event.text, by=known_person(event.by), at=event.at
-        )
+        SessionEvent.objects.create(session=session, **event.values())
     return session
 
 
-def _closed_at(events: list[KeptEvent]) -> Any:
+def _closed_at(events: list[EventLine]) -> Any:
     moves = [event for event in events if event.kind in ("opened", "closed", "resumed")]
     return moves[-1].at if moves[-1].kind == "closed" else None
 

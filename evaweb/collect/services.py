@@ -9,14 +9,14 @@ from django.db import IntegrityError, transaction
 from django.utils import timezone
 
 from evaweb.collect import selectors
-from evaweb.collect.kept import event_line, session_file
 from evaweb.collect.models import CollectSession, Result, SessionEvent, SessionEventKind
+from evaweb.collect.record import SESSIONS, EventLine
 from evaweb.collect.setups import require_same, setup_of
-from evaweb.episodes.jsonl import append_line, text
 from evaweb.episodes.publishing import DATASET_NAME
 from evaweb.episodes.services import publish_asked
 from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job
+from evaweb.journal import text
 from evaweb.roles import Role, require
 from evaweb.stations.holders import who
 from evaweb.stations.models import Station
@@ -151,7 +151,7 @@ def session_publish(
 def _note(session: CollectSession, user: Any, kind: SessionEventKind, words: str = "") -> None:
     """The caller holds the session's row."""
     event = SessionEvent(session=session, kind=kind, text=words, by=user, at=timezone.now())
-    append_line(session_file(session.pk), event_line(event))
+    SESSIONS.append(session.pk, EventLine.written(event))
     event.save(force_insert=True)
 
 

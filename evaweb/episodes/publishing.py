@@ -2,53 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from evaweb.episodes.manifest import Recorded
+from evaweb.journal import read_lines
 from runtime.recording.files import RecordingError
 
 DATASET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 
 
-@dataclass(frozen=True, slots=True)
-class ScoresRead:
-    """The whole lines of a scores file, oldest first, and the numbers of those that are not, from 1."""
-
-    lines: tuple[Mapping[str, Any], ...]
-    torn: tuple[int, ...]
-
-
-def read_scores(path: Path) -> ScoresRead:
-    """Read it, an absent one as empty; a line torn by a power cut never counted. RecordingError if unreadable."""
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        return ScoresRead((), ())
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-    found = {number: _line(line) for number, line in enumerate(data.split(b"\n"), start=1) if line.strip()}
-    lines = tuple(content for content in found.values() if content is not None)
-    return ScoresRead(lines, tuple(number for number, content in found.items() if content is None))
-
-
-def _line(line: bytes) -> Mapping[str, Any] | None:
-    try:
-        content = json.loads(line)
-    except ValueError:
-        return None
-    return content if isinstance(content, dict) else None
-
-
 def success_of(path: Path) -> bool | None:
     """Success by the newest score; None without a score. To void a trial changes no score."""
     success = None
-    for line in read_scores(path).lines:
+    for line in read_lines(path).lines:
         if line.get("kind", "score") == "score" and isinstance(line.get("success"), bool):
             success = line["success"]
     return success

@@ -14,8 +14,8 @@ from evaweb.episodes import services
 from evaweb.episodes.dataset_membership import places_read
 from evaweb.episodes.folders import episodes_dir, scores_dir, scores_file
 from evaweb.episodes.models import Episode
-from evaweb.episodes.publishing import read_scores
 from evaweb.errors import EvaError
+from evaweb.journal import read_lines
 from runtime.recording.files import RecordingError
 
 log = logging.getLogger(__name__)
@@ -135,6 +135,6 @@ def _scored(problems: list[str]) -> set[UUID]:
 
 
 def _lines(uuid: UUID, problems: list[str]) -> Sequence[Mapping[str, Any]]:
-    found = read_scores(scores_file(uuid))
+    found = read_lines(scores_file(uuid))
     problems += [f"{scores_file(uuid)}: line {number} is not whole and was left out" for number in found.torn]
     return found.lines

@@ -10,12 +10,11 @@ class PlansConfig(AppConfig):
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
-        from evaweb.append_only import keep
+        from evaweb.append_only import protect
 
         # They declare what is hidden from whom, and what is asked before a trial of a plan runs.
         from evaweb.plans import bench_checks as bench  # noqa: F401
         from evaweb.plans import blinding_rules as sight  # noqa: F401
         from evaweb.plans import setup_padding as pacing  # noqa: F401
-        from evaweb.plans.guarded import GUARDS
 
-        keep(self, GUARDS)
+        protect(self)

@@ -12,8 +12,8 @@ from django.contrib.auth.models import User
 from django.db import transaction
 from django.utils import timezone
 
-from evaweb.episodes.jsonl import text
 from evaweb.errors import Conflict, EvaError
+from evaweb.journal import text
 from evaweb.plans import pictures
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference

@@ -7,6 +7,7 @@ from django.core.validators import MaxValueValidator, MinValueValidator
 from django.db import models
 from django.db.models import Q
 
+from evaweb.append_only import AppendOnly
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene, Trial
 
@@ -109,6 +110,27 @@ class Plan(models.Model):
         related_name="+",
     )
 
+    append_only = AppendOnly(
+        "a frozen plan is never changed: amend it",
+        (
+            *(
+                "name",
+                "version",
+                "title",
+                "question",
+                "repetitions",
+                "blind",
+                "stopping",
+                "alpha",
+                "first",
+                "second",
+            ),
+            *("second_rater_share", "match_gate", "evaluation", "document", "digest", "commitment", "key"),
+            "frozen_at",
+        ),
+        only="OLD.state <> 'draft'",
+    )
+
     class Meta:
         ordering = ("name", "-version")
         constraints = [
@@ -170,6 +192,8 @@ class Handout(models.Model):
     reason = models.TextField(blank=True, help_text="Of a repetition: what became of the attempt before.")
     handed_at = models.DateTimeField(auto_now_add=True)
 
+    append_only = AppendOnly("what was handed out is never changed or removed")
+
     class Meta:
         ordering = ("plan", "number")
         constraints = [
@@ -188,6 +212,8 @@ class Look(models.Model):
     user = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
     at = models.DateTimeField(auto_now_add=True)
 
+    append_only = AppendOnly("who looked is never changed or removed")
+
     class Meta:
         ordering = ("plan", "at")
         constraints = [models.UniqueConstraint(fields=("plan", "user"), name="look_once")]
@@ -204,6 +230,8 @@ class PlanEvent(models.Model):
     by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
     what = models.CharField(max_length=12)
     text = models.TextField()
+
+    append_only = AppendOnly("what was done with a plan is never changed or removed")
 
     class Meta:
         ordering = ("plan", "id")
@@ -226,6 +254,8 @@ class Reference(models.Model):
     picture = models.CharField(max_length=64)
     by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
     at = models.DateTimeField(auto_now_add=True)
+
+    append_only = AppendOnly("a reference is never changed: take another one")
 
     class Meta:
         ordering = ("-pk",)
@@ -252,6 +282,8 @@ class Achieved(models.Model):
     by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
     at = models.DateTimeField(auto_now_add=True)
 
+    append_only = AppendOnly("what a trial began with is never changed or removed")
+
     class Meta:
         ordering = ("trial", "pk")
 
@@ -271,6 +303,8 @@ class CameraCheck(models.Model):
     seen = models.JSONField()
     by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
     at = models.DateTimeField(auto_now_add=True)
+
+    append_only = AppendOnly("who confirmed the cameras is never changed or removed")
 
     class Meta:
         ordering = ("-pk",)

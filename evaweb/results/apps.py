@@ -10,8 +10,7 @@ class ResultsConfig(AppConfig):
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
-        from evaweb.append_only import keep
-        from evaweb.results.guarded import GUARDS
+        from evaweb.append_only import protect
         from evaweb.results.ratings import restoring  # noqa: F401  it declares itself to those that reconcile
 
-        keep(self, GUARDS)
+        protect(self)

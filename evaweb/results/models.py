@@ -9,6 +9,7 @@ from django.db import models
 from django.db.models import F, Q
 from django.utils import timezone
 
+from evaweb.append_only import AppendOnly
 from evaweb.plans.models import Plan
 from evaweb.trials.models import Trial
 
@@ -26,6 +27,8 @@ class Rating(models.Model):
     note = models.TextField(blank=True)
     blind = models.BooleanField(help_text="Whether the rater could not know which checkpoint it was.")
     at = models.DateTimeField(default=timezone.now)
+
+    append_only = AppendOnly("what a second rater said is never changed or removed")
 
     class Meta:
         ordering = ("trial", "pk")
@@ -58,6 +61,8 @@ class Preference(models.Model):
     why = models.TextField(help_text="In a sentence.")
     blind = models.BooleanField(help_text="Whether the rater could not know which checkpoints they were.")
     at = models.DateTimeField(default=timezone.now)
+
+    append_only = AppendOnly("what somebody preferred is never changed or removed")
 
     class Meta:
         ordering = ("plan", "pk")

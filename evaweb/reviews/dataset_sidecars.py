@@ -8,14 +8,14 @@ from pathlib import Path
 from uuid import UUID
 
 from evaweb.episodes.dataset_sidecars import gives_sides
-from evaweb.reviews.kept import KeptReview, Line, kept_lines, segments_of
+from evaweb.reviews.record import REVIEWS, AnyReview, ReviewLine, segments_of
 
 
-def said_of(uuid: UUID) -> dict[str, Sequence[Line]]:
+def said_of(uuid: UUID) -> dict[str, Sequence[AnyReview]]:
     """Verdicts and annotations of the episode, by kind of side file."""
-    lines = kept_lines(uuid)
+    lines = REVIEWS.read(uuid)
     return {
-        "reviews": [line for line in lines if isinstance(line, KeptReview)],
+        "reviews": [line for line in lines if isinstance(line, ReviewLine)],
         "annotations": segments_of(lines),
     }
 

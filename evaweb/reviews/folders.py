@@ -13,11 +13,6 @@ def report_file(uuid: UUID) -> Path:
     return data_dir() / "quality" / f"{uuid}.json"
 
 
-def reviews_file(uuid: UUID) -> Path:
-    """File of people's words on an episode and its parts, a line each."""
-    return data_dir() / "reviews" / f"{uuid}.jsonl"
-
-
 def bounds_file() -> Path:
     """Other bounds of the checks than the usual ones, for all episodes of this lab."""
     return data_dir() / "quality.toml"

@@ -8,6 +8,7 @@ from django.conf import settings
 from django.db import models
 from django.utils import timezone
 
+from evaweb.append_only import AppendOnly
 from evaweb.episodes.models import Episode
 
 
@@ -31,6 +32,8 @@ class Review(models.Model):
     note = models.TextField(blank=True)
     reviewer = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="reviews")
     at = models.DateTimeField(default=timezone.now)
+
+    append_only = AppendOnly("a verdict is never changed or removed: say another one")
 
     class Meta:
         ordering = ("-at",)

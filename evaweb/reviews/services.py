@@ -11,14 +11,13 @@ from django.db import transaction
 from django.db.models.functions import Now
 from django.utils import timezone
 
-from evaweb.episodes.jsonl import append_line, text
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
-from evaweb.reviews.folders import reviews_file
-from evaweb.reviews.kept import removal_line, review_line, segment_line
+from evaweb.journal import text
 from evaweb.reviews.models import DECIDES, Review, Segment, Standing, Verdict
+from evaweb.reviews.record import REVIEWS, RemovalLine, ReviewLine, SegmentLine
 from evaweb.roles import Role, require, role_of
 
 LONGEST_NOTE = 8000  # characters
@@ -43,7 +42,7 @@ def review_add(*, user: Any, episode: Episode, verdict: str, note: str = "") -> 
     if newest is not None and (newest.reviewer, newest.verdict, newest.note) == (user, verdict, note):
         return newest  # said once more, because the answer was lost
     review = Review(episode=episode, verdict=verdict, note=note, reviewer=user, at=timezone.now())
-    append_line(reviews_file(episode.uuid), review_line(review))
+    REVIEWS.append(episode.uuid, ReviewLine.written(review))
     review.save(force_insert=True)
     standing_changed(episode=episode, review=review if verdict in DECIDES else None)
     return review
@@ -79,7 +78,7 @@ def segment_put(
         return there  # marked once more, because the answer was lost
     row = _own(user, episode, segment) if segment else Segment(episode=episode, annotator=user)
     row.first, row.last, row.label, row.milestone, row.at = first, last, label, milestone, timezone.now()
-    append_line(reviews_file(episode.uuid), segment_line(row))
+    REVIEWS.append(episode.uuid, SegmentLine.written(row))
     row.save()
     standing_changed(episode=episode)
     return row
@@ -91,7 +90,8 @@ def segment_remove(*, user: Any, episode: Episode, segment: UUID) -> None:
     require(user, Role.OPERATOR)
     _held(episode)
     row = _own(user, episode, segment)
-    append_line(reviews_file(episode.uuid), removal_line(row, user, timezone.now()))
+    said = {"by": user.get_username(), "at": timezone.now().isoformat()}
+    REVIEWS.append(episode.uuid, RemovalLine.written(row, **said))
     row.delete()
     standing_changed(episode=episode)
 

@@ -10,6 +10,7 @@ from django.core.validators import MaxValueValidator, MinValueValidator, RegexVa
 from django.db import models
 from django.utils import timezone
 
+from evaweb.append_only import AppendOnly
 from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
 from evaweb.trials.tables import check_bench, check_policy, check_tags
@@ -280,6 +281,24 @@ class Trial(models.Model):
     )
     changed_at = models.DateTimeField(auto_now=True)
 
+    append_only = AppendOnly(
+        "of a scored trial it is never changed what was tried, where and by whom",
+        (
+            *(
+                "uuid",
+                "evaluation",
+                "evaluation_version",
+                "checkpoint",
+                "scene",
+                "position",
+                "number",
+                "attempt",
+            ),
+            *("station", "operator", "instruction", "strategy", "seed"),
+        ),
+        only="OLD.status = 'scored'",
+    )
+
     class Meta:
         ordering = ("-prepared_at",)
         constraints = [
@@ -333,6 +352,8 @@ class Score(models.Model):
     source = models.CharField(max_length=16, choices=Source, default=Source.HUMAN)
     scored_at = models.DateTimeField(default=timezone.now)
 
+    append_only = AppendOnly("a score is never changed or removed: a correction is another score")
+
     class Meta:
         ordering = ("trial", "id")
 
@@ -357,6 +378,10 @@ class MilestoneOutcome(models.Model):
     required = models.BooleanField()
     reached = models.BooleanField()
     at_s = models.FloatField(null=True, blank=True, help_text="When, after the start of the run [s].")
+
+    append_only = AppendOnly(
+        "what was scored is never changed or removed: a correction is another score", but=("milestone",)
+    )
 
     class Meta:
         ordering = ("score", "order")

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from evaweb.episodes.services import station_known
 from evaweb.stations.models import Station
-from evaweb.trials.kept import KeptTrial
 from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene
+from evaweb.trials.record import TrialRecord
 from evaweb.trials.services import open_bench
 
 LOST = "Known from recordings alone: the database was lost."
 
 
-def station(facts: KeptTrial) -> Station:
+def station(facts: TrialRecord) -> Station:
     """The station of the trial."""
     return station_known(
         name=facts.station, robot="", simulated=facts.simulated, source=f"trial {facts.uuid}"
     )
 
 
-def evaluation(facts: KeptTrial, station: Station) -> Evaluation:
+def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
     """The trial's evaluation; the open bench of its station takes all versions."""
     if facts.evaluation_kind == Evaluation.Kind.PLAN:
         found, _ = Evaluation.objects.get_or_create(
@@ -32,7 +32,7 @@ def evaluation(facts: KeptTrial, station: Station) -> Evaluation:
     return found
 
 
-def checkpoint(facts: KeptTrial) -> Checkpoint:
+def checkpoint(facts: TrialRecord) -> Checkpoint:
     """The checkpoint of that name."""
     words = f"{LOST} Say again how it is reached, then switch it on."
     found, _ = Checkpoint.objects.get_or_create(
@@ -41,7 +41,7 @@ def checkpoint(facts: KeptTrial) -> Checkpoint:
     return found
 
 
-def scene(facts: KeptTrial) -> Scene:
+def scene(facts: TrialRecord) -> Scene:
     """The scene of that name; milestones it gets from the first scores that are restored."""
     words = f"{LOST} Write down again what counts as success, then switch it on."
     found, _ = Scene.objects.get_or_create(

@@ -24,9 +24,9 @@ from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import Kept, restores
 from evaweb.episodes.selectors import unrecorded_because
 from evaweb.errors import EvaError
+from evaweb.journal import absent
 from evaweb.roles import known_person
 from evaweb.trials import lifecycle, placeholders
-from evaweb.trials.kept import KeptOutcome, KeptScore, KeptTrial, KeptVoid, kept_line, kept_trial
 from evaweb.trials.models import (
     Milestone,
     MilestoneOutcome,
@@ -35,6 +35,7 @@ from evaweb.trials.models import (
     Trial,
     TrialStatus,
 )
+from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, TrialRecord, VoidLine, asked_trial
 from runtime.recording.reader import read_events
 
 log = logging.getLogger(__name__)
@@ -56,7 +57,7 @@ def restore(kept: Kept) -> int:
         return 0
     with transaction.atomic():
         trial, made = _trial(facts, kept, episode)
-        scores = _scores(trial, [line for line in lines if isinstance(line, KeptScore)])
+        scores = _scores(trial, [line for line in lines if isinstance(line, ScoreLine)])
         _judged(trial, lines)
         if made or scores:
             _publish(trial, made=made)
@@ -73,28 +74,27 @@ def _never_ran(trial: Trial) -> str:
     return why and f"trial {trial.pk} is scored and never ran, {why}: void it with a reason"
 
 
-def _judgements(kept: Kept) -> list[KeptScore | KeptVoid]:
+def _judgements(kept: Kept) -> list[ScoreLine | VoidLine]:
     """What its lines say; of a score that was given once more, as the database did not take it, the last."""
-    read = (kept_line(line, number) for number, line in enumerate(kept.lines, start=1))
-    lines = [line for line in read if line is not None]
-    last = {line.uuid: line for line in lines if isinstance(line, KeptScore)}
-    return [line for line in lines if isinstance(line, KeptVoid) or line is last[line.uuid]]
+    lines = JUDGEMENTS.parsed(kept.uuid, kept.lines)
+    last = {line.uuid: line for line in lines if isinstance(line, ScoreLine)}
+    return [line for line in lines if isinstance(line, VoidLine) or line is last[line.uuid]]
 
 
-def _facts(kept: Kept, lines: Sequence[KeptScore | KeptVoid]) -> KeptTrial | None:
+def _facts(kept: Kept, lines: Sequence[ScoreLine | VoidLine]) -> TrialRecord | None:
     """The newest line knows most of its trial; without one it is as its run was asked for."""
     named = {line.trial.uuid for line in lines}
     if len(named) > 1:
         raise EvaError(f"its scores are of several trials: {', '.join(sorted(map(str, named)))}")
     if lines:
         return lines[-1].trial
-    return kept_trial(recorded_in(journal_folder(kept.uuid)).trial) if kept.recorded else None
+    return asked_trial(recorded_in(journal_folder(kept.uuid)).trial) if kept.recorded else None
 
 
 # --- the trial ---------------------------------------------------------------------------------------------
 
 
-def _trial(facts: KeptTrial, kept: Kept, episode: Episode | None) -> tuple[Trial, bool]:
+def _trial(facts: TrialRecord, kept: Kept, episode: Episode | None) -> tuple[Trial, bool]:
     """The trial's row, held, and whether it was made."""
     trial = Trial.objects.select_for_update().filter(uuid=facts.uuid).first()
     if trial is None:
@@ -111,7 +111,7 @@ def _trial(facts: KeptTrial, kept: Kept, episode: Episode | None) -> tuple[Trial
     return trial, False
 
 
-def _episode(facts: KeptTrial, kept: Kept, found: Episode | None) -> Episode | None:
+def _episode(facts: TrialRecord, kept: Kept, found: Episode | None) -> Episode | None:
     """The recording, known as missing where its folder is lost too; a run that was none has the trial's uuid."""
     if found is not None or kept.uuid == facts.uuid:
         return found
@@ -126,7 +126,7 @@ def _episode(facts: KeptTrial, kept: Kept, found: Episode | None) -> Episode | N
     )
 
 
-def _made(facts: KeptTrial, episode: Episode | None) -> Trial:
+def _made(facts: TrialRecord, episode: Episode | None) -> Trial:
     """The row as it was; its id too, where that is free, so that addresses of trials stay valid."""
     station, scene = placeholders.station(facts), placeholders.scene(facts)
     key = {
@@ -139,15 +139,9 @@ def _made(facts: KeptTrial, episode: Episode | None) -> Trial:
     course = _course(facts, episode)
     trial = Trial.objects.create(
         pk=None if Trial.objects.filter(pk=facts.id).exists() else facts.id,
-        uuid=facts.uuid,
         station=station,
         operator=known_person((episode.operator if episode else "") or facts.operator),
-        instruction=facts.instruction,
-        time_limit_s=facts.time_limit_s,
-        strategy=facts.strategy,
-        seed=facts.seed,
-        **key,
-        **(course | _numbered(facts, key, course["reason"])),
+        **(facts.own() | key | course | _numbered(facts, key, course["reason"])),
     )
     prepared_at = facts.prepared_at or course["started_at"] or timezone.now()
     Trial.objects.filter(pk=trial.pk).update(prepared_at=prepared_at)  # `create` takes the present
@@ -155,7 +149,7 @@ def _made(facts: KeptTrial, episode: Episode | None) -> Trial:
     return Trial.objects.get(pk=trial.pk)
 
 
-def _numbered(facts: KeptTrial, key: Mapping[str, Any], reason: str) -> dict[str, Any]:
+def _numbered(facts: TrialRecord, key: Mapping[str, Any], reason: str) -> dict[str, Any]:
     """Its number and attempt; the next number where others were given these since, and the reason says so."""
     same = Trial.objects.filter(**key)
     if not same.filter(number=facts.number, attempt=facts.attempt).exists():
@@ -165,13 +159,14 @@ def _numbered(facts: KeptTrial, key: Mapping[str, Any], reason: str) -> dict[str
     return {"number": newest + 1, "attempt": 1, "reason": f"{reason} ({was})" if reason else was}
 
 
-def _course(facts: KeptTrial, episode: Episode | None) -> dict[str, Any]:
+def _course(facts: TrialRecord, episode: Episode | None) -> dict[str, Any]:
     """How the run went: what is kept of the trial itself first, then what its recording says."""
     ended_at, truth = _end(episode) if episode else (None, None)
     exact = episode.duration_s if episode else None
     missing = episode is None or episode.status == EpisodeStatus.MISSING
     whole = missing or (episode.status == EpisodeStatus.FINISHED and episode.frames > 0)
     return {
+        **facts.course(),
         "episode": episode,
         "status": TrialStatus.ENDED if whole else TrialStatus.INTERRUPTED,
         "reason": facts.reason or (episode.reason if episode else ""),
@@ -195,49 +190,34 @@ def _end(episode: Episode) -> tuple[datetime | None, Mapping[str, Any] | None]:
 # --- what was said of it -----------------------------------------------------------------------------------
 
 
-def _scores(trial: Trial, lines: Sequence[KeptScore]) -> int:
+def _scores(trial: Trial, lines: Sequence[ScoreLine]) -> int:
     """Add the scores that are not there."""
-    known = Score.objects.filter(uuid__in=[line.uuid for line in lines])
-    if other := known.exclude(trial=trial).first():
-        raise EvaError(f"its score {other.uuid} is of trial {other.trial_id}")
-    there = set(known.values_list("uuid", flat=True))
-    absent = [line for line in lines if line.uuid not in there]
-    for line in absent:
+    lost = absent(Score, lines, trial=trial)
+    for line in lost:
         _score(trial, line)
-    if absent:
+    if lost:
         trial.verdict = _newest(trial, lines)
         trial.save()
-    return len(absent)
+    return len(lost)
 
 
-def _newest(trial: Trial, lines: Sequence[KeptScore]) -> Score:
+def _newest(trial: Trial, lines: Sequence[ScoreLine]) -> Score:
     """That of the last line; of a trial with scores in two files (its episode was found late) the later one."""
     newest, known = Score.objects.get(uuid=lines[-1].uuid), trial.verdict
     elsewhere = known is not None and known.uuid not in [line.uuid for line in lines]
     return known if known and elsewhere and known.scored_at > newest.scored_at else newest
 
 
-def _score(trial: Trial, line: KeptScore) -> None:
-    score = Score.objects.create(
-        uuid=line.uuid,
-        trial=trial,
-        rater=known_person(line.rater),
-        success=line.success,
-        score=line.score,
-        note=line.note,
-        failure=line.failure,
-        reason=line.reason,
-        source=line.source,
-        scored_at=line.at,
-    )
+def _score(trial: Trial, line: ScoreLine) -> None:
+    score = Score.objects.create(trial=trial, **line.values())
     known = _milestones(trial.scene, line.milestones)
     MilestoneOutcome.objects.bulk_create(
-        MilestoneOutcome(score=score, milestone=known.get((each.order, each.text)), **each.model_dump())
+        MilestoneOutcome(score=score, milestone=known.get((each.order, each.text)), **each.values())
         for each in line.milestones
     )
 
 
-def _milestones(scene: Scene, outcomes: Sequence[KeptOutcome]) -> dict[tuple[int, str], Milestone]:
+def _milestones(scene: Scene, outcomes: Sequence[OutcomeLine]) -> dict[tuple[int, str], Milestone]:
     """The scene's by order and words; a scene that was made here gets those of the first score that has any."""
     if not scene.active and scene.criterion.startswith(placeholders.LOST) and not scene.milestones.exists():
         for each in outcomes:
@@ -245,12 +225,12 @@ def _milestones(scene: Scene, outcomes: Sequence[KeptOutcome]) -> dict[tuple[int
     return {(milestone.order, milestone.text): milestone for milestone in scene.milestones.all()}
 
 
-def _judged(trial: Trial, lines: Sequence[KeptScore | KeptVoid]) -> None:
+def _judged(trial: Trial, lines: Sequence[ScoreLine | VoidLine]) -> None:
     """Move the trial to where its lines have brought it; nothing leaves voided."""
-    void = next((line for line in lines if isinstance(line, KeptVoid)), None)
+    void = next((line for line in lines if isinstance(line, VoidLine)), None)
     if void is not None and trial.status != TrialStatus.VOIDED:
-        trial.status, trial.reason = TrialStatus.VOIDED, void.reason
-        trial.voided_by, trial.voided_at = known_person(void.by), void.at
+        for name, value in {"status": TrialStatus.VOIDED, **void.values()}.items():
+            setattr(trial, name, value)
         trial.save()
     elif lines and trial.status not in _JUDGED:
         trial.status = TrialStatus.SCORED

@@ -13,14 +13,14 @@ from django.db import IntegrityError, transaction
 from django.db.models import Max
 from django.utils import timezone
 
-from evaweb.episodes.jsonl import text
 from evaweb.episodes.selectors import unrecorded_because
 from evaweb.episodes.services import publish_asked
 from evaweb.errors import Conflict, EvaError, NotFound
+from evaweb.journal import text
 from evaweb.roles import Role, require
 from evaweb.stations.commands import identity_of
 from evaweb.stations.models import Station
-from evaweb.trials import journal, lifecycle
+from evaweb.trials import lifecycle
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import (
     Checkpoint,
@@ -32,6 +32,7 @@ from evaweb.trials.models import (
     Trial,
     TrialStatus,
 )
+from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, VoidLine, file_of
 from evaweb.trials.selectors import trial_open
 from evaweb.trials.station_events import run_changed
 from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, Verdict, verdict
@@ -275,7 +276,7 @@ def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
             return held  # asked for once more, because the answer was lost
         lifecycle.apply(held, Move.VOID)
         held.reason, held.voided_by, held.voided_at = why, user, timezone.now()
-        journal.append(held.episode_id or held.uuid, journal.void_line(held))
+        JUDGEMENTS.append(file_of(held), VoidLine.written(held))
         held.save()
         _publish(held)
     trial.refresh_from_db()
@@ -366,7 +367,8 @@ def _keep(trial: Trial, score: Score, found: Verdict) -> None:
         )
         for milestone, reached, at in found.reached
     ]
-    journal.append(trial.episode_id or trial.uuid, journal.score_line(score, outcomes))
+    milestones = [OutcomeLine.written(outcome) for outcome in outcomes]
+    JUDGEMENTS.append(file_of(trial), ScoreLine.written(score, milestones=milestones))
     score.save()
     MilestoneOutcome.objects.bulk_create(outcomes)
     lifecycle.apply(trial, Move.SCORE)

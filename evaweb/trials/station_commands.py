@@ -21,8 +21,8 @@ from evaweb.stations.models import CARRIED_OUT, NOT_CARRIED_OUT, Command
 from evaweb.stations.runtime_client import wire_to
 from evaweb.stations.selectors import last_set_up
 from evaweb.trials import lifecycle
-from evaweb.trials.facts import trial_facts
 from evaweb.trials.models import Checkpoint, Trial, TrialStatus
+from evaweb.trials.record import TrialRecord
 from evaweb.trials.services import checked
 from evaweb.trials.station_events import run_begun
 
@@ -110,7 +110,7 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
 def run_args(trial: Trial, user: User) -> dict[str, Any]:
     """Facts for the episode's manifest, and when the run ends by itself; never simulated or by steps."""
     args: dict[str, Any] = {
-        "trial": trial_facts(trial),
+        "trial": TrialRecord.asked(trial),
         "operator": user.get_username(),
         "mode": "continuous",
     }

@@ -21,6 +21,7 @@ from evaweb.trials import lifecycle, selectors, services
 from evaweb.trials.figures import scene_figures
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import Trial, TrialStatus
+from evaweb.trials.record import labelled
 from evaweb.trials.selectors import TrialFilters
 
 PER_PAGE = 50
@@ -113,6 +114,7 @@ def _trial_page(
         "commands": () if hidden else selectors.commands_of(trial=found),
         "hidden": hidden,
         "laid_out": laid_out(found),
+        "further": labelled(found, sight_for(request)),
         "fault": fault,
         "typed": typed or _as_scored(found),
         "uuid": uuid4(),  # of the score that may be sent from this page, and then be sent again

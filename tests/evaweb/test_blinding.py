@@ -14,9 +14,7 @@ from django.urls import reverse
 from evaweb.api.tokens import token_create
 from evaweb.blinding import sight_of
 from evaweb.plans.blinding_rules import look
-from evaweb.plans.guarded import GUARDS as of_plans
 from evaweb.plans.services import plan_reveal
-from evaweb.trials.guarded import GUARDS as of_trials
 from tests.evaweb.blind_lab import LATENCY, NAMES, SECRETS, Lab
 from tests.evaweb.crawling import QUERIES, crawled, leaks, told_apart, whispers
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
@@ -35,9 +33,7 @@ def _data(settings, tmp_path, monkeypatch):
 def lab(live, runtime, ann, recorded, settings):  # noqa: F811
     """A frozen plan of olga's, a runtime that says secrets, a scene, and an operator."""
     yield Lab(live, runtime, ann, recorded["finished"], settings.DATA_DIR)
-    with unguarded(
-        (*of_plans, *of_trials)
-    ):  # what the database refuses to remove is in the way of the next test
+    with unguarded("plans", "trials"):  # what the database refuses to remove is in the way of the next test
         call_command("flush", verbosity=0, interactive=False, inhibit_post_migrate=True)
 
 

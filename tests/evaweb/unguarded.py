@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from django.apps import apps
 from django.db import connection
 
-from evaweb.append_only import Guard, install, removal
+from evaweb.append_only import guards, install, removal
 
 
 @contextmanager
-def unguarded(guards: tuple[Guard, ...]) -> Iterator[None]:
-    """As for somebody who has the file."""
+def unguarded(*labels: str) -> Iterator[None]:
+    """The tables of these apps, as for somebody who has the file."""
+    declared = [guard for label in labels for guard in guards(apps.get_app_config(label))]
     with connection.cursor() as cursor:
-        for guard in guards:
+        for guard in declared:
             for statement in removal(connection, guard):
                 cursor.execute(statement)
     yield
-    install(connection, guards)
+    install(connection, declared)

@@ -13,18 +13,18 @@ from django.contrib.auth.models import User
 from django.db import IntegrityError, transaction
 from django.db.models import Exists, OuterRef, QuerySet
 
-from evaweb.episodes.jsonl import text
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
+from evaweb.journal import text
 from evaweb.plans.blinding_rules import has_looked
 from evaweb.plans.models import Handout, Plan, PlanState
 from evaweb.plans.seeded_draws import Chance
 from evaweb.results.models import Preference, Rating
-from evaweb.results.ratings import journal
+from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
 from evaweb.results.ratings.video_available import coming, require_seen_on_video, seen
 from evaweb.roles import Role, require
-from evaweb.trials.journal import append
 from evaweb.trials.models import Score, Trial, TrialStatus
+from evaweb.trials.record import file_of
 from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, verdict
 
 _STATES = (PlanState.FROZEN, PlanState.CLOSED, PlanState.REVEALED)
@@ -128,7 +128,7 @@ def rate(
         raise NotAllowed(f"you have seen results of {plan}: a second rater must not know them")
     require_seen_on_video(handout)
     rating = Rating(trial=trial, rater=user, blind=plan.sealed, **said)
-    append(journal.of_trial(trial), journal.rating_line(rating))
+    RATINGS.append(file_of(trial), RatingLine.written(rating))
     return _once(rating, twice)
 
 
@@ -188,7 +188,7 @@ def prefer(*, user: User, plan: Plan, first: str, second: str, outcome: str, why
         raise NotAllowed(f"you have seen results of {plan}: who prefers must not know them")
     require_seen_on_video(one, other)
     row = Preference(plan=plan, first=one.trial, second=other.trial, rater=user, blind=plan.sealed, **said)
-    append(journal.of_trial(other.trial), journal.preference_line(row))
+    RATINGS.append(file_of(other.trial), PreferenceLine.written(row))
     return _once(row, twice)
 
 

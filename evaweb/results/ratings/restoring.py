@@ -1,4 +1,4 @@
-"""Second ratings and preferences that the database has lost, made again from the files of scores; see .journal."""
+"""Second ratings and preferences that the database has lost, made again from the files of scores; see .record."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from evaweb.episodes.reconcile import Kept, restores
 from evaweb.errors import EvaError
 from evaweb.plans.models import Plan
 from evaweb.results.models import Preference, Rating
-from evaweb.results.ratings.journal import KeptPreference, KeptRating, kept_judgement
-from evaweb.roles import known_person
-from evaweb.trials.kept import KeptTrial
+from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
 from evaweb.trials.models import Trial
+from evaweb.trials.record import TrialRecord
 
 log = logging.getLogger(__name__)
 
@@ -21,53 +20,36 @@ log = logging.getLogger(__name__)
 @restores
 def restore(kept: Kept) -> int:
     """Make the rows that are not there; how many that were. The trials themselves were restored before."""
-    made = 0
-    for number, line in enumerate(kept.lines, start=1):
-        found = kept_judgement(line, number)
-        if isinstance(found, KeptRating):
-            made += _rating(found)
-        elif isinstance(found, KeptPreference):
-            made += _preference(found)
-    return made
+    lines = RATINGS.parsed(kept.uuid, kept.lines)
+    return sum(_rating(line) if isinstance(line, RatingLine) else _preference(line) for line in lines)
 
 
 @transaction.atomic
-def _rating(line: KeptRating) -> bool:
+def _rating(line: RatingLine) -> bool:
     if Rating.objects.filter(uuid=line.uuid).exists():
         return False
-    trial, rater = _trial(line.trial), known_person(line.rater)
-    if Rating.objects.filter(trial=trial, rater=rater).exists():
+    trial, said = _trial(line.trial), line.values()
+    if Rating.objects.filter(trial=trial, rater=said["rater"]).exists():
         return False  # written twice: the database took one of them
-    Rating.objects.create(
-        trial=trial,
-        rater=rater,
-        milestones=[list(row) for row in line.milestones],
-        **line.model_dump(include={"uuid", "at", "success", "score", "failure", "note", "blind"}),
-    )
+    Rating.objects.create(trial=trial, **said)
     return True
 
 
 @transaction.atomic
-def _preference(line: KeptPreference) -> bool:
+def _preference(line: PreferenceLine) -> bool:
     if Preference.objects.filter(uuid=line.uuid).exists():
         return False
-    first, second, rater = _trial(line.first), _trial(line.second), known_person(line.rater)
-    if Preference.objects.filter(first=first, second=second, rater=rater).exists():
+    first, second, said = _trial(line.first), _trial(line.second), line.values()
+    if Preference.objects.filter(first=first, second=second, rater=said["rater"]).exists():
         return False
     plan = Plan.objects.filter(name=line.plan, version=line.version).first()
     if plan is None:
         log.warning("preference %s is of plan %s v%d, which is lost", line.uuid, line.plan, line.version)
-    Preference.objects.create(
-        plan=plan,
-        first=first,
-        second=second,
-        rater=rater,
-        **line.model_dump(include={"uuid", "at", "outcome", "why", "blind"}),
-    )
+    Preference.objects.create(plan=plan, first=first, second=second, **said)
     return True
 
 
-def _trial(facts: KeptTrial) -> Trial:
+def _trial(facts: TrialRecord) -> Trial:
     found = Trial.objects.filter(uuid=facts.uuid).first()
     if found is None:
         raise EvaError(

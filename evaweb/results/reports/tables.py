@@ -6,83 +6,53 @@ import json
 from collections import defaultdict
 from collections.abc import Iterator
 from datetime import datetime
-from typing import Any, get_type_hints
+from typing import Any, get_args
 
 from django.db.models import QuerySet
 
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.filters import Chosen
 from evaweb.trials.models import MilestoneOutcome, Trial
+from evaweb.trials.record import COLUMNS as RECORDED
+from evaweb.trials.record import HINTS, TrialRecord
 
 
-class OutcomeRow:
-    """The columns; those of the score are empty where there is none. `milestones` is JSON: [[text, reached], ...]."""
-
-    trial: int
-    uuid: str
-    order: int
-    code: str
-    slot: int
-    block: str
-    checkpoint: str
-    scene: str
-    position: int
-    repetition: int
-    attempt: int
-    why_again: str
-    station: str
-    operator: str
-    status: str
-    reason: str
-    success: bool | None
-    score: float | None
-    milestones: str
-    failure: str | None
-    note: str | None
-    rater: str | None
-    source: str | None
-    scored_at: datetime | None
-    started_at: datetime | None
-    ended_at: datetime | None
-    duration_s: float | None
-    smoothness: float | None
-    smoothness_commanded: float | None
-    episode: str | None
+def _flat(hint: Any) -> Any:
+    """A type as exports have it: numbers, times and whether something is so; all else in words."""
+    kinds = set(get_args(hint)) or {hint}
+    if kinds - {type(None)} <= {bool, int, float, datetime}:
+        return hint
+    return str | None if type(None) in kinds else str
 
 
-COLUMNS: dict[str, Any] = get_type_hints(OutcomeRow)
-_FIELDS = (
-    ("trial", "pk"),
-    ("uuid", "uuid"),
-    ("order", "handout__number"),
-    ("code", "handout__code"),
-    ("slot", "handout__slot__index"),
-    ("block", "handout__slot__block"),
-    ("checkpoint", "checkpoint__name"),
-    ("scene", "scene__name"),
-    ("position", "position__number"),
-    ("repetition", "number"),
-    ("attempt", "attempt"),
-    ("why_again", "handout__reason"),
-    ("station", "station__name"),
-    ("operator", "operator__username"),
-    ("status", "status"),
-    ("reason", "reason"),
-    ("success", "verdict__success"),
-    ("score", "verdict__score"),
-    ("milestones", "verdict_id"),
-    ("failure", "verdict__failure"),
-    ("note", "verdict__note"),
-    ("rater", "verdict__rater__username"),
-    ("source", "verdict__source"),
-    ("scored_at", "verdict__scored_at"),
-    ("started_at", "started_at"),
-    ("ended_at", "ended_at"),
-    ("duration_s", "duration_s"),
-    ("smoothness", "episode__smoothness"),
-    ("smoothness_commanded", "episode__smoothness_commanded"),
-    ("episode", "episode_id"),
+# Of the plan, with where a trial has it; `milestones` is JSON: [[text, reached], ...].
+_OF_PLAN: dict[str, tuple[Any, str]] = {
+    "order": (int, "handout__number"),
+    "slot": (int, "handout__slot__index"),
+    "block": (str, "handout__slot__block"),
+    "why_again": (str, "handout__reason"),
+    "milestones": (str, "verdict_id"),
+    "smoothness": (float | None, "episode__smoothness"),
+    "smoothness_commanded": (float | None, "episode__smoothness_commanded"),
+}
+_CALLED = {"id": "trial", "number": "repetition"}  # columns of the record that have other names here
+# In this order since there are exports; what came later follows.
+_FIRST = (
+    *("trial", "uuid", "order", "code", "slot", "block", "checkpoint", "scene", "position", "repetition"),
+    *("attempt", "why_again", "station", "operator", "status", "reason", "success", "score", "milestones"),
+    *("failure", "note", "rater", "source", "scored_at", "started_at", "ended_at", "duration_s"),
+    *("smoothness", "smoothness_commanded", "episode"),
 )
+_ALL = _OF_PLAN | {
+    _CALLED.get(name, name): (_flat(HINTS[name]), TrialRecord.path_of(name))
+    for name, column in RECORDED.items()
+    if column.table
+}
+_ORDER = dict.fromkeys((*_FIRST, *_ALL))
+COLUMNS: dict[str, Any] = {name: _ALL[name][0] for name in _ORDER}
+"""The columns of an export with their types; those of the score are empty where there is none."""
+_FIELDS = [_ALL[name][1] for name in _ORDER]
+_TEXTS = [name for name, hint in COLUMNS.items() if hint in (str, str | None)]
 PAGE = 1000
 
 
@@ -120,13 +90,12 @@ def _attempts(plan: Plan, which: Chosen | None) -> QuerySet[Trial]:
 
 
 def _rows(attempts: QuerySet[Trial]) -> list[dict[str, Any]]:
-    rows = attempts.values_list(*(field for _, field in _FIELDS))
+    rows = attempts.values_list(*_FIELDS)
     found = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
     reached = _milestones([row["milestones"] for row in found if row["milestones"]])
     for row in found:
         row["milestones"] = json.dumps(reached.get(row["milestones"], []), ensure_ascii=False)
-        row["uuid"], row["block"] = str(row["uuid"]), str(row["block"])
-        row["episode"] = str(row["episode"]) if row["episode"] else None
+        row |= {name: str(row[name]) for name in _TEXTS if row[name] is not None}
     return found
 
 

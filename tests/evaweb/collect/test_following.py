@@ -7,17 +7,15 @@ from uuid import uuid4
 
 import pytest
 from django.contrib.auth.models import User
-from django.db import connection
 
-from evaweb.append_only import install, removal
 from evaweb.collect import services
 from evaweb.collect import station_events as following
-from evaweb.collect.guarded import GUARDS
-from evaweb.collect.kept import session_file
 from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
+from evaweb.collect.record import SESSIONS
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
 from tests.evaweb.collect.conftest import SETUP, Demonstrate, labelled
+from tests.evaweb.unguarded import unguarded
 
 pytestmark = pytest.mark.django_db
 
@@ -43,14 +41,10 @@ def test_what_is_of_no_session_is_left_alone(data_of: dict, session: CollectSess
 
 def lost() -> None:
     """The database, but for its guards' opinion."""
-    with connection.cursor() as cursor:
-        for guard in GUARDS:
-            for statement in removal(connection, guard):
-                cursor.execute(statement)
-    Demonstration.objects.all().delete()
-    SessionEvent.objects.all().delete()
-    CollectSession.objects.all().delete()
-    install(connection, GUARDS)
+    with unguarded("collect"):
+        Demonstration.objects.all().delete()
+        SessionEvent.objects.all().delete()
+        CollectSession.objects.all().delete()
 
 
 def test_sessions_and_labels_come_back_from_the_disk(
@@ -74,7 +68,7 @@ def test_without_its_own_file_a_session_is_what_its_episodes_say(
     session: CollectSession, demonstrate: Demonstrate
 ) -> None:
     made = demonstrate("partial")
-    session_file(session.pk).unlink()
+    SESSIONS.path(session.pk).unlink()
     lost()
     assert reconcile().problems == ()
     again = CollectSession.objects.get()

@@ -10,8 +10,8 @@ from django.contrib.auth.models import User
 from django.db import IntegrityError, connection
 
 from evaweb.collect import selectors, services
-from evaweb.collect.kept import session_file
 from evaweb.collect.models import CollectSession
+from evaweb.collect.record import SESSIONS
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.django_db
 
 
 def kinds(session: CollectSession) -> list[str]:
-    return [json.loads(line)["kind"] for line in session_file(session.pk).read_text().splitlines()]
+    return [json.loads(line)["kind"] for line in SESSIONS.path(session.pk).read_text().splitlines()]
 
 
 def test_a_session_has_the_set_up_of_its_station_and_a_line_on_the_disk(
@@ -37,7 +37,7 @@ def test_a_session_has_the_set_up_of_its_station_and_a_line_on_the_disk(
         20,
         SETUP,
     )
-    line = json.loads(session_file(session.pk).read_text())
+    line = json.loads(SESSIONS.path(session.pk).read_text())
     assert (line["kind"], line["by"], line["station"], line["setup"]) == ("opened", "ann", "bench", SETUP)
     assert [event.kind for event in session.events.all()] == ["opened"]
 

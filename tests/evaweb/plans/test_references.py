@@ -13,7 +13,6 @@ from django.urls import reverse
 from evaweb.errors import EvaError
 from evaweb.plans import pictures, references
 from evaweb.plans.exchange import exported, exported_with_pictures, imported
-from evaweb.plans.guarded import GUARDS
 from evaweb.plans.models import Reference
 from evaweb.plans.references import unpacked
 from tests.evaweb.plans.lab import jpeg
@@ -44,7 +43,7 @@ def taken(bench, owner):
 
 
 def lose():
-    with unguarded(GUARDS):
+    with unguarded("plans"):
         Reference.objects.all().delete()
 
 

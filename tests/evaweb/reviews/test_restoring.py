@@ -5,14 +5,13 @@ import json
 import pytest
 from django.contrib.auth.models import User
 
-from evaweb.append_only import removal
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
 from evaweb.reviews import services
-from evaweb.reviews.guarded import GUARDS
 from evaweb.reviews.models import Review, Segment, Standing
+from tests.evaweb.unguarded import unguarded
 
 pytestmark = pytest.mark.django_db
 
@@ -50,14 +49,9 @@ def spoken(closed, ann, bob):
 
 def lose():
     """All rows, as a database that was lost has none; no trigger stands in the way."""
-    from django.db import connection
-
-    with connection.cursor() as cursor:
-        for guard in GUARDS:
-            for statement in removal(connection, guard):
-                cursor.execute(statement)
-    for model in (Standing, Segment, Review, Episode, Job, User):
-        model.objects.all().delete()
+    with unguarded("reviews"):
+        for model in (Standing, Segment, Review, Episode, Job, User):
+            model.objects.all().delete()
 
 
 def test_what_was_said_comes_back_from_the_disk(spoken):

@@ -5,7 +5,7 @@ import json
 import pytest
 from django.db import DatabaseError, transaction
 
-from evaweb.episodes import jsonl as disk
+from evaweb import journal as disk
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.reviews import selectors, services

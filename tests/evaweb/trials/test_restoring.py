@@ -21,8 +21,7 @@ from evaweb.episodes.services import episode_closed
 from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Command, Station
-from evaweb.trials import journal, restoring, services
-from evaweb.trials.guarded import GUARDS
+from evaweb.trials import restoring, services
 from evaweb.trials.models import (
     Checkpoint,
     Evaluation,
@@ -33,6 +32,7 @@ from evaweb.trials.models import (
     Score,
     Trial,
 )
+from evaweb.trials.record import JUDGEMENTS
 from evaweb.trials.selectors import statistics, trial_get, trial_list
 from evaweb.trials.station_commands import trial_command
 from runtime.recording.export import export
@@ -134,7 +134,7 @@ class Lab:
 
 def lose(*models):
     """All rows of these are gone, as with the file they were in."""
-    with unguarded(GUARDS):
+    with unguarded("trials"):
         Trial.objects.update(verdict=None)
         for model in models:
             model.objects.all().delete()
@@ -215,7 +215,7 @@ def test_a_score_that_the_database_took_at_the_second_time_comes_back_once(lab, 
         with pytest.raises(OperationalError):
             lab.score(trial, True, True, True, uuid=uuid, note="first")
     lab.score(trial, True, True, True, uuid=uuid, note="again")
-    assert journal.path_of(trial.episode_id).read_text().count(str(uuid)) == 2
+    assert JUDGEMENTS.path(trial.episode_id).read_text().count(str(uuid)) == 2
     lose(*RECORDS)
     assert reconcile().problems == ()
     assert list(Score.objects.values_list("uuid", "note")) == [(uuid, "again")]
@@ -380,9 +380,9 @@ def test_a_score_of_another_trial_is_named(lab):
     first = lab.run()
     lab.score(first, True, True, True)
     second = lab.run()
-    line = json.loads(journal.path_of(first.episode_id).read_text())
+    line = json.loads(JUDGEMENTS.path(first.episode_id).read_text())
     told = line | {"trial": line["trial"] | {"uuid": str(second.uuid), "id": second.pk}}
-    journal.path_of(second.episode_id).write_text(json.dumps(told) + "\n")
+    JUDGEMENTS.path(second.episode_id).write_text(json.dumps(told) + "\n")
     (problem,) = reconcile().problems
     assert f"its score {line['uuid']} is of trial {first.pk}" in problem
     assert Trial.objects.get(pk=second.pk).status != "scored"
@@ -392,7 +392,7 @@ def test_a_line_cut_in_half_is_left_out_and_told(lab):
     trial = lab.run()
     lab.score(trial, True, False, False)
     lab.score(trial, True, True, True, reason="seen on the video")
-    file = journal.path_of(trial.episode_id)
+    file = JUDGEMENTS.path(trial.episode_id)
     first, second = file.read_bytes().splitlines()
     file.write_bytes(first + b"\n" + second[: len(second) // 2])
     lose(*RECORDS)
@@ -417,7 +417,7 @@ def test_a_line_that_says_what_cannot_be_is_told_and_keeps_no_other_run(lab, nam
     lab.score(damaged, True, True, True)
     whole = lab.run()
     lab.score(whole, True, True, True)
-    file = journal.path_of(damaged.episode_id)
+    file = JUDGEMENTS.path(damaged.episode_id)
     file.write_text(json.dumps(json.loads(file.read_text()) | {name: value}) + "\n")
     lose(*RECORDS)
     (problem,) = reconcile().problems
@@ -431,8 +431,8 @@ def test_lines_of_several_trials_in_one_file_are_told(lab):
     lab.score(first, True, True, True)
     second = lab.run()
     lab.score(second, True, True, True)
-    other = journal.path_of(second.episode_id)
-    other.write_bytes(other.read_bytes() + journal.path_of(first.episode_id).read_bytes())
+    other = JUDGEMENTS.path(second.episode_id)
+    other.write_bytes(other.read_bytes() + JUDGEMENTS.path(first.episode_id).read_bytes())
     lose(*RECORDS)
     (problem,) = reconcile().problems
     assert f"run {second.episode_id}: its scores are of several trials" in problem
@@ -462,10 +462,12 @@ def test_a_run_that_was_no_trial_stays_none(lab):
 def test_a_score_that_only_the_disk_has_counts_and_is_published(lab):
     trial = lab.run()
     lab.score(trial, True, False, False)
-    line = json.loads(journal.path_of(trial.episode_id).read_text())
+    line = json.loads(JUDGEMENTS.path(trial.episode_id).read_text())
     Job.objects.all().delete()
     uuid = str(uuid4())
-    journal.append(trial.episode_id, line | {"uuid": uuid, "success": True, "score": 1.0, "reason": "again"})
+    JUDGEMENTS.append(
+        trial.episode_id, line | {"uuid": uuid, "success": True, "score": 1.0, "reason": "again"}
+    )
     assert reconcile().restored == 1
     found = Trial.objects.get()
     assert (str(found.verdict.uuid), found.scores.count()) == (uuid, 2)

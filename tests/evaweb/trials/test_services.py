@@ -6,14 +6,15 @@ import pytest
 from django.db import IntegrityError, connection, transaction
 from django.db.models import ProtectedError
 
-from evaweb.episodes import jsonl as disk
+from evaweb import journal as disk
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import unrecorded_because
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
-from evaweb.trials import journal, services
+from evaweb.trials import services
 from evaweb.trials.lifecycle import MOVES, Move
 from evaweb.trials.models import Checkpoint, Evaluation, Milestone, Position, Score, Trial, TrialStatus
+from evaweb.trials.record import JUDGEMENTS
 from evaweb.trials.selectors import statistics
 from runtime.recording.base import Outcome
 from tests.evaweb.trials import builders
@@ -23,7 +24,7 @@ from tests.runtime.recording.test_episode import begun
 
 
 def lines(uuid):
-    return [json.loads(line) for line in journal.path_of(uuid).read_text("utf-8").splitlines()]
+    return [json.loads(line) for line in JUDGEMENTS.path(uuid).read_text("utf-8").splitlines()]
 
 
 def score(bench, trial, *reached, **given):
@@ -336,7 +337,7 @@ def test_what_has_not_ended_or_does_not_count_cannot_be_scored(bench, status):
     Trial.objects.filter(pk=trial.pk).update(status=status)
     with pytest.raises(Conflict, match="cannot be scored"):
         score(bench, trial)
-    assert not journal.path_of(trial.uuid).exists()
+    assert not JUDGEMENTS.path(trial.uuid).exists()
 
 
 def test_an_interrupted_trial_can_be_scored_until_it_is_repeated(bench):
@@ -388,7 +389,7 @@ def test_what_left_no_recorded_row_is_never_scored_and_can_be_voided(bench, stat
         Conflict, match=f"trial {trial.pk} cannot be scored: {why}.*; what never ran is voided"
     ):
         score(bench, trial)
-    assert not journal.path_of(trial.episode_id or trial.uuid).exists()
+    assert not JUDGEMENTS.path(trial.episode_id or trial.uuid).exists()
     assert [row.summary.success.n for row in statistics()] == [0]
     assert services.trial_void(user=bench.operator, trial=trial, reason="it never ran").status == "voided"
 
@@ -415,11 +416,11 @@ def test_a_correction_of_what_counted_already_needs_no_recording_any_more(bench)
 
 def test_a_line_that_was_torn_by_a_crash_stays_a_line_of_its_own():
     uuid = uuid4()
-    journal.append(uuid, {"n": 1})
-    with journal.path_of(uuid).open("ab") as file:
+    JUDGEMENTS.append(uuid, {"n": 1})
+    with JUDGEMENTS.path(uuid).open("ab") as file:
         file.write(b'{"n": 2, "to')
-    journal.append(uuid, {"n": 3})
-    assert journal.path_of(uuid).read_bytes().split(b"\n") == [b'{"n":1}', b'{"n": 2, "to', b'{"n":3}', b""]
+    JUDGEMENTS.append(uuid, {"n": 3})
+    assert JUDGEMENTS.path(uuid).read_bytes().split(b"\n") == [b'{"n":1}', b'{"n": 2, "to', b'{"n":3}', b""]
 
 
 def test_what_cannot_be_written_to_the_disk_is_no_score(bench, monkeypatch):

@@ -1,6 +1,6 @@
 import pytest
 
-from evaweb.episodes import jsonl as lines
+from evaweb import journal as lines
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode
 from evaweb.errors import Conflict, EvaError, NotAllowed

@@ -1,0 +1,37 @@
+"""The lines of DATA/sessions/<uuid>.jsonl: what happened to a session of collecting."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import AwareDatetime, Field
+
+from evaweb.collect.models import SessionEvent
+from evaweb.journal import From, Journal, Line, Person
+
+_OPENED = ("station", "dataset", "task", "setup")  # what never changes
+
+
+class EventLine(Line):
+    """One line; the first one, `opened`, has all that never changes as well."""
+
+    ELSEWHERE: ClassVar = frozenset[str]()
+
+    kind: Literal["opened", "closed", "resumed", "target", "published"]
+    by: Annotated[Person, From("by__username")]
+    at: AwareDatetime
+    text: str = ""
+    target: Annotated[Annotated[int, Field(ge=1, lt=2**31)] | None, From("session__target")] = None
+    station: Annotated[str, From("session__station__name")] = ""
+    dataset: Annotated[str, From("session__dataset")] = ""
+    task: Annotated[str, From("session__task")] = ""
+    setup: Annotated[dict[str, Any], From("session__setup")] = Field(default_factory=dict)
+
+    @classmethod
+    def written(cls, row: SessionEvent, **given: Any) -> dict[str, Any]:
+        """Of `opened` and `target` as the session is from then on."""
+        without = {"opened": (), "target": _OPENED}.get(row.kind, ("target", *_OPENED))
+        return {name: value for name, value in super().written(row).items() if name not in without}
+
+
+SESSIONS = Journal("sessions", "session {uuid}", EventLine)

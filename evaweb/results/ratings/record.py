@@ -1,0 +1,64 @@
+"""Second ratings and preferences as lines of an episode's own journal of verdicts.
+
+They lie beside its scores, DATA/scores/UUID.jsonl: a rating with the trial that it is of, a preference with the one
+that was run second, when the other one was there already. Nothing serves these files.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from pydantic import AwareDatetime, Field, StrictBool
+
+from evaweb.journal import From, Journal, Line, Person
+from evaweb.results.models import Preference, Rating
+from evaweb.trials.record import Name, TrialRecord
+
+
+class RatingLine(Line):
+    """A second rating."""
+
+    kind: Literal["rating"] = "rating"
+    uuid: UUID
+    trial: TrialRecord
+    rater: Annotated[Person, From("rater__username")]
+    at: AwareDatetime
+    success: StrictBool
+    score: Annotated[float, Field(ge=0, le=1)]
+    milestones: tuple[tuple[str, StrictBool], ...] = ()
+    failure: Annotated[str, Field(max_length=60)] = ""
+    note: str = ""
+    blind: StrictBool
+
+    @classmethod
+    def written(cls, row: Rating, **given: Any) -> dict[str, Any]:
+        """The line of a rating that is about to be saved."""
+        return super().written(row, trial=TrialRecord.asked(row.trial), **given)
+
+
+class PreferenceLine(Line):
+    """A preference; `plan` and `version` name the plan that it is of."""
+
+    kind: Literal["preference"] = "preference"
+    uuid: UUID
+    plan: Annotated[Name, From("plan__name")]
+    version: Annotated[int, Field(ge=1, lt=2**31), From("plan__version")]
+    first: TrialRecord
+    second: TrialRecord
+    rater: Annotated[Person, From("rater__username")]
+    at: AwareDatetime
+    outcome: Preference.Outcome
+    why: str
+    blind: StrictBool
+
+    @classmethod
+    def written(cls, row: Preference, **given: Any) -> dict[str, Any]:
+        """The line of a preference that is about to be saved."""
+        pair = {name: TrialRecord.asked(getattr(row, name)) for name in ("first", "second")}
+        return super().written(row, **pair, **given)
+
+
+RATINGS: Journal[RatingLine | PreferenceLine] = Journal(
+    "scores", "its scores", RatingLine, PreferenceLine, shared=True
+)

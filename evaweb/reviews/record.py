@@ -1,0 +1,61 @@
+"""The lines of DATA/reviews/<uuid>.jsonl: verdicts and notes, and the parts of an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+from uuid import UUID
+
+from pydantic import AwareDatetime, Field
+
+from evaweb.journal import From, Journal, Line, Person
+
+_Frame = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+class ReviewLine(Line):
+    """A verdict, or a note."""
+
+    kind: Literal["review"] = "review"
+    uuid: UUID
+    verdict: Literal["pass", "fail", "note"]
+    note: str = ""
+    by: Annotated[Person, From("reviewer__username")]
+    at: AwareDatetime
+
+
+class SegmentLine(Line):
+    """A part of the episode as it was from then on."""
+
+    kind: Literal["segment"] = "segment"
+    uuid: UUID
+    first: _Frame
+    last: _Frame
+    label: Annotated[str, Field(min_length=1, max_length=120)]
+    milestone: Annotated[str, Field(max_length=200)] = ""
+    by: Annotated[Person, From("annotator__username")]
+    at: AwareDatetime
+
+
+class RemovalLine(Line):
+    """A part that somebody took away again."""
+
+    kind: Literal["segment_removed"] = "segment_removed"
+    uuid: UUID
+    by: Person
+    at: AwareDatetime
+
+
+AnyReview = ReviewLine | SegmentLine | RemovalLine
+REVIEWS: Journal[AnyReview] = Journal("reviews", "its reviews", ReviewLine, SegmentLine, RemovalLine)
+
+
+def segments_of(lines: Sequence[AnyReview]) -> list[SegmentLine]:
+    """The segments that stand after all lines, in the order of their frames."""
+    found: dict[UUID, SegmentLine] = {}
+    for line in lines:
+        if isinstance(line, SegmentLine):
+            found[line.uuid] = line
+        elif isinstance(line, RemovalLine):
+            found.pop(line.uuid, None)
+    return sorted(found.values(), key=lambda segment: (segment.first, segment.last, segment.at))

@@ -1,0 +1,228 @@
+"""A trial's record: what it has, where it is written and shown, and to whom; and the lines of what was said of it.
+
+`TrialRecord` declares every column once. Manifests and scores files, restoring, REST, CSV, Parquet and the tables of
+results are made from it; a column is a field of models.Trial and one here (docs/contributing.md).
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from uuid import UUID
+
+from pydantic import AwareDatetime, Field, StrictBool
+
+from evaweb.blinding import HIDDEN, Sight, code_of
+from evaweb.journal import From, Journal, Line, Person, checked, value_at
+from evaweb.trials.models import Evaluation, Score, Trial, TrialStatus
+
+Name = Annotated[str, Field(min_length=1, max_length=120)]
+_Count = Annotated[int, Field(ge=0, lt=2**31)]
+_Small = Annotated[int, Field(ge=0, lt=2**15)]
+_Seconds = Annotated[float, Field(allow_inf_nan=False)]
+
+
+@dataclass(frozen=True, slots=True)
+class Column(From):
+    """One column: `path` is where a trial has it, "" under its own name.
+
+    While it is hidden from somebody which checkpoint a trial is of, a column that is not `open` is hidden too, or is
+    what `seen` says.
+    """
+
+    path: str = ""
+    open: bool = False  # it tells nothing of the checkpoint
+    seen: Callable[[Sight, Trial], Any] | None = None
+    written: Literal["before", "after", "never"] = (
+        "before"  # the run: manifests have what is written before it
+    )
+    api: Literal["list", "detail", "never"] = "list"  # from "list" CSV and Parquet too
+    table: bool = True  # in the tables of a plan's results
+    type: Any = None  # as it is shown; None: as it is read
+    label: str = ""  # on the trial's page; "" where that shows it otherwise, or not
+
+    def shown(self, name: str, hint: Any, trial: Trial, sight: Sight) -> Any:
+        """Its value as somebody may see it."""
+        if self.seen is not None:
+            return self.seen(sight, trial)
+        if self.open or not sight.hides(trial):
+            return value_at(trial, self.path or name)
+        return None if type(None) in get_args(hint) else HIDDEN
+
+
+class TrialRecord(Line):
+    """A trial, its columns in the order in which they are shown; what is not written is empty where it was read."""
+
+    id: Annotated[Annotated[int, Field(gt=0, lt=2**63)] | None, Column("pk", open=True, type=int)] = None
+    uuid: Annotated[UUID, Column(open=True)]
+    evaluation: Annotated[Name, Column("evaluation__name", open=True, table=False)]
+    evaluation_kind: Annotated[
+        Evaluation.Kind, Column("evaluation__kind", open=True, api="never", table=False)
+    ] = Evaluation.Kind.OPEN_BENCH
+    version: Annotated[_Count, Column("evaluation_version", open=True, table=False)]
+    station: Annotated[str, Field(min_length=1, max_length=63), Column("station__name", open=True)]
+    simulated: Annotated[StrictBool, Column("station__simulated", open=True, api="never", table=False)] = (
+        False
+    )
+    scene: Annotated[
+        str, Field(min_length=1, max_length=60, pattern=r"^[-\w]+$"), Column("scene__name", open=True)
+    ]
+    position: Annotated[_Small, Column("position__number", open=True)]
+    checkpoint: Annotated[Name, Column("checkpoint__name", seen=Sight.label)]
+    code: Annotated[
+        str, Column("handout__code", seen=lambda sight, trial: code_of(trial), written="never")
+    ] = ""
+    number: Annotated[_Count, Column(open=True)]
+    attempt: Annotated[_Small, Column(open=True)]
+    status: Annotated[TrialStatus | None, Column(open=True, written="never", type=TrialStatus)] = None
+    reason: Annotated[str, Column(seen=Sight.reason, written="after")] = ""
+    success: Annotated[bool | None, Column("verdict__success", open=True, written="never")] = None
+    score: Annotated[float | None, Column("verdict__score", open=True, written="never")] = None
+    duration_s: Annotated[_Seconds | None, Column(open=True, written="after")] = None
+    note: Annotated[str | None, Column("verdict__note", open=True, written="never")] = None
+    failure: Annotated[str | None, Column("verdict__failure", open=True, written="never")] = None
+    rater: Annotated[str | None, Column("verdict__rater__username", open=True, written="never")] = None
+    source: Annotated[str | None, Column("verdict__source", open=True, written="never")] = None
+    scored_at: Annotated[datetime | None, Column("verdict__scored_at", open=True, written="never")] = None
+    operator: Annotated[str, Field(max_length=150), Column("operator__username", open=True)] = ""
+    instruction: Annotated[str, Column(open=True, table=False)]
+    seed: Annotated[_Count | None, Column(open=True, table=False)] = None
+    strategy: Annotated[dict[str, Any] | None, Column(api="never", table=False)] = None
+    time_limit_s: Annotated[_Seconds | None, Column(open=True, table=False)] = None
+    prepared_at: Annotated[AwareDatetime | None, Column(open=True, table=False, type=datetime)] = None
+    started_at: Annotated[AwareDatetime | None, Column(open=True, written="after")] = None
+    ended_at: Annotated[AwareDatetime | None, Column(open=True, written="after")] = None
+    episode: Annotated[UUID | None, Column("episode_id", open=True, written="never")] = None
+    truth: Annotated[dict[str, Any] | None, Column(open=True, written="after", api="detail", table=False)] = (
+        None
+    )
+    voided_by: Annotated[
+        str | None, Column("voided_by__username", open=True, written="never", api="detail", table=False)
+    ] = None
+    voided_at: Annotated[datetime | None, Column(open=True, written="never", api="detail", table=False)] = (
+        None
+    )
+
+    @classmethod
+    def names(cls) -> Iterable[str]:
+        """What is written of it."""
+        return [name for name, column in COLUMNS.items() if column.written != "never"]
+
+    @classmethod
+    def asked(cls, trial: Trial) -> dict[str, Any]:
+        """The trial as its run is asked for, for the manifest: the uuid tells it from those of other databases."""
+        whole = cls.written(trial)
+        return {name: value for name, value in whole.items() if COLUMNS[name].written == "before"}
+
+    def own(self) -> dict[str, Any]:
+        """What was known before its run, as fields of models.Trial; without its id, and without other rows."""
+        return self._fields("before")
+
+    def course(self) -> dict[str, Any]:
+        """How its run went, as fields of models.Trial."""
+        return self._fields("after")
+
+    def _fields(self, when: str) -> dict[str, Any]:
+        mine = {name: self.path_of(name) for name, column in COLUMNS.items() if column.written == when}
+        return {path: getattr(self, name) for name, path in mine.items() if path != "pk" and "__" not in path}
+
+
+COLUMNS: Mapping[str, Column] = {
+    name: next(each for each in field.metadata if isinstance(each, Column))
+    for name, field in TrialRecord.model_fields.items()
+}
+
+
+def _shown_as(annotation: Any) -> Any:
+    """A type without what is asked of a value that is read."""
+    if get_origin(annotation) is Annotated:
+        return _shown_as(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, types.UnionType):
+        return Union[tuple(map(_shown_as, get_args(annotation)))]  # noqa: UP007  made of a list
+    return datetime if annotation is AwareDatetime else annotation
+
+
+HINTS: Mapping[str, Any] = {
+    name: column.type or _shown_as(TrialRecord.model_fields[name].annotation)
+    for name, column in COLUMNS.items()
+}
+"""The types of the columns, as they are shown."""
+
+
+def api_columns(where: Literal["list", "detail"]) -> dict[str, Any]:
+    """The columns of one trial in a list, or those that a single one has beside them, with their types."""
+    return {name: HINTS[name] for name, column in COLUMNS.items() if column.api == where}
+
+
+def shown(trial: Trial, sight: Sight, names: Iterable[str]) -> dict[str, Any]:
+    """The trial as somebody may see it."""
+    return {name: COLUMNS[name].shown(name, HINTS[name], trial, sight) for name in names}
+
+
+def labelled(trial: Trial, sight: Sight) -> Iterator[tuple[str, Any]]:
+    """What the trial's page shows of itself, as somebody may see it."""
+    for name, column in COLUMNS.items():
+        if column.label:
+            yield column.label, column.shown(name, HINTS[name], trial, sight)
+
+
+# --- DATA/scores/<uuid>.jsonl: every verdict on an episode, or on a trial that was not recorded ------------------
+
+
+class OutcomeLine(Line):
+    """A milestone as it was when it was scored."""
+
+    order: _Small
+    text: Annotated[str, Field(max_length=200)]
+    points: _Small
+    required: StrictBool
+    reached: StrictBool
+    at_s: _Seconds | None = None
+
+
+class ScoreLine(Line):
+    """A score."""
+
+    kind: Literal["score"] = "score"
+    uuid: UUID
+    trial: TrialRecord
+    rater: Annotated[Person, From("rater__username")]
+    at: Annotated[AwareDatetime, From("scored_at")]
+    success: StrictBool
+    score: Annotated[float, Field(ge=0, le=1)]
+    note: str = ""
+    failure: Annotated[str, Field(max_length=60)] = ""
+    reason: str = ""
+    source: Score.Source = Score.Source.HUMAN
+    milestones: Annotated[tuple[OutcomeLine, ...], From("outcomes__all")] = ()
+
+
+class VoidLine(Line):
+    """A trial taken out of the count."""
+
+    kind: Literal["void"] = "void"
+    trial: TrialRecord
+    by: Annotated[Person, From("voided_by__username")]
+    reason: str
+    at: Annotated[AwareDatetime, From("voided_at")]
+
+    @classmethod
+    def written(cls, row: Trial, **given: Any) -> dict[str, Any]:
+        """The line of a trial that is about to be saved as voided."""
+        return super().written(row, trial=TrialRecord.written(row), **given)
+
+
+JUDGEMENTS: Journal[ScoreLine | VoidLine] = Journal("scores", "its scores", ScoreLine, VoidLine, shared=True)
+
+
+def file_of(trial: Trial) -> UUID:
+    """What the file of a trial's verdicts is named by."""
+    return trial.episode_id or trial.uuid
+
+
+def asked_trial(asked: Mapping[str, Any]) -> TrialRecord | None:
+    """The trial that a manifest names; None where its run was none of ours."""
+    return checked(TrialRecord, asked, "the manifest's trial: ") if "uuid" in asked else None
