@@ -13,7 +13,7 @@ from robots.broken_pipe import unread_ends
 from runtime.clients.client import Refused, StationClient
 from runtime.clients.terminal import aims, watching
 from runtime.clients.terminal.arguments import arguments
-from runtime.clients.terminal.attendance import LASTING, attend
+from runtime.clients.terminal.command_follower import LASTING, attend
 from runtime.clients.terminal.figures import line, report, tuning
 from runtime.clients.terminal.settling import settle
 from runtime.clients.terminal.syntax import parse

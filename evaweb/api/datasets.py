@@ -11,7 +11,7 @@ from ninja import Router, Schema, Status
 
 from evaweb.api.answers import FAILURES
 from evaweb.api.jobs import JobOut
-from evaweb.datasets import listing, orders, work
+from evaweb.datasets import dataset_jobs, listing, orders
 from evaweb.datasets.finding import Overview, overview, overviews
 from evaweb.errors import Conflict
 from runtime.recording.files import RecordingError
@@ -47,7 +47,7 @@ class DatasetOut(Schema):
     def of(found: Overview) -> dict[str, Any]:
         """With what its newest check found."""
         own = [name for name in DatasetOut.model_fields if name != "check"]
-        checked = None if found.problem else work.checked(found.name)
+        checked = None if found.problem else dataset_jobs.checked(found.name)
         check = checked and {name: getattr(checked, name) for name in CheckOut.model_fields}
         return {**{name: getattr(found, name) for name in own}, "check": check}
 

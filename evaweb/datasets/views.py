@@ -12,7 +12,7 @@ from django.shortcuts import redirect, render
 from django.views.decorators.http import require_GET, require_POST
 
 import robots
-from evaweb.datasets import listing, orders, work
+from evaweb.datasets import dataset_jobs, listing, orders
 from evaweb.datasets.finding import overview, overviews
 from evaweb.errors import Conflict, EvaError
 from evaweb.roles import Role, role_of
@@ -26,7 +26,7 @@ FILTERS = ("words", "success", "verdict")
 @require_GET
 def dataset_list(request: HttpRequest) -> HttpResponse:
     """All datasets of the data folder."""
-    rows = [(one, None if one.problem else work.checked(one.name)) for one in overviews()]
+    rows = [(one, None if one.problem else dataset_jobs.checked(one.name)) for one in overviews()]
     context = {"rows": rows, "name": "", **_work(""), **_rights(request)}
     return render(request, "datasets/list.html", context)
 
@@ -47,7 +47,7 @@ def dataset(request: HttpRequest, name: str) -> HttpResponse:
     context = {
         "dataset": found,
         "problem": problem,
-        "checked": None if problem else work.checked(name),
+        "checked": None if problem else dataset_jobs.checked(name),
         "page": Paginator(rows, PER_PAGE).get_page(request.GET.get("page")),
         "chosen": chosen,
         "narrowed": any(chosen.values()),
@@ -81,7 +81,7 @@ def dataset_ask(request: HttpRequest) -> HttpResponse:
     except EvaError as error:
         messages.error(request, str(error))
     else:
-        messages.success(request, f"{work.told(job).title}: asked for")
+        messages.success(request, f"{dataset_jobs.told(job).title}: asked for")
     name = request.POST.get("dataset", "")
     return redirect("dataset", name=name) if name else redirect("dataset-list")
 
@@ -137,7 +137,7 @@ def _require_confirmed(form: QueryDict) -> None:
 
 
 def _work(name: str) -> dict[str, Any]:
-    jobs = work.jobs_of(name)
+    jobs = dataset_jobs.jobs_of(name)
     return {"jobs": jobs, "passing": any(job.passing for job in jobs)}
 
 

@@ -22,11 +22,11 @@ from django.db.models.functions import Now
 
 from evaweb.errors import Conflict
 from evaweb.jobs import doorbell
+from evaweb.jobs.database_retry import patiently
 from evaweb.jobs.heartbeat import Heartbeat
 from evaweb.jobs.kinds import Args, TakenOver, Work, kind_named
 from evaweb.jobs.locks import Worker, alone, worker_of
 from evaweb.jobs.models import Job, JobStatus
-from evaweb.jobs.patience import patiently
 from evaweb.jobs.selectors import jobs_ready
 
 log = logging.getLogger(__name__)

@@ -16,8 +16,8 @@ from django.db import close_old_connections, connection
 
 from evaweb.celery import app
 from evaweb.jobs import services
+from evaweb.jobs.database_retry import patiently
 from evaweb.jobs.kinds import chores, starts
-from evaweb.jobs.patience import patiently
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import field_validator
 
 from runtime.cameras.base import Address, CameraSettings
-from runtime.cameras.places import checked, with_password
+from runtime.cameras.camera_urls import checked, with_password
 
 
 class Config(CameraSettings):

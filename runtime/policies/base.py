@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from runtime.core.types import ActionChunk, Conditioning, Observation, Space
-from runtime.policies.reach import Dial
+from runtime.policies.connection import Dial
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from urllib.parse import urlsplit
 
 from runtime.core.errors import PolicyLostError, PolicyTimeout, RefusedError, TlsError, WrongProtocolError
-from runtime.policies.reach import Dial, reached
+from runtime.policies.connection import Dial, reached
 
 _STATUS = re.compile(rb"HTTP/1\.[01] ([0-9]{3})([^\r\n]*)\r?\n")
 _LONGEST = 4096  # bytes of a first line

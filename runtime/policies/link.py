@@ -26,7 +26,7 @@ from runtime.core.errors import (
     UnsolicitedError,
     WrongProtocolError,
 )
-from runtime.policies.reach import Dial, Place, reached
+from runtime.policies.connection import Dial, Place, reached
 from runtime.policies.watchdog import Watchdog
 
 if TYPE_CHECKING:

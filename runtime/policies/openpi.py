@@ -20,7 +20,7 @@ from runtime.core.types import ActionChunk, Conditioning, Float32, Observation
 from runtime.policies.agreement import Declared, agreed
 from runtime.policies.answers import AnswerSettings
 from runtime.policies.base import PolicyInfo
-from runtime.policies.grip import Convention, Grip
+from runtime.policies.gripper_convention import Convention, Grip
 from runtime.policies.link import ANSWER_LIMIT
 from runtime.policies.request import RequestLayout, RequestSettings, poses_of
 from runtime.policies.rows import action_rows

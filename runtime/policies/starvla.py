@@ -26,9 +26,9 @@ from runtime.core.errors import (
     WrongProtocolError,
 )
 from runtime.core.types import ActionChunk, Conditioning, Observation
+from runtime.policies.action_layout import MeaningSettings
 from runtime.policies.base import PolicyInfo
 from runtime.policies.link import headline
-from runtime.policies.meaning import MeaningSettings
 from runtime.policies.request import PIXELS, RequestLayout, Size
 from runtime.policies.rows import action_rows
 from runtime.policies.statistics import Statistics

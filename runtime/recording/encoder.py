@@ -15,8 +15,8 @@ from runtime.core.types import UInt8
 from runtime.recording.backlog import Picture, PictureQueue, codings
 from runtime.recording.digests import rows_of_piece
 from runtime.recording.files import AppendFile, DiskFullError
+from runtime.recording.histogram import Histogram
 from runtime.recording.settings import RecordingSettings
-from runtime.recording.spread import Spread
 from runtime.recording.video import FragmentedVideo
 
 
@@ -36,7 +36,7 @@ class CameraEncoder:
         self._captured: deque[float] = (
             deque()
         )  # of the frames in the encoder [s, monotonic]; NaN for a repeat
-        self._muxed = Spread()
+        self._muxed = Histogram()
         self._queue = PictureQueue(settings.queue_frames, settings.max_lag_s)
         try:
             self._video = FragmentedVideo(self.file, size, fps, settings)

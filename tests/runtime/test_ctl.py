@@ -15,7 +15,7 @@ from tests.runtime.terminal_station import AIM, Script, event, status
 def run(monkeypatch):
     """Runs a command line against a script; nobody is at the terminal, and waits take no time."""
     monkeypatch.setattr(settling.time, "sleep", lambda _: None)
-    monkeypatch.setattr("runtime.clients.terminal.attendance.keys", NoKeys)
+    monkeypatch.setattr("runtime.clients.terminal.command_follower.keys", NoKeys)
     monkeypatch.setenv("EVA_DATA_DIR", "/var/eva")
 
     def run(script, *words):

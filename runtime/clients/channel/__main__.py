@@ -19,8 +19,8 @@ from pathlib import Path
 import zmq
 
 from robots.broken_pipe import unread_ends
-from runtime.clients.channel.door import Door
 from runtime.clients.channel.names import Names
+from runtime.clients.channel.server import ChannelServer
 from runtime.clients.client import StationClient
 from runtime.config import loader as deployment
 from runtime.config.schema import ControlChannelSettings
@@ -90,11 +90,11 @@ def serve(station_dir: Path, settings: ControlChannelSettings, ended: Callable[[
 
 def _open(
     station_dir: Path, settings: ControlChannelSettings, names: Names, ended: Callable[[], bool]
-) -> Door | None:
+) -> ChannelServer | None:
     told = ""
     while not ended():
         try:
-            return Door(
+            return ChannelServer(
                 zmq.Context.instance(),
                 settings.port,
                 names,

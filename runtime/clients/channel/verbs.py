@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from runtime.clients.channel.deed import Deed, Scene, Step
+from runtime.clients.channel.verb_commands import Deed, Scene, Step
 
 STOPS = ("stop", "halt", "rollout_stop")  # verbs that overtake whatever waits
 _STOPPING_INTENTS = ("accept", "cancel")  # of operator_action

@@ -14,7 +14,7 @@ from runtime.core.settings import Settings
 from runtime.core.types import ActionChunk, Float32
 from runtime.policies.answers import Rate
 from runtime.policies.arena.wants import ActionSpace, Wants
-from runtime.policies.grip import Convention, Grip
+from runtime.policies.gripper_convention import Convention, Grip
 from runtime.policies.rows import action_rows
 from runtime.spaces.pose_rows import PoseRows
 

@@ -16,7 +16,7 @@ from runtime.core.types import EEF_WIDTH, Float32, Observation, UInt8
 from runtime.policies.arena.cameras import Cameras, Numbering, Slot
 from runtime.policies.arena.history import History
 from runtime.policies.arena.wants import Wants
-from runtime.policies.grip import Convention, Grip
+from runtime.policies.gripper_convention import Convention, Grip
 from runtime.policies.pictures import fitted
 from runtime.policies.request import Size
 from runtime.spaces.pose_rows import PoseRows

@@ -17,8 +17,8 @@ from runtime.core.errors import (
     ServerSaysError,
     WrongProtocolError,
 )
+from runtime.policies.connection import Dial, reached
 from runtime.policies.link import headline
-from runtime.policies.reach import Dial, reached
 
 if TYPE_CHECKING:
     import grpc

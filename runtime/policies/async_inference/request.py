@@ -11,6 +11,7 @@ from pydantic import Field
 
 from runtime.core.errors import ConfigurationError, ContradictionError, ShapeError, WrongProtocolError
 from runtime.core.types import Float32, Observation
+from runtime.policies.action_layout import MeaningSettings
 from runtime.policies.async_inference.pickles import (
     MODULES,
     RemotePolicyConfig,
@@ -18,8 +19,7 @@ from runtime.policies.async_inference.pickles import (
     TimedObservation,
     written,
 )
-from runtime.policies.grip import Convention, Grip
-from runtime.policies.meaning import MeaningSettings
+from runtime.policies.gripper_convention import Convention, Grip
 from runtime.policies.request import Dims, poses_of
 from runtime.policies.rows import action_rows
 

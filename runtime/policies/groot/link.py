@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import zmq
 
 from runtime.core.errors import PolicyError, PolicyGone, PolicyLostError, PolicyTimeout, WrongProtocolError
-from runtime.policies.reach import Dial, Place, reached
+from runtime.policies.connection import Dial, Place, reached
 
 _SPELL_MS = 20  # how soon a wait notices that it was aborted; an answer is noticed at once
 _SIGNATURE = b"\xff\0\0\0\0\0\0\0\1\x7f"  # how every ZMTP peer begins

@@ -19,9 +19,9 @@ from runtime.core.errors import (
     WrongProtocolError,
 )
 from runtime.core.types import Float32, Observation, UInt8
-from runtime.policies.grip import Convention, Grip
+from runtime.policies.action_layout import MeaningSettings
+from runtime.policies.gripper_convention import Convention, Grip
 from runtime.policies.groot.modality import Modalities, Modality, Written, listed
-from runtime.policies.meaning import MeaningSettings
 from runtime.policies.request import Dims, poses_of
 from runtime.policies.rows import action_rows
 

@@ -7,7 +7,7 @@ import os
 from urllib.parse import urlsplit
 
 from runtime.core.errors import ConfigurationError
-from runtime.policies.reach import Place
+from runtime.policies.connection import Place
 from runtime.policies.tunnel.settings import TunnelSettings, is_host
 
 _USUAL_PORTS = {"ws": 80, "wss": 443}

@@ -18,7 +18,7 @@ from runtime.core.errors import (
 from runtime.core.settings import Settings
 from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.policies.reach import Place
+from runtime.policies.connection import Place
 from runtime.policies.tunnel.command import command, far_end, require_files
 from runtime.policies.tunnel.keeper import Keeper, Status
 from runtime.policies.tunnel.process import Ssh, free_port

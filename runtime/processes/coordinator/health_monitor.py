@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runtime.cameras.telling import complaints
+from runtime.cameras.complaints import complaints
 from runtime.core.clock import Clock
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.messages import ReceptionReport

@@ -10,7 +10,7 @@ from django.db import OperationalError
 from django.db.models.functions import Now
 from django.utils import timezone
 
-from evaweb.jobs import locks, patience, services
+from evaweb.jobs import database_retry, locks, services
 from evaweb.jobs.kinds import UnknownKind, Work
 from evaweb.jobs.locks import alone
 from evaweb.jobs.models import Job, JobStatus
@@ -287,7 +287,7 @@ def test_a_locked_database_is_waited_for_before_a_job_and_after_it(
     toy: Toy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waited: list[float] = []
-    monkeypatch.setattr(patience.time, "sleep", waited.append)
+    monkeypatch.setattr(database_retry.time, "sleep", waited.append)
     for name in ("claim", "job_done"):
         monkeypatch.setattr(services, name, locked_twice(getattr(services, name)))
     job = enqueue()
@@ -295,7 +295,7 @@ def test_a_locked_database_is_waited_for_before_a_job_and_after_it(
     job.refresh_from_db()
     assert job.status == JobStatus.DONE
     assert len(toy.asked) == 1
-    assert waited == [*patience.WAITS_S[:2], *patience.WAITS_S[:2]]
+    assert waited == [*database_retry.WAITS_S[:2], *database_retry.WAITS_S[:2]]
 
 
 def locked_twice(action):
@@ -312,7 +312,7 @@ def locked_twice(action):
 
 @pytest.mark.django_db(transaction=True)
 def test_a_database_that_stays_away_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patience.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(database_retry.time, "sleep", lambda seconds: None)
     attempts = []
 
     def away() -> None:
@@ -320,5 +320,5 @@ def test_a_database_that_stays_away_is_told(monkeypatch: pytest.MonkeyPatch) -> 
         raise OperationalError("database is locked")
 
     with pytest.raises(OperationalError, match="locked"):
-        patience.patiently(away)
-    assert len(attempts) == len(patience.WAITS_S) + 1
+        database_retry.patiently(away)
+    assert len(attempts) == len(database_retry.WAITS_S) + 1

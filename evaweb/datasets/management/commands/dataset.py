@@ -9,7 +9,7 @@ from uuid import UUID
 
 from django.core.management.base import BaseCommand, CommandError
 
-from evaweb.datasets import work
+from evaweb.datasets import dataset_jobs
 from evaweb.datasets.finding import folder_named, overviews
 from evaweb.datasets.importing import imported
 from evaweb.datasets.orders import full_name
@@ -72,7 +72,7 @@ class Command(BaseCommand):
             if one.problem:
                 self.stdout.write(f"{one.name}: {one.problem}")
                 continue
-            checked = work.checked(one.name)
+            checked = dataset_jobs.checked(one.name)
             state = "not checked" if checked is None else _state(checked)
             self.stdout.write(
                 f"{one.name}: {one.version}, {one.robot or 'robot not said'}, {one.episodes} episodes, "
@@ -113,7 +113,7 @@ class Command(BaseCommand):
         return code
 
 
-def _state(checked: work.Checked) -> str:
+def _state(checked: dataset_jobs.Checked) -> str:
     if not checked.fresh:
         return "changed since its check"
     return f"{len(checked.problems)} problems" if checked.problems else "whole"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.cameras.telling import complaints
+from runtime.cameras.complaints import complaints
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.types import Float64

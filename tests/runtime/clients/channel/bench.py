@@ -9,8 +9,8 @@ from typing import Any
 
 import zmq
 
-from runtime.clients.channel.door import Door
 from runtime.clients.channel.names import Names
+from runtime.clients.channel.server import ChannelServer
 from runtime.clients.client import StationClient
 from runtime.ipc.bus import CommandServer, Endpoints
 from runtime.ipc.messages import Ack
@@ -34,7 +34,7 @@ class Bench:
         self._guard = CommandServer(self.context, self.folder, "estop")
         Endpoints(self.folder).write("guard", {"estop": self._guard.endpoint})
         self._open: list[Any] = []
-        self.door = Door(
+        self.door = ChannelServer(
             self.context, 0, Names("lab", scripts), silence_s, lambda name: StationClient(self.folder, name)
         )
         self.channel = self.door.endpoint

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from runtime.clients.channel import __main__ as channel
-from runtime.clients.channel.door import HOST
+from runtime.clients.channel.server import HOST
 from runtime.config.schema import ControlChannelSettings
 from runtime.core.errors import TransportError
 from runtime.ipc.bus import Endpoints

@@ -2,9 +2,9 @@ import json
 
 import pytest
 
-from runtime.clients.channel.deed import NotOurs, Scene
 from runtime.clients.channel.message import read
 from runtime.clients.channel.selection import Selection
+from runtime.clients.channel.verb_commands import NotOurs, Scene
 from runtime.clients.channel.verbs import VERBS, deed, stops
 from tests.runtime.terminal_station import status
 from tests.sources import ROOT

@@ -1,4 +1,4 @@
-from runtime.cameras.telling import complaints
+from runtime.cameras.complaints import complaints
 
 TOLD = {
     "high": {"source": "rtsp://h/x", "condition": "lost", "why": "mute"},

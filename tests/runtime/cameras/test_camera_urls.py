@@ -1,6 +1,6 @@
 import pytest
 
-from runtime.cameras.places import checked, with_password
+from runtime.cameras.camera_urls import checked, with_password
 from runtime.core.errors import ConfigurationError
 
 

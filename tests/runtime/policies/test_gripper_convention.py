@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from runtime.core.pose_format import PoseFormat
-from runtime.policies.grip import Grip
+from runtime.policies.gripper_convention import Grip
 from runtime.spaces.pose_rows import PoseRows
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 

@@ -4,8 +4,8 @@ import signal
 import pytest
 
 from runtime.clients.client import Refused
-from runtime.clients.terminal import attendance
-from runtime.clients.terminal.attendance import attend
+from runtime.clients.terminal import command_follower
+from runtime.clients.terminal.command_follower import attend
 from runtime.clients.terminal.keys import Keys, NoKeys
 from tests.runtime.terminal_station import Script, status
 
@@ -31,7 +31,7 @@ def at_the_terminal(monkeypatch):
     """Nobody, or who the test sets there; waits take no time."""
     there = {"keys": NoKeys()}
     monkeypatch.setattr("runtime.clients.terminal.keys.time.sleep", lambda _: None)
-    monkeypatch.setattr(attendance, "keys", lambda: there["keys"])
+    monkeypatch.setattr(command_follower, "keys", lambda: there["keys"])
     return there
 
 

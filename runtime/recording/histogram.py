@@ -1,4 +1,4 @@
-"""Spread of durations, in constant memory: a histogram whose buckets are one per cent wide."""
+"""Histogram of durations in constant memory, with buckets one per cent wide."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _STEP = math.log(1.01)
 _BUCKETS = math.ceil(math.log(_MOST / _LEAST) / _STEP) + 1
 
 
-class Spread:
+class Histogram:
     """Counts durations [s]; numbers that are not finite do not count."""
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ import zmq
 
 from runtime.clients.channel import answers, strict
 from runtime.clients.channel.brake import Brake, EStop, is_estop, is_stop
-from runtime.clients.channel.desk import Desk
+from runtime.clients.channel.executor import CommandExecutor
 from runtime.clients.channel.lane import Job, Lane
 from runtime.clients.channel.message import LARGEST, Malformed, Message, read
 from runtime.clients.channel.names import Names
@@ -29,7 +29,7 @@ _END_S = 1.0
 _AT_ONCE = 64  # messages, after which answers go out first: a flood keeps nobody waiting for theirs
 
 
-class Door:
+class ChannelServer:
     """Listens on loopback alone; what has to stop a robot has lanes of its own, which nothing else delays."""
 
     def __init__(
@@ -48,8 +48,8 @@ class Door:
         self._replies.bind(self._inbox)
         self._local = threading.local()
         outcomes = Outcomes()
-        desk = Desk(open_client, self._lives, outcomes, silence_s)
-        self._desk = self._lane("desk", desk, desk.keep)
+        executor = CommandExecutor(open_client, self._lives, outcomes, silence_s)
+        self._desk = self._lane("executor", executor, executor.keep)
         self._brake = self._lane("brake", Brake(open_client, self._lives, outcomes))
         self._estop = self._lane("estop", EStop(open_client, outcomes))
 

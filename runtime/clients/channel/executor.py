@@ -11,10 +11,10 @@ from typing import Any
 
 from runtime.clients.channel import answers
 from runtime.clients.channel import status as older
-from runtime.clients.channel.deed import NotOurs, Scene
 from runtime.clients.channel.message import Message
 from runtime.clients.channel.outcomes import Outcome, Outcomes, lasts
 from runtime.clients.channel.scripts import Lives, Script, Scripts
+from runtime.clients.channel.verb_commands import NotOurs, Scene
 from runtime.clients.channel.verbs import VERBS, deed
 from runtime.clients.client import Refused, StationClient
 from runtime.core.errors import RuntimeFault, TransportError
@@ -31,7 +31,7 @@ _FRAME_S = 0.5
 _LOOK_S = 0.1
 
 
-class Desk:
+class CommandExecutor:
     """The channel's one way to the coordinator, but for stops; used by one thread."""
 
     def __init__(
