@@ -28,7 +28,7 @@ from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
 from runtime.sim.surroundings import Surroundings
 from runtime.sim.tabletop import Reset
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities
@@ -167,6 +167,6 @@ def spec_of(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> C
         "recording": {"enabled": False},
         "lockstep": {"delay_ticks": delay},
     }
-    made = station_spec.spec_of(loader.resolve(tree, {}, "moving_target"))
+    made = checked_spec(loader.resolve(tree, {}, "moving_target"))
     gallery = Gallery(made.robot, Conveyor(made.robot, seed))
     return ConveyorPlan(made.resolved, made.robot, gallery, {})

@@ -23,7 +23,7 @@ from runtime.core.types import ActionChunk, Conditioning, Float32, Float64, Obse
 from runtime.ipc.session_state import SessionState
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.lockstep.lockstep import Lockstep
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Capabilities, Sink, Source
 
@@ -204,5 +204,5 @@ def lockstep_deployment(data: Path, robot: str, strategy: dict[str, Any], rate: 
 def _plan(data: Path, case: Case) -> KnownPlan:
     tree = lockstep_deployment(data, "agilex_piper", case.section, case.control_hz)
     tree["lockstep"] = {"delay_ticks": case.delay}
-    made = station_spec.spec_of(loader.resolve(tree, {}, "strategies"))
+    made = checked_spec(loader.resolve(tree, {}, "strategies"))
     return KnownPlan(made.resolved, made.robot, {})

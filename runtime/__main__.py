@@ -20,8 +20,9 @@ from runtime.core.clock import MonotonicClock
 from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.ipc.lifeline import Lifeline
 from runtime.processes.supervisor.supervisor import Supervisor
+from runtime.station.checks import checked_spec
 from runtime.station.rerun import data_folder, rerun
-from runtime.station.spec import StationSpec, spec_of
+from runtime.station.spec import StationSpec
 
 
 @unread_ends
@@ -30,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = _parser().parse_args(arguments)
     log.start("supervisor")
     try:
-        made = spec_of(_resolved(given))
+        made = checked_spec(_resolved(given))
         made.new_policy(
             MonotonicClock()
         ).close()  # what does not fit it is said here, not by a coordinator that dies

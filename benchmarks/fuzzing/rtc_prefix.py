@@ -30,7 +30,7 @@ from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.coordinator.inference.worker import LockstepRunner
 from runtime.processes.lockstep.lockstep import Around, Lockstep
 from runtime.spaces.end_effectors import EndEffectors
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 
 _TICKS = 240
 _HAIR = 1e-6  # of a step
@@ -276,7 +276,7 @@ class Keeper(Policy):
 def _plan(data: Path, made: Scenario) -> SeldomPlan:
     tree = lockstep_deployment(data, made.robot, made.strategy, made.control_hz)
     tree["faults"] = {"policy_lost": "slow", "patience_s": 1000.0}
-    planned = station_spec.spec_of(loader.resolve(tree, {}, "prefix"))
+    planned = checked_spec(loader.resolve(tree, {}, "prefix"))
     robot = planned.robot
     if made.endless:
         lower, upper = robot.lower.copy(), robot.upper.copy()

@@ -26,9 +26,9 @@ from runtime.policies.link import await_left
 from runtime.preflight.course import Course
 from runtime.preflight.report import Report
 from runtime.preflight.verdict import Stage, Verdict
+from runtime.station.checks import checked_spec
 from runtime.station.permissions import require_named
 from runtime.station.preflight_child import patience
-from runtime.station.spec import spec_of
 
 _LOOK_S = 0.2
 _LONGEST_S = 3600.0
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def preflight(resolved: Any, deadline: float | None = None) -> Report:
     """The report about what `resolved()` returns, within `deadline` seconds, None: the policy's own deadlines."""
     try:
-        made = spec_of(resolved())
+        made = checked_spec(resolved())
     except RuntimeFault as fault:
         return Report(Verdict.MISCONFIGURED, Stage.RESOLVE, str(fault), Verdict.MISCONFIGURED.advice)
     return Course(made).run(patience(made.deployment) if deadline is None else deadline)

@@ -31,7 +31,7 @@ from runtime.sim.link import Link
 from runtime.sim.node import Node
 from runtime.sim.node import parser as node_parser
 from runtime.sim.surroundings import Surroundings
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
 from runtime.transports import zmq
 
@@ -86,7 +86,7 @@ def station(
     path: Path, assignments: Sequence[str], seed: int, clock: VirtualClock, bench: str = "tabletop"
 ) -> ServedLockstep:
     """The station of a deployment at its bench, laid out by `seed`; RuntimeFault where it cannot be."""
-    made = station_spec.spec_of(loader.load(path, assignments))
+    made = checked_spec(loader.load(path, assignments))
     options = node_parser().parse_args(["--robot", made.robot.name, "--bench", bench, "--seed", str(seed)])
     around = surroundings.surroundings(made.robot, options)
     return ServedLockstep(planned(made, clock, around, options), clock, Rested(around.truth, clock))

@@ -14,13 +14,12 @@ import numpy as np
 
 import robots
 from robots import Robot
-from runtime.config import collection, loader
+from runtime.config import loader
 from runtime.config.loader import Resolved
 from runtime.config.schema import Deployment
 from runtime.core.clock import Clock
-from runtime.core.errors import ConfigurationError, RuntimeFault, SetupError
+from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.core.plugins import variants
-from runtime.core.pose_format import refuse_format
 from runtime.ipc.shared_state import SharedStateLayout
 from runtime.motion.timeline import DimensionKinds
 from runtime.safety.limits import Limits
@@ -205,44 +204,6 @@ class StationSpec:
         return PosePublisher(PoseRows(wanted.pose, self.robot, "publication.pose"), self.end_effectors())
 
 
-def spec_of(resolved: Resolved) -> StationSpec:
-    """Check that the parts of a deployment fit each other; raises ConfigurationError or SetupError."""
-    settings, made = resolved.deployment, unchecked(resolved)
-    robot = made.robot
-    if settings.setup.pose not in robot.poses:
-        raise ConfigurationError(
-            f"setup.pose = {settings.setup.pose!r}: {robot.name} has {', '.join(sorted(robot.poses))}"
-        )
-    unknown = set(settings.safety.workspace) - {arm.name for arm in robot.arms}
-    if unknown:
-        arms = ", ".join(arm.name for arm in robot.arms)
-        raise ConfigurationError(f"safety.workspace.{min(unknown)}: {robot.name} has the arms {arms}")
-    if made.fps > made.rate:
-        raise ConfigurationError(
-            f"recording.fps = {made.fps:g}: there would be more rows than ticks; "
-            f"allowed: at most {made.rate:g}, the control rate"
-        )
-    strange = [camera for camera in settings.recording.heights if camera not in made.cameras]
-    if strange:
-        raise ConfigurationError(
-            f"recording.heights: {', '.join(strange)} are no cameras of this station; "
-            f"allowed: {', '.join(made.cameras)}"
-        )
-    if settings.cameras:
-        from runtime.cameras.attaching import check
-
-        check(settings.cameras, robot)
-    collection.check(settings.collection, made.cameras)
-    _check_publication(made)
-    _check_collection(made)
-    if settings.safety.report_only and made.capabilities.moves_robot:
-        raise SetupError(
-            f"safety.report_only = true with transport {settings.transport.kind!r}: it can move a robot; "
-            "report-only is for transports that cannot (dataset)"
-        )
-    return made
-
-
 def unchecked(resolved: Resolved) -> StationSpec:
     """A deployment with its robot, whose parts are known to fit each other; ConfigurationError for no such robot."""
     settings = resolved.deployment
@@ -254,41 +215,6 @@ def unchecked(resolved: Resolved) -> StationSpec:
     except robots.RobotError as error:
         raise ConfigurationError(str(error)) from None
     return StationSpec(resolved, robot)
-
-
-def _check_collection(made: StationSpec) -> None:
-    """A node that drives by itself must be one that can be told to, and to leave off, and says what it applied."""
-    wanted, capabilities = made.deployment.collection, made.capabilities
-    if wanted is not None and wanted.source == "node" and not capabilities.leads:
-        kind = made.deployment.transport.kind
-        leads = kind if kind in variants("runtime.teleoperators") else "zmq"
-        raise SetupError(
-            f'collection.source = "node" with transport {kind!r}, over which a robot is neither told to follow a '
-            "leader of its own and to leave off, which every stop of ours has to, nor says what it applied; allowed: "
-            f'the transport zmq, or source = "relay" with collection.leader.kind = {leads!r}'
-        )
-
-
-def _check_publication(made: StationSpec) -> None:
-    """Poses are published only where the transport has such a command."""
-    wanted, capabilities = made.deployment.publication, made.capabilities
-    kind = made.deployment.transport.kind
-    if wanted.space not in capabilities.spaces:
-        raise SetupError(
-            f"publication.space = {wanted.space!r} with transport {kind!r}, which has no such command; "
-            f"allowed: {', '.join(sorted(capabilities.spaces))}"
-        )
-    if wanted.space == "joint":
-        refuse_format(wanted.pose, "publication.pose")
-        return
-    from runtime.spaces.pose_rows import PoseRows
-
-    PoseRows(wanted.pose, made.robot, "publication.pose")
-    if capabilities.poses and wanted.pose not in capabilities.poses:
-        raise SetupError(
-            f"publication.pose = {wanted.pose} with transport {kind!r}; "
-            f"allowed: {'; '.join(map(str, capabilities.poses))}"
-        )
 
 
 def planned(path: str, unread: Collection[str] = ()) -> StationSpec:

@@ -13,7 +13,7 @@ from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError
 from runtime.core.types import Float64, Observation
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from runtime.teleoperators.base import Leader
 from runtime.transports.base import Capabilities
 from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, StubRobot, on_time, spec_of
@@ -127,5 +127,5 @@ def collecting(data: Path, source: str = "relay", **changes: Any) -> CollectStat
     if source == "node":  # a recording drives no robot, and its deployment is refused
         on_top["transport"] = {"kind": "zmq"}
     resolved = loader.changed(spec_of(data, **tables).resolved, on_top, "test")
-    robot = station_spec.spec_of(resolved).robot
+    robot = checked_spec(resolved).robot
     return CollectStation(CollectPlan(resolved, robot, {}, STANDS, on_time, "joint", "", True, False))

@@ -17,7 +17,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Capabilities, Sink, Source
 from tests.runtime.recording.samples import numbered
@@ -194,7 +194,7 @@ def spec_of(
     }
     for table, values in settings.items():
         tree[table] = {**tree.get(table, {}), **values} if isinstance(values, dict) else values
-    made = station_spec.spec_of(loader.resolve(tree, {}, "test"))
+    made = checked_spec(loader.resolve(tree, {}, "test"))
     return StubPlan(made.resolved, made.robot, {}, start, rows, space, absent, moves_robot, simulated)
 
 

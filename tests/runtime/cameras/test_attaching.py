@@ -11,7 +11,7 @@ from runtime.cameras.live import LiveCamera
 from runtime.config import loader
 from runtime.core.clock import MonotonicClock, VirtualClock
 from runtime.core.errors import ConfigurationError, SetupError
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
 from runtime.transports.node_source import NodeSource
 
@@ -27,7 +27,7 @@ def planned(tmp_path: Path, cameras: dict[str, Any], **transport: Any) -> Statio
         "policy": {"kind": "mock"},
         "cameras": cameras,
     }
-    return station_spec.spec_of(loader.resolve(tree, {}, "test.toml"))
+    return checked_spec(loader.resolve(tree, {}, "test.toml"))
 
 
 def waits_for(spec: StationSpec) -> set[str]:

@@ -14,7 +14,7 @@ from runtime.config.schema import Deployment
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.plugins import variants
 from runtime.core.settings import Settings
-from runtime.station.spec import spec_of
+from runtime.station.checks import checked_spec
 
 DEPLOYMENTS = Path(__file__).parents[3] / "deployments"
 SMALL = """\
@@ -425,7 +425,7 @@ def test_every_deployment_that_comes_with_it_loads_and_survives_the_way_to_the_f
     again = loader.resolve(handed_over, {}, "resolved.json")
     assert (again.deployment, again.digest) == (resolved.deployment, resolved.digest)
     if path.name != "base.toml":
-        assert spec_of(resolved).robot.name == resolved.deployment.robot
+        assert checked_spec(resolved).robot.name == resolved.deployment.robot
 
 
 # --- a plan: the parts fit each other ----------------------------------------------------------------------
@@ -437,7 +437,7 @@ def demo():
 
 
 def planned(path, *assignments):
-    return spec_of(load(path, assignments))
+    return checked_spec(load(path, assignments))
 
 
 def test_report_only_is_refused_where_a_robot_can_move(demo):

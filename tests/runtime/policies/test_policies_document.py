@@ -21,7 +21,7 @@ from runtime.config import loader
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import PolicyLostError
 from runtime.policies.openpi import OpenpiPolicy
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 
 ROOT = Path(__file__).parents[3]
@@ -45,7 +45,7 @@ def built(shown: dict[str, Any], **policy: Any) -> tuple[Any, Robot]:
         **shown,
         "policy": shown["policy"] | policy,
     }
-    made = station_spec.spec_of(loader.resolve(tree, {}, "policies.md"))
+    made = checked_spec(loader.resolve(tree, {}, "policies.md"))
     found = made.policy.build(made.deployment.policy, made.robot, MonotonicClock(), made.rate)
     return found, made.robot
 

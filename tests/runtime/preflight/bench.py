@@ -12,7 +12,7 @@ from runtime.config import loader
 from runtime.preflight.course import Course
 from runtime.preflight.report import Report
 from runtime.sim.faults import NONE, Fault
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
 from tests.runtime.policies.peers import FRANKA, PIPER
 
@@ -104,7 +104,7 @@ def planned(wire: Wire, url: str, settings: Mapping[str, Any] | None = None, **t
         "policy": {**wire.settings, **PATIENT, "url": url, **(settings or {})},
         **tables,
     }
-    return station_spec.spec_of(loader.resolve(tree, {}, "test"))
+    return checked_spec(loader.resolve(tree, {}, "test"))
 
 
 @contextlib.contextmanager

@@ -33,7 +33,7 @@ from runtime.sim.render import Renderer
 from runtime.sim.script import Script
 from runtime.sim.surroundings import Surroundings
 from runtime.sim.tabletop import Reset, Tabletop
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities
@@ -136,7 +136,7 @@ def planned(
     """The station of the deployment `name` with the bench laid out by `seed`; nothing is recorded."""
     given = [f'data_dir="{data}"', "recording.enabled=false", "lockstep.delay_ticks=5", *assignments]
     given += [] if url is None else [f'policy.url="{url}"']
-    made = station_spec.spec_of(loader.load(DEPLOYMENTS / f"{name}.toml", given))
+    made = checked_spec(loader.load(DEPLOYMENTS / f"{name}.toml", given))
     bench = SlowEye(made.robot, Tabletop(made.robot, seed))
     return TabletopPlan(made.resolved, made.robot, bench, {})
 

@@ -26,7 +26,7 @@ from runtime.sim import lockstep, serve
 from runtime.sim.lockstep import Rested, planned
 from runtime.sim.node import parser
 from runtime.sim.tabletop import Tabletop
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from tests.runtime.lockstep_station import column
 from tests.runtime.sim.tabletop_station import DEPLOYMENTS, SlowEye
 
@@ -126,7 +126,7 @@ def courses(
         server.reply = replying
     urls = [str(server.start()["url"]) for server in servers]
     given = [f'data_dir="{data}"', f'policy.url="{urls[0]}"', "recording.export=false", "lease.ttl_s=600"]
-    made = station_spec.spec_of(loader.load(DEPLOYMENTS / "tabletop.toml", given))
+    made = checked_spec(loader.load(DEPLOYMENTS / "tabletop.toml", given))
     around = SlowEye(made.robot, Tabletop(made.robot, 1))
     options = parser().parse_args(["--robot", made.robot.name, "--bench", "tabletop", "--seed", "1"])
     over = Rested(around.truth, clock)

@@ -13,7 +13,7 @@ from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.shared_state import SharedState
 from runtime.motion.timeline import DimensionKinds
 from runtime.processes import child
-from runtime.station.spec import spec_of
+from runtime.station.checks import checked_spec
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities
 
@@ -50,7 +50,7 @@ def test_words_on_a_lifeline_do_not_cut_it(pipe):
 
 
 def test_a_plan_knows_the_modules_of_its_kinds(resolved):
-    made = spec_of(resolved)
+    made = checked_spec(resolved)
     assert made.transport.__name__ == "runtime.transports.zmq"
     assert made.policy.__name__ == "runtime.policies.openpi"
     assert made.strategy.Config.model_fields["kind"].default == "async"
@@ -58,7 +58,7 @@ def test_a_plan_knows_the_modules_of_its_kinds(resolved):
 
 
 def test_the_limits_and_the_page_are_the_robots(resolved):
-    made = spec_of(resolved)
+    made = checked_spec(resolved)
     limits, robot = made.limits, made.robot
     assert limits.names == robot.joint_names
     np.testing.assert_array_equal(limits.upper, robot.upper)
@@ -70,17 +70,17 @@ def test_the_limits_and_the_page_are_the_robots(resolved):
 
 def test_disabled_cameras_are_not_in_the_page(tmp_path):
     resolved = load(DEPLOYMENTS / "demo.toml", ['transport.disabled_cameras=["cam_high"]'])
-    assert spec_of(resolved).layout.cameras == ("cam_left_wrist", "cam_right_wrist")
+    assert checked_spec(resolved).layout.cameras == ("cam_left_wrist", "cam_right_wrist")
 
 
 def test_a_transport_that_says_nothing_of_cameras_has_all_of_them():
     resolved = load(DEPLOYMENTS / "replay_dataset.toml", ["transport.path=x", "policy.path=x"])
-    made = spec_of(resolved)
+    made = checked_spec(resolved)
     assert made.cameras == tuple(camera.key for camera in made.robot.cameras)
 
 
 def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path, monkeypatch):
-    shared, descriptor = SharedState.create(spec_of(resolved).layout)
+    shared, descriptor = SharedState.create(checked_spec(resolved).layout)
     shared.beat("coordinator", 12.5)
     handed = tmp_path / "resolved.json"
     handed.write_text(json.dumps(dict(resolved.tree)), "utf-8")
@@ -103,7 +103,7 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
 
 
 def test_angles_without_limits_wrap_and_grippers_that_know_two_places_switch(resolved):
-    made = spec_of(resolved)
+    made = checked_spec(resolved)
     assert made.dims == DimensionKinds()
     lower, upper = made.robot.lower.copy(), made.robot.upper.copy()
     lower[[2, 9]], upper[[2, 4]] = -np.inf, np.inf
@@ -122,7 +122,7 @@ def publishing(resolved, **publication):
 def test_poses_are_published_only_over_a_transport_that_has_such_a_command(resolved):
     said = "publication.space = 'eef' with transport 'zmq', which has no such command; allowed: joint$"
     with pytest.raises(SetupError, match=said):
-        spec_of(publishing(resolved, space="eef"))
+        checked_spec(publishing(resolved, space="eef"))
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ def taking_poses(monkeypatch):
 
 
 def test_poses_are_published_as_the_transport_takes_them(resolved, taking_poses):
-    made = spec_of(publishing(resolved, space="eef", pose={"orientation": "xyzw"}))
+    made = checked_spec(publishing(resolved, space="eef", pose={"orientation": "xyzw"}))
     home = made.robot.poses["home"]
     row = made.publication()(home)
     expected = made.spaces().eef_of(home)
@@ -143,17 +143,17 @@ def test_poses_are_published_as_the_transport_takes_them(resolved, taking_poses)
     with pytest.raises(
         SetupError, match=r"publication.pose = 6d of columns with transport 'zmq'; allowed: xyzw$"
     ):
-        spec_of(publishing(resolved, space="eef", pose={"orientation": "6d"}))
+        checked_spec(publishing(resolved, space="eef", pose={"orientation": "6d"}))
 
 
 def test_a_format_of_published_poses_that_does_not_fit_the_robot_is_refused(resolved, taking_poses):
     with pytest.raises(ConfigurationError, match=r"publication\.pose\.frame = 'moon' is no frame"):
-        spec_of(publishing(resolved, space="eef", pose={"orientation": "xyzw", "frame": "moon"}))
+        checked_spec(publishing(resolved, space="eef", pose={"orientation": "xyzw", "frame": "moon"}))
 
 
 def test_joints_alone_are_published_where_nothing_is_said(resolved):
-    assert spec_of(resolved).publication() is None
+    assert checked_spec(resolved).publication() is None
     with pytest.raises(
         ConfigurationError, match=r"publication\.pose = \{'orientation': 'xyzw'\}, but the space"
     ):
-        spec_of(publishing(resolved, pose={"orientation": "xyzw"}))
+        checked_spec(publishing(resolved, pose={"orientation": "xyzw"}))

@@ -20,7 +20,7 @@ from runtime.core.clock import MonotonicClock
 from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from runtime.transports import ros1, ros2
 from runtime.transports.ros import cdr, packed
 from runtime.transports.ros.messages import JointState, Wire
@@ -96,7 +96,7 @@ def demonstration(
         "safety": {"joint_age_s": PATIENCE_S, "picture_age_s": PATIENCE_S},
         "control": {"heartbeat_timeout_s": 10.0},
     }
-    station = lockstep.Lockstep(station_spec.spec_of(loader.resolve(tree, {}, "test")))
+    station = lockstep.Lockstep(checked_spec(loader.resolve(tree, {}, "test")))
     session = station.coordinator.session
     try:
         station.connect()

@@ -16,6 +16,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from tests.runtime.datasets.foreign import Plan, column, shown, write
 from tests.runtime.datasets.small import seen
 
@@ -47,7 +48,7 @@ def trial(tmp_path: Path, **tables: Any) -> station_spec.StationSpec:
         "recording": {"min_free_bytes": 0},
         **tables,
     }
-    return station_spec.spec_of(loader.resolve(tree, {}, "test"))
+    return checked_spec(loader.resolve(tree, {}, "test"))
 
 
 def stacked(table: Any, name: str) -> np.ndarray:

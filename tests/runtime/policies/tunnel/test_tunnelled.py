@@ -31,7 +31,7 @@ from runtime.sim.faults import Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.starvla_server import Star, StarvlaServer
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from tests.processes import alive, eventually
 from tests.runtime.policies.peers import PIPER, seen
 from tests.runtime.policies.tls import encrypted, self_signed
@@ -56,7 +56,7 @@ def through(tunnel: dict[str, Any], robot: str = "agilex_piper", **policy: Any) 
             **policy,
         },
     }
-    made = station_spec.spec_of(loader.resolve(tree, {}, "a test")).new_policy(MonotonicClock())
+    made = checked_spec(loader.resolve(tree, {}, "a test")).new_policy(MonotonicClock())
     assert isinstance(made, TunnelledPolicy)
     return made
 

@@ -12,7 +12,7 @@ from hypothesis.stateful import initialize, rule
 from runtime.config import loader
 from runtime.ipc.session_state import SessionState
 from runtime.recording.labels import newest
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from tests.runtime.collect_station import CollectPlan, CollectStation
 from tests.runtime.lockstep_station import STANDS, spec_of
 from tests.runtime.processes.coordinator.session import test_session_machine
@@ -34,10 +34,10 @@ class Collects(test_session_machine.Machine):
             "source": "relay",
             "mode": mode,
             "leader": {"kind": "zmq"},
-            "cameras": [camera.key for camera in station_spec.spec_of(made).robot.cameras[:1]],
+            "cameras": [camera.key for camera in checked_spec(made).robot.cameras[:1]],
         }
         resolved = loader.changed(made, {"collection": leads}, "test")
-        robot = station_spec.spec_of(resolved).robot
+        robot = checked_spec(resolved).robot
         collects = CollectPlan(resolved, robot, {}, STANDS, self.rows, "joint", "", True, False)
         self.opened: dict[str, bool] = {}  # the episodes, and whether each was discarded
         self.watch(CollectStation(collects))

@@ -16,7 +16,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.processes.control.process import Loop, make_tick, outlive
 from runtime.recording.labels import labels
 from runtime.recording.reader import Episode
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from tests.runtime.collect_station import CollectStation, SelfDriven, collecting
 from tests.runtime.lockstep_station import MOVED, STANDS, column, spec_of
 
@@ -424,7 +424,7 @@ def test_a_node_that_cannot_be_told_to_leave_off_is_refused(
         "recording": {"min_free_bytes": 0},
     }
     with pytest.raises(SetupError, match=r"to leave off.*nor says what it applied") as refused:
-        station_spec.spec_of(loader.resolve(tree, {}, "test"))
+        checked_spec(loader.resolve(tree, {}, "test"))
     assert f"collection.leader.kind = '{leader}'" in str(refused.value)
 
 

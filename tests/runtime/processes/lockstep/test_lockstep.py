@@ -18,7 +18,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.station import spec as station_spec
+from runtime.station.checks import checked_spec
 from tests.runtime.lockstep_station import DIM, MOVED, STANDS, Station, column, on_time, ramp, spec_of
 from tests.runtime.recording.samples import decoded, numbers
 
@@ -643,7 +643,7 @@ def test_what_was_published_plays_through_the_whole_pipeline_unchanged(tmp_path:
         "safety": {"report_only": True},
         "recording": {"min_free_bytes": 0},
     }
-    done = lockstep.run(station_spec.spec_of(loader.resolve(tree, {}, "test")))
+    done = lockstep.run(checked_spec(loader.resolve(tree, {}, "test")))
     assert (done.state, done.reason) == (SessionState.READY, "the recording that is the source has ended")
     source, copy = open_episode(Path(first.episode["path"])), open_episode(Path(done.episode["path"]))
     assert copy.frames == source.frames == 60

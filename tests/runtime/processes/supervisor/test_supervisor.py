@@ -9,7 +9,7 @@ from runtime.core.errors import SetupError, TransportError
 from runtime.ipc.bus import Endpoints
 from runtime.processes.supervisor import supervisor
 from runtime.processes.supervisor.supervisor import Supervisor
-from runtime.station.spec import spec_of
+from runtime.station.checks import checked_spec
 
 DEMO = Path(__file__).parents[4] / "deployments" / "demo.toml"
 WAITS = ["cat"]  # like our children it ends with its standard input
@@ -48,7 +48,7 @@ def started(monkeypatch):
 
 @pytest.fixture
 def station(tmp_path):
-    return Supervisor(spec_of(load(DEMO, [f'data_dir="{tmp_path}"'])))
+    return Supervisor(checked_spec(load(DEMO, [f'data_dir="{tmp_path}"'])))
 
 
 def all_ended(made):
@@ -82,11 +82,11 @@ def test_a_control_channel_that_dies_does_not_end_the_family_and_ends_with_it(tm
     made, commands = started
     sets = [f'data_dir="{tmp_path}"', "control_channel.enabled=true"]
     commands["channel"], commands["headless"] = DIES, ["sh", "-c", "sleep 0.3; exit 4"]
-    assert Supervisor(spec_of(load(DEMO, sets))).run(headless=True) == 4
+    assert Supervisor(checked_spec(load(DEMO, sets))).run(headless=True) == 4
     names = [child.process for child in made]
     assert names == ["guard", "reception", "media", "control", "coordinator", "channel", "headless"]
     commands["channel"] = WAITS
-    assert Supervisor(spec_of(load(DEMO, sets))).run(headless=True) == 4
+    assert Supervisor(checked_spec(load(DEMO, sets))).run(headless=True) == 4
     assert all_ended(made)
 
 
@@ -113,7 +113,7 @@ def test_headless_the_processes_log_only_what_matters_unless_told_otherwise(
     commands["coordinator"] = DIES  # so that it ends
     if given:
         monkeypatch.setenv("EVA_LOG_LEVEL", given)
-    Supervisor(spec_of(load(DEMO, [f'data_dir="{tmp_path}"']))).run(headless)
+    Supervisor(checked_spec(load(DEMO, [f'data_dir="{tmp_path}"']))).run(headless)
     assert {child.environment.get("EVA_LOG_LEVEL") for child in made} == {level}
 
 
