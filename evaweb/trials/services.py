@@ -33,7 +33,7 @@ from evaweb.trials.models import (
     TrialStatus,
 )
 from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, VoidLine, file_of
-from evaweb.trials.selectors import trial_open
+from evaweb.trials.selectors import attempts_of, trial_open
 from evaweb.trials.station_events import run_changed
 from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, Verdict, verdict
 
@@ -338,18 +338,7 @@ def _check_scorable(trial: Trial, reason: str) -> None:
 
 
 def _repeated(trial: Trial) -> bool:
-    same = {
-        name: getattr(trial, name)
-        for name in (
-            "evaluation_id",
-            "evaluation_version",
-            "checkpoint_id",
-            "scene_id",
-            "position_id",
-            "number",
-        )
-    }
-    newest = Trial.objects.filter(**same).aggregate(newest=Max("attempt"))["newest"]
+    newest = attempts_of(trial=trial).aggregate(newest=Max("attempt"))["newest"]
     return bool(newest > trial.attempt)
 
 

@@ -11,22 +11,23 @@ from evaweb.plans.models import Plan
 from evaweb.results.analysis.outcomes import Interruption, Outcome
 from evaweb.trials.models import MilestoneOutcome, Trial, TrialStatus
 
-_FIELDS = (
-    "pk",
-    "verdict_id",
-    "checkpoint__name",
-    "scene__name",
-    "position__number",
-    "number",
-    "duration_s",
-    "station__name",
-    "operator__username",
-    "verdict__success",
-    "verdict__score",
-    "verdict__failure",
-    "episode__smoothness",
-    "episode__smoothness_commanded",
-)
+# What an outcome calls it, and where a trial has it.
+_RUN = {
+    "trial": "pk",
+    "checkpoint": "checkpoint__name",
+    "scene": "scene__name",
+    "position": "position__number",
+    "duration": "duration_s",
+    "station": "station__name",
+    "operator": "operator__username",
+}
+_FIELDS = _RUN | {
+    "success": "verdict__success",
+    "score": "verdict__score",
+    "failure": "verdict__failure",
+    "smoothness": "episode__smoothness",
+    "commanded": "episode__smoothness_commanded",
+}
 
 
 def outcomes_of_plan(plan: Plan) -> list[Outcome]:
@@ -40,8 +41,8 @@ def outcomes_of_plan(plan: Plan) -> list[Outcome]:
 def interruptions_of_plan(plan: Plan) -> list[Interruption]:
     """Runs of a plan that were broken off and not scored."""
     broken = Trial.objects.filter(handout__plan=plan, status=TrialStatus.INTERRUPTED).order_by("pk")
-    named = ("pk", "checkpoint__name", "scene__name", "position__number", "duration_s")
-    return [Interruption(*row) for row in broken.values_list(*named, "station__name", "operator__username")]
+    rows = broken.values_list(*_RUN.values())
+    return [Interruption(**dict(zip(_RUN, row, strict=True))) for row in rows]
 
 
 def outcomes_of(trials: QuerySet[Trial]) -> list[Outcome]:
@@ -53,46 +54,20 @@ def outcomes_of(trials: QuerySet[Trial]) -> list[Outcome]:
 
 
 def _outcomes(trials: QuerySet[Trial], blocks: dict[int, str], order: dict[int, int]) -> list[Outcome]:
-    scored = trials.filter(status=TrialStatus.SCORED).order_by("started_at", "pk").values_list(*_FIELDS)
-    rows = list(scored)
+    scored = trials.filter(status=TrialStatus.SCORED).order_by("started_at", "pk")
+    rows = list(scored.values_list("verdict_id", "number", *_FIELDS.values()))
     milestones = _milestones(trials)
     found = []
-    for at, row in enumerate(rows):
-        (
-            trial,
-            verdict,
-            checkpoint,
-            scene,
-            position,
-            number,
-            duration,
-            station,
-            operator,
-            success,
-            score,
-            why,
-            smoothness,
-            commanded,
-        ) = row
+    for at, (verdict, number, *told) in enumerate(rows):
+        said = dict(zip(_FIELDS, told, strict=True))
         reached = milestones.get(verdict, [])
         found.append(
             Outcome(
-                trial=trial,
-                order=order.get(trial, at),
-                block=blocks.get(trial, f"{scene}/{position}/{number}"),
-                checkpoint=checkpoint,
-                scene=scene,
-                position=position,
-                success=success,
-                score=score,
-                duration=duration,
+                order=order.get(said["trial"], at),
+                block=blocks.get(said["trial"], f"{said['scene']}/{said['position']}/{number}"),
                 milestones=tuple(ok for _, ok in reached),
-                failure=why,
-                station=station,
-                operator=operator,
                 labels=tuple(text for text, _ in reached),
-                smoothness=smoothness,
-                commanded=commanded,
+                **said,
             )
         )
     return sorted(found, key=lambda outcome: outcome.order)
