@@ -252,7 +252,15 @@ class StationConsumer(AsyncWebsocketConsumer):
                 _renewals.ask(self._station, renew, key=key, identity=request.epoch)
             )
             refused = ack.status == "refused"
-            self._say({"type": "renewed", "ok": not refused, "lost": refused, "reason": ack.reason})
+            self._say(
+                {
+                    "type": "renewed",
+                    "ok": not refused,
+                    "lost": refused,
+                    "reason": ack.reason,
+                    "epoch": request.epoch,
+                }
+            )
         except (StationGone, TooMany) as gone:
             self._say({"type": "renewed", "ok": False, "lost": False, "reason": str(gone)})
         finally:

@@ -207,6 +207,7 @@ class LivePage:
     def claim(self) -> None:
         """Take the station; renewed from then on."""
         path = f"stations/{self.station}/lease"
+        self.epoch = 0  # what an earlier lease is still answered says nothing of this one
         self.epoch = int(self._visitor.post(path, {"action": "claim", "page": self.page})["epoch"])
 
     def command(self, kind: str, trial: int | None = None) -> Mapping[str, Any]:
@@ -258,7 +259,7 @@ class LivePage:
         self._send({"type": "credit"})
 
     def _told(self, message: Mapping[str, Any]) -> None:
-        if message.get("type") == "renewed" and message.get("lost") and self.epoch:
+        if message.get("type") == "renewed" and message.get("lost") and message.get("epoch") == self.epoch:
             self._fail(f"the lease was lost: {message.get('reason')}")
 
     def _fail(self, why: str) -> None:

@@ -226,7 +226,8 @@ def test_a_lease_is_renewed_and_a_restarted_web_goes_on_with_it(live, ann, runti
         for _ in range(2):  # the second is the page after a restart of the web
             page = await Page(live.name, ann).open()
             await page.say(type="renew", epoch=lease.epoch)
-            assert await page.told("renewed") == {"type": "renewed", "ok": True, "lost": False, "reason": ""}
+            renewed = {"type": "renewed", "ok": True, "lost": False, "reason": "", "epoch": lease.epoch}
+            assert await page.told("renewed") == renewed
             await page.close()
 
     run(scenario())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 
 from evaweb.lab import once, patience
@@ -133,3 +135,12 @@ def test_a_publication_that_has_failed_is_told_with_its_error(clock):
 
     with pytest.raises(VisitFailed, match="waiting for the dataset: job publish:u has failed: disk full"):
         once._published(Visitor(), "u")
+
+
+def test_an_answer_about_an_earlier_lease_ends_no_later_one(clock):
+    page = Page(clock, dict)
+    page.epoch, page._failure, page._changed = 2, "", threading.Condition()
+    page._told({"type": "renewed", "ok": False, "lost": True, "reason": "claim it first", "epoch": 1})
+    assert page._failure == ""
+    page._told({"type": "renewed", "ok": False, "lost": True, "reason": "claim it first", "epoch": 2})
+    assert page._failure == "the lease was lost: claim it first"
