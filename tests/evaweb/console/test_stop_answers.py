@@ -269,3 +269,11 @@ def test_a_button_that_is_pressed_before_its_first_press_is_answered_says_so_and
         return kinds;
         """,
     ) == ["pressed", "Set up: pressed already, and not answered yet", 1, "accepted", "pressed", 2]
+
+
+def test_a_station_that_was_started_before_an_upgrade_is_seen_latched_and_released() -> None:
+    body = """
+        const old = (state, clock) => { store.snapshot = { state, clock, boot: "b1" }; store.take(); };
+        old("idle", 1); await look(); old("faulted", 2); await look(); old("idle", 3); await look();
+    """
+    assert pressing(body) == ["rest", "stopped", "rest"]
