@@ -75,6 +75,16 @@ def pytest_report_header() -> str:
     return f"started in the scheduling class {_BEGAN}"
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Whether a file has none of the tests that `make test` asks for: ten thousand need not be made to be left out."""
+    if config.option.markexpr == "not alone":
+        return collection_path in _ALONE or None
+    if config.option.markexpr != "alone" or not collection_path.match("test_*.py"):
+        return None
+    placed = any(folder in collection_path.parents for folder in _ALONE)
+    return not (placed or b"mark.alone" in collection_path.read_bytes()) or None
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what `make test` does not run beside anything else."""

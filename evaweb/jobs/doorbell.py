@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import logging
 
-from celery.exceptions import CeleryError
-from kombu.exceptions import KombuError
-
 log = logging.getLogger(__name__)
 
 TASK = "evaweb.jobs.work"  # by name: what it does asks for jobs itself
@@ -14,7 +11,10 @@ TASK = "evaweb.jobs.work"  # by name: what it does asks for jobs itself
 
 def ring(queue: str) -> bool:
     """Tell the broker; False where it did not take it: a worker finds the row when it next looks."""
-    from evaweb.celery import app  # here, for it makes the broker's folders
+    from celery.exceptions import CeleryError  # here, for most programs of a lab never ring
+    from kombu.exceptions import KombuError
+
+    from evaweb.celery import app  # which makes the broker's folders
 
     try:
         app.send_task(TASK, (queue,), queue=queue, retry=False)

@@ -8,6 +8,7 @@ from tests.e2e.lab import CHROMIUM, NO_CHROMIUM, Demo, browsing
 # A machine whose cores draw pictures, encode and browse at once is late now and then. These labs wait for what is late
 # instead of holding; what holds when is asked of `shared`, of tests/crash, and of the runtime's own tests.
 PATIENT = {
+    "bus.preview_rate": 5,
     "control.heartbeat_timeout_s": 10,
     "control.orphan_hold_s": 0.5,  # each lab waits for it at its end
     "control.starvation_hold_s": 10,
