@@ -18,27 +18,25 @@ from runtime.ipc.identity import forged, identified, lacking
 from runtime.ipc.messages import Ack, Command, Event
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
-from runtime.processes.coordinator.session.effects import Effects, GuardFacts
 from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
-from runtime.processes.coordinator.session.transitions import STOPPING, SessionEvent
+from runtime.processes.coordinator.session.transitions import STOPPING, GuardFacts, SessionEvent
 
 DIM = 14
 
 
-class Effortless(Effects):
-    """Everything succeeds at once and moves nothing; `situation` is what the test says it is."""
+class Effortless:
+    """In place of the coordinator's actions and parts: everything succeeds at once and moves nothing.
+
+    `situation` is what the test says it is.
+    """
 
     situation = GuardFacts()
 
-    def _nothing(self, *arguments: Any) -> Mapping[str, Any]:
+    def __getattr__(self, name: str) -> Effortless:
+        return self
+
+    def __call__(self, *arguments: Any) -> Mapping[str, Any]:
         return {}
-
-    begin_setup = cancel_setup = begin_run = hold = resume_run = end_run = _nothing
-    go_home = release_estop = start_recording = stop_recording = _nothing
-    tune = step = commit = cancel = move = grip = approach = _nothing
-
-
-Effortless.__abstractmethods__ = frozenset()
 
 
 class StandIn:
