@@ -117,24 +117,13 @@ class StandIn:
         self.do(lambda: self._streams.publish(stream, content))
 
     def snapshot(self) -> dict[str, Any]:
-        held = self.lease.current(time.monotonic())
         return {
             "boot": self.boot,
-            "sequence": self.session.sequence,
             "clock": time.monotonic(),
             "station": self.name,
             "robot": "agilex_piper",
-            "state": str(self.session.state),
-            "state_is": self.session.state.told(),
-            "reason": self.session.reason,
-            "allowed": self.session.allowed(),
-            "guarded": self.session.guarded(),
-            "lease": {
-                "holder": held.holder if held else "",
-                "by": held.by if held else "",
-                "epoch": held.epoch if held else self.lease.epoch,
-                "expires_in": held.until - time.monotonic() if held else 0.0,
-            },
+            **self.session.status(),
+            "lease": self.lease.status(time.monotonic()),
             "collect": self.collect,
             "latency": float("nan"),
             "newest_event": self.events.newest,

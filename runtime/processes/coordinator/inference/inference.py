@@ -52,6 +52,11 @@ class PendingChunk:
     rows: Float64
     answered: PolicyResponse
 
+    def status(self, now: float) -> dict[str, Any]:
+        """Its number, its rows, and how old the joints are that the policy was shown [s]."""
+        age = now - self.answered.observation.captured.get("joints", now)
+        return {"chunk": self.number, "rows": len(self.rows), "age_s": age}
+
 
 @dataclass(frozen=True, slots=True)
 class ShownChunk:
@@ -113,6 +118,21 @@ class Inference:
     def notes(self) -> list[Event]:
         """For the coordinator to collect."""
         return self.requests.notes
+
+    def status(self) -> dict[str, Any]:
+        """Figures of the answers of late, and whether the policy is lost."""
+        return {
+            "answers": self.metrics.answers,
+            **self.metrics.newest(),
+            "lost": self.lost_for > 0,
+            "retry_in_s": self.retry_in,
+            "rtc": self.rtc,
+        }
+
+    @property
+    def simulated(self) -> bool:
+        """True if the policy is shown the joints of the simulated robot."""
+        return self.requests.policy_observation.simulated
 
     @property
     def asked(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import ARGUMENTS, read
@@ -49,6 +49,17 @@ class SessionMachine:
         self._answers = answers | self._answers
         epochs = [ack.data.get("epoch") for ack in answers.values()]
         self._lease.never_below(max((e for e in epochs if isinstance(e, int)), default=0))
+
+    def status(self) -> dict[str, Any]:
+        """State, why it is that, and the commands that it allows."""
+        return {
+            "sequence": self.sequence,
+            "state": str(self.state),
+            "state_is": self.state.told(),
+            "reason": self.reason,
+            "allowed": self.allowed(),
+            "guarded": self.guarded(),
+        }
 
     def allowed(self) -> list[str]:
         """The commands that would be accepted now."""
