@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from runtime.config.schema import Deployment
 from runtime.core import bounded_documents as bounded
 from runtime.core.errors import ConfigurationError
-from runtime.core.explanation import Key, explanation
+from runtime.core.settings import Key, explanation
 
 __all__ = [
     "ConfigurationError",

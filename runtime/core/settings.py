@@ -1,8 +1,23 @@
-"""The base of every part of a deployment file."""
+"""A table of settings, the base of every part of a deployment file, and what is wrong with one in sentences."""
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
+
+from runtime.core.plugins import OneOf, variants
+
+Key = tuple[str, ...]
+_SECRET = re.compile(
+    r"pass|secret|token|private", re.IGNORECASE
+)  # keys whose values nobody is to read in a message
+_NO_ORIGIN: Mapping[Key, str] = MappingProxyType({})
 
 
 class Settings(BaseModel):
@@ -13,3 +28,120 @@ class Settings(BaseModel):
 
     # A limit of infinity or NaN would be no limit at all, and neither is valid in a manifest's JSON.
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+def explanation(
+    invalid: ValidationError,
+    root: type[BaseModel],
+    tree: Mapping[str, Any],
+    source: str,
+    origin: Mapping[Key, str] = _NO_ORIGIN,
+) -> str:
+    """One line per error of `tree` as a `root`: which key, what was given, what is allowed.
+
+    `origin` names where a key came from, `source` all the others.
+    """
+    return "\n".join(_sentence(error, root, tree, source, origin) for error in invalid.errors())
+
+
+def _sentence(
+    error: ErrorDetails,
+    root: type[BaseModel],
+    tree: Mapping[str, Any],
+    source: str,
+    origin: Mapping[Key, str],
+) -> str:
+    key = _plain(error["loc"], tree)
+    where = next((origin[key[:n]] for n in range(len(key), 0, -1) if key[:n] in origin), source)
+    name = ".".join(key)
+    kind = error["type"]
+    if kind == "extra_forbidden":
+        allowed = _allowed(key[:-1], tree, root)
+        near = difflib.get_close_matches(key[-1], allowed, 1)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        given = "" if _SECRET.search(key[-1]) else f" = {error['input']!r:.200}"
+        if (instead := getattr(root, "GONE", {}).get(name)) is not None:
+            return f"{where}: {name}{given}: {instead}"
+        return f"{where}: {name}{given}: unknown key{hint}; allowed here: {', '.join(allowed)}"
+    if kind == "missing":
+        return f"{where}: {name} is missing and has no default"
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        where = origin.get((*key, "kind"), where)
+        given = f"= {error['input']['kind']!r:.200}" if "kind" in error["input"] else "is missing"
+        return f"{where}: {name}.kind {given}: must be one of {error['ctx']['expected_tags']}"
+    if kind == "secret":
+        return f"{where}: {name}: {error['msg']}"
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return f"{where}: {name} = {error['input']!r:.200}: must be a table"
+    return f"{where}: {name} = {error['input']!r:.200}: {error['msg'].removeprefix('Value error, ')}"
+
+
+def _plain(loc: tuple[int | str, ...], tree: Mapping[str, Any]) -> Key:
+    """The key as it stands in the file: without the tags that pydantic adds for unions."""
+    key: list[str] = []
+    at: Any = tree
+    for index, part in enumerate(loc):
+        last = index == len(loc) - 1
+        if isinstance(at, Mapping) and part in at:
+            at = at[part]
+            key.append(str(part))
+        elif isinstance(at, list) and isinstance(part, int):
+            at = at[part] if part < len(at) else None
+            key.append(str(part))
+        elif last and isinstance(at, Mapping) and at.get("kind") != part:
+            key.append(str(part))
+    return tuple(key)
+
+
+def _allowed(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[str]:
+    """The keys that the table at `key` may have."""
+    return sorted({name for model in _tables(key, tree, root) for name in model.model_fields})
+
+
+def _tables(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[type[BaseModel]]:
+    """Models that the table at `key` may be: one where its kind says so, else each it could be."""
+    annotations: list[Any] = [root]
+    at: Any = tree
+    for name in key:
+        at = at.get(name) if isinstance(at, Mapping) else None
+        annotations = [
+            chosen
+            for annotation in annotations
+            for found in _under(name, annotation)
+            for chosen in _chosen(found, at)
+        ]
+    return _models(annotations)
+
+
+def _under(name: str, annotation: Any) -> list[Any]:
+    """The annotations of what stands under `name` in something of type `annotation`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        field = annotation.model_fields.get(name)
+        return [field.annotation] if field else []
+    if get_origin(annotation) in (dict, list):
+        return [get_args(annotation)[-1]]
+    return [found for part in get_args(annotation) for found in _under(name, part)]
+
+
+def _chosen(annotation: Any, table: Any) -> list[Any]:
+    """The annotation, that of the kind that `table` names where there are several; [] where it names none."""
+    if isinstance(annotation, type) and issubclass(annotation, OneOf):
+        kind = table.get("kind") if isinstance(table, Mapping) else None
+        return (
+            [annotation.config(kind)]
+            if isinstance(kind, str) and kind in variants(annotation.package)
+            else []
+        )
+    if get_origin(annotation) in (dict, list) or not get_args(annotation):
+        return [annotation]
+    return [found for part in get_args(annotation) for found in _chosen(part, table)]
+
+
+def _models(annotations: Sequence[Any]) -> list[type[BaseModel]]:
+    found: list[type[BaseModel]] = []
+    for annotation in annotations:
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            found.append(annotation)
+        else:
+            found.extend(_models(get_args(annotation)))
+    return found

@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator, Field, JsonValue, ValidationError
 
 from runtime.core.errors import RuntimeFault
-from runtime.core.explanation import explanation
-from runtime.core.settings import Settings
+from runtime.core.settings import Settings, explanation
 from runtime.core.types import Result
 from runtime.ipc.messages import Mode
 

@@ -112,6 +112,17 @@ class Run:
             return 0.0
         return (now if self.held_since is None else self.held_since) - self.begun - self.held
 
+    def status(self, now: float) -> dict[str, Any]:
+        """Which run it is, how long it has run and been held [s], and its limit."""
+        held = self.held + (now - self.held_since if self.held_since is not None else 0.0)
+        return {
+            "number": self.number,
+            "uuid": self.uuid,
+            "elapsed": self.elapsed(now),
+            "held": held,
+            "duration_s": self.duration_s,
+        }
+
 
 @dataclass(frozen=True, slots=True)
 class Provenance:

@@ -9,6 +9,7 @@ const ASK_MS = 4000; // for which "again to discard" stands
 const SETTLE_MS = 600; // a Start that took the place of Stop is not yet pressed by the hand that pressed Stop
 const REST_MS = 10000; // for the robot to be at rest before it is recorded again
 const QUEUE_MS = 2000;
+const OF_SESSIONS = ["collect", "episode", "job"];
 
 export class CollectPanel {
   #store;
@@ -30,6 +31,7 @@ export class CollectPanel {
     store.on(["snapshot", "second"], () => this.draw());
     document.body.addEventListener("htmx:afterSettle", () => this.draw());
     store.on("second", () => this.#follow());
+    store.on("changed", (what) => what.some((name) => OF_SESSIONS.includes(name)) && this.refresh());
     gamepads((action) => this.#pressed(action));
     this.draw();
   }

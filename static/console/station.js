@@ -28,9 +28,8 @@ import { TrialPanel } from "./trial/trial.js";
 import { veil } from "./trial/veil.js";
 import { CLOSED } from "./live/words.js";
 
-const OF_SESSIONS = ["collect", "episode", "job"];
-
-function listen(store, { events, estop, commands, lease, trial, hand, collect }) {
+/** What hears the messages of the socket; those that are for a part of the page the store tells to it. */
+function listen(store, events) {
   const answers = {
     hello: ({ facts, role }) => {
       store.closed = null;
@@ -43,14 +42,10 @@ function listen(store, { events, estop, commands, lease, trial, hand, collect })
       store.tell("link");
     },
     events: (news) => events.add(news),
-    ack: (ack) => (ack.kind === "estop" ? estop() : commands()).acknowledged(ack),
-    aimed: (answer) => hand()?.aimed(answer), // which tells "eva:aimed" what is to be shown of it
-    renewed: (answer) => lease().renewed(answer),
-    changed: ({ what }) => {
-      if (what.includes("lease")) window.htmx.trigger("#lease", "eva:lease");
-      if (["trial", "episode", "sight"].some((one) => what.includes(one))) trial()?.refresh();
-      if (what.some((name) => OF_SESSIONS.includes(name))) collect()?.refresh();
-    },
+    ack: (ack) => store.tell("ack", ack),
+    aimed: (answer) => store.tell("aimed", answer),
+    renewed: (answer) => store.tell("renewed", answer),
+    changed: ({ what }) => store.tell("changed", what),
     error: ({ reason }) => console.error(`the server did not understand this page: ${reason}`),
   };
   return (message) => answers[message.type]?.(message);
@@ -62,16 +57,13 @@ async function start() {
   const store = new Store({ user: config.user, role: config.role, page: await pageId() });
   const events = new Events();
   const cameras = new Cameras(store);
-  const parts = {};
   const way = new StopWay(config.stops, config.api);
   const socket = new LiveSocket(`${config.socket}?page=${store.page}`, {
-    told: listen(store, { events, estop: () => parts.estop, commands: () => parts.commands, lease: () => parts.lease, trial: () => parts.trial, hand: () => parts.hand, collect: () => parts.collect }),
+    told: listen(store, events),
     draw: (frame) => draw(frame, store, cameras),
     changed: (open, code) => {
       store.open = open;
-      if (!open) store.closed = CLOSED[code] ?? null;
-      if (open) parts.estop.ask();
-      if (!open) store.link = { ok: false, reason: "" };
+      if (!open) Object.assign(store, { closed: CLOSED[code] ?? null, link: { ok: false, reason: "" } });
       store.tell("open");
     },
     greet: ({ again = false } = {}) => {
@@ -80,19 +72,18 @@ async function start() {
     },
     expected: () => store.link.ok,
   });
-  parts.estop = new EStop(store, socket, way); // first of all that can be pressed
+  new EStop(store, socket, way); // first of all that can be pressed
   keyboard();
   statusBar(store);
   const commands = new Commands(store, socket, way);
-  parts.commands = commands;
-  parts.lease = new LeaseControls(store, socket, commands);
+  new LeaseControls(store, socket, commands);
   if (config.page === "eval") {
-    parts.trial = new TrialPanel(store, commands);
+    new TrialPanel(store, commands);
     resetAid();
   }
-  if (config.page === "debug") parts.hand = byHand(store, socket, commands);
+  if (config.page === "debug") byHand(store, socket, commands);
   veil(store);
-  if (config.page === "collect") parts.collect = new CollectPanel(store, commands);
+  if (config.page === "collect") new CollectPanel(store, commands);
   setUp(store);
   preflights(store, commands);
   figures(store);

@@ -18,27 +18,25 @@ from runtime.ipc.identity import forged, identified, lacking
 from runtime.ipc.messages import Ack, Command, Event
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
-from runtime.processes.coordinator.session.effects import Effects, GuardFacts
 from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
-from runtime.processes.coordinator.session.transitions import STOPPING, SessionEvent
+from runtime.processes.coordinator.session.transitions import STOPPING, GuardFacts, SessionEvent
 
 DIM = 14
 
 
-class Effortless(Effects):
-    """Everything succeeds at once and moves nothing; `situation` is what the test says it is."""
+class Effortless:
+    """In place of the coordinator's actions and parts: everything succeeds at once and moves nothing.
+
+    `situation` is what the test says it is.
+    """
 
     situation = GuardFacts()
 
-    def _nothing(self, *arguments: Any) -> Mapping[str, Any]:
+    def __getattr__(self, name: str) -> Effortless:
+        return self
+
+    def __call__(self, *arguments: Any) -> Mapping[str, Any]:
         return {}
-
-    begin_setup = cancel_setup = begin_run = hold = resume_run = end_run = _nothing
-    go_home = release_estop = start_recording = stop_recording = _nothing
-    tune = step = commit = cancel = move = grip = approach = _nothing
-
-
-Effortless.__abstractmethods__ = frozenset()
 
 
 class StandIn:
@@ -119,24 +117,13 @@ class StandIn:
         self.do(lambda: self._streams.publish(stream, content))
 
     def snapshot(self) -> dict[str, Any]:
-        held = self.lease.current(time.monotonic())
         return {
             "boot": self.boot,
-            "sequence": self.session.sequence,
             "clock": time.monotonic(),
             "station": self.name,
             "robot": "agilex_piper",
-            "state": str(self.session.state),
-            "state_is": self.session.state.told(),
-            "reason": self.session.reason,
-            "allowed": self.session.allowed(),
-            "guarded": self.session.guarded(),
-            "lease": {
-                "holder": held.holder if held else "",
-                "by": held.by if held else "",
-                "epoch": held.epoch if held else self.lease.epoch,
-                "expires_in": held.until - time.monotonic() if held else 0.0,
-            },
+            **self.session.status(),
+            "lease": self.lease.status(time.monotonic()),
             "collect": self.collect,
             "latency": float("nan"),
             "newest_event": self.events.newest,

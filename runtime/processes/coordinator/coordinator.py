@@ -49,7 +49,7 @@ from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, Sessio
 from runtime.processes.coordinator.session.transitions import SessionEvent
 from runtime.processes.coordinator.session.tuning import strategy_of
 from runtime.processes.coordinator.setup.sequence import SetUp
-from runtime.processes.coordinator.snapshot import View, control_figures, facts, snapshot
+from runtime.processes.coordinator.snapshot import control_figures, facts, snapshot
 from runtime.processes.coordinator.timing_report import TimingReport
 from runtime.station import permissions as rights
 from runtime.station.run import Provenance, Run
@@ -74,7 +74,7 @@ class Coordinator:
     ) -> None:
         self.shared, self.clock = shared, clock
         self.people = people or clock  # of leases, and of how long commands are valid: lockstep has another
-        self._facts = facts(spec)
+        self.facts = facts(spec)
         self.boot = str(uuid.uuid4())
         self._own = spec.resolved
         settings = spec.deployment
@@ -101,7 +101,7 @@ class Coordinator:
             RtcPrefix(spec.rate, Mixture(spec.dims, spec.robot)),
         )
         self.setup = SetUp(spec, self.inference, self._orders, shared, clock, lambda: self.reception_report)
-        self._watch = HealthMonitor(
+        self.health = HealthMonitor(
             spec, shared, self.lease, clock, self.people, lambda: self.reception_report
         )
         control = settings.control
@@ -126,7 +126,7 @@ class Coordinator:
         parts = Parts(
             shared, clock, orders, self.inference, self.setup, self.runs, self.manual, self.collecting
         )
-        self.operations = SessionActions(spec, parts, self._state, self._watch.absent, self.say)
+        self.operations = SessionActions(spec, parts, self._state, self.health.absent, self.say)
         self.preflights = PreflightDesk(lambda: self.spec, spec, self._state, self.say, clock)
         self.session = SessionMachine(self.operations, self.lease, self.boot, self.people.now)
         self._take_over()
@@ -157,7 +157,7 @@ class Coordinator:
         for ring in _TO_MAIN:
             for payload in self.shared.rings[ring].drain():
                 self._hear(decode(payload))
-        for noticed in self._watch.notice(self.session.state, self.runs.open):
+        for noticed in self.health.notice(self.session.state, self.runs.open):
             self._observe(*noticed)
         if missed := self.collecting.look(self.session.state):
             self._observe(*missed)
@@ -170,28 +170,7 @@ class Coordinator:
 
     def snapshot(self) -> dict[str, Any]:
         """The station's state at this moment."""
-        return snapshot(
-            View(
-                spec=self.spec,
-                shared=self.shared,
-                session=self.session,
-                lease=self.lease,
-                inference=self.inference,
-                setup=self.setup,
-                runs=self.runs,
-                media=self.media_report,
-                reception=self.reception_report,
-                unheard=self.unheard,
-                manual=self.manual,
-                collecting=self.collecting,
-                estop=self._watch.estop,
-                boot=self.boot,
-                now=self.clock.now(),
-                people=self.people.now(),
-                newest_event=self.events.newest,
-                facts=self._facts,
-            )
-        )
+        return snapshot(self)
 
     def finish(self, reason: str) -> None:
         """The run is over, says who simulates what it is about."""

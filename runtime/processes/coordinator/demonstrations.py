@@ -287,7 +287,7 @@ class Demonstrations:
 
     # --- for pages -------------------------------------------------------------------------------------------
 
-    def shown(self) -> dict[str, Any] | None:
+    def status(self) -> dict[str, Any] | None:
         """For the snapshot; None where the deployment says nothing of collecting."""
         if self._settings is None:
             return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 HIGHEST_EPOCH = 2**52  # of a claim; beyond 2**53 a browser counts no more
 
@@ -28,6 +29,13 @@ class Lease:
     def current(self, now: float) -> Held | None:
         """The lease that is valid at `now`."""
         return self._held if self._held and now < self._held.until else None
+
+    def status(self, now: float) -> dict[str, Any]:
+        """Holder, name, epoch and the seconds that are left; for none the newest epoch and no holder."""
+        held = self.current(now)
+        if held is None:
+            return {"holder": "", "by": "", "epoch": self._epoch, "expires_in": 0.0}
+        return {"holder": held.holder, "by": held.by, "epoch": held.epoch, "expires_in": held.until - now}
 
     @property
     def epoch(self) -> int:

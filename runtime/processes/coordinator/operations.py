@@ -13,8 +13,6 @@ from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import (
     DiscardRequest,
     GripperRequest,
-    LabelRequest,
-    MoveRequest,
     RunRequest,
     SetUpRequest,
     TuneRequest,
@@ -27,7 +25,7 @@ from runtime.processes.coordinator.demonstrations import Demonstrations
 from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.runs import Runs
-from runtime.processes.coordinator.session.effects import Effects, GuardFacts, Told
+from runtime.processes.coordinator.session.transitions import GuardFacts, Told
 from runtime.processes.coordinator.session.tuning import strategy_of, tuned
 from runtime.processes.coordinator.setup.sequence import SetUp
 from runtime.station.spec import StationSpec
@@ -47,8 +45,12 @@ class Parts:
     collecting: Demonstrations
 
 
-class SessionActions(Effects):
-    """Carries out what the session has allowed; `plan` is the one in force, `absent` names a process that is silent."""
+class SessionActions:
+    """Carries out what the session has allowed and more than one part has to do with; `spec` is the one in force.
+
+    `absent` names a process that is silent. Each method raises RuntimeFault to refuse, and has changed nothing then.
+    What is returned goes into the answer.
+    """
 
     def __init__(
         self,
@@ -60,12 +62,22 @@ class SessionActions(Effects):
     ) -> None:
         self._own = spec  # the deployment's
         self.spec = spec  # as it was last set up or tuned
-        self.shared, self.clock = parts.shared, parts.clock
-        self.inference, self.setup = parts.inference, parts.setup
-        self.runs, self.manual, self.collecting = parts.runs, parts.manual, parts.collecting
+        self.shared: SharedState = parts.shared
+        self.clock = parts.clock
+        self.inference: Inference = parts.inference
+        self.setup: SetUp = parts.setup
+        self.runs: Runs = parts.runs
+        self.manual: ManualControl = parts.manual
+        self.collecting: Demonstrations = parts.collecting
         self._orders = parts.orders
         self._state, self._absent, self._say = state, absent, say
         self._tuned = False  # since the last set-up
+        self.by: str = ""  # the client whose command is being carried out
+        self.command: str = ""  # that command's uuid
+
+    def attribute(self, by: str, command: str) -> None:
+        """What is carried out next was asked for by `by`, in the command with that uuid."""
+        self.by, self.command = by, command
 
     # --- set-up and runs -------------------------------------------------------------------------------------
 
@@ -198,6 +210,7 @@ class SessionActions(Effects):
         )
 
     def tune(self, asked: TuneRequest) -> Told:
+        """Another strategy, other parameters, another instruction from now on."""
         if self.spec.collecting and asked.strategy is not None:
             raise RuntimeFault("tune: strategy while the station is set up to collect; allowed: task")
         spec = tuned(self.spec, asked, self.setup.info)
@@ -214,18 +227,10 @@ class SessionActions(Effects):
         self._say(Event("tuned_to", text, self.clock.now(), data=data))
         return {"strategy": strategy, "task": settings.task}
 
-    def step(self) -> None:
-        self.inference.step()
-
-    def commit(self) -> None:
-        self.inference.commit()
-
     def cancel(self) -> None:
+        """Forget the chunk that is shown, leave the rest of the one that is executed, end a motion; hold."""
         self.runs.cancel()
         self.manual.stand()
-
-    def move(self, asked: MoveRequest) -> Told:
-        return self.manual.move(asked)
 
     def grip(self, asked: GripperRequest) -> Told:
         run = self.runs.open
@@ -237,6 +242,7 @@ class SessionActions(Effects):
         return self.manual.grip(asked, free)
 
     def approach(self) -> None:
+        """Go to the policy's first action on a limited path: the one of the set-up, or the one that is shown."""
         made, first = self.inference.proposal, self.setup.first_action
         if self._state() is not SessionState.READY and made is not None:
             self.runs.approach(self.manual.checked("approach", made.rows[0]))
@@ -246,16 +252,12 @@ class SessionActions(Effects):
     # --- demonstrations -----------------------------------------------------------------------------
 
     def arm(self) -> None:
+        """A collected episode may begin from now on."""
         self._require_family()
         self.collecting.arm()
 
-    def disarm(self) -> None:
-        self.collecting.disarm(f"by {self.by}")
-
-    def label(self, asked: LabelRequest) -> Told:
-        return self.collecting.label(asked, self.by)
-
     def discard(self, asked: DiscardRequest) -> Told:
+        """Mark an episode as discarded; the open one ends, as by `end_run`, where none is named."""
         told = self.collecting.discard(asked, self.by)
         if asked.episode is None and self.collecting.run is not None:
             self.end_run("finished", "discarded by the operator")
@@ -264,6 +266,7 @@ class SessionActions(Effects):
     # --- what goes on -------------------------------------------------------------------------------
 
     def hold(self, reason: str) -> None:
+        """Decelerate, hold, stop asking the policy; a run stays open."""
         self.runs.hold(reason)
         self.manual.stand()
 
@@ -272,6 +275,7 @@ class SessionActions(Effects):
         self.runs.resume()
 
     def end_run(self, status: str, reason: str) -> None:
+        """Decelerate, hold, close the run and its episode; nothing to do where no run is open."""
         self.runs.end(status, reason)
         self.manual.stand()
 
@@ -279,15 +283,9 @@ class SessionActions(Effects):
         self.manual.require_robot("home")
         self.setup.begin_homing()
 
-    def release_estop(self) -> None:
-        self.shared.ask_release()
-
     def start_recording(self) -> Told:
         self._require_family()
         return {"episode": self.runs.record_alone(self.setup.info)}
-
-    def stop_recording(self) -> None:
-        self.runs.stop_alone()
 
     def _require_family(self) -> None:
         """Refuse while a process is still starting: what it is sent would be lost."""

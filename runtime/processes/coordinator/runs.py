@@ -76,10 +76,15 @@ class Runs:
         settings = self._plan.deployment
         require_room(settings.episodes_dir, settings.recording.min_free_bytes)
 
-    @property
-    def checkpoint(self) -> Mapping[str, Any]:
-        """The checkpoint that the station was set up with, as the operator named it; {} for none."""
-        return self._provenance.checkpoint
+    def status(self, now: float) -> dict[str, Any]:
+        """The open run, how the last one and the last episode ended, and the checkpoint."""
+        none = {"number": 0, "uuid": "", "elapsed": 0.0, "held": 0.0, "duration_s": None}
+        return {
+            "checkpoint": dict(self._provenance.checkpoint),
+            "run": self.open.status(now) if self.open else none,
+            "last_run": self.last,
+            "episode": self.last_episode,
+        }
 
     def describe(self, **changes: Any) -> None:
         """Another plan, checkpoint or layout of the bench, for the manifests of what follows: fields of Provenance."""

@@ -27,6 +27,7 @@ export class Commands {
       post: (command) => post(config.api.commands, command),
       late: (ack) => this.#late(ack),
     });
+    store.on("ack", (ack) => ack.kind !== "estop" && this.acknowledged(ack));
     document.addEventListener("click", (event) => this.#clicked(event));
     store.on(["snapshot", "link", "open", "second"], () => this.gate());
     document.body.addEventListener("htmx:afterSettle", () => this.gate());

@@ -41,6 +41,8 @@ export class EStop {
     window.addEventListener("keydown", (event) => this.#key(event), { capture: true });
     window.addEventListener("keyup", (event) => this.#keyUp(event), { capture: true });
     this.#heed();
+    store.on("open", () => store.open && this.ask());
+    store.on("ack", (ack) => ack.kind === "estop" && this.acknowledged(ack));
     store.on("snapshot", () => this.#news());
     this.ask();
     this.#area.dataset.ready = ""; // estop_early.js leaves it to us

@@ -30,6 +30,8 @@ export class LeaseControls {
     this.#socket = socket;
     this.#commands = commands;
     store.on(["snapshot", "link", "open"], () => this.#draw());
+    store.on("renewed", (answer) => this.#renewed(answer));
+    store.on("changed", (what) => what.includes("lease") && window.htmx.trigger("#lease", "eva:lease"));
     document.body.addEventListener("htmx:afterSettle", () => this.#draw());
     document.addEventListener("click", (event) => this.#clicked(event));
     document.addEventListener("submit", (event) => this.#taken(event));
@@ -40,7 +42,7 @@ export class LeaseControls {
   }
 
   /** The server answered a renewal; the station's own state says the rest. */
-  renewed({ ok, reason }) {
+  #renewed({ ok, reason }) {
     this.#refused = ok || this.#store.lease !== "mine" ? 0 : this.#refused + 1;
     if (this.#refused > 1) this.#commands.say(`Lease not renewed: ${reason}`, "refused"); // once: it was just handed over
   }

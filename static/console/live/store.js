@@ -1,6 +1,6 @@
 // What this page knows of its station: the newest of everything, and who wants to hear of it.
 
-/** Names told: "snapshot", "joints", "poses", "camera", "link", "events", "open", "hello", "second". */
+/** Names told: "snapshot", "joints", "poses", "camera", "link", "events", "open", "hello", "second"; answers of the web: "ack", "renewed", "aimed"; "changed", with the names of what has in the database. */
 export class Store {
   #listeners = new Map();
 

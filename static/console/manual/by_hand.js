@@ -9,9 +9,9 @@ import { robotPanel } from "../debug/robot_panel.js";
 import { groups } from "./targets.js";
 import { TuningPanel } from "../debug/tuning_panel.js";
 
-/** Returns {aimed(answer)}, which hears what the station says of targets. */
 export function byHand(store, socket, commands) {
   const aim = new Aim((message) => socket.send(message));
+  store.on("aimed", (answer) => aim.answered(answer));
   const shown = panels(document.getElementById("hand"));
   new ModePanel(store, commands, (mode) => shown.open(mode === "manual" ? "manual" : "policy"));
   new TuningPanel(store, commands);
@@ -21,7 +21,6 @@ export function byHand(store, socket, commands) {
   document.getElementById("hand").addEventListener("keydown", ({ key, target }) => {
     if (key === "Enter" && target.matches("input")) target.blur(); // what was typed counts, and the keys are free again
   });
-  return { aimed: (answer) => aim.answered(answer) };
 }
 
 /** Unit and range of a group's gripper. */

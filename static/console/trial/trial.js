@@ -6,6 +6,8 @@ import { config } from "../live/config.js";
 import { PlanControls, times } from "./plan.js";
 import { duration } from "../live/words.js";
 
+const OF_TRIALS = ["trial", "episode", "sight"];
+
 export class TrialPanel {
   #store;
   #commands;
@@ -21,6 +23,7 @@ export class TrialPanel {
     document.addEventListener("submit", (event) => this.#submitted(event));
     document.addEventListener("input", (event) => event.target.closest("#score") && scoreRule());
     store.on(["snapshot", "second"], () => this.draw());
+    store.on("changed", (what) => what.some((name) => OF_TRIALS.includes(name)) && this.refresh());
     document.body.addEventListener("htmx:afterSettle", () => this.draw());
     this.draw();
   }

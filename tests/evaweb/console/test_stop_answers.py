@@ -139,6 +139,35 @@ def test_what_an_answer_said_is_believed_until_the_station_says_later_that_it_is
     ) == ["stopped", "stopped", "rest"]
 
 
+def test_answers_over_the_socket_reach_who_pressed_though_another_part_of_the_page_fails() -> None:
+    body = f"""
+        const {{ Store }} = await import({json.dumps((MODULES / "live/store.js").as_uri())});
+        const {{ Commands }} = await import({json.dumps((MODULES / "commands/commands.js").as_uri())});
+        const page = new Store({{ user: "ann", role: "operator", page: "p1" }});
+        const failures = [];
+        globalThis.reportError = (error) => failures.push(error.message);
+        page.on(["ack", "open"], () => {{ throw new Error("a panel"); }});
+        let asked = 0;
+        way.ask = async () => {{ asked += 1; return true; }};
+        const button = new EStop(page, socket, way), commands = new Commands(page, socket, way);
+        const line = document.getElementById("outcome");
+        button.press("button"); commands.give("halt"); await look();
+        page.tell("ack", {{ kind: "halt", uuid: sent[1].uuid, status: "accepted" }}); await look();
+        kinds.push(line.dataset.kind);
+        page.tell("ack", {{ kind: "estop", uuid: sent[0].uuid, status: "done" }}); await look();
+        page.open = true; page.tell("open");
+        return [...kinds, asked, failures.length];
+    """
+    assert run("../site/identity.js", PRESSES + "way.post = () => null;" + body) == [
+        "pressed",
+        "pressed",
+        "accepted",
+        "stopped",
+        2,
+        3,
+    ]
+
+
 def test_the_process_for_stops_is_asked_again_until_it_answers() -> None:
     answers = "const answers = [false, false, true]; way.ask = async () => answers.shift();"
     body = """

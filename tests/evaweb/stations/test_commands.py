@@ -14,8 +14,7 @@ from evaweb.stations import commands, leases, stops
 from evaweb.stations.commands import NotSent, issue, settle
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.stops import HARDWARE_STOP
-from runtime.processes.coordinator.session.effects import GuardFacts
-from runtime.processes.coordinator.session.transitions import COMMANDS, STOPPING
+from runtime.processes.coordinator.session.transitions import COMMANDS, STOPPING, GuardFacts
 
 pytestmark = pytest.mark.django_db
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.core.backoff import BackOff
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError, RuntimeFault
 from runtime.core.types import Conditioning, Float64
@@ -21,6 +20,7 @@ from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.processes.coordinator.inference.metrics import PolicyMetrics
 from runtime.processes.coordinator.inference.policy_observation import StaleObservationError
 from runtime.processes.coordinator.inference.requests import PolicyRequests, PolicyResponse
+from runtime.processes.coordinator.inference.retry import Retry
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
 from runtime.processes.coordinator.inference.worker import telling
 from runtime.strategies.base import Progress, Query, StrategyParameters
@@ -51,6 +51,11 @@ class PendingChunk:
     number: int
     rows: Float64
     answered: PolicyResponse
+
+    def status(self, now: float) -> dict[str, Any]:
+        """Its number, its rows, and how old the joints are that the policy was shown [s]."""
+        age = now - self.answered.observation.captured.get("joints", now)
+        return {"chunk": self.number, "rows": len(self.rows), "age_s": age}
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +91,6 @@ class Inference:
         self.proposal: PendingChunk | None = None  # shown, and neither committed nor cancelled
         self.shown: ShownChunk | None = None
         self._planned: ShownChunk | None = None  # the newest that control has merged
-        self.failure = ""  # why the policy is being tried again
         self.rtc_warning = ""
         self._given: Conditioning | None = None  # with the newest request
         self._strategy = strategy
@@ -95,7 +99,7 @@ class Inference:
         self._clock = clock
         self._patience = patience
         self._commitment = commitment
-        self._back_off = BackOff()
+        self.retry = Retry(clock, patience.lost, self._note)
         self._run = 0
         self._mode: Mode = "continuous"
         self._wanted = False  # in a mode on demand: one chunk
@@ -114,6 +118,21 @@ class Inference:
         """For the coordinator to collect."""
         return self.requests.notes
 
+    def status(self) -> dict[str, Any]:
+        """Figures of the answers of late, and whether the policy is lost."""
+        return {
+            "answers": self.metrics.answers,
+            **self.metrics.newest(),
+            "lost": self.retry.lost_for > 0,
+            "retry_in_s": self.retry.due_in,
+            "rtc": self.rtc,
+        }
+
+    @property
+    def simulated(self) -> bool:
+        """True if the policy is shown the joints of the simulated robot."""
+        return self.requests.policy_observation.simulated
+
     @property
     def asked(self) -> bool:
         """True if the policy is being asked, or its answer has not reached the timeline."""
@@ -122,19 +141,9 @@ class Inference:
     @property
     def trouble(self) -> str:
         """Why there may be no chunk: what the policy last failed of, or for how long it owes an answer; else ""."""
-        if self.failure or self._flight is None:
-            return self.failure
+        if self.retry.failure or self._flight is None:
+            return self.retry.failure
         return f"the policy was asked {self._clock.now() - self._asked_at:.1f} s ago and has not answered yet"
-
-    @property
-    def lost_for(self) -> float:
-        """Time for which the policy has not answered [s], 0 where it does."""
-        return self._back_off.lasts(self._clock.now())
-
-    @property
-    def retry_in(self) -> float:
-        """When it is tried again [s]."""
-        return self._back_off.waiting(self._clock.now())
 
     @property
     def rtc(self) -> dict[str, Any]:
@@ -158,7 +167,7 @@ class Inference:
         self.pause()
         self.requests.exchange(policy, task)
         self.metrics.forget()
-        self._forget_failures()
+        self.retry.forget()
 
     def tune(self, strategy: Strategy, task: str) -> None:
         """Go on with another strategy, other parameters, another instruction; a request in flight stays."""
@@ -182,7 +191,7 @@ class Inference:
         else:
             self.requests.resume()
         self._commitment.clear()
-        self._forget_failures()
+        self.retry.forget()
         self._stale_since = None
         self._wanted, self.proposal = False, None
         self._unmerged.clear()
@@ -209,7 +218,7 @@ class Inference:
     def cancel(self) -> None:
         """Forget the chunk that is asked for, or shown, or under way to control, and what has failed meanwhile."""
         self._flight, self._stale_since = None, None
-        self._forget_failures()
+        self.retry.forget()
         self._wanted, self.proposal, self.shown, self._planned = False, None, None, None
         self._unmerged.clear()
         self._commitment.clear()
@@ -267,20 +276,12 @@ class Inference:
 
     def retries(self, error: RuntimeFault) -> bool:
         """Count a failure; True if the policy will be tried again, False where patience is at its end."""
-        now = self._clock.now()
-        first, self.failure = self._back_off.since is None, str(error)
-        self._back_off.failed(now)
         if isinstance(error, PolicyLostError):
             self.metrics.count_lost()
-        if self._back_off.lasts(now) > self._patience.lost:
-            return False
-        if first:
-            kind = "policy_lost" if isinstance(error, PolicyLostError) else "policy_failed"
-            self._note(kind, f"{error}; trying again for {self._patience.lost:g} s")
-        return True
+        return self.retry.failed(error)
 
     def _wants(self) -> bool:
-        if self._back_off.waiting(self._clock.now()):
+        if self.retry.due_in:
             return False
         return self._wanted if self._mode in ON_DEMAND else self._strategy.query.wants(self._progress())
 
@@ -335,7 +336,7 @@ class Inference:
         else:
             self._post(made)
         recorded = self._record(made)
-        self._recovered()  # not before: one whose answers cannot be used is not back
+        self.retry.recovered()  # not before: one whose answers cannot be used is not back
         return recorded
 
     def _record(self, made: PendingChunk) -> PolicyAnswer:
@@ -359,15 +360,6 @@ class Inference:
         first = answered.made.first
         self._orders.post(PostedChunk(made.number, self._run, step, made.rows, answered.waited, first))
         self._unmerged[made.number] = made
-
-    def _recovered(self) -> None:
-        if self._back_off.since is not None:
-            self._note("policy_back", f"the policy answers again after {self.lost_for:.1f} s")
-        self._forget_failures()
-
-    def _forget_failures(self) -> None:
-        self._back_off.forget()
-        self.failure = ""
 
     def _note(self, kind: str, text: str) -> None:
         self.notes.append(Event(kind, text, self._clock.now()))

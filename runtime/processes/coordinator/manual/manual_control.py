@@ -81,6 +81,10 @@ class ManualControl:
         self.lock(grip.locks)
         if grip.goal is not None:
             self._runs.move(grip.goal, 1.0)
+        return self.status()
+
+    def status(self) -> dict[str, Any]:
+        """How each gripper is commanded and locked."""
         return {"grippers": self.grippers.told(self.commanded())}
 
     def stand(self) -> None:

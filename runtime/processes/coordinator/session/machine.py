@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import ARGUMENTS, read
@@ -10,7 +11,6 @@ from runtime.ipc.identity import named
 from runtime.ipc.messages import Ack, AckStatus, Command
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
-from runtime.processes.coordinator.session.effects import Effects, Told
 from runtime.processes.coordinator.session.transitions import (
     CANCEL,
     CANCELLED,
@@ -21,7 +21,11 @@ from runtime.processes.coordinator.session.transitions import (
     REASONS,
     STOPPING,
     SessionEvent,
+    Told,
 )
+
+if TYPE_CHECKING:
+    from runtime.processes.coordinator.operations import SessionActions
 
 LEASE_COMMANDS = ("lease_claim", "lease_renew", "lease_give_up")
 ANSWERS_KEPT = 5000
@@ -30,7 +34,7 @@ ANSWERS_KEPT = 5000
 class SessionMachine:
     """Holds the state; `handle` and `observe` are the only places that change it."""
 
-    def __init__(self, effects: Effects, lease: Lease, boot: str, now: Callable[[], float]) -> None:
+    def __init__(self, effects: SessionActions, lease: Lease, boot: str, now: Callable[[], float]) -> None:
         self._effects = effects
         self._lease = lease
         self._boot = boot
@@ -45,6 +49,17 @@ class SessionMachine:
         self._answers = answers | self._answers
         epochs = [ack.data.get("epoch") for ack in answers.values()]
         self._lease.never_below(max((e for e in epochs if isinstance(e, int)), default=0))
+
+    def status(self) -> dict[str, Any]:
+        """State, why it is that, and the commands that it allows."""
+        return {
+            "sequence": self.sequence,
+            "state": str(self.state),
+            "state_is": self.state.told(),
+            "reason": self.reason,
+            "allowed": self.allowed(),
+            "guarded": self.guarded(),
+        }
 
     def allowed(self) -> list[str]:
         """The commands that would be accepted now."""

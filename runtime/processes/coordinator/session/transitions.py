@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from runtime.ipc.messages import Mode
 from runtime.ipc.session_state import SessionState
-from runtime.processes.coordinator.session.effects import Effects, GuardFacts, Told
+
+if TYPE_CHECKING:
+    from runtime.processes.coordinator.operations import SessionActions
+
+Told = Mapping[str, Any]  # for the data of an answer
 
 
 class SessionEvent(StrEnum):
@@ -29,6 +34,25 @@ class SessionEvent(StrEnum):
     FAMILY_DIED = "family_died"  # a process of the family was restarted
 
 
+@dataclass(frozen=True, slots=True)
+class GuardFacts:
+    """Facts that the guards of commands look at, beside the state."""
+
+    mode: Mode | None = None  # of the open run
+    trial: bool = False  # the open run is one of a trial: nobody may change what is measured
+    proposed: bool = False  # a chunk is shown and waits to be committed
+    asked: bool = False  # the policy is being asked, or its answer has not reached control
+    executing: bool = False  # steps are planned
+    first_action: bool = False  # the last set-up knows the policy's first action
+    opening: bool = False  # the open run has not begun: its recording is being opened
+    approaching: bool = False  # the robot is on its way to where the chunk that is shown begins
+    collection: bool = False  # the deployment says how to collect
+    collecting: bool = False  # it is set up to collect
+    armed: bool = False  # a person has switched on that a collected episode may begin
+    unled: str = ""  # why the leader cannot be followed just now
+    doubt: str = ""  # why nothing may begin to move: joints are read where they cannot be, or are not held
+
+
 Guard = Callable[[SessionState, GuardFacts], str]  # why it is not allowed just now, "" where it is
 
 
@@ -46,11 +70,12 @@ class Rule:
     """A command: the states it is allowed in, the state after it, what it does, its guard.
 
     `after` None leaves the state as it is. What a command takes is in runtime.ipc.command_arguments.ARGUMENTS.
+    `effect` raises RuntimeFault to refuse, and has changed nothing then; what it returns goes into the answer.
     """
 
     allowed: tuple[SessionState, ...]
     after: SessionState | Mapping[SessionState, SessionState] | None
-    effect: Callable[[Effects, Any], Told | None]
+    effect: Callable[[SessionActions, Any], Told | None]
     guard: Guard = _always
     stays: Callable[[Any], bool] = lambda asked: False  # by what it took, whether the state is left as it is
 
@@ -148,40 +173,44 @@ def _may_approach(state: SessionState, situation: GuardFacts) -> str:
 S = SessionState
 _STOPPED = "stopped by the operator"
 COMMANDS: dict[str, Rule] = {
-    "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda e, asked: e.begin_setup(asked)),
-    "run": Rule((S.READY,), S.RUNNING, lambda e, asked: e.begin_run(asked), guard=_placed(_may_run)),
-    "stop": Rule((S.RUNNING, S.HOLDING, S.READY), S.READY, lambda e, _: e.end_run("finished", _STOPPED)),
-    "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda e, _: e.hold("halted by the operator")),
-    "resume": Rule((S.HOLDING,), S.RUNNING, lambda e, _: e.resume_run(), guard=_placed(_may_resume)),
-    "home": Rule((S.READY,), S.SETTING_UP, lambda e, _: e.go_home(), guard=_placed()),
-    "release": Rule((S.FAULTED,), None, lambda e, _: e.release_estop()),
-    "record_start": Rule((S.IDLE, S.READY), None, lambda e, _: e.start_recording()),
+    "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda do, asked: do.begin_setup(asked)),
+    "run": Rule((S.READY,), S.RUNNING, lambda do, asked: do.begin_run(asked), guard=_placed(_may_run)),
+    "stop": Rule((S.RUNNING, S.HOLDING, S.READY), S.READY, lambda do, _: do.end_run("finished", _STOPPED)),
+    "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda do, _: do.hold("halted by the operator")),
+    "resume": Rule((S.HOLDING,), S.RUNNING, lambda do, _: do.resume_run(), guard=_placed(_may_resume)),
+    "home": Rule((S.READY,), S.SETTING_UP, lambda do, _: do.go_home(), guard=_placed()),
+    "release": Rule((S.FAULTED,), None, lambda do, _: do.shared.ask_release()),
+    "record_start": Rule((S.IDLE, S.READY), None, lambda do, _: do.start_recording()),
     "record_stop": Rule(
-        (S.DISCONNECTED, S.IDLE, S.SETTING_UP, S.READY, S.HOLDING), None, lambda e, _: e.stop_recording()
+        (S.DISCONNECTED, S.IDLE, S.SETTING_UP, S.READY, S.HOLDING), None, lambda do, _: do.runs.stop_alone()
     ),
     "tune": Rule(
-        (S.IDLE, S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.tune(asked), guard=_untried
+        (S.IDLE, S.READY, S.RUNNING, S.HOLDING), None, lambda do, asked: do.tune(asked), guard=_untried
     ),
-    "step": Rule((S.RUNNING,), None, lambda e, _: e.step(), guard=_placed(_may_step)),
-    "commit": Rule((S.RUNNING,), None, lambda e, _: e.commit(), guard=_placed(_may_commit)),
-    "cancel": Rule((S.RUNNING,), None, lambda e, _: e.cancel(), guard=_may_cancel),
-    "move": Rule((S.RUNNING,), None, lambda e, asked: e.move(asked), guard=_placed(_may_move)),
+    "step": Rule((S.RUNNING,), None, lambda do, _: do.inference.step(), guard=_placed(_may_step)),
+    "commit": Rule((S.RUNNING,), None, lambda do, _: do.inference.commit(), guard=_placed(_may_commit)),
+    "cancel": Rule((S.RUNNING,), None, lambda do, _: do.cancel(), guard=_may_cancel),
+    "move": Rule((S.RUNNING,), None, lambda do, asked: do.manual.move(asked), guard=_placed(_may_move)),
     "gripper": Rule(
-        (S.READY, S.RUNNING, S.HOLDING), None, lambda e, asked: e.grip(asked), guard=_placed(_may_grip)
+        (S.READY, S.RUNNING, S.HOLDING), None, lambda do, asked: do.grip(asked), guard=_placed(_may_grip)
     ),
     "approach": Rule(
         (S.READY, S.RUNNING),
         {S.READY: S.SETTING_UP},
-        lambda e, _: e.approach(),
+        lambda do, _: do.approach(),
         guard=_placed(_may_approach),
     ),
-    "arm": Rule((S.READY, S.HOLDING), None, lambda e, _: e.arm(), guard=_may_arm),
-    "disarm": Rule((S.READY, S.HOLDING), None, lambda e, _: e.disarm(), guard=_may_disarm),
-    "label": Rule(tuple(SessionState), None, lambda e, asked: e.label(asked), guard=_may_collect),
+    "arm": Rule((S.READY, S.HOLDING), None, lambda do, _: do.arm(), guard=_may_arm),
+    "disarm": Rule(
+        (S.READY, S.HOLDING), None, lambda do, _: do.collecting.disarm(f"by {do.by}"), guard=_may_disarm
+    ),
+    "label": Rule(
+        tuple(SessionState), None, lambda do, asked: do.collecting.label(asked, do.by), guard=_may_collect
+    ),
     "discard": Rule(
         tuple(SessionState),
         {S.RUNNING: S.READY, S.HOLDING: S.READY},
-        lambda e, asked: e.discard(asked),
+        lambda do, asked: do.discard(asked),
         guard=_may_collect,
         stays=lambda asked: asked is not None and asked.episode is not None,
     ),
@@ -215,7 +244,7 @@ EVENT_TRANSITIONS: dict[tuple[SessionEvent, SessionState], SessionState] = {
 # A gripper may be on its way in these, although no run goes on: the end of the lease stops it, and no more.
 MOVED_BY_HAND = (S.READY, S.HOLDING)
 CANCELLED = "set-up cancelled by the operator"
-CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda e, _: e.cancel_setup(CANCELLED))
+CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda do, _: do.cancel_setup(CANCELLED))
 REASONS = {
     "stop": _STOPPED,
     "halt": "halted by the operator: resume or stop",

@@ -42,6 +42,16 @@ class Stage(StrEnum):
     APPROACH = "approaching the policy's first action"
 
 
+_ALL = (
+    Stage.CONNECT,
+    Stage.OBSERVE,
+    Stage.HOME,
+    Stage.SETTLE,
+    Stage.RESET,
+    Stage.WARM_UP,
+)  # of a whole set-up
+
+
 class DrivesDisabledError(SetupError):
     """The robot can be seen, and cannot move."""
 
@@ -86,6 +96,44 @@ class SetUp:
     def outcome(self) -> str:
         """Result of the set-up, in one sentence."""
         return self._motion_only or self.validated
+
+    def status(self, now: float) -> dict[str, Any]:
+        """How far it is, how long its stages took [s], what came of it, and how far the policy's first action is."""
+        first = self.first_action
+        return {
+            "stage": str(self.stage),
+            "stages": [self._stage_status(stage, now) for stage in self._course],
+            "setup_took": dict(self.took),
+            "first_action": {} if first is None else self.distance_of(first),
+            "validated": self.validated,
+        }
+
+    def distance_of(self, action: Float64) -> dict[str, Any]:
+        """Distance of an action [D] from where the robot is now, as by `first_action`."""
+        return first_action(action, np.array(self._page.observation.read()["qpos"], np.float64), self._plan)
+
+    @property
+    def _course(self) -> tuple[Stage, ...]:
+        """Stages of the newest set-up in their order: of a motion alone those that were entered."""
+        whole = Stage.CONNECT in self.stages or not self.stages
+        return _ALL if whole else tuple(self.stages)
+
+    def _stage_status(self, stage: Stage, now: float) -> dict[str, Any]:
+        """Whether it is done, goes on, or failed, and how long it took."""
+        since = self.stages.get(stage)
+        if stage is self.stage:
+            state = "active"
+        elif stage is self.failed:
+            state = "failed"
+        elif since is not None:
+            state = "done"
+        else:
+            state = "waiting" if self.active or not self.stages else "skipped"
+        seconds = 0.0
+        if since is not None:
+            later = [at for other, at in self.stages.items() if other is not stage and at >= since]
+            seconds = min(later, default=now) - since
+        return {"name": str(stage), "state": state, "seconds": seconds}
 
     def begin(self, reset: dict[str, Any] | None, least: LeastTimes | None = None) -> None:
         """Start from the first stage; `reset` as by `BenchReset.of`."""

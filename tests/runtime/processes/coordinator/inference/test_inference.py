@@ -434,7 +434,7 @@ def test_a_policy_whose_answers_cannot_be_used_is_not_back(
             desk.inference.pump()
         if not desk.inference.retries(told.value):
             break
-        desk.clock.advance(desk.inference.retry_in + 0.01)
+        desk.clock.advance(desk.inference.retry.due_in + 0.01)
     assert not desk.inference.retries(told.value)
     assert [note.kind for note in desk.inference.notes] == ["policy_failed"]
 
@@ -623,15 +623,15 @@ def test_a_policy_that_comes_back_is_welcome(desk: Desk) -> None:
     with pytest.raises(PolicyLostError) as lost:
         desk.inference.pump()
     assert desk.inference.retries(lost.value)
-    assert desk.inference.lost_for == 0.0
-    assert desk.inference.retry_in > 0.0
+    assert desk.inference.retry.lost_for == 0.0
+    assert desk.inference.retry.due_in > 0.0
     assert desk.inference.pump() is None  # not yet
     desk.policy.answer = None
     desk.clock.advance(0.15)
     desk.observe()
     assert desk.inference.pump() is not None
     assert [note.kind for note in desk.inference.notes] == ["policy_lost", "policy_back"]
-    assert desk.inference.retry_in == 0.0
+    assert desk.inference.retry.due_in == 0.0
 
 
 def test_another_strategy_takes_over_while_a_request_is_in_flight() -> None:

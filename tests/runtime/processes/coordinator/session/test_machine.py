@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 from itertools import count, product
+from typing import get_type_hints
 
 import pytest
 
@@ -10,13 +11,14 @@ from runtime.ipc.command_arguments import BenchRequest, LabelRequest, RunRequest
 from runtime.ipc.messages import Ack, Command
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
+from runtime.processes.coordinator.operations import Parts, SessionActions
 from runtime.processes.coordinator.session import machine as session_module
-from runtime.processes.coordinator.session.effects import Effects, GuardFacts
 from runtime.processes.coordinator.session.machine import SessionMachine
 from runtime.processes.coordinator.session.transitions import (
     COMMANDS,
     EVENT_TRANSITIONS,
     STOPPING,
+    GuardFacts,
     SessionEvent,
 )
 
@@ -28,20 +30,23 @@ EFFECTS = {
     "halt": "hold",
     "resume": "resume_run",
     "home": "go_home",
-    "release": "release_estop",
+    "release": "shared.ask_release",
     "record_start": "start_recording",
-    "record_stop": "stop_recording",
+    "record_stop": "runs.stop_alone",
     "tune": "tune",
-    "step": "step",
-    "commit": "commit",
+    "step": "inference.step",
+    "commit": "inference.commit",
     "cancel": "cancel",
-    "move": "move",
+    "move": "manual.move",
     "gripper": "grip",
     "approach": "approach",
     "arm": "arm",
-    "disarm": "disarm",
-    "label": "label",
+    "disarm": "collecting.disarm",
+    "label": "collecting.label",
     "discard": "discard",
+}
+TOLD = {"begin_setup": {"bench": "bench-7"}, "begin_run": {"episode": "episode-7"}} | {
+    "start_recording": {"episode": "episode-8"}
 }
 ARGUMENTS = {"gripper": {"action": "open"}, "label": {"result": "success"}}  # where one is needed
 # Written out a second time, so that a change of the table is a decision and not a slip.
@@ -116,7 +121,23 @@ def allowed_in(state, situation):
     return found
 
 
-class Recorded(Effects):
+class Asked:
+    """A method of the actions, or of one of their parts, by its name."""
+
+    def __init__(self, recorded, name):
+        self._recorded, self._name = recorded, name
+
+    def __getattr__(self, name):
+        return Asked(self._recorded, f"{self._name}.{name}")
+
+    def __call__(self, *details):
+        if self._name in self._recorded.refuse:
+            raise RuntimeFault(f"cannot {self._name}")
+        self._recorded.done.append((self._name, *details))
+        return TOLD.get(self._name)
+
+
+class Recorded:
     """Remembers what was asked for; refuses what it is told to."""
 
     situation = GuardFacts()
@@ -124,81 +145,11 @@ class Recorded(Effects):
     def __init__(self):
         self.done, self.refuse = [], set()
 
-    def _do(self, name, *details):
-        if name in self.refuse:
-            raise RuntimeFault(f"cannot {name}")
-        self.done.append((name, *details))
+    def attribute(self, by, command):
+        self.by = by
 
-    def begin_setup(self, asked):
-        self._do("begin_setup", asked)
-        return {"bench": "bench-7"}
-
-    def cancel_setup(self, reason):
-        self._do("cancel_setup", reason)
-
-    def begin_run(self, asked):
-        self._do("begin_run", asked)
-        return {"episode": "episode-7"}
-
-    def hold(self, reason):
-        self._do("hold", reason)
-
-    def resume_run(self):
-        self._do("resume_run")
-
-    def end_run(self, status, reason):
-        self._do("end_run", status, reason)
-
-    def go_home(self):
-        self._do("go_home")
-
-    def release_estop(self):
-        self._do("release_estop")
-
-    def start_recording(self):
-        self._do("start_recording")
-        return {"episode": "episode-8"}
-
-    def stop_recording(self):
-        self._do("stop_recording")
-
-    def tune(self, asked):
-        self._do("tune", asked)
-        return {"task": "wave"}
-
-    def step(self):
-        self._do("step")
-
-    def commit(self):
-        self._do("commit")
-
-    def cancel(self):
-        self._do("cancel")
-
-    def move(self, asked):
-        self._do("move", asked)
-        return {"duration_s": 1.5}
-
-    def grip(self, asked):
-        self._do("grip", asked)
-        return {"grippers": {}}
-
-    def approach(self):
-        self._do("approach")
-
-    def arm(self):
-        self._do("arm")
-
-    def disarm(self):
-        self._do("disarm")
-
-    def label(self, asked):
-        self._do("label", asked)
-        return {"episode": "episode-9"}
-
-    def discard(self, asked):
-        self._do("discard", asked)
-        return {"episode": "episode-9"}
+    def __getattr__(self, name):
+        return Asked(self, name)
 
 
 class Bench:
@@ -269,6 +220,13 @@ def test_a_command_is_carried_out_exactly_where_table_and_guards_allow_it(kind, 
         assert (bench.session.sequence > sequence) == (cancels or COMMANDS[kind].next(state) is not None)
 
 
+@pytest.mark.parametrize("name", ["hold", "end_run", "cancel_setup", *EFFECTS.values()])
+def test_what_carries_out_a_command_is_a_method_of_the_actions_or_of_one_of_their_parts(name):
+    *part, method = name.split(".")
+    carries_out = get_type_hints(Parts)[part[0]] if part else SessionActions
+    assert callable(getattr(carries_out, method))
+
+
 def test_a_refusal_names_the_state_or_what_the_guard_says():
     bench = Bench(S.IDLE)
     assert bench.give("step").reason.startswith("step is not allowed while idle (")
@@ -307,8 +265,7 @@ def test_an_effect_knows_who_gave_the_command():
     bench = Bench(S.READY)
     bench.effects.situation = GuardFacts(collection=True)
     bench.give("label", args={"result": "fail", "note": "dropped"}, user="ben")
-    assert bench.effects.by == "ben"
-    assert bench.effects.done == [("label", LabelRequest(result="fail", note="dropped"))]
+    assert bench.effects.done == [("collecting.label", LabelRequest(result="fail", note="dropped"), "ben")]
 
 
 def test_going_to_the_first_action_is_a_set_up_of_its_own_but_within_a_run_the_run_goes_on():

@@ -4,8 +4,7 @@ import pytest
 from pydantic import AfterValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from runtime.core.explanation import explanation
-from runtime.core.settings import Settings
+from runtime.core.settings import Settings, explanation
 
 
 class Leg(Settings):

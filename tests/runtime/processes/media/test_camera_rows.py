@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.ipc.messages import Event
-from runtime.processes.media.dropouts import QUIET_S, DropoutLog
+from runtime.processes.media.camera_rows import QUIET_S, DropoutLog
 
 RATE = 10.0  # rows per second
 

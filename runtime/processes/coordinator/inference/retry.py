@@ -1,0 +1,52 @@
+"""When a policy that has failed is asked again, and for how long it is borne with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from runtime.core.backoff import BackOff
+from runtime.core.clock import Clock
+from runtime.core.errors import PolicyLostError, RuntimeFault
+
+
+class Retry:
+    """Failures in a row, from the first to the answer after the last; `say(kind, text)` tells of both."""
+
+    def __init__(self, clock: Clock, patience: float, say: Callable[[str, str], None]) -> None:
+        self._clock = clock
+        self._patience = patience  # without an answer, until the policy is given up [s]
+        self._say = say
+        self._back_off = BackOff()
+        self.failure = ""  # why the policy is being tried again
+
+    @property
+    def lost_for(self) -> float:
+        """Time for which the policy has not answered [s], 0 where it does."""
+        return self._back_off.lasts(self._clock.now())
+
+    @property
+    def due_in(self) -> float:
+        """When it is tried again [s]."""
+        return self._back_off.waiting(self._clock.now())
+
+    def failed(self, error: RuntimeFault) -> bool:
+        """Count a failure; True if the policy will be tried again, False where patience is at its end."""
+        first, self.failure = self._back_off.since is None, str(error)
+        self._back_off.failed(self._clock.now())
+        if self.lost_for > self._patience:
+            return False
+        if first:
+            kind = "policy_lost" if isinstance(error, PolicyLostError) else "policy_failed"
+            self._say(kind, f"{error}; trying again for {self._patience:g} s")
+        return True
+
+    def recovered(self) -> None:
+        """It answers."""
+        if self._back_off.since is not None:
+            self._say("policy_back", f"the policy answers again after {self.lost_for:.1f} s")
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing has failed."""
+        self._back_off.forget()
+        self.failure = ""
