@@ -39,8 +39,9 @@ class ChannelServer:
         names: Names,
         silence_s: float,
         open_client: Callable[[str], StationClient],
+        now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._names, self._lives, self._stops = names, Lives(time.monotonic), 0
+        self._names, self._lives, self._stops = names, Lives(now), 0
         self._socket, self.endpoint = _listening(context, port)
         self._context, self._inbox = context, _REPLIES.format(next(_NUMBERS))
         self._replies = context.socket(zmq.PULL)

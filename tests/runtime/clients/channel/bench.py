@@ -23,10 +23,12 @@ _TICK_S = 0.003  # ten times as fast as life
 
 
 class Bench:
-    """Ticks in a thread, one of its `threads`; `channel` is its door's endpoint."""
+    """Ticks in a thread, one of its `threads`; `channel` is its door's endpoint, which goes by the clock `now`."""
 
-    def __init__(self, folder, silence_s=60.0, scripts="together", **settings):
-        self.context = zmq.Context()
+    silence_s = 60.0
+
+    def __init__(self, folder, scripts="together", **settings):
+        self.context, self.now = zmq.Context(), 0.0
         self.lock, self._ended, self.frozen = threading.Lock(), threading.Event(), False
         self.station = Station(spec_of(folder, lease={"ttl_s": 60.0}, **settings))
         self.folder = self.station.spec.deployment.station_dir
@@ -35,7 +37,9 @@ class Bench:
         Endpoints(self.folder).write("guard", {"estop": self._guard.endpoint})
         self._open: list[Any] = []
         self.door = ChannelServer(
-            self.context, 0, Names("lab", scripts), silence_s, lambda name: StationClient(self.folder, name)
+            *(self.context, 0, Names("lab", scripts), self.silence_s),
+            lambda name: StationClient(self.folder, name),
+            lambda: self.now,
         )
         self.channel = self.door.endpoint
         self.threads = [threading.Thread(target=run) for run in (self._tick, self._press, self._listen)]
@@ -74,6 +78,15 @@ class Bench:
 
     def reach(self, state, seconds=20.0):
         eventually(lambda: self.station.state == state, seconds, f"{state}, not {self.station.state}")
+
+    def kept(self):
+        """The lease has been renewed since."""
+        began = self._until()
+        eventually(lambda: self._until() > began, 20.0, "the lease is renewed")
+
+    def _until(self):
+        held = self.station.coordinator.lease.current(self.station.clock.now())
+        return held.until if held else 0.0
 
     def close(self):
         self._ended.set()

@@ -2,7 +2,6 @@
 
 import json
 import re
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -236,10 +235,11 @@ def test_a_terminal_is_refused_while_a_script_holds_it(start):
 
 
 def test_a_script_that_dies_loses_its_lease_and_the_robot_holds(start):
-    bench = start(SessionState.READY, silence_s=0.5)
+    bench = start(SessionState.READY)
     script = bench.script()
     accepted(script.cmd("start"))
     script.close()
+    bench.now += bench.silence_s + 1
     bench.reach(SessionState.HOLDING)
     assert "lease" in bench.station.reason
     other = bench.script()
@@ -248,12 +248,13 @@ def test_a_script_that_dies_loses_its_lease_and_the_robot_holds(start):
 
 @pytest.mark.parametrize("scripts", ["together", "apart"])
 def test_a_dashboard_does_not_keep_a_dead_scripts_lease(start, scripts):
-    bench = start(SessionState.READY, silence_s=0.5, scripts=scripts)
+    bench = start(SessionState.READY, scripts=scripts)
     dashboard = bench.script()
     assert dashboard.query("status")["state"] == "ready"
     accepted(bench.script().cmd("start"))
 
     def looked():
+        bench.now += bench.silence_s / 4
         for question in ("frame", "config", "station", "events"):  # also with a connection for each
             bench.script().query(question)
         return dashboard.query("status")["state"] == "holding"
@@ -262,33 +263,38 @@ def test_a_dashboard_does_not_keep_a_dead_scripts_lease(start, scripts):
 
 
 def test_a_dashboards_stop_button_does_not_make_it_a_script(start):
-    bench = start(SessionState.READY, silence_s=0.5)
+    bench = start(SessionState.READY)
     dashboard = bench.script()
     accepted(bench.script().cmd("start"))
     done(dashboard.cmd("stop"))
     accepted(bench.script().cmd("start"))
-    eventually(lambda: dashboard.query("status")["state"] == "holding", 20, "holding")
+
+    def looked():
+        bench.now += bench.silence_s / 4
+        return dashboard.query("status")["state"] == "holding"
+
+    eventually(looked, 20, "holding")
 
 
 @pytest.mark.parametrize("question", ["status", "result"])
 def test_a_script_waits_with_a_connection_for_every_question(start, question):
-    bench = start(SessionState.READY, silence_s=1.0)
+    bench = start(SessionState.READY)
     run = accepted(bench.script().cmd("start"))
-    until = time.monotonic() + 2.5
-    while time.monotonic() < until:
+    for _ in range(5):
+        bench.now += bench.silence_s / 2
         bench.script().query(question, id=run["id"])
+        bench.kept()
         assert bench.station.state is SessionState.RUNNING
-        time.sleep(0.1)
 
 
 def test_a_script_that_asks_now_and_then_keeps_it(start):
-    bench = start(SessionState.READY, silence_s=1.0)
+    bench = start(SessionState.READY)
     script = bench.script()
     accepted(script.cmd("start"))
-    until = time.monotonic() + 2.5
-    while time.monotonic() < until:
+    for _ in range(5):
+        bench.now += bench.silence_s / 2
         assert script.query("status")["state"] == "running"
-        time.sleep(0.1)
+        bench.kept()
 
 
 def test_scripts_without_a_name_are_one_even_with_a_connection_for_every_message(start):
