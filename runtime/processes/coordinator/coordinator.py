@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from runtime.config.loader import Resolved
@@ -79,11 +79,11 @@ class Coordinator:
     operations: SessionActions
     preflights: PreflightDesk
     session: SessionMachine
-    media_report: MediaReport = MediaReport(0.0, 0, "", 0)
-    reception_report: ReceptionReport = ReceptionReport(0.0)
-    unheard: Mapping[str, str] = field(default_factory=dict)  # as by Sink.unheard
 
     def __post_init__(self) -> None:
+        self.media_report = MediaReport(0.0, 0, "", 0)
+        self.reception_report = ReceptionReport(0.0)
+        self.unheard: dict[str, str] = {}  # as by Sink.unheard
         self._take_over()
 
     def _take_over(self) -> None:
