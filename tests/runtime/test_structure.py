@@ -1,8 +1,39 @@
 """What no linter of imports sees."""
 
+import ast
 import re
 
+import pytest
+
 from tests.sources import ROOT
+
+MAKES = {
+    "dict",
+    "list",
+    "set",
+    "deque",
+    "defaultdict",
+    "Counter",
+    "OrderedDict",
+    "count",
+    "Lock",
+    "RLock",
+    "local",
+}
+MUTATES = {
+    "append",
+    "appendleft",
+    "extend",
+    "insert",
+    "add",
+    "update",
+    "setdefault",
+    "pop",
+    "popitem",
+    "popleft",
+}
+MUTATES |= {"remove", "discard", "clear"}
+NAMED = re.compile(r"# (cache|state): \w")
 
 
 def test_nothing_in_the_runtime_names_a_robot():
@@ -17,3 +48,69 @@ def test_nothing_in_the_runtime_names_a_robot():
         for path in files
         if (found := pattern.findall(path.read_text("utf-8")))
     } == {}
+
+
+def called(node):
+    """The last part of the name of what is called, or decorates."""
+    node = node.func if isinstance(node, ast.Call) else node
+    return getattr(node, "attr", getattr(node, "id", ""))
+
+
+def stateful(source):
+    """Lines of a module on which state of the module is made, or changed after the import, and not named."""
+    tree = ast.parse(source)
+    own = {
+        c.name
+        for c in tree.body
+        if isinstance(c, ast.ClassDef) and "__init__" in {getattr(d, "name", "") for d in c.body}
+    }
+    assigned = [n for n in tree.body if isinstance(n, ast.Assign | ast.AnnAssign) and n.value is not None]
+    names = {
+        t.id for n in assigned for t in getattr(n, "targets", None) or [n.target] if isinstance(t, ast.Name)
+    }
+    found = [
+        n for n in assigned if isinstance(n.value, ast.Dict | ast.List) and not ast.unparse(n.value)[1:-1]
+    ]
+    found += [n for n in assigned if isinstance(n.value, ast.Call) and called(n.value) in MAKES | own]
+    changing = [n for body in tree.body if not isinstance(body, ast.For) for n in ast.walk(body)]
+    for node in changing:
+        if isinstance(node, ast.Global):
+            found.append(node)
+        elif isinstance(node, ast.FunctionDef):
+            found += [d for d in node.decorator_list if called(d) in ("cache", "lru_cache")]
+        elif (
+            isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in MUTATES
+        ):
+            found += [node] if getattr(node.func.value, "id", None) in names else []
+        elif isinstance(node, ast.Subscript) and not isinstance(node.ctx, ast.Load):
+            found += [node] if getattr(node.value, "id", None) in names else []
+    lines = source.splitlines()
+    return sorted({lines[n.lineno - 1].strip() for n in found if not NAMED.search(lines[n.lineno - 1])})
+
+
+def test_a_module_of_the_runtime_keeps_nothing_but_caches_and_what_says_why():
+    """`# cache:` or `# state:` and the reason, on the line; two stations in one process are apart."""
+    files = sorted((ROOT / "runtime").rglob("*.py"))
+    assert {
+        str(path.relative_to(ROOT)): found for path in files if (found := stateful(path.read_text("utf-8")))
+    } == {}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "SEEN = []",
+        "SEEN: dict[str, int] = {}",
+        "NUMBERS = itertools.count()",
+        "LOCK = threading.Lock()",
+        "class Seen:\n    def __init__(self): ...\nSEEN = Seen()",
+        "@functools.cache\ndef made(): ...",
+        "@lru_cache(maxsize=8)\ndef made(): ...",
+        "def note():\n    global number",
+        "SEEN = {1: 2}\ndef note(): SEEN[1] = 3",
+        "SEEN = [1]\ndef note(): SEEN.append(3)",
+    ],
+)
+def test_state_of_a_module_is_noticed(line):
+    assert stateful(line)
+    assert not stateful("\n".join(f"{part}  # cache: a reason" for part in line.splitlines()))
