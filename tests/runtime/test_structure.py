@@ -7,32 +7,8 @@ import pytest
 
 from tests.sources import ROOT
 
-MAKES = {
-    "dict",
-    "list",
-    "set",
-    "deque",
-    "defaultdict",
-    "Counter",
-    "OrderedDict",
-    "count",
-    "Lock",
-    "RLock",
-    "local",
-}
-MUTATES = {
-    "append",
-    "appendleft",
-    "extend",
-    "insert",
-    "add",
-    "update",
-    "setdefault",
-    "pop",
-    "popitem",
-    "popleft",
-}
-MUTATES |= {"remove", "discard", "clear"}
+MAKES = re.compile("dict|list|set|deque|defaultdict|Counter|OrderedDict|count|Lock|RLock|local")
+MUTATES = re.compile("append(left)?|extend|insert|add|update|setdefault|pop(item|left)?|remove|discard|clear")
 NAMED = re.compile(r"# (cache|state): \w")
 
 
@@ -59,21 +35,17 @@ def called(node):
 def stateful(source):
     """Lines of a module on which state of the module is made, or changed after the import, and not named."""
     tree = ast.parse(source)
-    own = {
-        c.name
-        for c in tree.body
-        if isinstance(c, ast.ClassDef) and "__init__" in {getattr(d, "name", "") for d in c.body}
-    }
+    classes = [c for c in tree.body if isinstance(c, ast.ClassDef)]
+    own = {c.name for c in classes if any(getattr(part, "name", "") == "__init__" for part in c.body)}
     assigned = [n for n in tree.body if isinstance(n, ast.Assign | ast.AnnAssign) and n.value is not None]
-    names = {
-        t.id for n in assigned for t in getattr(n, "targets", None) or [n.target] if isinstance(t, ast.Name)
-    }
+    targets = [target for n in assigned for target in getattr(n, "targets", None) or [n.target]]
+    names = {target.id for target in targets if isinstance(target, ast.Name)}
     found = [
         n for n in assigned if isinstance(n.value, ast.Dict | ast.List) and not ast.unparse(n.value)[1:-1]
     ]
-    found += [n for n in assigned if isinstance(n.value, ast.Call) and called(n.value) in MAKES | own]
-    changing = [n for body in tree.body if not isinstance(body, ast.For) for n in ast.walk(body)]
-    for node in changing:
+    makers = [n for n in assigned if isinstance(n.value, ast.Call)]
+    found += [n for n in makers if called(n.value) in own or MAKES.fullmatch(called(n.value))]
+    for node in ast.walk(tree):
         if isinstance(node, ast.Global):
             found.append(node)
         elif isinstance(node, ast.FunctionDef):

@@ -87,8 +87,7 @@ def clock(monkeypatch):
 @pytest.fixture
 def plan(tmp_path):
     publish, run = SimpleNamespace(dataset=None), SimpleNamespace(mode="continuous")
-    settings = SimpleNamespace(publish=publish, data=tmp_path, run=run, station="bench-1")
-    return settings
+    return SimpleNamespace(publish=publish, data=tmp_path, run=run, station="bench-1")
 
 
 @pytest.fixture(autouse=True)
@@ -247,7 +246,7 @@ def test_an_episode_that_cannot_be_read_is_no_success(plan, monkeypatch):
     ],
 )
 def test_every_run_is_exported_and_what_moved_a_robot_is_published(plan, kept, mode, dataset, done):
-    plan.run.mode, plan.deployment.publish.dataset = mode, dataset
+    plan.run.mode, plan.publish.dataset = mode, dataset
     result = drive(plan, a_good_run())
     assert kept == done
     assert result["export_path"] == str(plan.data / "exports" / "one")
