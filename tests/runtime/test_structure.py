@@ -32,32 +32,38 @@ def called(node):
     return getattr(node, "attr", getattr(node, "id", ""))
 
 
-def stateful(source):
-    """Lines of a module on which state of the module is made, or changed after the import, and not named."""
-    tree = ast.parse(source)
+def made(tree):
+    """Statements that give a module what can change."""
     classes = [c for c in tree.body if isinstance(c, ast.ClassDef)]
     own = {c.name for c in classes if any(getattr(part, "name", "") == "__init__" for part in c.body)}
-    assigned = [n for n in tree.body if isinstance(n, ast.Assign | ast.AnnAssign) and n.value is not None]
-    targets = [target for n in assigned for target in getattr(n, "targets", None) or [n.target]]
-    names = {target.id for target in targets if isinstance(target, ast.Name)}
-    found = [
-        n for n in assigned if isinstance(n.value, ast.Dict | ast.List) and not ast.unparse(n.value)[1:-1]
-    ]
-    makers = [n for n in assigned if isinstance(n.value, ast.Call)]
-    found += [n for n in makers if called(n.value) in own or MAKES.fullmatch(called(n.value))]
+    for statement in tree.body:
+        value = getattr(statement, "value", None)
+        if isinstance(statement, ast.Assign | ast.AnnAssign) and value is not None:
+            empty = isinstance(value, ast.Dict | ast.List) and len(ast.unparse(value)) == 2
+            call = isinstance(value, ast.Call) and (MAKES.fullmatch(called(value)) or called(value) in own)
+            if empty or call:
+                yield statement
+
+
+def changed(tree):
+    """Nodes that keep something in a module, or change what it has."""
+    assigned = [n for n in tree.body if isinstance(n, ast.Assign | ast.AnnAssign)]
+    names = {getattr(t, "id", "") for n in assigned for t in getattr(n, "targets", None) or [n.target]} - {""}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Global):
-            found.append(node)
-        elif isinstance(node, ast.FunctionDef):
-            found += [d for d in node.decorator_list if called(d) in ("cache", "lru_cache")]
-        elif (
-            isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in MUTATES
-        ):
-            found += [node] if getattr(node.func.value, "id", None) in names else []
-        elif isinstance(node, ast.Subscript) and not isinstance(node.ctx, ast.Load):
-            found += [node] if getattr(node.value, "id", None) in names else []
-    lines = source.splitlines()
-    return sorted({lines[n.lineno - 1].strip() for n in found if not NAMED.search(lines[n.lineno - 1])})
+        if isinstance(node, ast.FunctionDef):
+            yield from (d for d in node.decorator_list if called(d) in ("cache", "lru_cache"))
+        told = isinstance(node, ast.Call) and MUTATES.fullmatch(called(node))
+        stored = isinstance(node, ast.Subscript) and not isinstance(node.ctx, ast.Load)
+        holder = getattr(node.func if told else node, "value", None)
+        if isinstance(node, ast.Global) or ((told or stored) and getattr(holder, "id", None) in names):
+            yield node
+
+
+def stateful(source):
+    """Lines of a module on which state of the module is made or changed, and not named."""
+    tree, lines = ast.parse(source), source.splitlines()
+    found = {lines[node.lineno - 1].strip() for node in (*made(tree), *changed(tree))}
+    return sorted(line for line in found if not NAMED.search(line))
 
 
 def test_a_module_of_the_runtime_keeps_nothing_but_caches_and_what_says_why():
