@@ -485,7 +485,7 @@ def test_homing_comes_to_the_pose_within_the_limits_of_motions(tmp_path: Path) -
     robot = made.spec.robot
     home = robot.poses["home"]
     assert np.allclose(station.robot.position, home, atol=1e-6)
-    speeds = np.abs(np.diff(station.robot.sent, axis=0)) * made.rate
+    speeds = np.abs(np.diff(station.robot.sent, axis=0)) * made.spec.rate
     assert (speeds <= robot.velocity * 0.3 + 1e-4).all()
     station.close()
 
