@@ -70,8 +70,7 @@ class Direct:
 def lab(tmp_path, monkeypatch, db):
     """A lab around a whole station in lockstep."""
     monkeypatch.setattr(doorbell, "ring", lambda queue: True)
-    stubs = stubbed(tmp_path, simulated=True)
-    made = Lab(builders.bench("bench"), Lockstep(stubs.spec, peers=stubs.peers))
+    made = Lab(builders.bench("bench"), Lockstep(stubbed(tmp_path, simulated=True)))
     for place in ("evaweb.stations.commands", "evaweb.stations.stops", "evaweb.trials.station_commands"):
         monkeypatch.setattr(f"{place}.wire_to", lambda name: Direct(made.station))
     return made
