@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,23 +14,21 @@ import numpy as np
 import robots
 from robots import Robot
 from runtime.config import loader
-from runtime.core.clock import Clock
+from runtime.core.clock import VirtualClock
 from runtime.core.types import ActionChunk, Conditioning, Float64, Observation, UInt8
 from runtime.policies.base import Policy, PolicyInfo
+from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.sim.bench import BenchState, camera_arm
 from runtime.sim.chase import Chase, Places
 from runtime.sim.continuing import Prefix, continued
 from runtime.sim.conveyor import CONVEYOR, Conveyor
-from runtime.sim.link import Link
-from runtime.sim.node import Node, parser
+from runtime.sim.lockstep import linked
+from runtime.sim.node import parser
 from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
 from runtime.sim.surroundings import Surroundings
 from runtime.sim.tabletop import Reset
 from runtime.station.checks import checked_spec
-from runtime.station.spec import StationSpec
-from runtime.transports import zmq
-from runtime.transports.base import Capabilities
 
 HORIZON = 50  # rows of a chunk
 _WIDTH, _HEIGHT = 320, 240
@@ -117,44 +114,8 @@ class Seeing(Policy):
         """Nothing to release."""
 
 
-@dataclass(frozen=True, slots=True)
-class ConveyorPlan(StationSpec):
-    """A plan whose transport is the simulated node, and whose policy sees that node's pictures."""
-
-    gallery: Gallery
-    links: dict[int, Link]  # by the clock of their station
-
-    @property
-    def conveyor(self) -> Conveyor:
-        """Conveyor on the bench."""
-        return self.gallery.conveyor
-
-    @property
-    def transport(self) -> Any:
-        return SimpleNamespace(source=self._link, sink=self._link)
-
-    @property
-    def policy(self) -> Any:
-        return SimpleNamespace(build=self._policy)
-
-    @property
-    def capabilities(self) -> Capabilities:
-        return zmq.capabilities(zmq.Config(simulated=True))
-
-    def _link(self, config: object, robot: Robot, clock: Clock) -> Link:
-        if id(clock) not in self.links:
-            line = ["--robot", robot.name, "--bench", "conveyor", "--start-pose", "ready"]
-            node = Node(robot, parser().parse_args(line), clock, self.gallery)
-            self.links[id(clock)] = Link(node, robot, clock)
-        return self.links[id(clock)]
-
-    def _policy(self, config: object, robot: Robot, clock: Clock, rate: float) -> Seeing:
-        script = Chase(robot, HORIZON, rate, clock=clock, places=_places(robot.name))
-        return Seeing(script, self.gallery)
-
-
-def spec_of(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> ConveyorPlan:
-    """A station at the belt whose course is that of `seed`; nothing is recorded."""
+def station_at(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> tuple[Conveyor, Lockstep]:
+    """The belt whose course is that of `seed`, and a station at it; nothing is recorded."""
     tree: dict[str, Any] = {
         "station": "conveyor",
         "robot": "agilex_piper",
@@ -169,4 +130,10 @@ def spec_of(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> C
     }
     made = checked_spec(loader.resolve(tree, {}, "moving_target"))
     gallery = Gallery(made.robot, Conveyor(made.robot, seed))
-    return ConveyorPlan(made.resolved, made.robot, gallery, {})
+    clock = VirtualClock()
+    options = parser().parse_args(
+        ["--robot", made.robot.name, "--bench", "conveyor", "--start-pose", "ready"]
+    )
+    script = Chase(made.robot, HORIZON, made.rate, clock=clock, places=_places(made.robot.name))
+    peers = replace(linked(made, clock, gallery, options), policy=lambda spec, clock: Seeing(script, gallery))
+    return gallery.conveyor, Lockstep(made, clock, peers=peers)

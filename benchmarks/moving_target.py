@@ -33,7 +33,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.conveyor_station import spec_of
+from benchmarks.conveyor_station import station_at
 from benchmarks.report import Figure, Report
 from runtime.core.types import Float64
 from runtime.ipc.session_state import SessionState
@@ -120,11 +120,11 @@ def chase(strategy: Mapping[str, Any], delay: int, seed: int) -> Chased:
     """One episode in lockstep, to the end of the course; one that never begins has no share of it."""
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
-        made = spec_of(Path(folder), strategy, delay, seed)
-        with closing(Lockstep(made)) as station:
-            commanded = _follow(station, made.conveyor)
-            state, rate = str(station.coordinator.session.state), made.rate
-    course, escort = made.conveyor, made.conveyor.escort
+        course, made = station_at(Path(folder), strategy, delay, seed)
+        with closing(made) as station:
+            commanded = _follow(station, course)
+            state, rate = str(station.coordinator.session.state), station.spec.rate
+    escort = course.escort
     return Chased(
         strategy=str(strategy["kind"]),
         delay=delay,

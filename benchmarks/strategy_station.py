@@ -5,9 +5,8 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,12 +16,12 @@ from benchmarks.step_loop import Policy as Answering
 from benchmarks.step_loop import StepLoop
 from robots import Robot
 from runtime.config import loader
-from runtime.core.clock import Clock
+from runtime.core.clock import Clock, VirtualClock
 from runtime.core.plugins import variants
 from runtime.core.types import ActionChunk, Conditioning, Float32, Float64, Observation, RobotCommand
 from runtime.ipc.session_state import SessionState
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.processes.lockstep.lockstep import Lockstep
+from runtime.processes.lockstep.lockstep import Around, Lockstep, Peers
 from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Capabilities, Sink, Source
@@ -89,27 +88,13 @@ class Known(Policy):
         """Nothing to release."""
 
 
-@dataclass(frozen=True, slots=True)
-class KnownPlan(StationSpec):
-    """A plan whose robot and policy are those above; they are kept in `made`."""
-
-    made: dict[str, Any]
-
-    @property
-    def transport(self) -> Any:
-        return SimpleNamespace(source=self._robot, sink=self._robot)
-
-    @property
-    def policy(self) -> Any:
-        return SimpleNamespace(build=lambda *given: self.made["policy"])
-
-    @property
-    def capabilities(self) -> Capabilities:
-        return Capabilities(moves_robot=True)
-
-    def _robot(self, config: object, robot: Robot, clock: Clock) -> Obedient:
-        found: Obedient = self.made.setdefault("robot", Obedient(robot, clock))
-        return found
+def station_of(
+    spec: StationSpec, robot: Obedient, policy: Policy, clock: VirtualClock, around: Around | None = None
+) -> Lockstep:
+    """A station in lockstep with that robot and that policy in the place of its own."""
+    spec = replace(spec, capabilities=Capabilities(moves_robot=True))
+    peers = Peers(lambda spec, clock: robot, lambda spec, clock: robot, lambda spec, clock: policy)
+    return Lockstep(spec, clock, around, peers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,8 +120,7 @@ def compare(case: Case) -> tuple[int, int]:
         spec = _plan(Path(folder), case)
         start = spec.robot.poses["ready"].astype(np.float64)
         answer = _answer(start, case)
-        spec.made["policy"] = Known(answer, case.horizon)
-        first, planned = _run(spec)
+        first, planned = _run(spec, Known(answer, case.horizon))
     module = variants("runtime.strategies")[case.strategy]
     config = module.Config.model_validate(case.section)
     loop = StepLoop(module, config, answer, lambda number: case.delay, spec.rate, start, spec.dims)
@@ -149,10 +133,11 @@ def compare(case: Case) -> tuple[int, int]:
     return len(meant), len(other)
 
 
-def _run(spec: KnownPlan) -> tuple[int, Mapping[int, Float32]]:
+def _run(spec: StationSpec, policy: Known) -> tuple[int, Mapping[int, Float32]]:
     """The step of the run's first observation, and by control step what was planned, before safety."""
     planned: dict[int, Float32] = {}
-    with closing(Lockstep(spec)) as station:
+    clock = VirtualClock()
+    with closing(station_of(spec, Obedient(spec.robot, clock), policy, clock)) as station:
         session = station.coordinator.session
         station.connect()
         station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
@@ -167,7 +152,7 @@ def _run(spec: KnownPlan) -> tuple[int, Mapping[int, Float32]]:
             return station.step >= end
 
         station.until(over, 60.0, "the run")
-        return spec.made["policy"].first, planned
+        return policy.first, planned
 
 
 def _answer(start: Float64, case: Case) -> Answering:
@@ -201,8 +186,7 @@ def lockstep_deployment(data: Path, robot: str, strategy: dict[str, Any], rate: 
     }
 
 
-def _plan(data: Path, case: Case) -> KnownPlan:
+def _plan(data: Path, case: Case) -> StationSpec:
     tree = lockstep_deployment(data, "agilex_piper", case.section, case.control_hz)
     tree["lockstep"] = {"delay_ticks": case.delay}
-    made = checked_spec(loader.resolve(tree, {}, "strategies"))
-    return KnownPlan(made.resolved, made.robot, {})
+    return checked_spec(loader.resolve(tree, {}, "strategies"))

@@ -10,6 +10,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from robots.broken_pipe import unread_ends
 from runtime.config import loader
@@ -19,10 +20,14 @@ from runtime.core import logs as log
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.ipc.lifeline import Lifeline
+from runtime.processes.coordinator.builders import make_policy
 from runtime.processes.supervisor.supervisor import Supervisor
 from runtime.station.checks import checked_spec
 from runtime.station.rerun import data_folder, rerun
 from runtime.station.spec import StationSpec
+
+if TYPE_CHECKING:
+    from runtime.processes.lockstep.lockstep import Peers
 
 
 @unread_ends
@@ -32,14 +37,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     log.start("supervisor")
     try:
         made = checked_spec(_resolved(given))
-        made.new_policy(
-            MonotonicClock()
-        ).close()  # what does not fit it is said here, not by a coordinator that dies
+        # What does not fit it is said here, not by a coordinator that dies.
+        make_policy(made, MonotonicClock()).close()
         _require_encoder(made)
         if given.headless:
             from runtime.clients import headless
 
-            headless.check(made)
+            headless.check(made.deployment)
         if given.lockstep:
             from runtime.processes.lockstep import lockstep
 
@@ -115,12 +119,12 @@ def _check(made: StationSpec) -> int:
     return 0
 
 
-def run_in_lockstep(made: StationSpec) -> int:
-    """Run, print how it went, export it, publish what ended well; returns the exit code."""
+def run_in_lockstep(made: StationSpec, peers: Peers | None = None) -> int:
+    """Run, print how it went, export it, publish what ended well; returns the exit code. `peers` as by `Lockstep`."""
     from runtime.ipc.session_state import SessionState
     from runtime.processes.lockstep import lockstep
 
-    done = lockstep.run(made)
+    done = lockstep.run(made, peers=peers)
     episode = done.episode
     print(f"{done.state}: {done.reason}")
     print(

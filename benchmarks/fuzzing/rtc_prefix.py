@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.strategy_station import KnownPlan, Obedient, lockstep_deployment
+from benchmarks.strategy_station import Obedient, lockstep_deployment, station_of
 from robots import Robot
 from runtime.config import loader
-from runtime.core.clock import Clock
+from runtime.core.clock import Clock, VirtualClock
 from runtime.core.errors import PolicyLostError
 from runtime.core.types import EEF_WIDTH, ActionChunk, Conditioning, Float64, Observation
 from runtime.ipc.session_state import SessionState
@@ -31,6 +31,7 @@ from runtime.processes.coordinator.inference.worker import LockstepRunner
 from runtime.processes.lockstep.lockstep import Around, Lockstep
 from runtime.spaces.end_effectors import EndEffectors
 from runtime.station.checks import checked_spec
+from runtime.station.spec import StationSpec
 
 _TICKS = 240
 _HAIR = 1e-6  # of a step
@@ -101,8 +102,8 @@ def once(seed: int) -> list[str]:
     made, random = scenario(seed), np.random.default_rng([seed, 1])
     with tempfile.TemporaryDirectory() as folder:
         spec = _plan(Path(folder), made)
-        keeper = spec.made["policy"] = Keeper(made, spec, random)
-        planned = _run(spec, made, random)
+        keeper = Keeper(made, spec, random)
+        planned = _run(spec, made, keeper, random)
     return [f"seed {seed}: {text}" for text in _violations(made, keeper, planned)]
 
 
@@ -134,18 +135,6 @@ class Seldom(Obedient):
 
 
 @dataclass(frozen=True, slots=True)
-class SeldomPlan(KnownPlan):
-    """A plan whose robot is the one above."""
-
-    every: int
-
-    def _robot(self, config: object, robot: Robot, clock: Clock) -> Obedient:
-        stands = self.made["policy"].stands.copy()
-        found: Obedient = self.made.setdefault("robot", Seldom(self.robot, clock, stands, self.every))
-        return found
-
-
-@dataclass(frozen=True, slots=True)
 class Declared:
     """Content of a request: rows [d, W] that are fixed, the first for control step `step`."""
 
@@ -156,7 +145,7 @@ class Declared:
 class Keeper(Policy):
     """Wanders about where it stands; continues what it is told, where it keeps the contract."""
 
-    def __init__(self, made: Scenario, spec: SeldomPlan, random: np.random.Generator) -> None:
+    def __init__(self, made: Scenario, spec: StationSpec, random: np.random.Generator) -> None:
         self._made, self._random = made, random
         self._robot = spec.robot
         self._eef = EndEffectors(spec.robot, ChainForward(spec.robot))
@@ -273,7 +262,7 @@ class Keeper(Policy):
         return rows * self._scale + self._shift if self._made.own else rows
 
 
-def _plan(data: Path, made: Scenario) -> SeldomPlan:
+def _plan(data: Path, made: Scenario) -> StationSpec:
     tree = lockstep_deployment(data, made.robot, made.strategy, made.control_hz)
     tree["faults"] = {"policy_lost": "slow", "patience_s": 1000.0}
     planned = checked_spec(loader.resolve(tree, {}, "prefix"))
@@ -282,7 +271,7 @@ def _plan(data: Path, made: Scenario) -> SeldomPlan:
         lower, upper = robot.lower.copy(), robot.upper.copy()
         lower[0], upper[0] = -np.inf, np.inf
         robot = replace(robot, lower=lower, upper=upper)
-    return SeldomPlan(planned.resolved, robot, {}, made.seen_every)
+    return replace(planned, robot=robot)
 
 
 @dataclass(slots=True)
@@ -305,10 +294,11 @@ class Planned:
         return max((off for at, off in self.missed.items() if step - 2 * horizon <= at <= step), default=0.0)
 
 
-def _run(spec: SeldomPlan, made: Scenario, random: np.random.Generator) -> Planned:
+def _run(spec: StationSpec, made: Scenario, keeper: Keeper, random: np.random.Generator) -> Planned:
     planned = Planned({}, set(), {}, set(), {}, 0)
-    around = Around(runner=Late(*made.delay, random))
-    with closing(Lockstep(spec, around=around)) as station:
+    around, clock = Around(runner=Late(*made.delay, random)), VirtualClock()
+    robot = Seldom(spec.robot, clock, keeper.stands.copy(), made.seen_every)
+    with closing(station_of(spec, robot, keeper, clock, around)) as station:
         session = station.coordinator.session
         station.connect()
         station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")

@@ -14,9 +14,10 @@ from typing import Any
 from robots.broken_pipe import unread_ends
 from runtime.clients.client import StationClient
 from runtime.clients.terminal.figures import figure, line
+from runtime.config import loader
+from runtime.config.schema import Deployment
 from runtime.core import logs as log
 from runtime.core.errors import RuntimeFault, SetupError
-from runtime.station.spec import StationSpec, planned
 
 _START_S = 30.0
 _SETUP_S = 240.0
@@ -31,9 +32,9 @@ _SILENT = frozenset(
 RESULT_NAME = "headless.json"
 
 
-def drive(spec: StationSpec, client: StationClient) -> dict[str, Any]:
+def drive(settings: Deployment, client: StationClient) -> dict[str, Any]:
     """One run from start to published dataset; returns what came of it. Raises RuntimeFault with the reason."""
-    check(spec)
+    check(settings)
     attended = Attended(client)
     attended.begin()
     status = attended.run()
@@ -45,7 +46,7 @@ def drive(spec: StationSpec, client: StationClient) -> dict[str, Any]:
         result = _result(status, how, attended.seconds)
         well = well and status["last_run"].get("status", "finished") == "finished"
         if result["episode_path"]:
-            result |= _keep(spec, Path(result["episode_path"]), well)
+            result |= _keep(settings, Path(result["episode_path"]), well)
     except RuntimeFault as fault:  # on top of why the run ended
         raise RuntimeFault(f"the run ended ({how}), but then: {fault}") from None
     print("\n".join(summary(result)), flush=True)
@@ -54,9 +55,9 @@ def drive(spec: StationSpec, client: StationClient) -> dict[str, Any]:
     return result
 
 
-def check(spec: StationSpec) -> None:
+def check(settings: Deployment) -> None:
     """Raise SetupError for a mode that needs a person."""
-    mode, station = spec.deployment.run.mode, spec.deployment.station
+    mode, station = settings.run.mode, settings.station
     if mode not in MODES:
         raise SetupError(
             f"run.mode = {mode!r} needs a person; headless: {', '.join(MODES)}. Start the station without "
@@ -172,21 +173,21 @@ def _of_episode(path: Path) -> dict[str, Any]:
     }
 
 
-def _keep(spec: StationSpec, episode: Path, well: bool) -> dict[str, Any]:
+def _keep(settings: Deployment, episode: Path, well: bool) -> dict[str, Any]:
     """Export the streams of any run; publish what ended well and moved a robot. Raises RuntimeFault."""
     from runtime.recording.export import export
 
-    result: dict[str, Any] = {"export_path": str(export(episode, spec.deployment.data))}
-    if well and spec.deployment.publish.dataset and spec.deployment.run.mode != "sim":
-        result |= _publish(spec, episode)
+    result: dict[str, Any] = {"export_path": str(export(episode, settings.data))}
+    if well and settings.publish.dataset and settings.run.mode != "sim":
+        result |= _publish(settings, episode)
     return result
 
 
-def _publish(spec: StationSpec, episode: Path) -> dict[str, Any]:
+def _publish(settings: Deployment, episode: Path) -> dict[str, Any]:
     from runtime.datasets.published import publish
 
-    dataset = spec.deployment.data / str(spec.deployment.publish.dataset)
-    published = publish(episode, dataset, version=spec.deployment.publish.version)
+    dataset = settings.data / str(settings.publish.dataset)
+    published = publish(episode, dataset, version=settings.publish.version)
     return {
         "dataset_path": str(published.dataset),
         "episode_index": published.episode_index,
@@ -228,11 +229,13 @@ def main() -> int:
     parser.add_argument("--boot", required=True)
     given = parser.parse_args()
     log.start("headless")
-    spec = planned(given.resolved)
-    station_dir = spec.deployment.station_dir
+    settings = loader.resolve(
+        json.loads(Path(given.resolved).read_text("utf-8")), {}, given.resolved
+    ).deployment
+    station_dir = settings.station_dir
     client = StationClient(station_dir, holder=f"headless:{given.boot}")
     try:
-        result = drive(spec, client)
+        result = drive(settings, client)
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
         (station_dir / RESULT_NAME).write_text(json.dumps({"error": str(fault)}), "utf-8")

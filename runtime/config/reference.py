@@ -144,7 +144,7 @@ def _meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
     return _first_line(models[0]) if len(models) == 1 else "One of the kinds below." if models else ""
 
 
-@functools.cache
+@functools.cache  # cache: of sources, which do not change while this runs
 def _said_of_keys(model: type) -> dict[str, str]:
     """The strings below a model's own keys. Read here: every process of a station would wait for its sources else."""
     (table,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body

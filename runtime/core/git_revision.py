@@ -15,7 +15,7 @@ _PATIENCE_S = 5.0
 _CODE = ("runtime/", "robots/", "deployments/")  # a new file there changes what runs
 
 
-@cache
+@cache  # cache: of what runs here, which is what was loaded at the start
 def revision() -> Mapping[str, object]:
     """`commit` and `dirty` of our own checkout, found once; {} where we run from none, or git does not tell."""
     return MappingProxyType(revision_of(Path(_here).resolve().parent.parent))

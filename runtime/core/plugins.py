@@ -48,7 +48,7 @@ class Variants(Mapping[str, ModuleType]):
         return len(self._modules)
 
 
-@functools.cache
+@functools.cache  # cache: of tables in the code
 def variants(package: str) -> Variants:
     """The variants that `package` names in its table KINDS."""
     return Variants(package)

@@ -162,7 +162,7 @@ def _peer(frame: zmq.Frame) -> tuple[int | None, int | None]:
         return None, None
 
 
-@lru_cache(maxsize=8)  # a flood is refused for one reason
+@lru_cache(maxsize=8)  # cache: a flood is refused for one reason
 def _refusal(reason: str) -> bytes:
     return encode(Ack("", "refused", reason))
 

@@ -43,7 +43,7 @@ class EStop(IntEnum):
     LATCHED = 2
 
 
-@functools.cache  # every observation asks
+@functools.cache  # cache: every observation asks
 def _observation_dtype(d: int, e: int, c: int) -> np.dtype[np.void]:
     return np.dtype(
         [

@@ -218,7 +218,7 @@ def _robot_of(libraries: _Libraries, robot: Robot, group: Group) -> Any:
     return dataclasses.replace(made, joint_var_cls=_variable_of(libraries, len(moving)))
 
 
-@functools.cache
+@functools.cache  # cache: what is compiled is bound to it
 def _variable_of(libraries: _Libraries, size: int) -> Any:
     """The variable of as many joints: PyRoki makes one for each robot, and what is compiled is bound to it."""
     zeros = libraries.jax.numpy.zeros(size)
@@ -227,7 +227,7 @@ def _variable_of(libraries: _Libraries, size: int) -> Any:
     )
 
 
-@functools.cache
+@functools.cache  # cache: to compile it takes longer than a thousand chunks
 def _scan_of(libraries: _Libraries, config: Config) -> Any:
     """The function from an arm, poses and bounds of a chunk to joints and the boxes they were solved in.
 

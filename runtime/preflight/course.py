@@ -18,11 +18,13 @@ from runtime.policies.base import Policy, PolicyInfo
 from runtime.preflight.report import Call, Chunk, Report
 from runtime.preflight.subject import Subject
 from runtime.preflight.verdict import Stage, Verdict, stage_of, verdict_of
+from runtime.processes.coordinator.builders import make_kinematics, make_policy
 from runtime.processes.coordinator.inference.requests import PolicyRequests, PolicyResponse
 from runtime.processes.coordinator.inference.worker import LockstepRunner
 from runtime.processes.coordinator.session.tuning import strategy_of
 from runtime.processes.coordinator.setup.sequence import check_info, first_action
 from runtime.recording import trial
+from runtime.spaces.conversion import ActionSpaces
 from runtime.station.spec import StationSpec
 
 _TOLERANCE = 1e-6
@@ -138,11 +140,11 @@ class Course:
         if spec.deployment.recording.enabled:
             trial.require(spec.deployment.recording)
         strategy = strategy_of(spec)
-        policy = self._policy = Timed(spec.new_policy(self._clock), self._clock)
+        policy = self._policy = Timed(make_policy(spec, self._clock), self._clock)
         info = runner.submit(policy.connect).result()
         check_info(info, spec, strategy.query.continues)
         kinematics = Loading(ChainForward(spec.robot), self._kinematics, runner.aside)
-        spaces, subject = spec.spaces(kinematics), Subject(spec, self._clock)
+        spaces, subject = ActionSpaces(spec.robot, kinematics, spec.rate), Subject(spec, self._clock)
         asking = PolicyRequests(policy, spec.deployment.task, spaces, subject, runner, self._clock)
         for _ in range(2):  # the first resets before it asks
             answered = self._answered = asking.ask(k_max=strategy.parameters.k_max).result()
@@ -153,7 +155,7 @@ class Course:
     def _kinematics(self) -> Kinematics:
         self._loading = begun = self._clock.now()
         try:
-            return self._plan.kinematics()
+            return make_kinematics(self._plan)
         finally:
             self._loaded, self._loading = self._loaded + self._clock.now() - begun, None
 

@@ -24,9 +24,10 @@ def join(process: str, pictures: bool = True, unread: Collection[str] = ()) -> M
     """Read what the supervisor handed over on the command line; `unread` as by `planned`."""
     parser = argparse.ArgumentParser(prog=f"runtime.{process}", description="started by the supervisor")
     parser.add_argument("--resolved", required=True)
+    parser.add_argument("--capabilities", required=True)
     parser.add_argument("--shared", required=True, type=int)
     parser.add_argument("--boot", required=True)
     given = parser.parse_args()
     log.start(process)
-    made = planned(given.resolved, unread)
+    made = planned(given.resolved, given.capabilities, unread)
     return Member(SharedState.attach(made.layout, given.shared, pictures), given.boot, Lifeline(), made)

@@ -39,7 +39,7 @@ class Eye:
     up: Point = (-1.0, 0.0, 0.0)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=64)  # cache: a search, for robots that do not change
 def wrist_eye(robot: Robot, arm: str) -> Eye:
     """Of an arm: the nearest place from which enough is in view, else that with most, judged in the ready posture."""
     q = robot.poses.get("ready", robot.poses["home"])

@@ -7,7 +7,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -117,7 +117,7 @@ class Gr00tServer:
                 self._wire.send_multipart(frames)
         self._wire.close(linger=0)
 
-    def _replies(self, payload: bytes) -> list[bytes] | None:
+    def _replies(self, payload: bytes) -> Sequence[bytes] | None:
         """The frames that answer; None where the connection is to end without."""
         fault = self._behaviour.fault
         try:
@@ -140,7 +140,7 @@ class Gr00tServer:
         """True if the server knows MNP, in which it then answers."""
         return self._behaviour.version.startswith("n1.7")
 
-    def _spoilt_frames(self) -> list[bytes] | None:
+    def _spoilt_frames(self) -> Sequence[bytes] | None:
         """Frames that the fault sends in place of an answer; `_RIGHT` where the answer itself is right."""
         fault, number = self._behaviour.fault, self._asked
         self._asked += 1
@@ -281,7 +281,7 @@ class Gr00tServer:
         return np.stack([part, part]) if self._behaviour.fault.name == "two_batches" else part[None]
 
 
-_RIGHT: list[bytes] = []
+_RIGHT: tuple[bytes, ...] = ()
 
 
 def _value(observation: Mapping[str, Any], name: str, key: str, flat: bool) -> Any:

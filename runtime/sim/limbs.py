@@ -62,13 +62,13 @@ class Limb:
         return np.asarray(self._body.poses(q)[self._first])
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=32)  # cache: reads the description of a robot, which does not change
 def limbs(robot: Robot) -> Mapping[str, Limb]:
     """The robot's arms by name."""
     return MappingProxyType({arm.name: Limb(robot, arm) for arm in robot.arms})
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=32)  # cache: reads the description of a robot, which does not change
 def _body_of(robot: Robot) -> Body:
     return Body(robot)
 

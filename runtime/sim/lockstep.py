@@ -12,19 +12,17 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import robots
-from robots import Robot
 from robots.broken_pipe import unread_ends
 from runtime.config import loader
 from runtime.core import environment
 from runtime.core import logs as log
 from runtime.core.clock import Clock, VirtualClock
 from runtime.core.errors import RuntimeFault, SetupError
+from runtime.processes.lockstep.lockstep import Peers
 from runtime.processes.lockstep.server import ServedLockstep
 from runtime.sim import serve, standin, surroundings
 from runtime.sim.link import Link
@@ -33,25 +31,10 @@ from runtime.sim.node import parser as node_parser
 from runtime.sim.surroundings import Surroundings
 from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
-from runtime.transports import zmq
 
 REST_S = 1.0  # of success, after which nothing more is to be seen
 # Deadlines are in real seconds; a server of this process is not lost because the machine is busy.
 _PATIENT = ["policy.connect_deadline=60.0", "policy.inference_deadline=60.0"]
-
-
-@dataclass(frozen=True, slots=True)
-class BenchPlan(StationSpec):
-    """A plan whose transport is a simulated node in this process."""
-
-    link: Link
-
-    @property
-    def transport(self) -> Any:
-        return SimpleNamespace(source=self._linked, sink=self._linked, capabilities=zmq.capabilities)
-
-    def _linked(self, config: object, robot: Robot, clock: Clock) -> Link:
-        return self.link
 
 
 class Rested:
@@ -71,15 +54,15 @@ class Rested:
         return f"the simulated bench has said success for {REST_S:g} s" if rested else ""
 
 
-def planned(made: StationSpec, clock: Clock, around: Surroundings, options: argparse.Namespace) -> BenchPlan:
-    """The plan of a deployment, with a node in this process; SetupError where it declares none."""
+def linked(made: StationSpec, clock: Clock, around: Surroundings, options: argparse.Namespace) -> Peers:
+    """A simulated node in this process in the place of the transport; SetupError where the deployment declares none."""
     transport = made.deployment.transport
     if not made.capabilities.resets_bench or transport.kind != "zmq":
         raise SetupError(
             f"transport.kind = {transport.kind!r} with a bench in lockstep; allowed: zmq with simulated = true"
         )
     link = Link(Node(made.robot, options, clock, around), made.robot, clock)
-    return BenchPlan(made.resolved, made.robot, link)
+    return Peers(source=lambda spec, clock: link, sink=lambda spec, clock: link)
 
 
 def station(
@@ -89,7 +72,8 @@ def station(
     made = checked_spec(loader.load(path, assignments))
     options = node_parser().parse_args(["--robot", made.robot.name, "--bench", bench, "--seed", str(seed)])
     around = surroundings.surroundings(made.robot, options)
-    return ServedLockstep(planned(made, clock, around, options), clock, Rested(around.truth, clock))
+    peers = linked(made, clock, around, options)
+    return ServedLockstep(made, clock, Rested(around.truth, clock), peers=peers)
 
 
 def parser() -> argparse.ArgumentParser:

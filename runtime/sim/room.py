@@ -41,7 +41,7 @@ class Room:
         return float((self._clearance.distances(looked_at)[:, self._links] - self._wanted).min())
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=32)  # cache: reads the meshes of a robot, which do not change
 def room_of(robot: Robot) -> Room:
     """That of a robot, made once."""
     return Room(robot)

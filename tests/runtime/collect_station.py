@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,13 @@ from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError
 from runtime.core.types import Float64, Observation
+from runtime.processes.coordinator.builders import make_policy
+from runtime.processes.lockstep.lockstep import Peers
 from runtime.station.checks import checked_spec
+from runtime.station.spec import StationSpec
 from runtime.teleoperators.base import Leader
 from runtime.transports.base import Capabilities
-from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, StubRobot, on_time, spec_of
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubRobot, Stubs, stubbed
 
 
 class HeldLeader(Leader):
@@ -68,41 +72,45 @@ class SelfDriven(StubRobot):
         self.collects = word == "collect_start"
 
 
-@dataclass(frozen=True, slots=True)
-class CollectPlan(StubPlan):
-    """A plan whose leader, or whose self-driven robot, is the test's."""
+@dataclass
+class CollectStubs(Stubs):
+    """Those of a station whose leader, or whose self-driven robot, is the test's."""
+
+    mute: bool = False  # the leader says nothing
+
+    def __post_init__(self) -> None:
+        self.spec = replace(self.spec, capabilities=Capabilities(moves_robot=True, leads=True))
 
     @property
-    def capabilities(self) -> Capabilities:
-        return replace(StubPlan.capabilities.fget(self), leads=True)  # type: ignore[attr-defined]
+    def peers(self) -> Peers:
+        policy = partial(make_policy, build=self.policy, leader=self.leader)
+        return Peers(self.robot, self.robot, policy)
 
-    def leader(self, clock: Clock) -> HeldLeader:
-        self.built["leader"] = HeldLeader(self.robot, clock)
-        if "mute" in self.built:
-            self.built["leader"].joints = None
-        return self.built["leader"]
+    def leader(self, spec: StationSpec, clock: Clock) -> HeldLeader:
+        self.built["leader"] = leader = HeldLeader(spec.robot, clock)
+        if self.mute:
+            leader.joints = None
+        return leader
 
-    def _robot(self, config: object, robot: object, clock: object) -> StubRobot:
-        if "robot" not in self.built:
-            source = self.deployment.collection.source if self.deployment.collection else ""
-            self.built["robot"] = (SelfDriven if source == "node" else StubRobot)(self, clock)
-        return self.built["robot"]
+    def robot(self, spec: StationSpec, clock: Clock) -> StubRobot:
+        if spec.deployment.collection is not None and spec.deployment.collection.source == "node":
+            self.built.setdefault("robot", SelfDriven(self, clock))
+        return super().robot(spec, clock)
 
 
 class CollectStation(Station):
     """Moves its leader, which speaks once per tick, by `turn` per tick on two joints."""
 
-    def __init__(self, made: StubPlan) -> None:
-        super().__init__(made)
-        self.made = made
+    def __init__(self, stubs: CollectStubs) -> None:
+        super().__init__(stubs)
         self.turn = 0.0
 
     @property
     def leader(self) -> HeldLeader:
-        return self.made.built["leader"]
+        return self.stubs.built["leader"]
 
     def tick(self) -> None:
-        if "leader" in self.made.built and self.leader.joints is not None:
+        if "leader" in self.stubs.built and self.leader.joints is not None:
             self.leader.joints[list(MOVED)] += self.turn
             self.leader.speak()
         super().tick()
@@ -126,6 +134,5 @@ def collecting(data: Path, source: str = "relay", **changes: Any) -> CollectStat
     on_top: dict[str, Any] = {"collection": {"source": source, **leader, **changes}}
     if source == "node":  # a recording drives no robot, and its deployment is refused
         on_top["transport"] = {"kind": "zmq"}
-    resolved = loader.changed(spec_of(data, **tables).resolved, on_top, "test")
-    robot = checked_spec(resolved).robot
-    return CollectStation(CollectPlan(resolved, robot, {}, STANDS, on_time, "joint", "", True, False))
+    resolved = loader.changed(stubbed(data, **tables).spec.resolved, on_top, "test")
+    return CollectStation(CollectStubs(checked_spec(resolved)))

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from runtime.config import loader
+from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError
+from runtime.core.plugins import variants
 from runtime.core.types import ActionChunk, Conditioning, Float64, Observation, RobotCommand, Space
 from runtime.ipc.session_state import SessionState
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.processes.lockstep.lockstep import Lockstep
+from runtime.processes.coordinator.assembly import assemble
+from runtime.processes.coordinator.builders import make_policy
+from runtime.processes.lockstep.lockstep import Lockstep, Peers
 from runtime.recording.reader import Episode, open_episode
 from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
@@ -38,18 +42,18 @@ def ramp(first: int, count: int, speed: float = 0.002) -> Float64:
 class StubRobot(Source, Sink):
     """Goes wherever it is told, at once; each observation shows its own number on every camera."""
 
-    def __init__(self, spec: StubPlan, clock: Any) -> None:
-        self._plan, self._clock = spec, clock
-        self.position = spec.start.copy()
+    def __init__(self, stubs: Stubs, clock: Any) -> None:
+        self._clock = clock
+        self.position = stubs.start.copy()
         self.commands: list[RobotCommand] = []
         self.blocked = False
         self.silent = False
-        self.cameras = [camera.key for camera in spec.robot.cameras]
+        self.cameras = [camera.key for camera in stubs.spec.robot.cameras]
         self.picture = numbered
         self.bias: Float64 = np.zeros(DIM)  # it stands beside where it is told to go
         self.misread: Float64 = np.zeros(DIM)  # by how much its encoders are off
         self.told: list[tuple[str, dict[str, Any]]] = []
-        self.wordless = not spec.simulated
+        self.wordless = not stubs.spec.capabilities.resets_bench
         self.deaf = 0  # control words that are lost on their way to it
         self.truth: dict[str, Any] | None = None
         self.drives: dict[str, Any] | None = None
@@ -97,25 +101,25 @@ class StubRobot(Source, Sink):
 class StubPolicy(Policy):
     """Answers with what `rows(observation, number)` says; `number` counts the answers since the reset."""
 
-    def __init__(self, spec: StubPlan) -> None:
-        self._plan = spec
+    def __init__(self, stubs: Stubs) -> None:
+        self._stubs = stubs
         self.calls: list[str] = []
         self.number = 0
         self.first: int | None = None  # step of the first observation since the reset
 
     def connect(self) -> PolicyInfo:
         self.calls.append("connect")
-        if self._plan.absent:
-            raise PolicyError(self._plan.absent)
+        if self._stubs.absent:
+            raise PolicyError(self._stubs.absent)
         return PolicyInfo("stub")
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         self.calls.append("infer")
         if self.first is None:
             self.first = observation.step
-        rows = self._plan.rows(replace(observation, step=observation.step - self.first), self.number)
+        rows = self._stubs.rows(replace(observation, step=observation.step - self.first), self.number)
         self.number += 1
-        return ActionChunk(np.asarray(rows, np.float32), space=self._plan.space)
+        return ActionChunk(np.asarray(rows, np.float32), space=self._stubs.space)
 
     def reset(self) -> None:
         self.calls.append("reset")
@@ -130,44 +134,39 @@ def on_time(observation: Observation, number: int) -> Float64:
     return ramp(observation.step, 20)
 
 
-@dataclass(frozen=True, slots=True)
-class StubPlan(StationSpec):
-    """A plan whose transport and policy are the test's; it keeps what it has built."""
+@dataclass
+class Stubs:
+    """A station's spec, and the robot and policy of the test's in the place of its own; keeps what it has built."""
 
-    built: dict[str, Any]
-    start: Float64
-    rows: Rows
-    space: Space
-    absent: str
-    moves_robot: bool
-    simulated: bool
-
-    @property
-    def transport(self) -> Any:
-        return SimpleNamespace(source=self._robot, sink=self._robot)
+    spec: StationSpec
+    start: Float64 = field(default_factory=STANDS.copy)
+    rows: Rows = on_time
+    space: Space = "joint"
+    absent: str = ""
+    real: str = ""  # kind of policy that is what the deployment says
+    unfit: Exception | None = None  # what making a policy ends with
+    built: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def policy(self) -> Any:
-        return SimpleNamespace(build=self._policy)
+    def peers(self) -> Peers:
+        return Peers(self.robot, self.robot, partial(make_policy, build=self.policy))
 
-    @property
-    def capabilities(self) -> Capabilities:
-        return Capabilities(moves_robot=self.moves_robot, resets_bench=self.simulated)
+    def robot(self, spec: StationSpec, clock: Clock) -> StubRobot:
+        return self.built.setdefault("robot", StubRobot(self, clock))
 
-    def _robot(self, config: object, robot: object, clock: object) -> StubRobot:
-        if "robot" not in self.built:
-            self.built["robot"] = StubRobot(self, clock)
-        return self.built["robot"]
-
-    def _policy(self, config: object, robot: object, clock: object, rate: float) -> StubPolicy:
-        if "unfit" in self.built:
-            raise self.built["unfit"]
-        self.built["policy"] = StubPolicy(self)
-        self.built.setdefault("policies", []).append(self.built["policy"])
-        return self.built["policy"]
+    def policy(self, config: Any, *given: Any) -> Policy:
+        if self.unfit is not None:
+            raise self.unfit
+        if config.kind == self.real:
+            made: Policy = variants("runtime.policies")[self.real].build(config, *given)
+        else:
+            made = StubPolicy(self)
+        self.built["policy"] = made
+        self.built.setdefault("policies", []).append(made)
+        return made
 
 
-def spec_of(
+def stubbed(
     data: Path,
     rows: Rows = on_time,
     strategy: str = "async",
@@ -177,9 +176,10 @@ def spec_of(
     absent: str = "",
     moves_robot: bool = True,
     simulated: bool = False,
+    real: str = "",
     **settings: Any,
-) -> StubPlan:
-    """A station on the bundled robot's description; `settings` are tables of the deployment."""
+) -> Stubs:
+    """A station on the bundled robot's description, stood in for; `settings` are tables of the deployment."""
     tree: dict[str, Any] = {
         "station": "bench",
         "robot": "agilex_piper",
@@ -194,20 +194,28 @@ def spec_of(
     }
     for table, values in settings.items():
         tree[table] = {**tree.get(table, {}), **values} if isinstance(values, dict) else values
-    made = checked_spec(loader.resolve(tree, {}, "test"))
-    return StubPlan(made.resolved, made.robot, {}, start, rows, space, absent, moves_robot, simulated)
+    can = Capabilities(moves_robot=moves_robot, resets_bench=simulated)
+    spec = replace(checked_spec(loader.resolve(tree, {}, "test")), capabilities=can)
+    return Stubs(spec, start, rows, space, absent, real)
 
 
 class Station(Lockstep):
     """A lockstep station with its robot, its policy, and a few words for what tests do again and again."""
 
-    def __init__(self, made: StubPlan) -> None:
-        made.built.clear()
-        super().__init__(made)
-        self.robot: StubRobot = made.built["robot"]
-        self.policy: StubPolicy = made.built["policy"]  # the deployment's own
-        self.policies: list[StubPolicy] = made.built["policies"]  # all that were built since
+    def __init__(self, stubs: Stubs) -> None:
+        self.stubs = stubs
+        stubs.built.clear()
+        super().__init__(stubs.spec, peers=stubs.peers)
+        self.robot: StubRobot = stubs.built["robot"]
+        self.policy: StubPolicy = stubs.built["policy"]  # the deployment's own
+        self.policies: list[StubPolicy] = stubs.built["policies"]  # all that were built since
         self.connect()
+
+    def restart_coordinator(self) -> None:
+        """Another coordinator in the place of this one, with what was shared."""
+        self.coordinator = assemble(
+            self.spec, self.shared, self.clock, self._runner, make_policy=self.stubs.peers.policy
+        )
 
     @property
     def state(self) -> SessionState:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import threading
 import time
+import uuid
 from collections.abc import Callable
 from typing import Any
 
@@ -24,7 +24,6 @@ from runtime.core.errors import TransportError
 
 HOST = "127.0.0.1"
 _REPLIES = "inproc://channel-replies-{}"
-_NUMBERS = itertools.count()
 _END_S = 1.0
 _AT_ONCE = 64  # messages, after which answers go out first: a flood keeps nobody waiting for theirs
 
@@ -43,7 +42,7 @@ class ChannelServer:
     ) -> None:
         self._names, self._lives, self._stops = names, Lives(now), 0
         self._socket, self.endpoint = _listening(context, port)
-        self._context, self._inbox = context, _REPLIES.format(next(_NUMBERS))
+        self._context, self._inbox = context, _REPLIES.format(uuid.uuid4())
         self._replies = context.socket(zmq.PULL)
         self._replies.linger = 0
         self._replies.bind(self._inbox)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import gc
 import logging
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from runtime.core import realtime
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault
+from runtime.core.plugins import variants
 from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.child import join
@@ -24,22 +26,48 @@ from runtime.spaces.binary_grippers import switches
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Sink
 
+if TYPE_CHECKING:
+    from runtime.spaces.published_poses import PosePublisher
+
 log = logging.getLogger(__name__)
 _LATENESS_KEPT = 2000
 # Of a deployment, what others make: what is wrong with its modules costs control nothing.
 _UNREAD = ("runtime.policies", "runtime.teleoperators", "runtime.cameras", "runtime.kinematics")
 
 
+def make_sink(spec: StationSpec, clock: Clock) -> Sink:
+    """The robot as the transport tells it what to do, not yet connected."""
+    settings = spec.deployment.transport
+    sink: Sink = variants("runtime.transports")[settings.kind].sink(settings, spec.robot, clock)
+    return sink
+
+
+def make_publisher(spec: StationSpec) -> PosePublisher | None:
+    """Publisher of the poses of a joint command; None where joints alone are published."""
+    wanted, robot = spec.deployment.publication, spec.robot
+    if wanted.space == "joint":
+        return None
+    from runtime.kinematics.forward import ChainForward
+    from runtime.spaces.end_effectors import EndEffectors
+    from runtime.spaces.pose_rows import PoseRows
+    from runtime.spaces.published_poses import PosePublisher
+
+    return PosePublisher(
+        PoseRows(wanted.pose, robot, "publication.pose"), EndEffectors(robot, ChainForward(robot))
+    )
+
+
 def make_tick(spec: StationSpec, shared: SharedState, sink: Sink, now: Callable[[], float]) -> Tick:
     """The tick of a deployment; the same object in real time and in lockstep."""
     deployment, limits = spec.deployment, spec.limits
+    merging = variants("runtime.strategies")[deployment.strategy.kind]
     workspace = Workspace(spec.robot, deployment.safety.workspace)
     collisions = Collisions(spec.robot, deployment.safety.collision_margin)
     return Tick(
         shared,
         sink,
         SafetyFilter(deployment.safety, limits, workspace if workspace.arms else None, collisions),
-        Strategy(deployment.strategy.kind, spec.strategy.merge(deployment.strategy, spec.dims)),
+        Strategy(deployment.strategy.kind, merging.merge(deployment.strategy, spec.dims)),
         TickSettings(
             period=1.0 / spec.rate,
             limits=limits,
@@ -50,7 +78,7 @@ def make_tick(spec: StationSpec, shared: SharedState, sink: Sink, now: Callable[
             starvation_hold=deployment.control.starvation_hold_s,
             moves_robot=spec.capabilities.moves_robot,
             switches=switches(spec.robot),
-            publication=spec.publication(),
+            publication=make_publisher(spec),
         ),
         now,
     )
@@ -124,7 +152,7 @@ def main() -> None:
     clock = MonotonicClock()
     for _ in shared.rings["orders"].drain():
         pass  # given to a predecessor that died: its motions are not ours to finish
-    sink: Sink = spec.transport.sink(spec.deployment.transport, spec.robot, clock)
+    sink = make_sink(spec, clock)
     _connect(sink, clock, member.lifeline)
     tick = make_tick(spec, shared, sink, clock.now)
     settings = spec.deployment.control

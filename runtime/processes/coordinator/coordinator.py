@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
-import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
+from runtime.config.loader import Resolved
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError, RuntimeFault
 from runtime.ipc.bus import EventLog
@@ -28,31 +30,23 @@ from runtime.ipc.messages import (
 )
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop, SharedState
-from runtime.kinematics.forward import ChainForward
-from runtime.kinematics.loading import Loading
 from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.processes.coordinator.demonstrations import Demonstrations
 from runtime.processes.coordinator.health_monitor import HealthMonitor
-from runtime.processes.coordinator.inference.chunk_mixture import Mixture
-from runtime.processes.coordinator.inference.inference import Inference, Patience
-from runtime.processes.coordinator.inference.policy_observation import PolicyObservation, SightSettings
-from runtime.processes.coordinator.inference.requests import PolicyRequests
-from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
-from runtime.processes.coordinator.inference.worker import Runner
+from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.manual.manual_control import ManualControl
-from runtime.processes.coordinator.manual.targets import Targets
-from runtime.processes.coordinator.operations import Parts, SessionActions
+from runtime.processes.coordinator.operations import SessionActions
 from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
 from runtime.processes.coordinator.runs import Runs
 from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
 from runtime.processes.coordinator.session.transitions import SessionEvent
-from runtime.processes.coordinator.session.tuning import strategy_of
 from runtime.processes.coordinator.setup.sequence import SetUp
-from runtime.processes.coordinator.snapshot import control_figures, facts, snapshot
+from runtime.processes.coordinator.snapshot import snapshot
 from runtime.processes.coordinator.timing_report import TimingReport
+from runtime.spaces.conversion import ActionSpaces
 from runtime.station import permissions as rights
-from runtime.station.run import Provenance, Run
+from runtime.station.run import Run
 from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
@@ -61,74 +55,35 @@ _TO_MAIN = ("control_events", "reception_events", "media_events")  # rings
 _HOLDS = ("refusals", "implausible", "unmeasured", "family", "orphaned", "too_far", "moved_away")
 
 
+@dataclass(eq=False)
 class Coordinator:
-    """One `pump` does everything that is due; lockstep calls it tick by tick."""
+    """One `pump` does everything that is due; lockstep calls it tick by tick. `assembly.assemble` puts it together."""
 
-    def __init__(
-        self,
-        spec: StationSpec,
-        shared: SharedState,
-        clock: Clock,
-        runner: Runner,
-        people: Clock | None = None,
-    ) -> None:
-        self.shared, self.clock = shared, clock
-        self.people = people or clock  # of leases, and of how long commands are valid: lockstep has another
-        self.facts = facts(spec)
-        self.boot = str(uuid.uuid4())
-        self._own = spec.resolved
-        settings = spec.deployment
-        self.events = EventLog()
-        self.lease = Lease(settings.lease.ttl_s)
-        self._orders = orders = ControlQueue(shared)
+    boot: str
+    shared: SharedState
+    clock: Clock
+    people: Clock  # of leases, and of how long commands are valid: lockstep has another
+    own: Resolved  # as the station was started with
+    facts: Mapping[str, Any]  # what a snapshot says of a station that does not change
+    events: EventLog
+    lease: Lease
+    orders: ControlQueue
+    spaces: ActionSpaces
+    inference: Inference
+    setup: SetUp
+    runs: Runs
+    manual: ManualControl
+    collecting: Demonstrations
+    health: HealthMonitor
+    timing: TimingReport
+    operations: SessionActions
+    preflights: PreflightDesk
+    session: SessionMachine
+
+    def __post_init__(self) -> None:
         self.media_report = MediaReport(0.0, 0, "", 0)
         self.reception_report = ReceptionReport(0.0)
         self.unheard: dict[str, str] = {}  # as by Sink.unheard
-        kinematics = Loading(ChainForward(spec.robot), spec.kinematics, runner.aside)
-        self.spaces = spec.spaces(kinematics)
-        spaces, policy_observation = spec.spaces(kinematics), _sight(spec, shared, clock)
-        requests = PolicyRequests(
-            spec.new_policy(clock), settings.task, spaces, policy_observation, runner, clock
-        )
-        patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
-        self.inference = Inference(
-            requests,
-            strategy_of(spec),
-            shared,
-            self._orders,
-            clock,
-            patience,
-            RtcPrefix(spec.rate, Mixture(spec.dims, spec.robot)),
-        )
-        self.setup = SetUp(spec, self.inference, self._orders, shared, clock, lambda: self.reception_report)
-        self.health = HealthMonitor(
-            spec, shared, self.lease, clock, self.people, lambda: self.reception_report
-        )
-        control = settings.control
-        self._punctuality = TimingReport(
-            shared, spec.rate, control.realtime_priority, control.realtime == "auto"
-        )
-        provenance = Provenance(spec, self.boot)
-        self.runs = Runs(
-            spec,
-            shared,
-            clock,
-            self.inference,
-            self._orders,
-            provenance,
-            lambda: control_figures(shared, spec.rate),
-            kinematics.prepare,
-        )
-        self.manual = ManualControl(spec, shared, orders, self.runs, Targets(spec, self.spaces, kinematics))
-        self.collecting = Demonstrations(
-            spec, shared, clock, self.inference, self.setup, lambda: self.runs.open, self.say
-        )
-        parts = Parts(
-            shared, clock, orders, self.inference, self.setup, self.runs, self.manual, self.collecting
-        )
-        self.operations = SessionActions(spec, parts, self._state, self.health.absent, self.say)
-        self.preflights = PreflightDesk(lambda: self.spec, spec, self._state, self.say, clock)
-        self.session = SessionMachine(self.operations, self.lease, self.boot, self.people.now)
         self._take_over()
 
     def _take_over(self) -> None:
@@ -142,9 +97,6 @@ class Coordinator:
     def spec(self) -> StationSpec:
         """As it was last set up or tuned."""
         return self.operations.spec
-
-    def _state(self) -> SessionState:
-        return self.session.state
 
     @property
     def run(self) -> Run | None:
@@ -161,7 +113,7 @@ class Coordinator:
             self._observe(*noticed)
         if missed := self.collecting.look(self.session.state):
             self._observe(*missed)
-        for event in self._punctuality.look(self.clock.now()):
+        for event in self.timing.look(self.clock.now()):
             self.say(event)
         self.runs.pump()
         self._advance_setup()
@@ -280,7 +232,7 @@ class Coordinator:
             done = self.setup.pump()
         except RuntimeFault as error:
             self.setup.fail()
-            self._orders.give("hold")
+            self.orders.give("hold")
             self._observe(SessionEvent.SETUP_FAILED, str(error))
             return
         if self.setup.stage is not stage:
@@ -359,7 +311,7 @@ class Coordinator:
         if self.session.answered(command) is not None:
             return ""
         try:
-            rights.require(command, self._own)
+            rights.require(command, self.own)
         except RuntimeFault as fault:
             return str(fault)
         return ""
@@ -386,10 +338,3 @@ class Coordinator:
         self.preflights.close()
         self.inference.policy.close()
         self.inference.runner.close()
-
-
-def _sight(spec: StationSpec, shared: SharedState, clock: Clock) -> PolicyObservation:
-    safety = spec.deployment.safety
-    return PolicyObservation(
-        shared, clock, SightSettings(spec.rate, safety.joint_age_s, safety.picture_age_s)
-    )

@@ -20,6 +20,7 @@ from runtime.ipc.command_arguments import (
 from runtime.ipc.messages import Event, Mode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
+from runtime.processes.coordinator.builders import MakePolicy
 from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.processes.coordinator.demonstrations import Demonstrations
 from runtime.processes.coordinator.inference.inference import Inference
@@ -59,6 +60,7 @@ class SessionActions:
         state: Callable[[], SessionState],
         absent: Callable[[], str],
         say: Callable[[Event], None],
+        make_policy: MakePolicy,
     ) -> None:
         self._own = spec  # the deployment's
         self.spec = spec  # as it was last set up or tuned
@@ -71,6 +73,7 @@ class SessionActions:
         self.collecting: Demonstrations = parts.collecting
         self._orders = parts.orders
         self._state, self._absent, self._say = state, absent, say
+        self._make_policy = make_policy
         self._tuned = False  # since the last set-up
         self.by: str = ""  # the client whose command is being carried out
         self.command: str = ""  # that command's uuid
@@ -86,7 +89,7 @@ class SessionActions:
         policy = self.inference.policy
         other = spec.deployment.policy != self.spec.deployment.policy
         if spec.collecting != self.spec.collecting or (other and not spec.collecting):
-            policy = spec.new_policy(self.clock)
+            policy = self._make_policy(spec, self.clock)
         self._orders.tune(spec.deployment.strategy.model_dump())
         self.manual.unlock()
         # Nothing is refused from here on.

@@ -17,6 +17,7 @@ from runtime.ipc.fair_queue import Asked, Turns
 from runtime.ipc.identity import forged, identified, lacking
 from runtime.ipc.messages import Ack, Command, Event
 from runtime.processes.child import join
+from runtime.processes.coordinator.assembly import assemble
 from runtime.processes.coordinator.command_journal import CommandJournal
 from runtime.processes.coordinator.coordinator import Coordinator
 from runtime.processes.coordinator.inference.inference import ShownChunk
@@ -226,7 +227,7 @@ def main() -> None:
     heap.keep()
     descriptors.allow_all()
     member = join("coordinator")
-    deciding = Coordinator(member.spec, member.shared, MonotonicClock(), ThreadRunner())
+    deciding = assemble(member.spec, member.shared, MonotonicClock(), ThreadRunner())
     service = CommandService(deciding, zmq.Context.instance())
     while not member.lifeline.cut:
         deciding.pump()

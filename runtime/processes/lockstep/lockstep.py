@@ -21,15 +21,17 @@ from runtime.ipc.identity import LOCAL
 from runtime.ipc.messages import Ack, Command
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
-from runtime.processes.control.process import make_tick
-from runtime.processes.coordinator.coordinator import Coordinator
+from runtime.processes.control.process import make_sink, make_tick
+from runtime.processes.coordinator.assembly import assemble
+from runtime.processes.coordinator.builders import MakePolicy, make_policy
 from runtime.processes.coordinator.inference.worker import LockstepRunner, Runner
 from runtime.processes.guard.process import Guard
 from runtime.processes.media.episode_closing import Close, at_once
 from runtime.processes.media.process import Media, make_recorder
 from runtime.processes.media.recorder import ClosedEpisode
-from runtime.processes.reception.process import Reception
+from runtime.processes.reception.process import Reception, make_source
 from runtime.station.spec import StationSpec
+from runtime.transports.base import Sink, Source
 
 log = logging.getLogger(__name__)
 _HOLDER = "lockstep"
@@ -58,28 +60,41 @@ class Around:
     on_disk: Callable[[Path], None] = lambda folder: None
 
 
+@dataclass(frozen=True, slots=True)
+class Peers:
+    """Makers of what a station is connected to; by default of what its deployment names."""
+
+    source: Callable[[StationSpec, Clock], Source] = make_source
+    sink: Callable[[StationSpec, Clock], Sink] = make_sink
+    policy: MakePolicy = make_policy
+
+
 class Lockstep:
     """One station without processes; each `tick` is reception, media, the coordinator, control in that order.
 
-    `clock` and `around` are given where somebody else has a part in it.
+    `clock`, `around` and `peers` are given where somebody else has a part in it.
     """
 
     def __init__(
-        self, spec: StationSpec, clock: VirtualClock | None = None, around: Around | None = None
+        self,
+        spec: StationSpec,
+        clock: VirtualClock | None = None,
+        around: Around | None = None,
+        peers: Peers | None = None,
     ) -> None:
         self.spec = spec
         self.clock = clock = clock or VirtualClock()
         self.shared = SharedState(spec.layout, mmap.mmap(-1, SharedState.size(spec.layout)))
-        settings, around = spec.deployment, around or Around()
+        settings, around, peers = spec.deployment, around or Around(), peers or Peers()
         waits = around.waits or clock
         self.guard = Guard(self.shared, Latch(settings.station_dir), waits, 1.0 / spec.rate, settings.station)
-        self._source = spec.source(clock)
-        self._sink = spec.transport.sink(settings.transport, spec.robot, clock)
+        self._source = peers.source(spec, clock)
+        self._sink = peers.sink(spec, clock)
         recorder = make_recorder(spec, clock.now, patient=True)
         self.media = Media(self.shared, recorder, clock, around.preview, around.closer, around.on_disk)
         self.reception = Reception(self.shared, self._source, clock, LOCKSTEP)
         self._runner = around.runner or LockstepRunner(settings.lockstep.delay_ticks)
-        self.coordinator = Coordinator(spec, self.shared, clock, self._runner, around.people)
+        self.coordinator = assemble(spec, self.shared, clock, self._runner, around.people, peers.policy)
         self._tick = make_tick(spec, self.shared, self._sink, self.clock.now)
         self.step = 0
 
@@ -159,21 +174,22 @@ def check(spec: StationSpec) -> None:
     its joints.
     """
     kind = spec.deployment.transport.kind
-    if getattr(spec.transport, "REAL_TIME", False):
-        known = variants("runtime.transports").items()
-        allowed = ", ".join(sorted(name for name, module in known if not getattr(module, "REAL_TIME", False)))
+    known = variants("runtime.transports")
+    if getattr(known[kind], "REAL_TIME", False):
+        lasting = (name for name, module in known.items() if not getattr(module, "REAL_TIME", False))
+        allowed = ", ".join(sorted(lasting))
         raise SetupError(
             f"transport.kind = {kind!r} with --lockstep: what is at its other end goes on in real time, and lockstep "
             f"has a clock of its own; allowed: {allowed}, or leave --lockstep out"
         )
 
 
-def run(spec: StationSpec, longest: float = 3600.0) -> LockstepRun:
+def run(spec: StationSpec, longest: float = 3600.0, peers: Peers | None = None) -> LockstepRun:
     """Set up, run to the end of the source or of run.duration_s, close; raises RuntimeFault where it cannot.
 
-    `longest` bounds the virtual time of the run [s].
+    `longest` bounds the virtual time of the run [s]; `peers` as by `Lockstep`.
     """
-    station = Lockstep(spec)
+    station = Lockstep(spec, peers=peers)
     session = station.coordinator.session
     try:
         station.connect()

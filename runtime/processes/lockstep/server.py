@@ -26,7 +26,7 @@ from runtime.processes.coordinator.inference.requests import PolicyResponse
 from runtime.processes.coordinator.inference.worker import DeclaredRunner
 from runtime.processes.coordinator.process import CommandService
 from runtime.processes.guard.process import Desk
-from runtime.processes.lockstep.lockstep import Around, Lockstep
+from runtime.processes.lockstep.lockstep import Around, Lockstep, Peers
 from runtime.processes.media.crash_repair import start_repair
 from runtime.processes.media.episode_closing import in_background
 from runtime.processes.media.export_jobs import Exports
@@ -89,6 +89,7 @@ class ServedLockstep(Lockstep):
         clock: VirtualClock,
         over: Over = lambda running: "",
         people: Clock | None = None,
+        peers: Peers | None = None,
     ) -> None:
         settings = spec.deployment
         if settings.control_channel.enabled:
@@ -111,7 +112,7 @@ class ServedLockstep(Lockstep):
             closer=in_background,
             on_disk=self._exports.start,
         )
-        super().__init__(spec, clock, around)
+        super().__init__(spec, clock, around, peers)
         self._figures = Lateness(self._tick.status, LOCKSTEP)
         context: zmq.Context[Any] = zmq.Context.instance()
         self._estops = Desk(self.guard, self.shared, context, settings.station_dir)

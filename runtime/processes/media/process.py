@@ -35,6 +35,7 @@ from runtime.ipc.messages import (
 from runtime.ipc.observation_messages import as_observation
 from runtime.ipc.shared_memory import TornReadError
 from runtime.ipc.shared_state import SharedState
+from runtime.kinematics.forward import ChainForward
 from runtime.processes.child import join
 from runtime.processes.media.background import LowPriorityWorker
 from runtime.processes.media.crash_repair import start_repair
@@ -44,6 +45,7 @@ from runtime.processes.media.previews import Previews
 from runtime.processes.media.recorder import ClosedEpisode, DatasetGrid, Recorder
 from runtime.processes.media.unclosed_episodes import Unclosed
 from runtime.recording.episode import EpisodeJournal
+from runtime.spaces.end_effectors import EndEffectors
 from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
@@ -311,9 +313,8 @@ def make_recorder(spec: StationSpec, now: Callable[[], float], patient: bool = F
     }
     root, recording = spec.deployment.episodes_dir, spec.deployment.recording
     journal = EpisodeJournal(root, recording, patient=patient)
-    grid = DatasetGrid(
-        described, spec.layout.cameras, spec.rate, spec.fps, spec.end_effectors().eef_of, recording
-    )
+    eef_of = EndEffectors(robot, ChainForward(robot)).eef_of
+    grid = DatasetGrid(described, spec.cameras, spec.rate, spec.fps, eef_of, recording)
     return Recorder(journal, root, grid, now)
 
 

@@ -5,18 +5,20 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 
 from runtime.core import malloc as heap
 from runtime.core import realtime
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault
+from runtime.core.plugins import variants
 from runtime.core.types import Observation
 from runtime.ipc.messages import BeginRun, EndRun, Event, Message, ReceptionReport, RunBegun, decode, encode
 from runtime.ipc.observation_messages import as_message
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.child import join
 from runtime.processes.reception.receiver import ObservationReceiver
-from runtime.station.spec import StationSpec
+from runtime.station.spec import StationSpec, delivered
 from runtime.transports.base import Source
 
 log = logging.getLogger(__name__)
@@ -128,6 +130,23 @@ class Reception:
             log.warning("the coordinator does not read: %s lost", type(message).__name__)
 
 
+def make_source(spec: StationSpec, clock: Clock) -> Source:
+    """The observations, not yet connected: the transport's, with the cameras of the deployment's own.
+
+    The transport is told of a robot without these: it must not wait for them. What it leaves out itself stays.
+    """
+    settings = spec.deployment
+    own = settings.cameras.keys() & set(delivered(settings, spec.robot))
+    robot = replace(spec.robot, cameras=tuple(c for c in spec.robot.cameras if c.key not in own))
+    transport = variants("runtime.transports")[settings.transport.kind]
+    source: Source = transport.source(settings.transport, robot, clock)
+    if not settings.cameras:
+        return source
+    from runtime.cameras.attaching import attached
+
+    return attached(source, settings.cameras, clock)
+
+
 def main() -> None:
     """Receive until the supervisor is gone, and control with it."""
     heap.keep()
@@ -136,7 +155,7 @@ def main() -> None:
     shared.beat("reception", clock.now())
     scheduling = _scheduling(member.spec)  # before there are other threads, which are to have the same
     log.info("receiving, scheduling %s", scheduling)
-    source = member.spec.source(clock)
+    source = make_source(member.spec, clock)
     reception = Reception(shared, source, clock, scheduling)
     connected, retry_at = False, 0.0
     share = Share() if scheduling.startswith("FIFO") else None

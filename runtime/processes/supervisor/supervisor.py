@@ -21,7 +21,7 @@ from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.shared_state import PROCESSES, SharedState
 from runtime.processes.supervisor.optional_child import OptionalChild
 from runtime.station.lock import hold, unwritable
-from runtime.station.spec import StationSpec
+from runtime.station.spec import CAPABILITIES, StationSpec
 
 log = logging.getLogger(__name__)
 _MODULES = {
@@ -103,13 +103,21 @@ class Supervisor:
         return subprocess.Popen(
             [
                 *(sys.executable, "-m", _MODULES[process], "--boot", self.boot),
-                *(self._for_guard() if process == "guard" else ("--resolved", str(self._resolved))),
+                *(self._for_guard() if process == "guard" else self._for_readers(process)),
                 *shared,
             ],
             stdin=self._lifeline_out,
             pass_fds=(self._page_fd,) if shared else (),
             env=self._environment,
             start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them in order
+        )
+
+    def _for_readers(self, process: str) -> tuple[str, ...]:
+        known = CAPABILITIES.dump_json(self._plan.capabilities).decode()
+        return (
+            "--resolved",
+            str(self._resolved),
+            *(() if process == "headless" else ("--capabilities", known)),
         )
 
     def _for_guard(self) -> tuple[str, ...]:

@@ -95,7 +95,7 @@ class _Domains:
                 self._open[number] = (domain, configured, users - 1)
 
 
-_domains = _Domains()
+_domains = _Domains()  # state: the library has one of each per process, whoever made it
 
 
 class DdsMiddleware(Middleware):

@@ -55,7 +55,7 @@ class Site:
         return kept | {"ROS_MASTER_URI": self.master, "ROS_IP": self.address}
 
 
-@functools.cache
+@functools.cache  # cache: to look starts a process
 def require(python: str) -> None:
     """SetupError with what to install where that Python does not exist or has no rospy; a success is remembered."""
     line = [python, str(_PROGRAM), json.dumps({"check": True})]

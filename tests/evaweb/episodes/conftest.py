@@ -18,7 +18,7 @@ from evaweb.jobs.services import work
 from evaweb.stations.models import Station
 from runtime.recording.export import export
 from tests.runtime.lockstep_station import Station as Bench
-from tests.runtime.lockstep_station import spec_of
+from tests.runtime.lockstep_station import stubbed
 
 FRAMES = 24
 HELD = 6
@@ -29,7 +29,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Folders of one finished and one interrupted episode, by status; in both the robot was held for a while."""
     made = {}
     for status in ("finished", "interrupted"):
-        bench = Bench(spec_of(tmp_path_factory.mktemp(status)))
+        bench = Bench(stubbed(tmp_path_factory.mktemp(status)))
         bench.running(12)
         bench.command("halt")
         bench.go(HELD)

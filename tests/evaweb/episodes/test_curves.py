@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +15,12 @@ from evaweb.episodes.curves import curves, held_spans
 from evaweb.episodes.poses import poses
 from evaweb.errors import NotFound
 from evaweb.stations.robot_geometry import looks_of
+from runtime.kinematics.forward import ChainForward
 from runtime.recording.files import RecordingError
 from runtime.recording.reader import open_episode
 from runtime.recording.tables import write_table
-from tests.runtime.lockstep_station import STANDS, Station, column, spec_of
+from runtime.spaces.end_effectors import EndEffectors
+from tests.runtime.lockstep_station import STANDS, Station, column, stubbed
 from tests.runtime.recording.test_tables import old_raw
 
 
@@ -86,10 +87,10 @@ def test_spans_of_rows_in_which_nobody_asked(sources: list[str], spans: list[lis
 
 
 def test_a_policy_that_speaks_in_poses_has_no_raw_joint_curve(tmp_path: Path) -> None:
-    made = spec_of(tmp_path, space="eef")
-    eef_of = made.spaces().eef_of
-    stands = replace(made, rows=lambda seen, number: eef_of(np.tile(STANDS, (20, 1))))
-    bench = Station(stands)
+    made = stubbed(tmp_path, space="eef")
+    eef_of = EndEffectors(made.spec.robot, ChainForward(made.spec.robot)).eef_of
+    made.rows = lambda seen, number: eef_of(np.tile(STANDS, (20, 1)))
+    bench = Station(made)
     bench.running(12)
     frame = decode(curves(bench.stop().path))
     assert frame.header["streams"]["raw"]["json"]["spaces"] == ["eef"]
@@ -158,7 +159,7 @@ def test_every_tick_names_the_chunk_that_owns_it_and_all_that_made_it(folder: Pa
 
 
 def test_of_every_chunk_it_is_known_when_and_how_late_it_came(tmp_path: Path) -> None:
-    bench = Station(spec_of(tmp_path, delay=3))
+    bench = Station(stubbed(tmp_path, delay=3))
     bench.running(40)
     folder = bench.stop().path
     frame, episode = decode(curves(folder)), open_episode(folder)

@@ -39,7 +39,7 @@ from runtime.recording.export import export
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import unguarded
 from tests.runtime.lockstep_station import Station as Lockstep
-from tests.runtime.lockstep_station import spec_of
+from tests.runtime.lockstep_station import stubbed
 
 pytestmark = pytest.mark.django_db
 
@@ -70,7 +70,7 @@ class Direct:
 def lab(tmp_path, monkeypatch, db):
     """A lab around a whole station in lockstep."""
     monkeypatch.setattr(doorbell, "ring", lambda queue: True)
-    made = Lab(builders.bench("bench"), Lockstep(spec_of(tmp_path, simulated=True)))
+    made = Lab(builders.bench("bench"), Lockstep(stubbed(tmp_path, simulated=True)))
     for place in ("evaweb.stations.commands", "evaweb.stations.stops", "evaweb.trials.station_commands"):
         monkeypatch.setattr(f"{place}.wire_to", lambda name: Direct(made.station))
     return made

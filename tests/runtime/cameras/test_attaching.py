@@ -11,6 +11,7 @@ from runtime.cameras.live import LiveCamera
 from runtime.config import loader
 from runtime.core.clock import MonotonicClock, VirtualClock
 from runtime.core.errors import ConfigurationError, SetupError
+from runtime.processes.reception.process import make_source
 from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
 from runtime.transports.node_source import NodeSource
@@ -32,7 +33,7 @@ def planned(tmp_path: Path, cameras: dict[str, Any], **transport: Any) -> Statio
 
 def waits_for(spec: StationSpec) -> set[str]:
     """The cameras that the transport itself must deliver."""
-    source = spec.source(MonotonicClock())
+    source = make_source(spec, MonotonicClock())
     inner = source._source if isinstance(source, Attached) else source
     assert isinstance(inner, NodeSource)
     return set(inner._messages._cameras)
@@ -79,7 +80,7 @@ def test_a_password_is_in_no_manifest_and_in_no_sentence(
     monkeypatch.setenv("CAMERA_PASSWORD", "s3cret")
     wanted = {"kind": "rtsp", "url": "rtsp://h/x", "user": "me", "password_env": "CAMERA_PASSWORD"}
     spec = planned(tmp_path, {"cam_high": wanted})
-    source = spec.source(MonotonicClock())
+    source = make_source(spec, MonotonicClock())
     assert isinstance(source, Attached)
     (camera,) = source._cameras
     assert isinstance(camera, LiveCamera)
@@ -113,7 +114,7 @@ def test_on_a_virtual_clock_there_is_no_live_camera(tmp_path: Path) -> None:
     with pytest.raises(
         SetupError, match=r"cameras\.cam_high: kind 'mjpeg' goes on by itself.*allowed there: 'file'"
     ):
-        planned(tmp_path, {"cam_high": HIGH}).source(VirtualClock())
+        make_source(planned(tmp_path, {"cam_high": HIGH}), VirtualClock())
 
 
 def test_a_device_is_asked_for_what_the_table_says(tmp_path: Path) -> None:

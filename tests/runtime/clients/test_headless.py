@@ -87,8 +87,7 @@ def clock(monkeypatch):
 @pytest.fixture
 def plan(tmp_path):
     publish, run = SimpleNamespace(dataset=None), SimpleNamespace(mode="continuous")
-    settings = SimpleNamespace(publish=publish, data=tmp_path, run=run, station="bench-1")
-    return SimpleNamespace(deployment=settings)
+    return SimpleNamespace(publish=publish, data=tmp_path, run=run, station="bench-1")
 
 
 @pytest.fixture(autouse=True)
@@ -247,15 +246,15 @@ def test_an_episode_that_cannot_be_read_is_no_success(plan, monkeypatch):
     ],
 )
 def test_every_run_is_exported_and_what_moved_a_robot_is_published(plan, kept, mode, dataset, done):
-    plan.deployment.run.mode, plan.deployment.publish.dataset = mode, dataset
+    plan.run.mode, plan.publish.dataset = mode, dataset
     result = drive(plan, a_good_run())
     assert kept == done
-    assert result["export_path"] == str(plan.deployment.data / "exports" / "one")
+    assert result["export_path"] == str(plan.data / "exports" / "one")
     assert ("dataset_path" in result) is ("publish" in done)
 
 
 def test_a_run_that_did_not_end_well_is_exported_and_not_published(plan, kept):
-    plan.deployment.publish.dataset = "demo"
+    plan.publish.dataset = "demo"
     station = a_good_run()
     station.statuses[-1] = station.statuses[-1] | {"last_run": FINISHED | {"status": "failed"}}
     with pytest.raises(RuntimeFault, match="did not end well"):
@@ -274,7 +273,7 @@ def test_an_export_that_fails_is_told_on_top_of_how_the_run_ended(plan, monkeypa
 
 @pytest.mark.parametrize("mode", ["step", "preview", "manual"])
 def test_a_mode_that_needs_a_person_is_refused_before_anything_is_done(plan, mode):
-    plan.deployment.run.mode = mode
+    plan.run.mode = mode
     station = Station(status("idle"))
     says = f"run.mode = '{mode}' needs a person; headless: continuous, sim.*ctl bench-1 run --mode {mode}"
     with pytest.raises(SetupError, match=says):

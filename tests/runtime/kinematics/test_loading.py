@@ -17,7 +17,7 @@ from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
 from runtime.kinematics.loading import Loading
 from runtime.processes.coordinator.inference.worker import LockstepRunner, ThreadRunner
-from tests.runtime.lockstep_station import Station, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 
 ROBOT = robots.load("ur5e")
 Q = ROBOT.poses["home"]
@@ -115,8 +115,8 @@ def test_what_cannot_be_made_is_said_to_who_solves_and_forward_goes_on(error: Ex
 def test_a_station_with_a_policy_of_joints_loads_no_compiler(tmp_path: Path) -> None:
     """In a process of its own: this one has loaded it."""
     script = (
-        "import sys; from pathlib import Path; from tests.runtime.lockstep_station import Station, spec_of\n"
-        f"station = Station(spec_of(Path({str(tmp_path)!r}))).running(30)\n"
+        "import sys; from pathlib import Path; from tests.runtime.lockstep_station import Station, stubbed\n"
+        f"station = Station(stubbed(Path({str(tmp_path)!r}))).running(30)\n"
         "assert station.coordinator.spaces.eef_of(station.coordinator.manual.commanded()).shape == (16,)\n"
         "assert 'numba' not in sys.modules, 'loaded'\n"
         "station._handle('aim', {'jog': {'arm': 'left_arm', 'translation': [0.01, 0, 0]}})\n"
@@ -129,7 +129,7 @@ def test_a_station_with_a_policy_of_joints_loads_no_compiler(tmp_path: Path) -> 
 def test_a_run_by_hand_begins_when_steps_can_be_answered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     loaded: list[bool] = []
     monkeypatch.setattr(station.coordinator.runs, "_prepared", lambda: bool(loaded))
     station.command("run", mode="manual")

@@ -10,24 +10,15 @@ import pytest
 
 import robots
 from runtime.ipc.session_state import SessionState
-from runtime.policies import replay
-from tests.runtime.lockstep_station import Station, StubPlan, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 from tests.runtime.quality import built
 
 ROWS = 90
 
 
 @pytest.fixture
-def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Station:
-    own = StubPlan._policy
-
-    def build(self: StubPlan, config: Any, robot: Any, clock: Any, rate: float) -> Any:
-        if config.kind == "replay":
-            return replay.build(config, robot, clock, rate)
-        return own(self, config, robot, clock, rate)
-
-    monkeypatch.setattr(StubPlan, "_policy", build)
-    return Station(spec_of(tmp_path))
+def station(tmp_path: Path) -> Station:
+    return Station(stubbed(tmp_path, real="replay"))
 
 
 def recorded(station: Station, root: Path) -> tuple[Path, np.ndarray]:

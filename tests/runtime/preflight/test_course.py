@@ -230,10 +230,11 @@ def test_a_report_without_a_policy_is_two_lines_and_advice() -> None:
 
 @pytest.mark.slow
 def test_compiling_kinematics_is_not_the_policys_time(flown: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from runtime.station.spec import StationSpec
-
-    made = StationSpec.kinematics
-    monkeypatch.setattr(StationSpec, "kinematics", lambda spec: (threading.Event().wait(3.2), made(spec))[1])
+    backend = variants("runtime.kinematics")[
+        planned(MOCK, "", policy={"kind": "mock"}).deployment.kinematics.kind
+    ]
+    build = backend.build
+    monkeypatch.setattr(backend, "build", lambda *given: (threading.Event().wait(3.2), build(*given))[1])
     poses = np.concatenate([np.append(arm.pose(FRANKA.poses["home"]), 0.5) for arm in FRANKA.arms])
 
     class Posed(Stub):

@@ -12,7 +12,7 @@ from runtime.ipc.messages import Command, Event
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
 from runtime.station.preflight_child import Flight
-from tests.runtime.lockstep_station import Station, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 from tests.runtime.preflight.bench import LEROBOT, WIRES, planned
 from tests.standing import standing
 
@@ -143,7 +143,7 @@ def test_reports_and_servers_are_told() -> None:
 
 
 def test_a_station_takes_its_policy_back_for_a_set_up_and_for_a_run(tmp_path: Any, monkeypatch: Any) -> None:
-    station = Station(spec_of(tmp_path))
+    station = Station(stubbed(tmp_path))
     flights = Recorder()
     monkeypatch.setattr(station.coordinator.preflights, "_preflights", flights)
     try:

@@ -10,7 +10,6 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,14 +17,14 @@ import numpy as np
 import robots
 from robots import Robot
 from runtime.config import loader
-from runtime.core.clock import Clock
+from runtime.core.clock import VirtualClock
 from runtime.core.types import Float64, UInt8
 from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.sim.bench import Bench, camera_arm
 from runtime.sim.in_poses import InPoses
-from runtime.sim.link import Link
-from runtime.sim.node import Node, parser
+from runtime.sim.lockstep import linked
+from runtime.sim.node import parser
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.pick_place import PickPlace, Skill, poses_apart
 from runtime.sim.plant import Plant
@@ -35,8 +34,6 @@ from runtime.sim.surroundings import Surroundings
 from runtime.sim.tabletop import Reset, Tabletop
 from runtime.station.checks import checked_spec
 from runtime.station.spec import StationSpec
-from runtime.transports import zmq
-from runtime.transports.base import Capabilities
 
 DEPLOYMENTS = Path(__file__).parents[3] / "deployments"
 HORIZON = 50
@@ -78,29 +75,6 @@ class SlowEye(Surroundings):
         self.table.reset(wish)
 
 
-@dataclass(frozen=True, slots=True)
-class TabletopPlan(StationSpec):
-    """A plan whose transport is the simulated node in this process."""
-
-    bench: SlowEye
-    links: dict[int, Link]  # by the clock of their station
-
-    @property
-    def transport(self) -> Any:
-        return SimpleNamespace(source=self._link, sink=self._link)
-
-    @property
-    def capabilities(self) -> Capabilities:
-        return zmq.capabilities(zmq.Config(simulated=True))
-
-    def _link(self, config: object, robot: Robot, clock: Clock) -> Link:
-        if id(clock) not in self.links:
-            line = ["--robot", robot.name, "--bench", "tabletop"]
-            node = Node(robot, parser().parse_args(line), clock, self.bench)
-            self.links[id(clock)] = Link(node, robot, clock)
-        return self.links[id(clock)]
-
-
 @dataclass(frozen=True)
 class Trial:
     """How a trial ended: what the bench says of it, the station's state and reason, its events, virtual seconds."""
@@ -121,62 +95,49 @@ class PolicyServer(Protocol):
     def close(self) -> None: ...
 
 
-Serve = Callable[[TabletopPlan, Script], PolicyServer]
+Serve = Callable[[StationSpec, Script], PolicyServer]
 """Makes the server that plays a script, for a plan that does not know its address yet."""
 
 
-def openpi_server(made: TabletopPlan, script: Script) -> PolicyServer:
+def openpi_server(made: StationSpec, script: Script) -> PolicyServer:
     """What is served where nothing else is said."""
     return OpenpiServer(made.robot, Behaviour(HORIZON, made.rate, rtc="none"), 0, script)
 
 
-def planned(
-    name: str, seed: int, data: Path, url: str | None, assignments: Sequence[str] = ()
-) -> TabletopPlan:
-    """The station of the deployment `name` with the bench laid out by `seed`; nothing is recorded."""
+def planned(name: str, data: Path, url: str | None, assignments: Sequence[str] = ()) -> StationSpec:
+    """The station of the deployment `name`; nothing is recorded."""
     given = [f'data_dir="{data}"', "recording.enabled=false", "lockstep.delay_ticks=5", *assignments]
     given += [] if url is None else [f'policy.url="{url}"']
-    made = checked_spec(loader.load(DEPLOYMENTS / f"{name}.toml", given))
-    bench = SlowEye(made.robot, Tabletop(made.robot, seed))
-    return TabletopPlan(made.resolved, made.robot, bench, {})
+    return checked_spec(loader.load(DEPLOYMENTS / f"{name}.toml", given))
 
 
 @contextmanager
 def served(
     name: str, seed: int, data: Path, assignments: Sequence[str] = (), serve: Serve = openpi_server
-) -> Iterator[tuple[TabletopPlan, Lockstep]]:
-    """A station that is not yet connected, and its policy served on loopback on the station's clock."""
-    made = planned(name, seed, data, None, assignments)
+) -> Iterator[tuple[Tabletop, Lockstep]]:
+    """A bench laid out by `seed`, and a station at it, not yet connected; its policy is served on its clock."""
+    made, clock = planned(name, data, None, assignments), VirtualClock()
+    bench = SlowEye(made.robot, Tabletop(made.robot, seed))
+    options = parser().parse_args(["--robot", made.robot.name, "--bench", "tabletop"])
     policy = made.deployment.policy
     in_poses = policy.action_space == "eef"
     skill, apart = Skill(_NOISE, seed=seed), poses_apart if in_poses else None
-    script = PickPlace(made.robot, HORIZON, made.rate, skill, clock=_Later(), apart=apart)
+    script = PickPlace(made.robot, HORIZON, made.rate, skill, clock=clock, apart=apart)
     spoken = InPoses(script, made.robot, made.rate, policy.action_pose) if in_poses else script
     server = serve(made, spoken)
     url = str(server.start()["url"])
     with closing(server):
-        made = planned(name, seed, data, url, assignments)
-        with closing(Lockstep(made)) as station:
-            script.clock = station.clock
-            yield made, station
-
-
-class _Later(Clock):
-    """Stands in for the station's clock until there is a station."""
-
-    def now(self) -> float:
-        return 0.0
-
-    def sleep_until(self, deadline: float) -> None:
-        raise AssertionError(f"nobody waits until {deadline}")
+        made = planned(name, data, url, assignments)
+        with closing(Lockstep(made, clock, peers=linked(made, clock, bench, options))) as station:
+            yield bench.table, station
 
 
 def pick_and_place(
     name: str, seed: int, data: Path, assignments: Sequence[str] = (), serve: Serve = openpi_server
 ) -> Trial:
     """Set up, run until the block lies on the plate or for so long."""
-    with served(name, seed, data, assignments, serve) as (made, station):
-        session, table = station.coordinator.session, made.bench.table
+    with served(name, seed, data, assignments, serve) as (table, station):
+        session = station.coordinator.session
         station.connect()
         station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
         station.command("setup")

@@ -23,7 +23,8 @@ from runtime.ipc.session_state import SessionState
 from runtime.policies import gr00t
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.script import Script
-from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place, planned
+from runtime.station.spec import StationSpec
+from tests.runtime.sim.tabletop_station import HORIZON, pick_and_place, planned
 
 ROOT = Path(__file__).parents[3]
 VECTORS = Path(__file__).parents[1] / "vectors"
@@ -70,7 +71,7 @@ def toml(table: dict[str, Any]) -> str:
 
 @pytest.mark.parametrize("version", ["n1.7-early", "starvla"])
 def test_a_trial_through_gr00t_puts_the_block_on_the_plate(tmp_path: Path, version: Any) -> None:
-    robot = planned("tabletop_ur5e", 0, tmp_path, None).robot
+    robot = planned("tabletop_ur5e", tmp_path, None).robot
     groups = toml({group.name: list(range(group.slice.start, group.slice.stop)) for group in robot.groups})
     cameras = toml({camera.key: camera.key for camera in robot.cameras})
     assignments = [
@@ -79,7 +80,7 @@ def test_a_trial_through_gr00t_puts_the_block_on_the_plate(tmp_path: Path, versi
     ]  # fmt: skip
     servers: list[Gr00tServer] = []
 
-    def serve(made: TabletopPlan, script: Script) -> Gr00tServer:
+    def serve(made: StationSpec, script: Script) -> Gr00tServer:
         servers.append(Gr00tServer(made.robot, Gr00tBehaviour(version, False, HORIZON, made.rate), 0, script))
         return servers[0]
 

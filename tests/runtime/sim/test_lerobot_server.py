@@ -20,7 +20,8 @@ from runtime.core.types import Observation
 from runtime.ipc.session_state import SessionState
 from runtime.policies import lerobot
 from runtime.sim.script import Script
-from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place, planned
+from runtime.station.spec import StationSpec
+from tests.runtime.sim.tabletop_station import HORIZON, pick_and_place, planned
 
 grpc = pytest.importorskip("grpc", reason="the extra lerobot-grpc is not installed")
 from runtime.sim import lerobot_wire as wire  # noqa: E402
@@ -142,7 +143,7 @@ def test_the_process_serves_the_client(start: Any) -> None:
 
 
 def test_a_trial_through_lerobot_puts_the_block_on_the_plate(tmp_path: Path) -> None:
-    robot = planned("tabletop_ur5e", 0, tmp_path, None).robot
+    robot = planned("tabletop_ur5e", tmp_path, None).robot
     cameras = ", ".join(f"{camera.key} = {json.dumps(camera.key)}" for camera in robot.cameras)
     assignments = [
         'policy.kind="lerobot"', 'policy.policy_type="act"', 'policy.checkpoint="stand-in"',
@@ -150,7 +151,7 @@ def test_a_trial_through_lerobot_puts_the_block_on_the_plate(tmp_path: Path) -> 
     ]  # fmt: skip
     servers: list[LerobotServer] = []
 
-    def serve(made: TabletopPlan, script: Script) -> LerobotServer:
+    def serve(made: StationSpec, script: Script) -> LerobotServer:
         servers.append(LerobotServer(made.robot, LerobotBehaviour(HORIZON, made.rate), 0, script))
         return servers[0]
 

@@ -23,7 +23,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.server import ServedLockstep
 from runtime.recording.reader import open_episode
 from runtime.sim import lockstep, serve
-from runtime.sim.lockstep import Rested, planned
+from runtime.sim.lockstep import Rested, linked
 from runtime.sim.node import parser
 from runtime.sim.tabletop import Tabletop
 from runtime.station.checks import checked_spec
@@ -129,8 +129,8 @@ def courses(
     made = checked_spec(loader.load(DEPLOYMENTS / "tabletop.toml", given))
     around = SlowEye(made.robot, Tabletop(made.robot, 1))
     options = parser().parse_args(["--robot", made.robot.name, "--bench", "tabletop", "--seed", "1"])
-    over = Rested(around.truth, clock)
-    with closing(ServedLockstep(planned(made, clock, around, options), clock, over)) as station:
+    over, peers = Rested(around.truth, clock), linked(made, clock, around, options)
+    with closing(ServedLockstep(made, clock, over, peers=peers)) as station:
         operator = Operator(station, dawdles)
         for policy, seed, seconds in trials:
             operator.trial(urls[policy], seed, seconds)

@@ -14,7 +14,8 @@ from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.roboarena_server import Arena, RoboarenaServer
 from runtime.sim.script import Script
 from runtime.sim.starvla_server import Star, StarvlaServer
-from tests.runtime.sim.tabletop_station import HORIZON, TabletopPlan, pick_and_place, served
+from runtime.station.spec import StationSpec
+from tests.runtime.sim.tabletop_station import HORIZON, pick_and_place, served
 
 ARENA = ['policy.kind="roboarena"', 'policy.cameras={cam_high="first", cam_wrist="wrist"}']
 STARVLA = ['policy.kind="starvla"', 'policy.cameras=["cam_wrist", "cam_high"]']
@@ -24,14 +25,14 @@ LIMITS = f"{{low={list(map(float, ARM.lower))}, high={list(map(float, ARM.upper)
 
 
 def arena_server(**arena: Any) -> Any:
-    def made(spec: TabletopPlan, script: Script) -> RoboarenaServer:
+    def made(spec: StationSpec, script: Script) -> RoboarenaServer:
         return RoboarenaServer(spec.robot, Arena(HORIZON, spec.rate, resolution=SIZE, **arena), 0, script)
 
     return made
 
 
 def starvla_server(old: bool) -> Any:
-    def made(spec: TabletopPlan, script: Script) -> StarvlaServer:
+    def made(spec: StationSpec, script: Script) -> StarvlaServer:
         star = Star(HORIZON, spec.rate, size=SIZE, views=("cam_wrist", "cam_high"), old=old)
         return StarvlaServer(spec.robot, star, 0, script)
 
@@ -39,7 +40,7 @@ def starvla_server(old: bool) -> Any:
 
 
 def rtc_server(dialect: Any) -> Any:
-    def made(spec: TabletopPlan, script: Script) -> OpenpiServer:
+    def made(spec: StationSpec, script: Script) -> OpenpiServer:
         return OpenpiServer(spec.robot, Behaviour(HORIZON, spec.rate, rtc=dialect), 0, script)
 
     return made

@@ -16,7 +16,7 @@ from runtime.motion.timeline import DimensionKinds
 from runtime.policies.base import PolicyInfo
 from runtime.safety.limits import Limits
 from runtime.spaces.binary_grippers import DWELL_S, Dwell, Switch, switches
-from tests.runtime.lockstep_station import Station, StubPlan, spec_of
+from tests.runtime.lockstep_station import Station, Stubs, stubbed
 from tests.runtime.tick_bench import PERIOD, WITH_GRIPPER, Bench
 
 PERCENT = Switch(6, 100.0, 0.0, 80.0, 5.0)  # an R1 Lite's
@@ -77,7 +77,7 @@ def test_every_binary_gripper_of_a_robot_is_one() -> None:
 
 def test_the_hysteresis_is_the_deployments_where_it_says_so(tmp_path: Path) -> None:
     table = {"left_arm": {"binary": True, "threshold": 0.05, "hysteresis": 0.5}}
-    (only,) = switches(spec_of(tmp_path, grippers=table).robot)
+    (only,) = switches(stubbed(tmp_path, grippers=table).spec.robot)
     assert only.snapped(np.array([0.06, 0.074, 0.076, 0.03, 0.02]), 0.0).tolist() == [0, 0, 0.1, 0.1, 0]
 
 
@@ -241,7 +241,7 @@ class Rtc:
         station.policy.connect = lambda: PolicyInfo("stub", supports_rtc=True)  # type: ignore[method-assign]
 
 
-def r1_lite(tmp_path: Path, kind: str, told: list[float], **more: Any) -> tuple[StubPlan, np.ndarray]:
+def r1_lite(tmp_path: Path, kind: str, told: list[float], **more: Any) -> tuple[Stubs, np.ndarray]:
     home = robots.load("r1_lite").poses["home"].copy()
     home[[6, 13]] = 0.0
 
@@ -251,7 +251,7 @@ def r1_lite(tmp_path: Path, kind: str, told: list[float], **more: Any) -> tuple[
         made[:, 13] = 37.0
         return made
 
-    return spec_of(tmp_path, rows, kind, robot="r1_lite", start=home, delay=2, **more), home
+    return stubbed(tmp_path, rows, kind, robot="r1_lite", start=home, delay=2, **more), home
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop, SharedState
 from runtime.processes.control.process import make_tick
 from tests.runtime.collision_samples import collisions, turned
-from tests.runtime.lockstep_station import Station, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 from tests.runtime.tick_bench import RecordingSink
 
 INWARDS = 0.01  # [rad] per step
@@ -33,7 +33,7 @@ def to_and_fro(observation: Observation, number: int) -> Float64:
 def run(tmp_path: Path, mode: str, recorded: bool = False) -> Station:
     safety = {"collision": mode, "jump": 1.0}
     recording = {"enabled": recorded}
-    made = spec_of(tmp_path, to_and_fro, start=turned(0.8), safety=safety, recording=recording)
+    made = stubbed(tmp_path, to_and_fro, start=turned(0.8), safety=safety, recording=recording)
     return Station(made).running(130)
 
 
@@ -66,7 +66,7 @@ def test_where_collisions_are_refused_the_robot_stops_before_it_and_the_run_hold
 
 def test_a_motion_by_hand_into_the_other_arm_is_refused_before_anything_moves(tmp_path: Path) -> None:
     station = Station(
-        spec_of(tmp_path, start=turned(0.5), run={"mode": "manual"}, recording={"enabled": False})
+        stubbed(tmp_path, start=turned(0.5), run={"mode": "manual"}, recording={"enabled": False})
     ).running(5)
     before = station.robot.position.copy()
     with pytest.raises(RuntimeFault, match=r"move: left_arm/\w+ and right_arm/\w+ would be .* of the way"):
@@ -88,7 +88,7 @@ def entangled() -> Float64:
 
 
 def test_homing_through_the_other_arm_fails_the_set_up_with_what_to_do(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, start=entangled(), setup={"home": True}))
+    station = Station(stubbed(tmp_path, start=entangled(), setup={"home": True}))
     station.prepare()
     assert station.state is SessionState.IDLE
     assert "going to the pose 'home': left_arm/link" in station.reason
@@ -98,7 +98,7 @@ def test_homing_through_the_other_arm_fails_the_set_up_with_what_to_do(tmp_path:
 
 
 def test_homing_by_command_through_the_other_arm_is_refused_and_nothing_changes(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, start=entangled())).ready()
+    station = Station(stubbed(tmp_path, start=entangled())).ready()
     with pytest.raises(RuntimeFault, match="going to the pose 'home': left_arm/link"):
         station.command("home")
     assert station.state is SessionState.READY
@@ -110,7 +110,7 @@ def control(
     tmp_path: Path, start: Float64, **safety: Any
 ) -> tuple[Any, SharedState, RecordingSink, VirtualClock]:
     """Control alone, engaged at `start`."""
-    made = spec_of(tmp_path, start=start, safety=safety)
+    made = stubbed(tmp_path, safety=safety).spec
     shared, _ = SharedState.create(made.layout)
     shared.set_estop(EStop.CLEAR)
     clock, sink = VirtualClock(10.0), RecordingSink()
@@ -148,9 +148,9 @@ import sys
 from pathlib import Path
 from runtime.processes.control.process import make_tick
 from runtime.ipc.shared_state import SharedState
-from tests.runtime.lockstep_station import spec_of
+from tests.runtime.lockstep_station import stubbed
 from tests.runtime.tick_bench import RecordingSink
-made = spec_of(Path({str(tmp_path)!r}), safety={{"workspace": {box!r}}})
+made = stubbed(Path({str(tmp_path)!r}), safety={{"workspace": {box!r}}}).spec
 shared, _ = SharedState.create(made.layout)
 make_tick(made, shared, RecordingSink(), lambda: 0.0)
 print("numba" in sys.modules)

@@ -19,7 +19,7 @@ from runtime.ipc.messages import Command, encode
 from runtime.ipc.shared_state import EStop
 from runtime.processes.coordinator.process import CommandService
 from runtime.processes.guard.process import Desk
-from tests.runtime.lockstep_station import Station, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="to be another account one has to be root")
 NOBODY = 65534
@@ -55,7 +55,7 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.context: zmq.Context[Any] = zmq.Context()
-        self.station = Station(spec_of(folder))
+        self.station = Station(stubbed(folder))
         self.folder = self.station.spec.deployment.station_dir
         self.coordinator = CommandService(self.station.coordinator, self.context)
         self.guard = Desk(self.station.guard, self.station.coordinator.shared, self.context, self.folder)

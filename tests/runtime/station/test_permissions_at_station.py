@@ -13,8 +13,7 @@ import pytest
 
 from runtime.ipc.messages import Ack, Command
 from runtime.ipc.session_state import SessionState
-from runtime.policies import openpi
-from tests.runtime.lockstep_station import Station, StubPlan, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 
 CANARY = "the canary sings"
 
@@ -29,14 +28,8 @@ def server() -> Iterator[socket.socket]:
 
 @pytest.fixture
 def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Station]:
-    own = StubPlan._policy
-
-    def build(self: StubPlan, config: Any, robot: Any, clock: Any, rate: float) -> Any:
-        return (openpi.build if config.kind == "openpi" else own.__get__(self))(config, robot, clock, rate)
-
-    monkeypatch.setattr(StubPlan, "_policy", build)
     monkeypatch.setenv("LAB_SECRET", CANARY)
-    made = Station(spec_of(tmp_path))
+    made = Station(stubbed(tmp_path, real="openpi"))
     made.until(lambda: made.state is SessionState.IDLE, 30.0, "a state to set up from")
     yield made
     made.close()

@@ -17,7 +17,7 @@ from runtime.recording.reader import open_episode
 from runtime.station import rerun
 from runtime.station.rerun import find
 from runtime.station.run import Provenance
-from tests.runtime.lockstep_station import spec_of
+from tests.runtime.lockstep_station import stubbed
 
 ONE = "1a2b3c4d-0000-4000-8000-000000000001"
 CLEAN = {"commit": "c" * 40, "dirty": False}
@@ -26,7 +26,7 @@ OTHER = "1a2b9999-0000-4000-8000-000000000002"
 
 def kept(data: Path, run: str = ONE, mode: str = "continuous", **changes: Any) -> dict[str, Any]:
     """The manifest of an episode in `data`, as a station writes it, with `changes`."""
-    manifest = Provenance(spec_of(data, strategy="sync"), "boot-1").manifest(mode, None)
+    manifest = Provenance(stubbed(data, strategy="sync").spec, "boot-1").manifest(mode, None)
     manifest |= {"uuid": run, "git": CLEAN} | changes
     folder = data / "episodes" / run
     folder.mkdir(parents=True)
@@ -247,13 +247,13 @@ def test_a_run_in_lockstep_is_exported_and_one_of_mode_sim_is_in_no_dataset(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = {"duration_s": 0.5, "mode": "sim"}
-    made = spec_of(tmp_path, run=run, publish={"dataset": "set"})
-    assert command_line.run_in_lockstep(made) == 0
+    made = stubbed(tmp_path, run=run, publish={"dataset": "set"})
+    assert command_line.run_in_lockstep(made.spec, made.peers) == 0
     (path,) = (tmp_path / "exports" / "stack-the-cups" / "sim" / "async").glob("*.parquet")
     assert f"export   {path}" in capsys.readouterr().out
     assert not (tmp_path / "set").exists()
     episode = open_episode(tmp_path / "episodes" / path.stem)
     told = json.loads(pq.read_schema(path).metadata[b"eva.manifest"])
     assert told == json.loads(document(episode.manifest, "it"))
-    assert rerun.rerun(path.stem, tmp_path).resolved.digest == made.resolved.digest
+    assert rerun.rerun(path.stem, tmp_path).resolved.digest == made.spec.resolved.digest
     assert "sim" in set(episode.ticks["control_source"].to_pylist())

@@ -3,7 +3,7 @@ import json
 from runtime.core.git_revision import revision
 from runtime.recording.files import document
 from runtime.station.run import Provenance, Run, installed_versions
-from tests.runtime.lockstep_station import spec_of
+from tests.runtime.lockstep_station import stubbed
 
 BEGUN = {"ticks": 900, "missed": 2, "records_lost": 1, "lateness_p99_ms": 0.4}
 
@@ -20,7 +20,7 @@ def test_a_control_that_was_restarted_meanwhile_counts_from_its_own_beginning():
 
 
 def test_a_manifest_says_what_the_run_was_made_with(tmp_path):
-    made = spec_of(tmp_path, strategy="sync")
+    made = stubbed(tmp_path, strategy="sync").spec
     manifest = Provenance(made, "boot-1", checkpoint={"id": 7, "name": "good"}).manifest("step", None)
     assert manifest["configuration"] == made.resolved.tree
     assert manifest["configuration_hash"] == made.resolved.digest

@@ -11,9 +11,13 @@ from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.pose_format import PoseFormat
 from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.shared_state import SharedState
+from runtime.kinematics.forward import ChainForward
 from runtime.motion.timeline import DimensionKinds
 from runtime.processes import child
+from runtime.processes.control.process import make_publisher
+from runtime.spaces.end_effectors import EndEffectors
 from runtime.station.checks import checked_spec
+from runtime.station.spec import CAPABILITIES
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities
 
@@ -49,14 +53,6 @@ def test_words_on_a_lifeline_do_not_cut_it(pipe):
     assert not lifeline.cut
 
 
-def test_a_plan_knows_the_modules_of_its_kinds(resolved):
-    made = checked_spec(resolved)
-    assert made.transport.__name__ == "runtime.transports.zmq"
-    assert made.policy.__name__ == "runtime.policies.openpi"
-    assert made.strategy.Config.model_fields["kind"].default == "async"
-    assert made.capabilities.moves_robot
-
-
 def test_the_limits_and_the_page_are_the_robots(resolved):
     made = checked_spec(resolved)
     limits, robot = made.limits, made.robot
@@ -80,7 +76,10 @@ def test_a_transport_that_says_nothing_of_cameras_has_all_of_them():
 
 
 def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path, monkeypatch):
-    shared, descriptor = SharedState.create(checked_spec(resolved).layout)
+    made = checked_spec(resolved)
+    poses = (PoseFormat(orientation="euler", degrees=True),)
+    told = replace(made.capabilities, spaces=frozenset({"joint", "eef"}), poses=poses)
+    shared, descriptor = SharedState.create(made.layout)
     shared.beat("coordinator", 12.5)
     handed = tmp_path / "resolved.json"
     handed.write_text(json.dumps(dict(resolved.tree)), "utf-8")
@@ -88,6 +87,8 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
         "runtime.processes.control.process",
         "--resolved",
         str(handed),
+        "--capabilities",
+        CAPABILITIES.dump_json(told).decode(),
         "--shared",
         str(descriptor),
         "--boot",
@@ -95,7 +96,9 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
     ]
     monkeypatch.setattr("sys.argv", arguments)
     monkeypatch.setattr(child.log, "start", lambda process: None)
+    monkeypatch.setattr(zmq, "capabilities", lambda config: pytest.fail("asked once more"))
     member = child.join("control", pictures=False)
+    assert member.spec.capabilities == told
     assert member.spec.resolved.digest == resolved.digest
     assert member.shared.last_beat("coordinator") == 12.5
     assert member.boot == "b"
@@ -135,8 +138,8 @@ def taking_poses(monkeypatch):
 def test_poses_are_published_as_the_transport_takes_them(resolved, taking_poses):
     made = checked_spec(publishing(resolved, space="eef", pose={"orientation": "xyzw"}))
     home = made.robot.poses["home"]
-    row = made.publication()(home)
-    expected = made.spaces().eef_of(home)
+    row = make_publisher(made)(home)
+    expected = EndEffectors(made.robot, ChainForward(made.robot)).eef_of(home)
     assert row.dtype == np.float32
     np.testing.assert_allclose(row[:3], expected[:3], atol=1e-6)
     np.testing.assert_allclose(row[3:7], expected[[4, 5, 6, 3]], atol=1e-6)
@@ -152,7 +155,7 @@ def test_a_format_of_published_poses_that_does_not_fit_the_robot_is_refused(reso
 
 
 def test_joints_alone_are_published_where_nothing_is_said(resolved):
-    assert checked_spec(resolved).publication() is None
+    assert make_publisher(checked_spec(resolved)) is None
     with pytest.raises(
         ConfigurationError, match=r"publication\.pose = \{'orientation': 'xyzw'\}, but the space"
     ):

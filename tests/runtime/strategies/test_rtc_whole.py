@@ -7,18 +7,16 @@ import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from runtime.core.plugins import variants
 from runtime.core.types import Float32, Float64, UInt8
 from runtime.ipc.session_state import SessionState
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.script import Answer, Script
-from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, column, spec_of
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, column, stubbed
 
 HORIZON, DELAY = 16, 4
 
@@ -37,20 +35,6 @@ class Wavering(Script):
             return rows
 
         return answer
-
-
-class WiredPlan(StubPlan):
-    """The stub robot, with the policy of the deployment."""
-
-    @property
-    def policy(self) -> Any:
-        return SimpleNamespace(build=self._wired)
-
-    def _wired(self, *given: Any) -> Any:
-        made = variants("runtime.policies")["openpi"].build(*given)
-        self.built["policy"] = made
-        self.built.setdefault("policies", []).append(made)
-        return made
 
 
 @dataclass
@@ -79,17 +63,18 @@ class Log:
 def wired(
     tmp_path: Path, dialect: str, strategy: str, served: str = "", log: Log | None = None, **settings: Any
 ) -> Iterator[Station]:
-    bare = spec_of(tmp_path)
-    server = OpenpiServer(bare.robot, Behaviour(HORIZON, 30.0, rtc=served or dialect), 0, Wavering())
+    bare = stubbed(tmp_path)
+    server = OpenpiServer(bare.spec.robot, Behaviour(HORIZON, 30.0, rtc=served or dialect), 0, Wavering())
     if log is not None:
         log.listen(server)
     if dialect == "openpi_rtc":
         settings = {"rtc_envelope": {"server_shift": HORIZON // 2}, **settings}
     with contextlib.closing(server):
-        made = spec_of(
+        made = stubbed(
             tmp_path,
             strategy=strategy,
             delay=DELAY,
+            real="openpi",
             policy={
                 "kind": "openpi",
                 "url": server.start()["url"],
@@ -98,8 +83,7 @@ def wired(
                 **settings,
             },
         )
-        parts = {name: getattr(made, name) for name in StubPlan.__slots__}
-        station = Station(WiredPlan(made.resolved, made.robot, **parts))
+        station = Station(made)
         yield station
         station.close()
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from runtime.config import loader
 from runtime.core.errors import RuntimeFault
+from runtime.core.plugins import variants
 from runtime.ipc.command_arguments import TuneRequest
 from runtime.policies.base import PolicyInfo
 from runtime.processes.coordinator.inference.inference import Strategy
@@ -15,7 +16,7 @@ from runtime.station.spec import StationSpec
 def strategy_of(spec: StationSpec) -> Strategy:
     """The asking half of a plan's strategy."""
     settings = spec.deployment.strategy
-    return Strategy(spec.strategy.query(settings), settings)
+    return Strategy(variants("runtime.strategies")[settings.kind].query(settings), settings)
 
 
 def tuned(spec: StationSpec, asked: TuneRequest, info: PolicyInfo | None) -> StationSpec:

@@ -12,6 +12,7 @@ import numpy as np
 from runtime.cameras.complaints import complaints
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError, SetupError
+from runtime.core.plugins import variants
 from runtime.core.types import Float64
 from runtime.ipc.command_arguments import LeastTimes
 from runtime.ipc.messages import Event, ReceptionReport
@@ -357,8 +358,9 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
             "another strategy, or a server and policy.rtc that do"
         )
     # More rows cannot be executed of each answer than it has.
-    wanted = spec.deployment.strategy.execution_horizon
-    if wanted is None or info.horizon is None or "execution_horizon" not in spec.strategy.USES:
+    strategy = spec.deployment.strategy
+    wanted, uses = strategy.execution_horizon, variants("runtime.strategies")[strategy.kind].USES
+    if wanted is None or info.horizon is None or "execution_horizon" not in uses:
         return
     steps = resampling.length(info.horizon, info.rate or spec.rate, spec.rate)
     if wanted > steps:

@@ -16,7 +16,7 @@ from runtime.ipc.bus import CommandServer, Endpoints
 from runtime.ipc.messages import Ack
 from runtime.processes.coordinator.process import CommandService
 from tests.processes import eventually
-from tests.runtime.lockstep_station import Station, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 
 ANSWER_MS = 5000  # as the older channel's own script waits
 _TICK_S = 0.003  # ten times as fast as life
@@ -30,7 +30,7 @@ class Bench:
     def __init__(self, folder, scripts="together", **settings):
         self.context, self.now = zmq.Context(), 0.0
         self.lock, self._ended, self.frozen = threading.Lock(), threading.Event(), False
-        self.station = Station(spec_of(folder, lease={"ttl_s": 60.0}, **settings))
+        self.station = Station(stubbed(folder, lease={"ttl_s": 60.0}, **settings))
         self.folder = self.station.spec.deployment.station_dir
         self._service = CommandService(self.station.coordinator, self.context)
         self._guard = CommandServer(self.context, self.folder, "estop")

@@ -14,6 +14,7 @@ from runtime.policies.base import Policy
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.policies.tunnel import policy as tunnelled
 from runtime.policies.tunnel.policy import TunnelledPolicy
+from runtime.processes.coordinator.builders import make_policy
 from runtime.station.checks import checked_spec
 from tests.runtime.policies.peers import PIPER, seen
 
@@ -40,7 +41,7 @@ def ssh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def made(**policy: Any) -> Policy:
     tree = {"station": "bench", "robot": "agilex_piper", "transport": {"kind": "zmq"}, "policy": policy}
-    return checked_spec(loader.resolve(tree, {}, "a test")).new_policy(MonotonicClock())
+    return make_policy(checked_spec(loader.resolve(tree, {}, "a test")), MonotonicClock())
 
 
 def test_only_those_that_say_so_have_one() -> None:

@@ -27,6 +27,7 @@ from runtime.policies.base import Policy
 from runtime.policies.tunnel import policy as tunnelled
 from runtime.policies.tunnel.policy import TunnelledPolicy
 from runtime.policies.tunnel.process import free_port
+from runtime.processes.coordinator.builders import make_policy
 from runtime.sim.faults import Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
@@ -56,7 +57,7 @@ def through(tunnel: dict[str, Any], robot: str = "agilex_piper", **policy: Any) 
             **policy,
         },
     }
-    made = checked_spec(loader.resolve(tree, {}, "a test")).new_policy(MonotonicClock())
+    made = make_policy(checked_spec(loader.resolve(tree, {}, "a test")), MonotonicClock())
     assert isinstance(made, TunnelledPolicy)
     return made
 

@@ -12,7 +12,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState, SharedStateLayout
 from runtime.processes.control.command_subscribers import SubscriberCheck
 from runtime.transports.base import Sink
-from tests.runtime.lockstep_station import Station, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 
 WHY = "a subscriber of /right is incompatible in its reliability"
 
@@ -99,7 +99,7 @@ def test_a_main_that_is_started_anew_is_told_again_when_it_is_there(desk: Desk) 
 def test_it_is_in_the_status_before_anything_is_set_up_and_leaves_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    station = Station(spec_of(tmp_path))
+    station = Station(stubbed(tmp_path))
     found = {"/left": ""}
     monkeypatch.setattr(station.robot, "unheard", lambda: dict(found), raising=False)
     station.go(90)

@@ -116,12 +116,13 @@ def test_the_tick_of_a_deployment_keeps_its_arms_in_their_boxes(
     tmp_path: Path, half: float, refused: bool
 ) -> None:
     box = {"lower": [-half] * 3, "upper": [half] * 3}
-    spec = station.spec_of(tmp_path, safety={"workspace": {"left_arm": box}})
+    stubs = station.stubbed(tmp_path, safety={"workspace": {"left_arm": box}})
+    spec = stubs.spec
     shared, _ = SharedState.create(spec.layout)
     shared.set_estop(EStop.CLEAR)
     clock, sink = VirtualClock(10.0), RecordingSink()
     tick = make_tick(spec, shared, sink, clock.now)
-    source = spec.transport.source(None, None, clock)
+    source = stubs.robot(spec, clock)
     for step in range(5):  # until the joints are believed
         if step == 4:
             shared.rings["orders"].push(encode(Order(1, "follow", run=1)))

@@ -13,8 +13,8 @@ from runtime.config import loader
 from runtime.ipc.session_state import SessionState
 from runtime.recording.labels import newest
 from runtime.station.checks import checked_spec
-from tests.runtime.collect_station import CollectPlan, CollectStation
-from tests.runtime.lockstep_station import STANDS, spec_of
+from tests.runtime.collect_station import CollectStation, CollectStubs
+from tests.runtime.lockstep_station import stubbed
 from tests.runtime.processes.coordinator.session import test_session_machine
 from tests.runtime.processes.coordinator.session.test_session_machine import ticks
 
@@ -27,9 +27,9 @@ class Collects(test_session_machine.Machine):
 
     @initialize(mode=st.sampled_from(["absolute", "relative"]), home=st.booleans())
     def begin(self, mode: str, home: bool) -> None:
-        made = spec_of(
+        made = stubbed(
             Path(self.folder.name), self.rows, setup={"home": home}, recording={"min_free_bytes": 0}
-        ).resolved
+        ).spec.resolved
         leads = {
             "source": "relay",
             "mode": mode,
@@ -37,8 +37,7 @@ class Collects(test_session_machine.Machine):
             "cameras": [camera.key for camera in checked_spec(made).robot.cameras[:1]],
         }
         resolved = loader.changed(made, {"collection": leads}, "test")
-        robot = checked_spec(resolved).robot
-        collects = CollectPlan(resolved, robot, {}, STANDS, self.rows, "joint", "", True, False)
+        collects = CollectStubs(checked_spec(resolved), rows=self.rows)
         self.opened: dict[str, bool] = {}  # the episodes, and whether each was discarded
         self.watch(CollectStation(collects))
 
@@ -60,7 +59,7 @@ class Collects(test_session_machine.Machine):
         robot = self.station.robot
         robot.blocked = robot.silent = False
         self.does, self.keeps_lease = "ramp", True
-        if "leader" in self.station.made.built:
+        if "leader" in self.station.stubs.built:
             self.station.leader.silent = False
         if self.station.state is SessionState.FAULTED:
             self.release(3)
@@ -87,7 +86,7 @@ class Collects(test_session_machine.Machine):
 
     @rule(silent=st.booleans(), wait=st.integers(1, 40))
     def falls_silent(self, silent: bool, wait: int) -> None:
-        if "leader" in self.station.made.built:
+        if "leader" in self.station.stubs.built:
             self.station.leader.silent = silent
         self.tick(wait)
 

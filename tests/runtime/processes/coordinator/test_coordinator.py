@@ -8,8 +8,7 @@ import pytest
 from runtime.core.errors import SetupError
 from runtime.ipc.messages import UNHEARD, Command, EpisodeOpened, Event, encode
 from runtime.ipc.session_state import SessionState
-from runtime.processes.coordinator.coordinator import Coordinator
-from tests.runtime.lockstep_station import STANDS, Station, ramp, spec_of
+from tests.runtime.lockstep_station import STANDS, Station, ramp, stubbed
 
 
 def without(station: Station, process: str, seconds: float) -> None:
@@ -22,7 +21,7 @@ def without(station: Station, process: str, seconds: float) -> None:
 
 @pytest.mark.parametrize("process", ["control", "reception", "media"])
 def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(tmp_path: Path, process: str) -> None:
-    station = Station(spec_of(tmp_path)).running(10)
+    station = Station(stubbed(tmp_path)).running(10)
     without(station, process, 1.5)
     assert station.state is SessionState.HOLDING
     assert f"no sign of life from the process {process}" in station.reason
@@ -40,7 +39,7 @@ def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(tmp_path: Path, pro
 def test_a_run_whose_chunks_all_come_too_late_is_ended_by_the_rule_of_starvation(
     tmp_path: Path, answer: str, state: SessionState
 ) -> None:
-    late = spec_of(tmp_path, lambda seen, number: ramp(seen.step, 2), delay=4, faults={"starvation": answer})
+    late = stubbed(tmp_path, lambda seen, number: ramp(seen.step, 2), delay=4, faults={"starvation": answer})
     station = Station(late).ready()
     station.command("run")
     station.reach(state, 5.0)
@@ -56,7 +55,7 @@ def test_a_run_whose_chunks_all_come_too_late_is_ended_by_the_rule_of_starvation
 def test_a_run_of_which_no_answer_can_be_used_is_ended_by_the_rule_of_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, state: SessionState
 ) -> None:
-    station = Station(spec_of(tmp_path, faults={"policy_error": answer, "starvation": "slow"})).ready()
+    station = Station(stubbed(tmp_path, faults={"policy_error": answer, "starvation": "slow"})).ready()
     monkeypatch.setattr(station.coordinator.inference.requests, "note", lambda answered: [][0])
     station.command("run")
     station.reach(state, 10.0)
@@ -67,7 +66,7 @@ def test_a_run_of_which_no_answer_can_be_used_is_ended_by_the_rule_of_errors(
 def test_an_arm_that_was_moved_while_ready_makes_the_station_idle_and_stays_where_it_is(
     tmp_path: Path,
 ) -> None:
-    station = Station(spec_of(tmp_path)).running(10)
+    station = Station(stubbed(tmp_path)).running(10)
     station.stop()
     station.robot.blocked = True
     moved = STANDS.copy()
@@ -85,7 +84,7 @@ def test_an_arm_that_was_moved_while_ready_makes_the_station_idle_and_stays_wher
 
 
 def test_cameras_that_send_nothing_are_named(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path))
+    station = Station(stubbed(tmp_path))
     station.robot.cameras.remove("cam_left_wrist")
     station.go(10)
     assert station.state is SessionState.DISCONNECTED
@@ -97,7 +96,7 @@ def test_cameras_that_send_nothing_are_named(tmp_path: Path) -> None:
 
 
 def test_a_recording_without_a_run_that_fails_is_over_and_a_run_may_begin(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     station.command("record_start")
     station.go(5)
     station.robot.picture = lambda number: np.zeros((2, 2, 3), np.uint8)  # a camera that changes its size
@@ -121,7 +120,7 @@ def restarted(station: Station, process: str) -> None:
 def test_the_death_of_control_closes_a_recording_without_a_run_and_a_run_records_its_own(
     tmp_path: Path,
 ) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     alone = station.command("record_start").data["episode"]
     station.go(5)
     restarted(station, "control")
@@ -140,7 +139,7 @@ def test_the_death_of_control_closes_a_recording_without_a_run_and_a_run_records
 def test_the_death_of_the_guard_leaves_a_recording_without_a_run_open_until_it_is_stopped(
     tmp_path: Path,
 ) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     alone = station.command("record_start").data["episode"]
     station.go(5)
     restarted(station, "guard")
@@ -161,7 +160,7 @@ def test_the_death_of_the_guard_leaves_a_recording_without_a_run_open_until_it_i
 def test_a_process_that_was_restarted_and_says_nothing_yet_is_not_told_to_be_silent_since_the_machine_started(
     tmp_path: Path,
 ) -> None:
-    station = Station(spec_of(tmp_path)).running(60)
+    station = Station(stubbed(tmp_path)).running(60)
     station.shared.beat("media", 0.0)  # as the supervisor does before it starts one anew
     beat = station.shared.beat
     station.shared.beat = lambda name, now: None if name == "media" else beat(name, now)
@@ -172,7 +171,7 @@ def test_a_process_that_was_restarted_and_says_nothing_yet_is_not_told_to_be_sil
 
 
 def test_the_snapshot_says_how_the_last_run_ended(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, run={"duration_s": 0.5}))
+    station = Station(stubbed(tmp_path, run={"duration_s": 0.5}))
     station.running(30)
     shown = station.coordinator.snapshot()
     assert shown["state"] == "ready"
@@ -184,7 +183,7 @@ def test_the_snapshot_says_how_the_last_run_ended(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", ["stop", "estop"])
 def test_a_media_that_does_not_read_keeps_nobody_from_stopping(tmp_path: Path, how: str) -> None:
-    station = Station(spec_of(tmp_path)).running(10)
+    station = Station(stubbed(tmp_path)).running(10)
     station.shared.rings["minutes"].push = lambda payload: False
     if how == "stop":
         station.command("stop")
@@ -197,7 +196,7 @@ def test_a_media_that_does_not_read_keeps_nobody_from_stopping(tmp_path: Path, h
 
 
 def test_a_query_with_nonsense_is_refused_and_nothing_ends(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path))
+    station = Station(stubbed(tmp_path))
     ack = station.coordinator.handle(Command("1", "events_since", {"number": "seven"}))
     assert ack.status == "refused"
     assert "'seven': must be a whole number" in ack.reason
@@ -205,7 +204,7 @@ def test_a_query_with_nonsense_is_refused_and_nothing_ends(tmp_path: Path) -> No
 
 
 def test_a_media_that_does_not_read_costs_the_record_and_not_the_station(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).running(10)
+    station = Station(stubbed(tmp_path)).running(10)
     station.shared.rings["minutes"].push = lambda payload: False
     station.media.digest = lambda: None
     station.go(20)
@@ -217,13 +216,13 @@ def test_a_media_that_does_not_read_costs_the_record_and_not_the_station(tmp_pat
 def test_events_from_before_main_was_there_are_kept_and_nothing_that_was_told_is_acted_on(
     tmp_path: Path,
 ) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     rings, told = station.shared.rings, {"unheard": {"left_arm": "nobody listens"}}
     rings["media_events"].push(encode(Event("source_frozen_cam_high", "the same picture", 0.1)))
     rings["media_events"].push(encode(EpisodeOpened(1, "one", "", "no room")))
     rings["control_events"].push(encode(Event(UNHEARD, "nobody listens", 0.1, data=told)))
     rings["control_events"].push(encode(Event("displaced", "the arm was moved", 0.1)))
-    station.coordinator = Coordinator(station.spec, station.shared, station.clock, station._runner)
+    station.restart_coordinator()
     assert [event["kind"] for event in station.coordinator.events.since(0)] == [
         UNHEARD,
         "displaced",

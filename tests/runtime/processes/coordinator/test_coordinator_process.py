@@ -13,7 +13,7 @@ import zmq
 from runtime.ipc.bus import Endpoints, Subscriber
 from runtime.ipc.messages import Ack, Command, decode, encode
 from runtime.processes.coordinator.process import CommandService
-from tests.runtime.lockstep_station import DIM, Station, spec_of
+from tests.runtime.lockstep_station import DIM, Station, stubbed
 
 PATIENCE = 500  # times 10 ms
 
@@ -23,7 +23,7 @@ class Watched:
 
     def __init__(self, folder: Path) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
-        self.station = Station(spec_of(folder))
+        self.station = Station(stubbed(folder))
         self._service = CommandService(self.station.coordinator, self._context)
         endpoint = Endpoints(self.station.spec.deployment.station_dir).read("coordinator")["state"]
         self._reader = Subscriber(self._context, endpoint, "joints")

@@ -18,7 +18,7 @@ from runtime.recording.labels import labels
 from runtime.recording.reader import Episode
 from runtime.station.checks import checked_spec
 from tests.runtime.collect_station import CollectStation, SelfDriven, collecting
-from tests.runtime.lockstep_station import MOVED, STANDS, column, spec_of
+from tests.runtime.lockstep_station import MOVED, STANDS, column, stubbed
 
 LEFT = MOVED[0]
 SESSION = {"uuid": "00000000-0000-4000-8000-000000000007", "dataset": "cups"}
@@ -175,7 +175,7 @@ def test_what_a_leader_wants_is_limited_by_safety_like_anything_else(tmp_path: P
 
 def test_no_leader_fails_the_set_up_with_its_sentence(tmp_path: Path) -> None:
     station = collecting(tmp_path)
-    station.made.built["mute"] = True
+    station.stubs.mute = True
     station.prepare(collect=True)
     assert station.state is SessionState.IDLE
     assert "the leader in the test says nothing" in station.reason
@@ -439,7 +439,7 @@ def test_a_set_up_to_collect_takes_no_policy(tmp_path: Path, given: dict[str, An
 def test_a_deployment_without_a_collection_says_so(tmp_path: Path) -> None:
     from tests.runtime.lockstep_station import Station
 
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     assert station.coordinator.snapshot()["collect"] is None
     with pytest.raises(SetupError, match=r"no \[collection\]"):
         station.command("setup", collect=True)
@@ -451,7 +451,7 @@ def test_a_deployment_without_a_collection_says_so(tmp_path: Path) -> None:
 def test_a_snapshot_says_what_the_next_episode_will_be_like_in_the_words_of_its_manifest(
     tmp_path: Path,
 ) -> None:
-    cameras = list(spec_of(tmp_path).cameras)[:2]
+    cameras = list(stubbed(tmp_path).spec.cameras)[:2]
     station = collecting(tmp_path, cameras=cameras, columns=["eef"])
     assert station.collect["setup"] is None
     station.armed()

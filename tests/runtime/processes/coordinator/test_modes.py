@@ -10,14 +10,14 @@ import pytest
 
 from runtime.core.errors import PolicyError, PolicyLostError, SetupError
 from runtime.ipc.session_state import SessionState
-from tests.runtime.lockstep_station import STANDS, Station, column, on_time, ramp, spec_of
+from tests.runtime.lockstep_station import STANDS, Station, column, on_time, ramp, stubbed
 
 LEFT_GRIPPER = 6
 
 
 def begun(tmp_path: Path, mode: str, rows: Any = on_time, **settings: Any) -> Station:
     """A station with an open run of that mode, recording."""
-    station = Station(spec_of(tmp_path, rows, **settings)).ready()
+    station = Station(stubbed(tmp_path, rows, **settings)).ready()
     station.command("run", mode=mode)
     station.go(3)
     assert station.state is SessionState.RUNNING
@@ -119,7 +119,7 @@ def test_approach_goes_to_where_the_shown_chunk_begins_and_commit_executes_it_fr
 
 
 def test_a_far_first_action_is_said_at_set_up_and_can_be_approached_before_the_run(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, lambda o, n: ramp(400, 20))).ready()
+    station = Station(stubbed(tmp_path, lambda o, n: ramp(400, 20))).ready()
     first = station.coordinator.snapshot()["first_action"]
     assert first["far"]
     assert "far" in station.reason
@@ -139,7 +139,7 @@ def test_simulation_moves_the_simulated_robot_and_never_the_real_one(tmp_path: P
         seen.append(observation.qpos.copy())
         return on_time(observation, number)
 
-    station = Station(spec_of(tmp_path, rows)).ready()
+    station = Station(stubbed(tmp_path, rows)).ready()
     station.command("run", mode="sim", sim_state=sim_state)
     station.go(40)
     assert station.robot.commands == [] or np.allclose(station.robot.sent, STANDS)
@@ -220,7 +220,7 @@ def test_what_leads_nowhere_is_refused_before_anything_moves(tmp_path: Path) -> 
 
 
 def test_aiming_moves_nothing_and_needs_no_lease(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     ack = station._handle("aim", {"pose": "home"})
     assert ack.status == "done"
     assert ack.data["reached"]
@@ -232,7 +232,7 @@ def test_aiming_moves_nothing_and_needs_no_lease(tmp_path: Path) -> None:
 
 
 def test_a_gripper_opens_by_hand_while_the_station_is_ready(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     station.command("gripper", arm="left_arm", action="open")
     station.go(60)
     wide = station.spec.robot.group("left_arm").gripper.open
@@ -250,7 +250,7 @@ def test_a_locked_gripper_stays_whatever_the_policy_wants_and_the_record_says_so
         wanted[:, LEFT_GRIPPER] = 0.09 if number < 25 else 0.02
         return wanted
 
-    station = Station(spec_of(tmp_path, rows)).running(20)
+    station = Station(stubbed(tmp_path, rows)).running(20)
     at = float(station.shared.control.read()["commanded"][LEFT_GRIPPER])
     station.command("gripper", arm="left_arm", action="lock")
     station.go(20)
@@ -265,7 +265,7 @@ def test_a_locked_gripper_stays_whatever_the_policy_wants_and_the_record_says_so
 
 
 def test_a_trial_is_run_as_it_was_set_up_or_not_at_all(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     with pytest.raises(SetupError, match="a trial runs in the mode continuous, and sim was asked for"):
         station.command("run", trial={"id": 1}, mode="sim")
     station.command("tune", strategy={"blend_window": 3})
@@ -290,7 +290,7 @@ def test_a_trial_is_run_as_it_was_set_up_or_not_at_all(tmp_path: Path) -> None:
 def test_another_strategy_takes_over_within_a_run_without_a_gap_or_a_jump(
     tmp_path: Path, before: str, after: str
 ) -> None:
-    station = Station(spec_of(tmp_path, strategy=before, delay=2)).running(25)
+    station = Station(stubbed(tmp_path, strategy=before, delay=2)).running(25)
     station.command("tune", strategy={"kind": after})
     station.go(60)
     assert station.state is SessionState.RUNNING, station.reason
@@ -312,7 +312,7 @@ def test_another_instruction_reaches_the_policy_within_the_run(tmp_path: Path) -
         prompts.append(observation.prompt)
         return on_time(observation, number)
 
-    station = Station(spec_of(tmp_path, rows)).running(10)
+    station = Station(stubbed(tmp_path, rows)).running(10)
     station.command("tune", task="put it back")
     station.go(30)
     assert prompts[0] == "stack the cups"
@@ -332,7 +332,7 @@ def test_another_instruction_reaches_the_policy_within_the_run(tmp_path: Path) -
 def test_a_strategy_that_there_is_not_is_refused_and_nothing_changes(
     tmp_path: Path, strategy: dict[str, Any], sentence: str
 ) -> None:
-    station = Station(spec_of(tmp_path)).running(10)
+    station = Station(stubbed(tmp_path)).running(10)
     before = station.coordinator.snapshot()["tuning"]
     with pytest.raises(SetupError, match=sentence):
         station.command("tune", strategy=strategy)
@@ -372,7 +372,7 @@ def test_a_policy_that_fails_is_answered_as_the_deployment_says(
     tmp_path: Path, error: Exception, answer: str, state: SessionState, status: str
 ) -> None:
     faults = {"policy_lost": answer, "policy_error": answer}
-    station = Station(spec_of(tmp_path, Failing(error, 4, 1000), faults=faults)).running(30)
+    station = Station(stubbed(tmp_path, Failing(error, 4, 1000), faults=faults)).running(30)
     assert station.state is state
     assert str(error) in station.reason
     station.go(3)
@@ -386,7 +386,7 @@ def test_slowly_means_going_on_with_what_is_planned_and_with_the_policy_when_it_
     tmp_path: Path, error: Exception
 ) -> None:
     faults = {"policy_lost": "slow", "policy_error": "slow"}
-    station = Station(spec_of(tmp_path, Failing(error, 6, 2), faults=faults)).running(90)
+    station = Station(stubbed(tmp_path, Failing(error, 6, 2), faults=faults)).running(90)
     assert station.state is SessionState.RUNNING, station.reason
     assert len(station.events("policy_back")) == 1
     assert station.events("starved") == []  # what was planned has lasted
@@ -396,7 +396,7 @@ def test_slowly_means_going_on_with_what_is_planned_and_with_the_policy_when_it_
 @pytest.mark.parametrize("strategy", ["async", "sync"])
 def test_patience_ends_in_holding_and_the_run_can_be_resumed(tmp_path: Path, strategy: str) -> None:
     policy = Failing(LOST, 6, 10**6)
-    station = Station(spec_of(tmp_path, policy, strategy=strategy)).running(10)
+    station = Station(stubbed(tmp_path, policy, strategy=strategy)).running(10)
     station.reach(SessionState.HOLDING)
     asked = policy.asked
     station.go(60)
@@ -409,7 +409,7 @@ def test_patience_ends_in_holding_and_the_run_can_be_resumed(tmp_path: Path, str
 
 
 def test_the_outcome_of_a_run_tells_how_the_policy_did(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, delay=3)).running(60)
+    station = Station(stubbed(tmp_path, delay=3)).running(60)
     outcome = station.stop().outcome
     assert outcome is not None
     policy: Any = outcome["details"]["policy"] if "details" in outcome else outcome["policy"]  # type: ignore[index]
@@ -423,7 +423,7 @@ def test_the_outcome_of_a_run_tells_how_the_policy_did(tmp_path: Path) -> None:
 def test_a_run_whose_first_action_is_farther_than_a_jump_moves_nothing_and_holds(
     tmp_path: Path, strategy: str
 ) -> None:
-    station = Station(spec_of(tmp_path, lambda o, n: ramp(400, 20), strategy=strategy)).ready()
+    station = Station(stubbed(tmp_path, lambda o, n: ramp(400, 20), strategy=strategy)).ready()
     station.command("run")
     station.reach(SessionState.HOLDING)
     assert "allowed 0.5 (safety.jump): approach it, or start elsewhere" in station.reason
@@ -505,7 +505,7 @@ def test_an_e_stop_forgets_locks_on_both_sides(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("held", [False, True])
 def test_in_simulation_no_gripper_of_the_real_robot_is_opened_or_closed(tmp_path: Path, held: bool) -> None:
-    station = Station(spec_of(tmp_path, setup={"home": True})).ready()
+    station = Station(stubbed(tmp_path, setup={"home": True})).ready()
     station.command("run", mode="sim")
     station.go(5)
     if held:
@@ -555,7 +555,7 @@ def test_an_arm_that_was_moved_while_a_person_looks_holds_the_run(tmp_path: Path
 
 
 def test_another_instruction_makes_the_first_action_of_the_set_up_unknown(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, lambda o, n: ramp(400, 20))).ready()
+    station = Station(stubbed(tmp_path, lambda o, n: ramp(400, 20))).ready()
     station.command("tune", strategy={"blend_window": 4})
     assert "approach" in station.coordinator.snapshot()["allowed"]
     station.command("tune", task="something else")
@@ -568,7 +568,7 @@ def test_another_instruction_makes_the_first_action_of_the_set_up_unknown(tmp_pa
 def test_a_run_is_merged_by_the_strategy_it_was_set_up_with_also_by_a_control_that_was_restarted(
     tmp_path: Path,
 ) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     station.command("setup", strategy={"kind": "sync"})
     for _ in station.shared.rings["orders"].drain():
         pass  # a control that begins knows the deployment alone
@@ -592,7 +592,7 @@ def test_a_failure_that_was_cancelled_is_not_held_against_the_next_question(tmp_
         raise PolicyLostError("no answer")
 
     station = begun(tmp_path, "step", faults={"policy_lost": "slow"})
-    station.policy._plan = spec_of(tmp_path / "other", rows)
+    station.stubs.rows = rows
     station.command("step")
     station.go(15)
     assert station.coordinator.snapshot()["policy"]["lost"]
@@ -606,7 +606,7 @@ def test_a_failure_that_was_cancelled_is_not_held_against_the_next_question(tmp_
 
 
 def test_the_end_of_a_motion_before_is_not_taken_for_the_end_of_homing(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     station.command("gripper", action="open")
     station.until(
         lambda: station.shared.control.read()["behaviour"] == b"hold", 5.0, "the gripper to be open"
@@ -627,7 +627,7 @@ def test_a_gripper_that_a_policy_wants_beyond_its_travel_is_no_obstacle_to_an_ap
         wanted[:, LEFT_GRIPPER] = -0.002
         return wanted
 
-    station = Station(spec_of(tmp_path, rows)).ready()
+    station = Station(stubbed(tmp_path, rows)).ready()
     station.command("approach")
     station.reach(SessionState.READY)
     assert left_gripper(station) == pytest.approx(0.0, abs=1e-6)
@@ -646,7 +646,7 @@ def test_a_late_policy_that_means_to_begin_where_the_robot_stands_begins(tmp_pat
     def rows(observation: Any, number: int) -> Any:
         return ramp(observation.step, 50, speed=0.02)
 
-    station = Station(spec_of(tmp_path, rows, delay=28)).ready()
+    station = Station(stubbed(tmp_path, rows, delay=28)).ready()
     station.command("run", duration_s=1.3)
     station.go(38)
     assert station.state is SessionState.RUNNING, station.reason

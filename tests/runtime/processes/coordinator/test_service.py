@@ -18,7 +18,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
 from runtime.processes.coordinator.process import CommandService
 from tests import presses
-from tests.runtime.lockstep_station import Station, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 
 PATIENCE = 500  # turns
 PAGE = "web:ann:p1"
@@ -29,7 +29,7 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.context: zmq.Context[Any] = zmq.Context()
-        self.station = Station(spec_of(folder))
+        self.station = Station(stubbed(folder))
         self.coordinator = self.station.coordinator
         self.service = CommandService(self.coordinator, self.context)
         self.folder = self.station.spec.deployment.station_dir

@@ -15,11 +15,12 @@ from runtime.core.pose_format import PoseFormat
 from runtime.core.types import ActionChunk, ActionMode, Conditioning, Float64, Observation
 from runtime.ipc.session_state import SessionState
 from runtime.kinematics.base import IkFlag
+from runtime.processes.coordinator.builders import make_kinematics
 from runtime.spaces.conversion import ActionSpaces
 from runtime.spaces.pose_rows import PoseRows
 from runtime.spaces.relative_poses import absolute
 from runtime.transports.base import Capabilities
-from tests.runtime.lockstep_station import MOVED, STANDS, Station, StubPlan, column, on_time, ramp, spec_of
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, column, on_time, ramp, stubbed
 
 SIX = PoseFormat(orientation="6d", gripper=False)
 EULER = PoseFormat(orientation="euler", euler_order="ZYX", degrees=True, frame="world")
@@ -72,7 +73,7 @@ def speaking(station: Station, rows: Rows, pose: PoseFormat, mode: ActionMode = 
 def test_poses_of_any_format_and_mode_move_the_joints_as_they_are_meant(
     tmp_path: Path, pose: PoseFormat, mode: ActionMode, delay: int
 ) -> None:
-    station = speaking(Station(spec_of(tmp_path, delay=delay)), on_time, pose, mode).running(60)
+    station = speaking(Station(stubbed(tmp_path, delay=delay)), on_time, pose, mode).running(60)
     episode = station.stop()
     chosen = column(episode.ticks, "control_source") == "policy"
     steps = column(episode.ticks, "step")[chosen] - episode.ticks["step"][0].as_py()
@@ -91,7 +92,7 @@ def test_poses_of_any_format_and_mode_move_the_joints_as_they_are_meant(
 
 
 def test_poses_out_of_reach_are_executed_as_near_as_can_be_and_recorded_as_missed(tmp_path: Path) -> None:
-    station = speaking(Station(spec_of(tmp_path)), on_time, PoseFormat())
+    station = speaking(Station(stubbed(tmp_path)), on_time, PoseFormat())
     infer = station.policy.infer
 
     def stretched(observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
@@ -131,7 +132,7 @@ def test_a_policy_that_means_to_begin_far_away_is_found_out_although_the_first_s
         rows[:, MOVED] += 0.9
         return rows
 
-    station = speaking(Station(spec_of(tmp_path, strategy=strategy)), far, SIX).ready()
+    station = speaking(Station(stubbed(tmp_path, strategy=strategy)), far, SIX).ready()
     first = station.coordinator.snapshot()["first_action"]
     assert first["far"]
     assert first["distance"] == pytest.approx(0.9, abs=0.01)
@@ -142,7 +143,7 @@ def test_a_policy_that_means_to_begin_far_away_is_found_out_although_the_first_s
 
 
 def test_joint_chunks_say_nothing_of_poses(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).running(20)
+    station = Station(stubbed(tmp_path)).running(20)
     assert station.coordinator.snapshot()["policy"]["ik"] == {}
     raw = station.stop().raw.to_pylist()
     assert {row["ik_flags"] for row in raw} == {row["eef_source"] for row in raw} == {None}
@@ -153,7 +154,7 @@ def test_joint_chunks_say_nothing_of_poses(tmp_path: Path) -> None:
 def test_the_recording_says_which_poses_there_were_and_which_the_policy_was_shown(
     tmp_path: Path, wanted: Any
 ) -> None:
-    station = speaking(Station(spec_of(tmp_path)), on_time, SIX, "relative")
+    station = speaking(Station(stubbed(tmp_path)), on_time, SIX, "relative")
     station.policy.sees_poses, station.policy.observation_eef = True, wanted
     receive = station.robot.receive
 
@@ -179,27 +180,20 @@ def test_the_recording_says_which_poses_there_were_and_which_the_policy_was_show
 # Publication
 
 
-class PosePlan(StubPlan):
-    """A transport that takes poses beside joints."""
-
-    @property
-    def capabilities(self) -> Capabilities:
-        return Capabilities(moves_robot=True, spaces=frozenset({"joint", "eef"}))
-
-
 def publishing(tmp_path: Path, pose: PoseFormat) -> Station:
-    made = spec_of(tmp_path)
+    made = stubbed(tmp_path)
     wanted = {"publication": {"space": "eef", "pose": pose.model_dump()}}
-    fields = {name: getattr(made, name) for name in StubPlan.__dataclass_fields__}
-    fields["resolved"] = loader.changed(made.resolved, wanted, "test")
-    return Station(PosePlan(**fields))
+    takes = Capabilities(moves_robot=True, spaces=frozenset({"joint", "eef"}))
+    resolved = loader.changed(made.spec.resolved, wanted, "test")
+    made.spec = replace(made.spec, resolved=resolved, capabilities=takes)
+    return Station(made)
 
 
 @pytest.mark.parametrize("pose", [SIX, EULER], ids=str)
 def test_published_poses_are_those_of_the_safe_joint_command(tmp_path: Path, pose: PoseFormat) -> None:
     station = publishing(tmp_path, pose).running(60)
     robot = station.spec.robot
-    spaces, layout = ActionSpaces(robot, station.spec.kinematics(), 30.0), PoseRows(pose, robot)
+    spaces, layout = ActionSpaces(robot, make_kinematics(station.spec), 30.0), PoseRows(pose, robot)
     sent = station.robot.commands
     assert len(sent) > 50
     previous = None
@@ -213,6 +207,6 @@ def test_published_poses_are_those_of_the_safe_joint_command(tmp_path: Path, pos
 
 
 def test_where_joints_are_published_there_are_no_poses(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, start=STANDS)).running(10)
+    station = Station(stubbed(tmp_path, start=STANDS)).running(10)
     assert {command.eef for command in station.robot.commands} == {None}
     station.close()

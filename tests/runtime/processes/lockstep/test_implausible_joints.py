@@ -6,7 +6,7 @@ import pytest
 from runtime.core.errors import SetupError
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
-from tests.runtime.lockstep_station import MOVED, Station, spec_of
+from tests.runtime.lockstep_station import MOVED, Station, stubbed
 
 JOINT = "left_arm.joint0"
 LEAP = 0.9  # [rad] beyond the following error
@@ -24,7 +24,7 @@ def stay(observation, number):
 
 
 def ready(folder, home=True):
-    made = spec_of(folder, rows=stay, setup={"home": home, "pose": "ready"}, recording={"enabled": False})
+    made = stubbed(folder, rows=stay, setup={"home": home, "pose": "ready"}, recording={"enabled": False})
     station = Station(made).ready()
     station.go(45)
     return station

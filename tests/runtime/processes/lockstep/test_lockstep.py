@@ -16,10 +16,12 @@ from runtime.datasets.published import publish
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
+from runtime.kinematics.forward import ChainForward
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
+from runtime.spaces.end_effectors import EndEffectors
 from runtime.station.checks import checked_spec
-from tests.runtime.lockstep_station import DIM, MOVED, STANDS, Station, column, on_time, ramp, spec_of
+from tests.runtime.lockstep_station import DIM, MOVED, STANDS, Station, column, on_time, ramp, stubbed
 from tests.runtime.recording.samples import decoded, numbers
 
 DELAYS = [0, 3, 7]
@@ -52,7 +54,7 @@ def finite_and_within_limits(station: Station) -> bool:
 def test_async_executes_for_every_step_exactly_what_the_policy_meant_for_it(
     tmp_path: Path, delay: int
 ) -> None:
-    station = Station(spec_of(tmp_path, delay=delay)).running(90)
+    station = Station(stubbed(tmp_path, delay=delay)).running(90)
     episode = station.stop()
     steps, actions = executed(episode)
     assert steps.tolist() == list(
@@ -78,7 +80,7 @@ def test_async_executes_for_every_step_exactly_what_the_policy_meant_for_it(
 def test_sync_executes_every_action_once_and_in_order_and_stands_while_it_waits(
     tmp_path: Path, delay: int
 ) -> None:
-    station = Station(spec_of(tmp_path, in_order, strategy="sync", delay=delay)).running(100)
+    station = Station(stubbed(tmp_path, in_order, strategy="sync", delay=delay)).running(100)
     episode = station.stop()
     steps, actions = executed(episode)
     assert (actions == ramp(0, len(actions)).astype(np.float32)).all()
@@ -97,8 +99,8 @@ def test_sync_executes_every_action_once_and_in_order_and_stands_while_it_waits(
 def test_two_runs_are_recorded_equal_to_the_last_bit(tmp_path: Path, strategy: str, delay: int) -> None:
     episodes = []
     for name in ("one", "two"):
-        made = spec_of(tmp_path / name, strategy=strategy, delay=delay, run={"duration_s": 2.0})
-        done = lockstep.run(made)
+        made = stubbed(tmp_path / name, strategy=strategy, delay=delay, run={"duration_s": 2.0})
+        done = lockstep.run(made.spec, peers=made.peers)
         assert done.state is SessionState.READY, done.reason
         episodes.append(open_episode(Path(done.episode["path"])))
     one, two = episodes
@@ -114,7 +116,7 @@ def test_two_runs_are_recorded_equal_to_the_last_bit(tmp_path: Path, strategy: s
 
 def test_a_policy_of_another_rate_still_means_the_same_times(tmp_path: Path) -> None:
     """A policy at 15 Hz under control at 30 Hz: every other step is a row of it, those between are midway."""
-    made = spec_of(tmp_path, lambda o, n: ramp(o.step, 20)[::2], delay=3)
+    made = stubbed(tmp_path, lambda o, n: ramp(o.step, 20)[::2], delay=3)
     station = Station(made).ready()
     infer = station.policy.infer
 
@@ -131,7 +133,7 @@ def test_a_policy_of_another_rate_still_means_the_same_times(tmp_path: Path) -> 
 
 
 def test_control_at_100_hz_is_recorded_on_a_grid_of_30(tmp_path: Path) -> None:
-    made = spec_of(tmp_path, control={"rate": 100.0}, recording={"fps": 30.0})
+    made = stubbed(tmp_path, control={"rate": 100.0}, recording={"fps": 30.0})
     station = Station(made).running(200)
     episode = station.stop()
     first = episode.ticks["step"][0].as_py()
@@ -146,7 +148,7 @@ def test_control_at_100_hz_is_recorded_on_a_grid_of_30(tmp_path: Path) -> None:
 
 
 def test_each_row_has_its_own_picture(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).running(40)
+    station = Station(stubbed(tmp_path)).running(40)
     episode = station.stop()
     for video in episode.videos.values():
         assert numbers(video) == column(episode.rows, "sequence").tolist()
@@ -167,7 +169,7 @@ def test_a_policy_that_answers_nan_leads_to_holding_with_a_named_reason(
             answer[4, 2] = np.nan
         return answer
 
-    station = Station(spec_of(tmp_path, rows, strategy=strategy)).running(0)
+    station = Station(stubbed(tmp_path, rows, strategy=strategy)).running(0)
     station.reach(SessionState.HOLDING)
     assert "nan for left_arm.joint2 in row 4" in station.reason
     station.go(30)
@@ -178,7 +180,7 @@ def test_a_policy_that_answers_nan_leads_to_holding_with_a_named_reason(
 
 
 def test_a_policy_with_the_wrong_dimension_fails_the_set_up_with_a_sentence(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, lambda o, n: np.zeros((10, 13))))
+    station = Station(stubbed(tmp_path, lambda o, n: np.zeros((10, 13))))
     station.prepare()
     assert station.state is SessionState.IDLE
     assert "joint actions of shape (10, 13); agilex_piper takes [H, 14]" in station.reason
@@ -199,7 +201,7 @@ def test_a_policy_that_raises_in_the_middle_of_a_run_is_held_and_not_asked_again
             raise error
         return ramp(observation.step, 20)
 
-    station = Station(spec_of(tmp_path, rows, delay=delay)).running(0)
+    station = Station(stubbed(tmp_path, rows, delay=delay)).running(0)
     station.reach(SessionState.HOLDING)
     assert str(error) in station.reason
     assert type(error).__name__ in station.reason
@@ -219,7 +221,7 @@ def test_a_policy_that_jumps_is_refused_and_held(tmp_path: Path) -> None:
             answer[:, 0] += 1.5
         return answer
 
-    station = Station(spec_of(tmp_path, rows, strategy="sync")).running(0)
+    station = Station(stubbed(tmp_path, rows, strategy="sync")).running(0)
     station.reach(SessionState.HOLDING)
     assert "10 actions refused in a row" in station.reason
     assert "left_arm.joint0 would be 1.5" in station.reason
@@ -229,7 +231,7 @@ def test_a_policy_that_jumps_is_refused_and_held(tmp_path: Path) -> None:
 
 
 def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, lambda o, n: ramp(o.step, 5), delay=7)).running(0)
+    station = Station(stubbed(tmp_path, lambda o, n: ramp(o.step, 5), delay=7)).running(0)
     station.reach(SessionState.HOLDING, 10.0)
     assert "no usable chunk" in station.reason
     assert len(station.events("chunk_dropped")) >= 2
@@ -238,7 +240,7 @@ def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_p
 
 
 def test_of_a_policy_that_does_not_answer_it_is_said_since_when(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, delay=300)).running(0)
+    station = Station(stubbed(tmp_path, delay=300)).running(0)
     station.reach(SessionState.HOLDING, 20.0)
     reason = r"no usable chunk for [\d.]+ s: the policy was asked [1-9][\d.]* s ago and has not answered yet"
     assert re.fullmatch(reason, station.reason), station.reason
@@ -248,27 +250,26 @@ def test_of_a_policy_that_does_not_answer_it_is_said_since_when(tmp_path: Path) 
 def test_a_run_that_held_is_no_success_and_is_not_published(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made = spec_of(tmp_path, lambda o, n: ramp(o.step, 5), delay=7, publish={"dataset": "set"})
-    assert command_line.run_in_lockstep(made) == 1
+    made = stubbed(tmp_path, lambda o, n: ramp(o.step, 5), delay=7, publish={"dataset": "set"})
+    assert command_line.run_in_lockstep(made.spec, made.peers) == 1
     assert "holding: no usable chunk" in capsys.readouterr().out
     assert not (tmp_path / "set").exists()
-    assert (
-        command_line.run_in_lockstep(spec_of(tmp_path, run={"duration_s": 0.5}, publish={"dataset": "set"}))
-        == 0
-    )
+    short = stubbed(tmp_path, run={"duration_s": 0.5}, publish={"dataset": "set"})
+    assert command_line.run_in_lockstep(short.spec, short.peers) == 0
     assert (tmp_path / "set/meta/info.json").exists()
 
 
 def test_a_policy_that_is_absent_fails_the_set_up_with_its_sentence(tmp_path: Path) -> None:
+    made = stubbed(tmp_path, absent="no server listens there")
     with pytest.raises(SetupError, match="set-up failed: no server listens there"):
-        lockstep.run(spec_of(tmp_path, absent="no server listens there"))
+        lockstep.run(made.spec, peers=made.peers)
 
 
 # --- commands ----------------------------------------------------------------------------------------------
 
 
 def test_the_e_stop_in_the_middle_of_a_run_faults_and_sends_the_measured_position(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).running(30)
+    station = Station(stubbed(tmp_path)).running(30)
     assert station.guard.press("ada", "smoke") == ""
     station.robot.blocked = True
     station.robot.position = STANDS + 0.01
@@ -291,7 +292,7 @@ def test_the_e_stop_in_the_middle_of_a_run_faults_and_sends_the_measured_positio
 def test_an_e_stop_is_told_with_who_pressed_where_the_disk_has_it_soon(
     tmp_path: Path, on_disk: bool, reason: str
 ) -> None:
-    station = Station(spec_of(tmp_path)).running(30)
+    station = Station(stubbed(tmp_path)).running(30)
     station.shared.set_estop(EStop.LATCHED)
     station.go(3)
     assert station.state is SessionState.RUNNING  # control obeys already; nobody knows yet who it was
@@ -308,12 +309,12 @@ def test_an_e_stop_is_told_with_who_pressed_where_the_disk_has_it_soon(
 def test_the_e_stop_is_latched_on_disk_and_read_before_the_first_command_of_a_second_start(
     tmp_path: Path,
 ) -> None:
-    made = spec_of(tmp_path)
+    made = stubbed(tmp_path)
     station = Station(made).running(30)
     station.guard.press("ada", "smoke")
     station.go(3)
     station.close()
-    latched = Latch(made.deployment.station_dir).read()
+    latched = Latch(made.spec.deployment.station_dir).read()
     assert latched is not None
     assert (latched.by, latched.why) == ("ada", "smoke")
 
@@ -330,14 +331,14 @@ def test_the_e_stop_is_latched_on_disk_and_read_before_the_first_command_of_a_se
     second.command("release")
     second.go(3)
     assert second.state is SessionState.IDLE
-    assert Latch(made.deployment.station_dir).read() is None
+    assert Latch(made.spec.deployment.station_dir).read() is None
     second.running(20)
     assert second.state is SessionState.RUNNING
     second.close()
 
 
 def test_the_duration_ends_the_run_and_time_on_hold_does_not_count(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, run={"duration_s": 2.0})).running(30)
+    station = Station(stubbed(tmp_path, run={"duration_s": 2.0})).running(30)
     station.command("halt")
     station.go(45)
     station.command("resume")
@@ -354,7 +355,7 @@ def test_the_duration_ends_the_run_and_time_on_hold_does_not_count(tmp_path: Pat
 
 
 def test_halt_and_resume_keep_one_episode_with_its_held_rows_marked(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, delay=3)).running(30)
+    station = Station(stubbed(tmp_path, delay=3)).running(30)
     station.command("halt")
     assert station.state is SessionState.HOLDING
     asked = station.policy.calls.count("infer")
@@ -376,7 +377,7 @@ def test_halt_and_resume_keep_one_episode_with_its_held_rows_marked(tmp_path: Pa
 
 
 def test_a_run_that_is_halted_before_it_began_begins_when_it_is_resumed(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, run={"duration_s": 1.0})).ready()
+    station = Station(stubbed(tmp_path, run={"duration_s": 1.0})).ready()
     station.command("run")
     station.command("halt")  # media has not even heard of the run
     station.go(30)
@@ -392,7 +393,7 @@ def test_a_run_that_is_halted_before_it_began_begins_when_it_is_resumed(tmp_path
 
 
 def test_stop_writes_the_outcome_and_holds(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).running(45)
+    station = Station(stubbed(tmp_path)).running(45)
     episode = station.stop()
     assert episode.outcome is not None
     assert episode.outcome["status"] == "finished"
@@ -409,7 +410,7 @@ def test_stop_writes_the_outcome_and_holds(tmp_path: Path) -> None:
 def test_the_policy_is_told_once_of_each_end_of_what_it_drove(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     policy = station.coordinator.inference.policy
     monkeypatch.setattr(policy, "rest", lambda: policy.calls.append("rest"))
     station.command("run", mode="manual")
@@ -432,7 +433,7 @@ def test_a_policy_that_cannot_end_its_rollout_keeps_no_run_from_ending(
     def rest() -> None:
         raise PolicyError("the server is mute")
 
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     monkeypatch.setattr(station.coordinator.inference.policy, "rest", rest)
     station.command("run")
     station.go(20)
@@ -447,7 +448,7 @@ def test_a_policy_that_cannot_end_its_rollout_keeps_no_run_from_ending(
 
 
 def test_a_second_run_is_an_episode_of_its_own(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).running(20)
+    station = Station(stubbed(tmp_path)).running(20)
     first = station.stop()
     station.command("run")
     station.go(20)
@@ -459,7 +460,7 @@ def test_a_second_run_is_an_episode_of_its_own(tmp_path: Path) -> None:
 
 
 def test_a_lease_that_is_not_renewed_holds_the_robot(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, lease={"ttl_s": 1.0})).running(20)
+    station = Station(stubbed(tmp_path, lease={"ttl_s": 1.0})).running(20)
     for _ in range(40):
         station.tick()
     assert station.state is SessionState.HOLDING
@@ -471,7 +472,7 @@ def test_a_lease_that_is_not_renewed_holds_the_robot(tmp_path: Path) -> None:
 
 
 def test_a_node_that_falls_silent_holds_the_robot(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).running(30)
+    station = Station(stubbed(tmp_path)).running(30)
     station.robot.silent = True
     station.reach(SessionState.HOLDING, 3.0)
     assert "old, allowed" in station.reason
@@ -479,17 +480,18 @@ def test_a_node_that_falls_silent_holds_the_robot(tmp_path: Path) -> None:
 
 
 def test_homing_comes_to_the_pose_within_the_limits_of_motions(tmp_path: Path) -> None:
-    made = spec_of(tmp_path, setup={"home": True})
+    made = stubbed(tmp_path, setup={"home": True})
     station = Station(made).ready()
-    home = made.robot.poses["home"]
+    robot = made.spec.robot
+    home = robot.poses["home"]
     assert np.allclose(station.robot.position, home, atol=1e-6)
-    speeds = np.abs(np.diff(station.robot.sent, axis=0)) * made.rate
-    assert (speeds <= made.robot.velocity * 0.3 + 1e-4).all()
+    speeds = np.abs(np.diff(station.robot.sent, axis=0)) * made.spec.rate
+    assert (speeds <= robot.velocity * 0.3 + 1e-4).all()
     station.close()
 
 
 def test_a_halt_while_it_homes_stops_it(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"home": True}))
+    station = Station(stubbed(tmp_path, setup={"home": True}))
     station.reach(SessionState.IDLE)
     station.command("setup")
     station.go(15)
@@ -506,7 +508,7 @@ def test_a_halt_while_it_homes_stops_it(tmp_path: Path) -> None:
 def test_without_room_on_the_disk_nothing_is_begun_and_the_refusal_says_how_much_is_wanted(
     tmp_path: Path, kind: str
 ) -> None:
-    station = Station(spec_of(tmp_path, recording={"min_free_bytes": 10**15})).ready()
+    station = Station(stubbed(tmp_path, recording={"min_free_bytes": 10**15})).ready()
     wanted = rf"room to record in {tmp_path}/episodes: \d+ bytes free, at least {10**15} wanted"
     with pytest.raises(SetupError, match=wanted):
         station.command(kind)
@@ -525,7 +527,7 @@ def test_without_room_on_the_disk_nothing_is_begun_and_the_refusal_says_how_much
 def test_a_recording_that_cannot_be_opened_ends_a_trial_before_it_began_and_says_so(
     tmp_path: Path, on_failure: str
 ) -> None:
-    station = Station(spec_of(tmp_path, recording={"on_failure": on_failure})).ready()
+    station = Station(stubbed(tmp_path, recording={"on_failure": on_failure})).ready()
     (tmp_path / "episodes").write_text("in its place")
     ack = station.command("run", trial={"id": 1})
     station.go(5)
@@ -548,7 +550,7 @@ def test_a_recording_that_cannot_be_opened_ends_a_trial_before_it_began_and_says
 
 
 def test_a_run_that_is_stopped_before_it_began_is_told_as_such(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     run = station.command("run").uuid
     station.command("stop")  # before media has heard of either
     station.go(5)
@@ -565,7 +567,7 @@ def test_a_run_that_is_stopped_before_it_began_is_told_as_such(tmp_path: Path) -
 
 
 def test_a_trial_is_refused_where_nothing_is_recorded(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, recording={"enabled": False})).ready()
+    station = Station(stubbed(tmp_path, recording={"enabled": False})).ready()
     with pytest.raises(SetupError, match=r"a trial counts by its recording, and recording\.enabled = false"):
         station.command("run", trial={"id": 1})
     station.command("run")
@@ -573,7 +575,7 @@ def test_a_trial_is_refused_where_nothing_is_recorded(tmp_path: Path) -> None:
 
 
 def test_where_evidence_is_not_wanted_a_run_goes_on_without_its_recording(tmp_path: Path) -> None:
-    made = spec_of(tmp_path, recording={"min_free_bytes": 10**15, "on_failure": "continue"})
+    made = stubbed(tmp_path, recording={"min_free_bytes": 10**15, "on_failure": "continue"})
     station = Station(made).running(30)
     assert station.state is SessionState.RUNNING
     assert len(station.events("recording_failed")) == 1
@@ -582,7 +584,7 @@ def test_where_evidence_is_not_wanted_a_run_goes_on_without_its_recording(tmp_pa
 
 
 def test_a_run_whose_recording_was_lost_is_not_resumed(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).running(20)
+    station = Station(stubbed(tmp_path)).running(20)
     station.robot.picture = lambda number: np.zeros((24, 32, 3), np.uint8)  # another size from now on
     station.reach(SessionState.HOLDING, 5.0)
     assert "must be uint8" in station.reason
@@ -600,13 +602,13 @@ def test_a_run_whose_recording_was_lost_is_not_resumed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("delay", [0, 3])
 def test_a_policy_that_speaks_poses_reaches_them(tmp_path: Path, delay: int) -> None:
-    made = spec_of(tmp_path, delay=delay, space="eef")
-    eef_of = made.spaces().eef_of
+    made = stubbed(tmp_path, delay=delay, space="eef")
+    eef_of = EndEffectors(made.spec.robot, ChainForward(made.spec.robot)).eef_of
 
     def poses(observation: Observation, number: int) -> Any:
         return eef_of(ramp(observation.step, 20))
 
-    object.__setattr__(made, "rows", poses)
+    made.rows = poses
     station = Station(made).running(45)
     episode = station.stop()
     steps, actions = executed(episode)
@@ -630,7 +632,8 @@ def test_a_policy_that_speaks_poses_reaches_them(tmp_path: Path, delay: int) -> 
 
 @pytest.mark.parametrize("strategy", ["sync", "async"])
 def test_what_was_published_plays_through_the_whole_pipeline_unchanged(tmp_path: Path, strategy: str) -> None:
-    first = lockstep.run(spec_of(tmp_path, run={"duration_s": 2.0}))
+    made = stubbed(tmp_path, run={"duration_s": 2.0})
+    first = lockstep.run(made.spec, peers=made.peers)
     publish(Path(first.episode["path"]), tmp_path / "set")
     mapping = {"eef": "eef_state", "action_eef": "eef_action"}
     tree = {
@@ -655,7 +658,7 @@ def test_what_was_published_plays_through_the_whole_pipeline_unchanged(tmp_path:
 
 
 def test_no_command_ever_leaves_before_set_up(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path))
+    station = Station(stubbed(tmp_path))
     station.go(30)
     assert station.state is SessionState.IDLE
     assert station.robot.commands == []

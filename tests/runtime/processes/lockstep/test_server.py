@@ -27,7 +27,7 @@ from runtime.processes.lockstep.server import ServedLockstep
 from runtime.processes.media.episode_closing import Close, in_background
 from runtime.processes.media.recorder import ClosedEpisode
 from runtime.recording.reader import Episode, open_episode
-from tests.runtime.lockstep_station import STANDS, StubPlan, StubPolicy, StubRobot, column, spec_of
+from tests.runtime.lockstep_station import STANDS, StubPolicy, StubRobot, Stubs, column, stubbed
 
 TURNS = 5000
 
@@ -35,15 +35,15 @@ TURNS = 5000
 class Client:
     """A station and who commands it, turn by turn in one thread; `people` is the time that they have."""
 
-    def __init__(self, made: StubPlan, over: Callable[[bool], str] = lambda running: "") -> None:
+    def __init__(self, made: Stubs, over: Callable[[bool], str] = lambda running: "") -> None:
         made.built.clear()
         self.people = VirtualClock(100.0)
-        self.station = ServedLockstep(made, VirtualClock(), over, self.people)
+        self.station = ServedLockstep(made.spec, VirtualClock(), over, self.people, made.peers)
         self.station.connect()
         self.robot: StubRobot = made.built["robot"]
         self.policy: StubPolicy = made.built["policy"]
         self._context: zmq.Context[Any] = zmq.Context()
-        self._endpoints = Endpoints(made.deployment.station_dir)
+        self._endpoints = Endpoints(made.spec.deployment.station_dir)
         self._coordinator = self._connected("coordinator", "commands")
         self._guard = self._connected("guard", "estop")
         self.until(SessionState.IDLE)
@@ -144,12 +144,12 @@ class Client:
 
 
 @pytest.fixture
-def made(tmp_path: Path) -> StubPlan:
-    return spec_of(tmp_path, recording={"min_free_bytes": 0, "export": False})
+def made(tmp_path: Path) -> Stubs:
+    return stubbed(tmp_path, recording={"min_free_bytes": 0, "export": False})
 
 
 @pytest.fixture
-def client(made: StubPlan) -> Iterator[Client]:
+def client(made: Stubs) -> Iterator[Client]:
     client = Client(made)
     yield client
     client.close()
@@ -206,7 +206,7 @@ def test_what_a_person_moves_in_between_takes_its_time_and_then_it_stands_still(
 def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: Path) -> None:
     said = []
     for name, waits in (("quick", 0.0), ("slow", 0.02)):
-        made = spec_of(tmp_path / name, recording={"min_free_bytes": 0, "export": False})
+        made = stubbed(tmp_path / name, recording={"min_free_bytes": 0, "export": False})
         client = Client(made)
         infer = client.policy.infer
 
@@ -243,7 +243,7 @@ def test_no_tick_more_passes_after_a_run(client: Client) -> None:
 
 
 def test_who_sets_up_while_a_recording_is_closed_finds_the_same_as_who_comes_later(
-    made: StubPlan, monkeypatch: pytest.MonkeyPatch
+    made: Stubs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gate = threading.Event()
 
@@ -289,7 +289,7 @@ def test_a_time_that_cannot_be_is_refused(client: Client) -> None:
     assert "policy_timing.infer_ms is -1.0: lockstep goes by it; allowed: 0 or more" in client.reason
 
 
-def test_a_run_ends_where_its_bench_says_so_and_its_episode_is_whole(made: StubPlan) -> None:
+def test_a_run_ends_where_its_bench_says_so_and_its_episode_is_whole(made: Stubs) -> None:
     asked = []
 
     def over(running: bool) -> str:
@@ -371,26 +371,26 @@ def test_a_policy_that_hangs_keeps_nobody_from_stopping(client: Client) -> None:
 # --- a station like any other ------------------------------------------------------------------------------
 
 
-def test_a_station_is_of_one_process(made: StubPlan, client: Client) -> None:
+def test_a_station_is_of_one_process(made: Stubs, client: Client) -> None:
     with pytest.raises(SetupError, match="station 'bench' is already running"):
-        ServedLockstep(made, VirtualClock())
+        ServedLockstep(made.spec, VirtualClock(), peers=made.peers)
 
 
 def test_there_is_no_control_channel(tmp_path: Path) -> None:
-    made = spec_of(tmp_path, control_channel={"enabled": True})
+    made = stubbed(tmp_path, control_channel={"enabled": True})
     with pytest.raises(SetupError, match=r"control_channel\.enabled = true in lockstep, which has none"):
-        ServedLockstep(made, VirtualClock())
+        ServedLockstep(made.spec, VirtualClock(), peers=made.peers)
 
 
-def test_when_it_ends_its_episode_is_closed_and_nothing_is_found_of_it(made: StubPlan) -> None:
+def test_when_it_ends_its_episode_is_closed_and_nothing_is_found_of_it(made: Stubs) -> None:
     client = Client(made)
     client.ready().running()
     client.close()
-    (folder,) = made.deployment.episodes_dir.iterdir()
+    (folder,) = made.spec.deployment.episodes_dir.iterdir()
     outcome = open_episode(folder).outcome
     assert outcome is not None
     assert outcome["status"] == "interrupted"
     with pytest.raises(TransportError, match="is not running here"):
-        Endpoints(made.deployment.station_dir).read("coordinator")
+        Endpoints(made.spec.deployment.station_dir).read("coordinator")
     assert client.robot.sent[-1] == pytest.approx(STANDS, abs=0.2)
     Client(made).close()

@@ -12,14 +12,14 @@ import simplejpeg
 
 from runtime.core.types import Observation
 from runtime.processes.media.previews import Previews
-from tests.runtime.lockstep_station import spec_of
+from tests.runtime.lockstep_station import stubbed
 
 
 class Looking:
     """What is shown of a station's pictures."""
 
     def __init__(self, folder: Path) -> None:
-        made = spec_of(folder, bus={"preview_rate": 15.0})
+        made = stubbed(folder, bus={"preview_rate": 15.0}).spec
         self.previews, self._dim = Previews(made), made.robot.dim
         self._socket, self.previews._publisher = self.previews._publisher, self  # type: ignore[assignment]
         self._shown: list[tuple[str, bytes]] = []

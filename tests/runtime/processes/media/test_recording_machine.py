@@ -13,7 +13,7 @@ from runtime.ipc.messages import Ack
 from runtime.ipc.session_state import SessionState
 from runtime.recording.reader import open_episode
 from runtime.station.run import Run
-from tests.runtime.lockstep_station import Station, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 
 SETTLED = 4  # ticks after which an order has gone to media and its answer to the coordinator
 ticks = st.integers(0, 6)
@@ -32,7 +32,7 @@ class Recorded(RuleBasedStateMachine):
     @initialize(on_failure=st.sampled_from(["hold", "continue"]))
     def begin(self, on_failure: str) -> None:
         self.episodes = Path(self.folder.name) / "episodes"
-        self.station = Station(spec_of(Path(self.folder.name), recording={"on_failure": on_failure}))
+        self.station = Station(stubbed(Path(self.folder.name), recording={"on_failure": on_failure}))
         runs = self.station.coordinator.runs
         follow = runs._follow
 

@@ -2,7 +2,7 @@ import pytest
 
 from runtime.ipc.session_state import SessionState
 from runtime.processes.reception.drive_status import Drives
-from tests.runtime.lockstep_station import Station, spec_of
+from tests.runtime.lockstep_station import Station, stubbed
 
 GOOD = {"enabled": True, "faults": []}
 OFF = {"enabled": False, "faults": []}
@@ -51,7 +51,7 @@ def test_a_change_that_stays_is_told_although_it_came_too_soon(drives):
 
 
 def test_a_robot_whose_drives_are_off_is_not_set_up_until_they_are_on(tmp_path):
-    station = Station(spec_of(tmp_path))
+    station = Station(stubbed(tmp_path))
     station.robot.drives = {"enabled": False, "faults": ["axis 2 is hot"]}
     station.prepare()
     assert station.state is SessionState.IDLE
@@ -64,7 +64,7 @@ def test_a_robot_whose_drives_are_off_is_not_set_up_until_they_are_on(tmp_path):
 
 
 def test_drives_that_switch_off_in_a_run_are_told_in_its_episode(tmp_path):
-    station = Station(spec_of(tmp_path)).running()
+    station = Station(stubbed(tmp_path)).running()
     station.robot.drives = OFF
     station.robot.blocked = True
     station.go(30)

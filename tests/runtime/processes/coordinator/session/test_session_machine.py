@@ -19,9 +19,8 @@ from runtime.ipc.messages import ChunkMerged, TickDone, decode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
 from runtime.processes.control.process import make_tick
-from runtime.processes.coordinator.coordinator import Coordinator
 from runtime.processes.coordinator.session.transitions import COMMANDS
-from tests.runtime.lockstep_station import DIM, STANDS, Station, spec_of
+from tests.runtime.lockstep_station import DIM, STANDS, Station, stubbed
 
 PERIOD = 1 / 30
 BRAKES = 10.0  # [rad/s2] at least, half of what a stop is set to: the last step of one is shorter
@@ -93,7 +92,7 @@ class Machine(RuleBasedStateMachine):
     def begin(self, delay: int, home: bool, strategy: str) -> None:
         self.watch(
             Station(
-                spec_of(
+                stubbed(
                     Path(self.folder.name),
                     self.rows,
                     strategy=strategy,
@@ -242,7 +241,7 @@ class Machine(RuleBasedStateMachine):
         self.look(station.shared.observation.read()["qpos"].astype(np.float64), told)
         station.step += 1
         station.clock.sleep_until(station.step / station.spec.rate)
-        station.coordinator = Coordinator(station.spec, station.shared, station.clock, station._runner)
+        station.restart_coordinator()
         self.going = False
         self.merged.clear()
 

@@ -11,21 +11,21 @@ import pytest
 from runtime.config import loader
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.ipc.session_state import SessionState
-from tests.runtime.lockstep_station import Station, on_time, spec_of
+from tests.runtime.lockstep_station import Station, on_time, stubbed
 
 OTHER = {"amplitude": 0.1}  # of the mock policy, whose default is 0.2
 BENCH = {"id": "reset-1", "seed": 7, "positions": {"block": [0.1, 0.3, 45.0]}}
 
 
 def simulated(folder: Path, **settings: Any) -> Station:
-    return Station(spec_of(folder, simulated=True, **settings))
+    return Station(stubbed(folder, simulated=True, **settings))
 
 
 # --- the policy --------------------------------------------------------------------------------------------
 
 
 def test_another_policy_takes_the_place_of_the_former_which_is_closed_first(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     station.ready(policy=OTHER)
     former, other = station.policies
     assert former.calls == ["connect", "reset", "infer", "infer", "close"]
@@ -42,7 +42,7 @@ def test_a_policy_whose_module_cannot_be_loaded_is_refused_by_name_and_the_stati
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "runtime.policies.starvla", None)
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     with pytest.raises(SetupError, match=r"'starvla' cannot be loaded: .*starvla.py: ModuleNotFoundError"):
         station.command("setup", policy={"kind": "starvla", "url": "ws://127.0.0.1:1"})
     station.command("run")
@@ -52,7 +52,7 @@ def test_a_policy_whose_module_cannot_be_loaded_is_refused_by_name_and_the_stati
 
 
 def test_the_same_policy_is_kept_and_connected_anew(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready(policy={"amplitude": 0.2})
+    station = Station(stubbed(tmp_path)).ready(policy={"amplitude": 0.2})
     station.ready(policy={"kind": "mock"})
     assert station.policies == [station.policy]
     assert station.policy.calls.count("connect") == 2
@@ -61,7 +61,7 @@ def test_the_same_policy_is_kept_and_connected_anew(tmp_path: Path) -> None:
 
 
 def test_a_set_up_that_names_none_takes_the_deployments_own_again(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, policy={"period_s": 5.0}))
+    station = Station(stubbed(tmp_path, policy={"period_s": 5.0}))
     station.ready(policy=OTHER)
     assert station.coordinator.spec.deployment.policy.period_s == 5.0  # merged over the deployment's own
     station.ready(policy={"horizon": 20})
@@ -101,7 +101,7 @@ REFUSED = {
 def test_a_refused_set_up_leaves_everything_as_it_was(
     tmp_path: Path, arguments: dict[str, Any], sentence: str
 ) -> None:
-    station = Station(spec_of(tmp_path)).ready(task="first", checkpoint={"id": 1, "name": "A"})
+    station = Station(stubbed(tmp_path)).ready(task="first", checkpoint={"id": 1, "name": "A"})
     before, calls = station.coordinator.spec, list(station.policy.calls)
     with pytest.raises(SetupError, match=sentence):
         station.command("setup", **arguments)
@@ -118,8 +118,8 @@ def test_a_refused_set_up_leaves_everything_as_it_was(
 
 
 def test_a_policy_that_does_not_fit_the_robot_is_refused_before_the_former_is_closed(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
-    station.spec.built["unfit"] = ConfigurationError("policy.cameras names nose")
+    station = Station(stubbed(tmp_path)).ready()
+    station.stubs.unfit = ConfigurationError("policy.cameras names nose")
     with pytest.raises(SetupError, match=r"policy\.cameras names nose"):
         station.command("setup", policy=OTHER)
     assert station.coordinator.inference.policy is station.policy
@@ -128,8 +128,8 @@ def test_a_policy_that_does_not_fit_the_robot_is_refused_before_the_former_is_cl
 
 
 def test_a_policy_whose_own_code_fails_is_refused_and_ends_nothing(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
-    station.spec.built["unfit"] = ZeroDivisionError("0 / 0")
+    station = Station(stubbed(tmp_path)).ready()
+    station.stubs.unfit = ZeroDivisionError("0 / 0")
     with pytest.raises(SetupError, match="policy 'mock' cannot be made: ZeroDivisionError: 0 / 0"):
         station.command("setup", policy=OTHER)
     assert (station.state, station.coordinator.inference.policy) == (SessionState.READY, station.policy)
@@ -137,7 +137,7 @@ def test_a_policy_whose_own_code_fails_is_refused_and_ends_nothing(tmp_path: Pat
 
 
 def test_the_manifest_says_what_was_really_used(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready(policy=OTHER, task="fold", checkpoint={"id": 7, "name": "B"})
+    station = Station(stubbed(tmp_path)).ready(policy=OTHER, task="fold", checkpoint={"id": 7, "name": "B"})
     station.command("run")
     station.go(20)
     manifest = station.stop().manifest
@@ -162,14 +162,14 @@ def test_the_policy_is_given_the_task_of_the_set_up(tmp_path: Path) -> None:
         prompts.append(observation.prompt)
         return on_time(observation, number)
 
-    station = Station(spec_of(tmp_path, rows)).ready(task="fold the towel")
+    station = Station(stubbed(tmp_path, rows)).ready(task="fold the towel")
     station.ready()
     assert prompts == ["fold the towel"] * 2 + ["stack the cups"] * 2
     station.close()
 
 
 def test_figures_of_the_former_policy_are_not_the_new_ones(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).running(20)
+    station = Station(stubbed(tmp_path)).running(20)
     assert station.coordinator.snapshot()["policy"]["answers"] > 0
     station.stop()
     station.ready(policy=OTHER)
@@ -178,11 +178,10 @@ def test_figures_of_the_former_policy_are_not_the_new_ones(tmp_path: Path) -> No
 
 
 def test_a_failed_set_up_can_be_made_good_by_another_policy(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, absent="no server there: start it"))
+    station = Station(stubbed(tmp_path, absent="no server there: start it"))
     station.prepare(policy=OTHER)
     assert (station.state, station.reason) == (SessionState.IDLE, "no server there: start it")
-    object.__setattr__(station.spec, "absent", "")  # somebody starts it
-    object.__setattr__(station.coordinator.operations._own, "absent", "")
+    station.stubs.absent = ""  # somebody starts it
     station.ready(policy={"amplitude": 0.3})
     assert [policy.calls[0] for policy in station.policies[1:]] == ["connect", "connect"]
     assert station.policies[1].calls[-1] == "close"
@@ -190,7 +189,7 @@ def test_a_failed_set_up_can_be_made_good_by_another_policy(tmp_path: Path) -> N
 
 
 def test_an_open_recording_keeps_the_policy_that_its_manifest_names(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     station.command("record_start")
     station.go(2)
     with pytest.raises(SetupError, match=r"a recording is open, .* record stop first"):
@@ -206,7 +205,7 @@ def test_an_open_recording_keeps_the_policy_that_its_manifest_names(tmp_path: Pa
 
 
 def test_a_run_is_told_its_trial_and_its_operator_and_answers_with_its_episode(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     ack = station.command(
         "run", trial={"id": 12, "scene": {"name": "cups"}}, operator="anna", duration_s=30.0
     )
@@ -219,7 +218,7 @@ def test_a_run_is_told_its_trial_and_its_operator_and_answers_with_its_episode(t
 
 
 def test_a_run_without_arguments_has_the_deployments_operator_and_limit(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, operator="ben", run={"duration_s": 20.0})).ready()
+    station = Station(stubbed(tmp_path, operator="ben", run={"duration_s": 20.0})).ready()
     station.command("run")
     station.go(10)
     assert station.coordinator.snapshot()["run"]["duration_s"] == 20.0
@@ -229,7 +228,7 @@ def test_a_run_without_arguments_has_the_deployments_operator_and_limit(tmp_path
 
 
 def test_the_limit_of_a_run_is_its_own(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, run={"duration_s": 20.0})).ready()
+    station = Station(stubbed(tmp_path, run={"duration_s": 20.0})).ready()
     station.command("run", duration_s=0.5)
     station.reach(SessionState.READY, 1.0)
     assert station.reason == "the run's 0.5 s are over"
@@ -238,13 +237,13 @@ def test_the_limit_of_a_run_is_its_own(tmp_path: Path) -> None:
 
 
 def test_a_run_that_is_not_recorded_has_no_episode(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, recording={"enabled": False})).ready()
+    station = Station(stubbed(tmp_path, recording={"enabled": False})).ready()
     assert station.command("run").data["episode"] == ""
     station.close()
 
 
 def test_a_recording_alone_answers_with_its_episode_too(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     episode = station.command("record_start").data["episode"]
     station.go(5)
     station.command("record_stop")
@@ -424,6 +423,6 @@ def test_the_snapshot_says_what_is_set_up(tmp_path: Path) -> None:
 
 
 def test_a_real_bench_is_shown_as_such(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     assert station.coordinator.snapshot()["simulated"] is False
     station.close()

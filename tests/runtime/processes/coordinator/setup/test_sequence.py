@@ -14,7 +14,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.policies.base import PolicyInfo
 from runtime.processes.coordinator.setup.sequence import Stage
 from runtime.spaces.conversion import CommandRows
-from tests.runtime.lockstep_station import MOVED, STANDS, Station, on_time, ramp, spec_of
+from tests.runtime.lockstep_station import MOVED, STANDS, Station, on_time, ramp, stubbed
 
 
 def failed(station: Station) -> str:
@@ -40,7 +40,7 @@ def without_control(station: Station, seconds: float, beating: bool = True) -> N
 
 
 def test_it_goes_from_stage_to_stage_and_says_so(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"home": True})).ready()
+    station = Station(stubbed(tmp_path, setup={"home": True})).ready()
     assert station.events("setup") == [
         "waiting for a complete observation",
         "going to the pose",
@@ -55,14 +55,14 @@ def test_it_goes_from_stage_to_stage_and_says_so(tmp_path: Path) -> None:
 
 
 def test_the_policy_is_reset_once_and_warmed_up_as_often_as_asked(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"warmup_chunks": 4})).ready()
+    station = Station(stubbed(tmp_path, setup={"warmup_chunks": 4})).ready()
     assert station.policy.calls == ["connect", "reset", "infer", "infer", "infer", "infer"]
     assert station.robot.commands == []  # nothing moved: no homing was asked for
     station.close()
 
 
 def test_the_first_row_is_compared_with_where_the_arm_is(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, lambda o, n: ramp(100, 5))).ready()
+    station = Station(stubbed(tmp_path, lambda o, n: ramp(100, 5))).ready()
     assert (
         station.coordinator.setup.validated
         == "5 rows in 0 ms, the first at most 0.200 rad away (left_arm.joint0)"
@@ -71,7 +71,7 @@ def test_the_first_row_is_compared_with_where_the_arm_is(tmp_path: Path) -> None
 
 
 def test_a_policy_that_cannot_be_reached_ends_it_with_its_sentence(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, absent="no server at ws://there: start it"))
+    station = Station(stubbed(tmp_path, absent="no server at ws://there: start it"))
     assert failed(station) == "no server at ws://there: start it"
     assert station.policy.calls == ["connect", "close"]
     station.close()
@@ -84,7 +84,7 @@ def test_a_policy_that_fails_while_it_is_warmed_up_ends_it(tmp_path: Path, error
             raise error
         return on_time(observation, number)
 
-    station = Station(spec_of(tmp_path, rows, delay=2))
+    station = Station(stubbed(tmp_path, rows, delay=2))
     assert str(error) in failed(station)
     assert station.policy.calls == ["connect", "reset", "infer", "infer", "close"]
     station.close()
@@ -97,14 +97,14 @@ def test_a_policy_that_answers_what_is_no_number_ends_it(tmp_path: Path, value: 
         answer[3, 9] = value
         return answer
 
-    station = Station(spec_of(tmp_path, rows))
+    station = Station(stubbed(tmp_path, rows))
     assert f"{value} for right_arm.joint2 in row 3" in failed(station)
     assert station.robot.commands == []
     station.close()
 
 
 def test_a_camera_that_falls_away_ends_it_with_its_name(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"observation_timeout_s": 1.0}))
+    station = Station(stubbed(tmp_path, setup={"observation_timeout_s": 1.0}))
     station.reach(SessionState.IDLE)
     station.robot.cameras.remove("cam_left_wrist")
     station.go(30)  # the last picture of it grows old
@@ -115,7 +115,7 @@ def test_a_camera_that_falls_away_ends_it_with_its_name(tmp_path: Path) -> None:
 
 
 def test_an_arm_that_does_not_arrive_ends_it_with_its_name_and_how_far_it_is(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"home": True}))
+    station = Station(stubbed(tmp_path, setup={"home": True}))
     station.robot.bias[8] = 0.2
     reason = failed(station)
     assert "the arm did not arrive: right_arm.joint1 is 0.20 rad from the pose 'home'" in reason
@@ -126,7 +126,7 @@ def test_an_arm_that_does_not_arrive_ends_it_with_its_name_and_how_far_it_is(tmp
 
 
 def test_a_blocked_arm_is_not_pulled_at_further_than_the_following_error(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"home": True}))
+    station = Station(stubbed(tmp_path, setup={"home": True}))
     station.robot.blocked = True
     reason = failed(station)
     assert "10 actions refused in a row" in reason
@@ -140,7 +140,7 @@ def test_a_blocked_arm_is_not_pulled_at_further_than_the_following_error(tmp_pat
 
 
 def test_a_node_that_falls_silent_while_it_homes_stops_the_motion(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"home": True}))
+    station = Station(stubbed(tmp_path, setup={"home": True}))
     station.reach(SessionState.IDLE)
     station.command("setup")
     station.go(15)
@@ -155,7 +155,7 @@ def test_a_node_that_falls_silent_while_it_homes_stops_the_motion(tmp_path: Path
 def test_joints_that_read_exactly_0_are_named_before_anything_moves(tmp_path: Path) -> None:
     standing = STANDS.copy()
     standing[[3, 12]] = 0.0
-    station = Station(spec_of(tmp_path, start=standing)).ready()
+    station = Station(stubbed(tmp_path, start=standing)).ready()
     (named,) = station.events("zero_joints")
     zero = np.flatnonzero(station.spec.limits.places & (standing == 0.0))
     assert named.startswith(", ".join(station.spec.limits.names[i] for i in zero) + " read exactly 0 rad")
@@ -163,7 +163,7 @@ def test_joints_that_read_exactly_0_are_named_before_anything_moves(tmp_path: Pa
 
 
 def test_a_set_up_waits_until_the_joints_are_believed(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"observation_timeout_s": 1.0}))
+    station = Station(stubbed(tmp_path, setup={"observation_timeout_s": 1.0}))
     station.reach(SessionState.IDLE)
     noise = np.random.default_rng(1)
     station.robot.blocked = True
@@ -178,7 +178,7 @@ def test_a_set_up_waits_until_the_joints_are_believed(tmp_path: Path) -> None:
 
 
 def test_a_motion_that_control_never_finishes_ends_it(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"home": True}))
+    station = Station(stubbed(tmp_path, setup={"home": True}))
     station.reach(SessionState.IDLE)
     station.go(10)  # control has seen the joints
     station.command("setup")
@@ -189,7 +189,7 @@ def test_a_motion_that_control_never_finishes_ends_it(tmp_path: Path) -> None:
 
 
 def test_without_control_no_motion_is_ordered(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"home": True, "observation_timeout_s": 3.0}))
+    station = Station(stubbed(tmp_path, setup={"home": True, "observation_timeout_s": 3.0}))
     station.reach(SessionState.IDLE)
     station.command("setup")
     without_control(station, 4.5, beating=False)
@@ -201,7 +201,7 @@ def test_without_control_no_motion_is_ordered(tmp_path: Path) -> None:
 @pytest.mark.parametrize("ticks", [1, 3, 8])  # while connecting, before and within warming up
 @pytest.mark.parametrize("command", ["stop", "halt"])
 def test_it_can_be_cancelled_at_any_time_and_begun_again(tmp_path: Path, ticks: int, command: str) -> None:
-    station = Station(spec_of(tmp_path, delay=4))
+    station = Station(stubbed(tmp_path, delay=4))
     station.reach(SessionState.IDLE)
     station.command("setup")
     station.go(ticks)
@@ -216,7 +216,7 @@ def test_it_can_be_cancelled_at_any_time_and_begun_again(tmp_path: Path, ticks: 
 
 
 def test_homing_alone_asks_no_policy(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     asked = len(station.policy.calls)
     station.command("home")
     assert station.state is SessionState.SETTING_UP
@@ -228,7 +228,7 @@ def test_homing_alone_asks_no_policy(tmp_path: Path) -> None:
 
 
 def test_a_transport_that_moves_nothing_is_not_homed(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, moves_robot=False, setup={"home": True})).ready()
+    station = Station(stubbed(tmp_path, moves_robot=False, setup={"home": True})).ready()
     assert station.robot.commands == []
     with pytest.raises(SetupError, match="transport 'dataset' moves no robot"):
         station.command("home")
@@ -237,7 +237,7 @@ def test_a_transport_that_moves_nothing_is_not_homed(tmp_path: Path) -> None:
 
 
 def test_a_second_set_up_connects_and_validates_anew(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path)).ready()
+    station = Station(stubbed(tmp_path)).ready()
     station.command("setup")
     assert station.coordinator.setup.validated == ""
     station.reach(SessionState.READY)
@@ -247,7 +247,7 @@ def test_a_second_set_up_connects_and_validates_anew(tmp_path: Path) -> None:
 
 
 def test_the_e_stop_ends_it(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path, setup={"home": True}))
+    station = Station(stubbed(tmp_path, setup={"home": True}))
     station.reach(SessionState.IDLE)
     station.command("setup")
     station.go(15)
@@ -266,9 +266,10 @@ def test_the_e_stop_ends_it(tmp_path: Path) -> None:
 
 def with_horizon(tmp_path: Path, steps: int, **said: Any) -> Station:
     """A station that is to execute so many steps of each answer; its policy says of itself what is `said`."""
-    made = spec_of(tmp_path, strategy="sync")
+    made = stubbed(tmp_path, strategy="sync")
     strategy = {"strategy": {"execution_horizon": steps}}
-    station = Station(replace(made, resolved=loader.changed(made.resolved, strategy, "test")))
+    made.spec = replace(made.spec, resolved=loader.changed(made.spec.resolved, strategy, "test"))
+    station = Station(made)
     station.policy.connect = lambda: PolicyInfo("stub", **said)  # type: ignore[method-assign]
     return station
 
@@ -290,7 +291,7 @@ def test_no_more_steps_can_be_executed_of_an_answer_than_it_has(tmp_path: Path, 
 def test_a_short_fast_chunk_is_set_up_and_moves_the_robot(
     tmp_path: Path, strategy: str, rate: float, count: int
 ) -> None:
-    station = Station(spec_of(tmp_path, lambda seen, number: ramp(seen.step, count), strategy))
+    station = Station(stubbed(tmp_path, lambda seen, number: ramp(seen.step, count), strategy))
     infer = station.policy.infer
     station.policy.infer = lambda *asked: replace(infer(*asked), rate=rate)  # type: ignore[method-assign]
     station.ready().command("run")
@@ -306,7 +307,7 @@ def test_a_short_fast_chunk_is_set_up_and_moves_the_robot(
 def test_what_goes_wrong_with_an_answer_ends_the_set_up_and_not_main(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    station = Station(spec_of(tmp_path))
+    station = Station(stubbed(tmp_path))
     monkeypatch.setattr(CommandRows, "meant", property(lambda made: made.rows[len(made.rows)]))
     assert "the policy's answer cannot be used: IndexError: index 20 is out of bounds" in failed(station)
     assert "Traceback" in caplog.text
@@ -326,7 +327,7 @@ def test_as_many_steps_as_it_has_can_be(tmp_path: Path, said: dict[str, Any]) ->
 
 def measuring(tmp_path: Path, off: float) -> Station:
     """A station whose robot measures the pose of its right arm `off` metres too high."""
-    station = Station(spec_of(tmp_path))
+    station = Station(stubbed(tmp_path))
     receive = station.robot.receive
 
     def with_poses(timeout: float) -> Observation | None:
@@ -380,7 +381,7 @@ def set_up_in(station: Station, **args: Any) -> float:
 
 
 def test_whose_policy_is_quick_takes_as_long_as_it_is_told_to(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path))
+    station = Station(stubbed(tmp_path))
     station.until(lambda: station.state is SessionState.IDLE, 5.0, "observations")
     quick = set_up_in(station)
     assert quick < 1.0
@@ -396,7 +397,7 @@ def test_whose_policy_is_quick_takes_as_long_as_it_is_told_to(tmp_path: Path) ->
 
 
 def test_a_rest_can_be_cancelled_and_times_that_cannot_be_are_refused(tmp_path: Path) -> None:
-    station = Station(spec_of(tmp_path))
+    station = Station(stubbed(tmp_path))
     station.until(lambda: station.state is SessionState.IDLE, 5.0, "observations")
     station.command("setup", least={"warm_up_s": 100.0})
     station.go(90)

@@ -1,0 +1,131 @@
+"""Assembly of the coordinator from its parts; the same in a process and in lockstep."""
+
+from __future__ import annotations
+
+import uuid
+from functools import partial
+
+from runtime.core.clock import Clock
+from runtime.ipc.bus import EventLog
+from runtime.ipc.messages import Event, ReceptionReport
+from runtime.ipc.session_state import SessionState
+from runtime.ipc.shared_state import SharedState
+from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.loading import Loading
+from runtime.processes.coordinator.builders import MakePolicy, make_kinematics, make_policy
+from runtime.processes.coordinator.control_queue import ControlQueue
+from runtime.processes.coordinator.coordinator import Coordinator
+from runtime.processes.coordinator.demonstrations import Demonstrations
+from runtime.processes.coordinator.health_monitor import HealthMonitor
+from runtime.processes.coordinator.inference.chunk_mixture import Mixture
+from runtime.processes.coordinator.inference.inference import Inference, Patience
+from runtime.processes.coordinator.inference.policy_observation import PolicyObservation, SightSettings
+from runtime.processes.coordinator.inference.requests import PolicyRequests
+from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
+from runtime.processes.coordinator.inference.worker import Runner
+from runtime.processes.coordinator.lease import Lease
+from runtime.processes.coordinator.manual.manual_control import ManualControl
+from runtime.processes.coordinator.manual.targets import Targets
+from runtime.processes.coordinator.operations import Parts, SessionActions
+from runtime.processes.coordinator.preflight_desk import PreflightDesk
+from runtime.processes.coordinator.runs import Runs
+from runtime.processes.coordinator.session.machine import SessionMachine
+from runtime.processes.coordinator.session.tuning import strategy_of
+from runtime.processes.coordinator.setup.sequence import SetUp
+from runtime.processes.coordinator.snapshot import control_figures, facts
+from runtime.processes.coordinator.timing_report import TimingReport
+from runtime.spaces.conversion import ActionSpaces
+from runtime.station.run import Provenance
+from runtime.station.spec import StationSpec
+
+
+def assemble(
+    spec: StationSpec,
+    shared: SharedState,
+    clock: Clock,
+    runner: Runner,
+    people: Clock | None = None,
+    make_policy: MakePolicy = make_policy,
+) -> Coordinator:
+    """The coordinator of a station; `people` is the clock of leases and commands where it is another one."""
+
+    # What parts ask of the coordinator, or tell it, once it is there.
+    def say(event: Event) -> None:
+        coordinator.say(event)
+
+    def state() -> SessionState:
+        return coordinator.session.state
+
+    def reception() -> ReceptionReport:
+        return coordinator.reception_report
+
+    boot, people = str(uuid.uuid4()), people or clock
+    lease, orders = Lease(spec.deployment.lease.ttl_s), ControlQueue(shared)
+    kinematics = Loading(ChainForward(spec.robot), partial(make_kinematics, spec), runner.aside)
+    spaces = ActionSpaces(spec.robot, kinematics, spec.rate)
+    inference = _inference(spec, shared, clock, runner, orders, kinematics, make_policy)
+    setup = SetUp(spec, inference, orders, shared, clock, reception)
+    health = HealthMonitor(spec, shared, lease, clock, people, reception)
+    runs = Runs(
+        spec,
+        shared,
+        clock,
+        inference,
+        orders,
+        Provenance(spec, boot),
+        lambda: control_figures(shared, spec.rate),
+        kinematics.prepare,
+    )
+    manual = ManualControl(spec, shared, orders, runs, Targets(spec, spaces, kinematics))
+    collecting = Demonstrations(spec, shared, clock, inference, setup, lambda: runs.open, say)
+    parts = Parts(shared, clock, orders, inference, setup, runs, manual, collecting)
+    operations = SessionActions(spec, parts, state, health.absent, say, make_policy)
+    settings = spec.deployment.control
+    coordinator = Coordinator(
+        boot=boot,
+        shared=shared,
+        clock=clock,
+        people=people,
+        own=spec.resolved,
+        facts=facts(spec),
+        events=EventLog(),
+        lease=lease,
+        orders=orders,
+        spaces=spaces,
+        inference=inference,
+        setup=setup,
+        runs=runs,
+        manual=manual,
+        collecting=collecting,
+        health=health,
+        timing=TimingReport(shared, spec.rate, settings.realtime_priority, settings.realtime == "auto"),
+        operations=operations,
+        preflights=PreflightDesk(lambda: operations.spec, spec, state, say, clock),
+        session=SessionMachine(operations, lease, boot, people.now),
+    )
+    return coordinator
+
+
+def _inference(
+    spec: StationSpec,
+    shared: SharedState,
+    clock: Clock,
+    runner: Runner,
+    orders: ControlQueue,
+    kinematics: Loading,
+    make_policy: MakePolicy,
+) -> Inference:
+    """What asks the policy, with action spaces of its own: they are used in the thread of the call."""
+    settings = spec.deployment
+    ages = SightSettings(spec.rate, settings.safety.joint_age_s, settings.safety.picture_age_s)
+    requests = PolicyRequests(
+        make_policy(spec, clock),
+        settings.task,
+        ActionSpaces(spec.robot, kinematics, spec.rate),
+        PolicyObservation(shared, clock, ages),
+        runner,
+        clock,
+    )
+    patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
+    prefix = RtcPrefix(spec.rate, Mixture(spec.dims, spec.robot))
+    return Inference(requests, strategy_of(spec), shared, orders, clock, patience, prefix)

@@ -1,0 +1,76 @@
+"""Builders of what the coordinator asks: the policy, or a leader in its place, and kinematics."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from robots import Robot
+from runtime.core.clock import Clock
+from runtime.core.errors import ConfigurationError, RuntimeFault
+from runtime.core.plugins import variants
+from runtime.policies.base import Policy
+from runtime.policies.tunnel.policy import through_tunnel
+from runtime.station.spec import StationSpec
+
+# What a deployment does not name is not loaded.
+if TYPE_CHECKING:
+    from runtime.kinematics.base import Kinematics
+    from runtime.teleoperators.base import Leader
+
+MakePolicy = Callable[[StationSpec, Clock], Policy]
+
+
+def make_leader(spec: StationSpec, clock: Clock) -> Leader:
+    """The leader of a deployment that relays one, not yet connected."""
+    wanted = spec.deployment.collection
+    if wanted is None or wanted.leader is None:
+        raise ConfigurationError("this deployment has no [collection.leader]")
+    kind = variants("runtime.teleoperators")[wanted.leader.kind]
+    made: Leader = kind.build(wanted.leader, spec.robot, clock)
+    return made
+
+
+def make_policy(
+    spec: StationSpec,
+    clock: Clock,
+    build: Callable[[Any, Robot, Clock, float], Policy] | None = None,
+    leader: Callable[[StationSpec, Clock], Leader] = make_leader,
+) -> Policy:
+    """The policy, not yet connected; raises RuntimeFault where it does not fit the robot, or cannot be made.
+
+    `build` stands in for that of the policy's kind, `leader` for the deployment's.
+    """
+    if spec.collecting:
+        return _teleoperation(spec, clock, leader)
+    settings = spec.deployment.policy
+    try:
+        build = build or variants("runtime.policies")[settings.kind].build
+        return through_tunnel(build(settings, spec.robot, clock, spec.rate), settings)
+    except RuntimeFault:
+        raise
+    except Exception as error:  # of a policy's own code: it must not end coordinator
+        logging.getLogger(__name__).exception("the policy's own code failed")
+        raise ConfigurationError(
+            f"policy {settings.kind!r} cannot be made: {type(error).__name__}: {error}"
+        ) from error
+
+
+def _teleoperation(spec: StationSpec, clock: Clock, leader: Callable[[StationSpec, Clock], Leader]) -> Policy:
+    """The policy that is asked while the operator drives the robot."""
+    from runtime.teleoperators.relay import NodeLed, Relay
+
+    wanted = spec.deployment.collection
+    if wanted is None:
+        raise ConfigurationError("this deployment has no [collection]: it says nothing of who leads")
+    if wanted.source == "node":
+        return NodeLed()
+    return Relay(leader(spec, clock), spec.robot, wanted.mode, wanted.max_age_s, spec.rate, clock)
+
+
+def make_kinematics(spec: StationSpec) -> Kinematics:
+    """Forward and inverse kinematics of the robot, compiled or loaded when this returns."""
+    settings = spec.deployment.kinematics
+    made: Kinematics = variants("runtime.kinematics")[settings.kind].build(settings, spec.robot)
+    return made
