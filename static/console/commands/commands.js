@@ -30,7 +30,7 @@ export class Commands {
     store.on("ack", (ack) => ack.kind !== "estop" && this.acknowledged(ack));
     document.addEventListener("click", (event) => this.#clicked(event));
     store.on(["snapshot", "link", "open", "second"], () => this.gate());
-    document.body.addEventListener("htmx:afterSettle", () => this.gate());
+    for (const moment of ["htmx:afterSwap", "htmx:afterSettle"]) document.body.addEventListener(moment, () => this.gate());
     this.gate();
   }
 

@@ -300,9 +300,23 @@ def test_a_button_that_is_pressed_before_its_first_press_is_answered_says_so_and
     ) == ["pressed", "Set up: pressed already, and not answered yet", 1, "accepted", "pressed", 2]
 
 
-def test_a_station_that_was_started_before_an_upgrade_is_seen_latched_and_released() -> None:
-    body = """
-        const old = (state, clock) => { store.snapshot = { state, clock, boot: "b1" }; store.take(); };
-        old("idle", 1); await look(); old("faulted", 2); await look(); old("idle", 3); await look();
-    """
-    assert pressing(body) == ["rest", "stopped", "rest"]
+def test_a_button_of_a_fragment_that_came_can_be_pressed_at_once() -> None:
+    assert (
+        run(
+            "../site/identity.js",
+            STOPS
+            + """
+        Object.assign(store, { fresh: true, role: "operator", lease: "mine" });
+        Object.assign(store.snapshot, { allowed: ["stop"] });
+        const happens = {};
+        document.body.addEventListener = (moment, act) => { happens[moment] = act; };
+        new Commands(store, socket, way);
+        const button = { dataset: { command: "stop" }, "aria-disabled": "true" };
+        Object.assign(button, { getAttribute: (name) => button[name], setAttribute(name, to) { button[name] = to; } });
+        document.querySelectorAll = () => [button];
+        happens["htmx:afterSwap"]();
+        return button["aria-disabled"];
+        """,
+        )
+        == "false"
+    )

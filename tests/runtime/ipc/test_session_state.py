@@ -42,7 +42,9 @@ def test_a_word_that_is_no_state_means_nothing() -> None:
 
 
 @pytest.mark.parametrize("state", S)
-def test_a_station_that_was_started_before_an_upgrade_says_as_much_as_one_of_today(state: SessionState) -> None:
+def test_a_station_that_was_started_before_an_upgrade_says_as_much_as_one_of_today(
+    state: SessionState,
+) -> None:
     assert with_meaning({"state": str(state), "reason": "so"}) == {
         "state": str(state),
         "reason": "so",
