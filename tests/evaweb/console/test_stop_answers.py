@@ -300,23 +300,33 @@ def test_a_button_that_is_pressed_before_its_first_press_is_answered_says_so_and
     ) == ["pressed", "Set up: pressed already, and not answered yet", 1, "accepted", "pressed", 2]
 
 
+GATED = (
+    STOPS
+    + """
+    Object.assign(store, { fresh: true, role: "operator", lease: "mine" });
+    Object.assign(store.snapshot, { allowed: ["stop"] });
+    const happens = {};
+    document.body.addEventListener = (moment, act) => { happens[moment] = act; };
+    const gated = (command) => ({
+      dataset: { command }, mark: "true", getAttribute() { return this.mark; }, setAttribute(_, to) { this.mark = to; },
+    });
+    const stop = gated("stop"), setup = gated("setup"), reported = [];
+    new Commands(store, socket, way);
+    """
+)
+
+
 def test_a_button_of_a_fragment_that_came_can_be_pressed_at_once() -> None:
-    assert (
-        run(
-            "../site/identity.js",
-            STOPS
-            + """
-        Object.assign(store, { fresh: true, role: "operator", lease: "mine" });
-        Object.assign(store.snapshot, { allowed: ["stop"] });
-        const happens = {};
-        document.body.addEventListener = (moment, act) => { happens[moment] = act; };
-        new Commands(store, socket, way);
-        const button = { dataset: { command: "stop" }, "aria-disabled": "true" };
-        Object.assign(button, { getAttribute: (name) => button[name], setAttribute(name, to) { button[name] = to; } });
-        document.querySelectorAll = () => [button];
-        happens["htmx:afterSwap"]();
-        return button["aria-disabled"];
-        """,
-        )
-        == "false"
-    )
+    body = 'document.querySelectorAll = () => [stop]; happens["htmx:afterSwap"](); return stop.mark;'
+    assert run("../site/identity.js", GATED + body) == "false"
+
+
+def test_a_button_whose_reason_cannot_be_found_does_not_keep_stop_disabled() -> None:
+    body = """
+    globalThis.reportError = (error) => reported.push(error.name);
+    document.querySelectorAll = () => [setup, stop];
+    delete store.snapshot.state_is;
+    happens["htmx:afterSettle"]();
+    return [setup.mark, stop.mark, reported];
+    """
+    assert run("../site/identity.js", GATED + body) == ["true", "false", ["TypeError"]]
