@@ -66,7 +66,7 @@ class Station:
             except RuntimeFault as fault:
                 why = str(fault)
                 continue
-            if status["state"] == "running":
+            if status["state_is"]["going"]:
                 self._newest_event = status["newest_event"]
                 return
             why = status["reason"]
@@ -74,27 +74,27 @@ class Station:
 
     def _tried(self) -> Mapping[str, Any]:
         """State after a second of a run, or wherever it came to instead."""
-        state = self.appeared()["state"]
-        if state == "faulted":
+        state_is = self.appeared()["state_is"]
+        if state_is["latched"]:
             self.release()
-        elif state == "holding":
+        elif state_is["held"]:
             self.client.command("stop")
-        self.client.wait(lambda found: found["state"] in ("idle", "ready"), _READY_S)
+        self.client.wait(lambda found: found["state_is"]["idle"] or found["state_is"]["ready"], _READY_S)
         self.client.command("setup")
-        status = self.client.wait(lambda found: found["state"] != "setting_up", _READY_S)
-        if status["state"] != "ready":
+        status = self.client.wait(lambda found: not found["state_is"]["preparing"], _READY_S)
+        if not status["state_is"]["ready"]:
             return status
         self.client.command("run")
         return self.client.wait(
-            lambda found: found["run"]["elapsed"] > 1.0 or found["state"] != "running", _READY_S
+            lambda found: found["run"]["elapsed"] > 1.0 or not found["state_is"]["going"], _READY_S
         )
 
     def release(self) -> bool:
         """Release the e-stop; False where the coordinator does not."""
         try:
-            self.client.wait(lambda status: status["state"] == "faulted", _RELEASE_S)
+            self.client.wait(lambda status: status["state_is"]["latched"], _RELEASE_S)
             self.client.command("release")
-            self.client.wait(lambda status: status["state"] != "faulted", _RELEASE_S)
+            self.client.wait(lambda status: not status["state_is"]["latched"], _RELEASE_S)
         except RuntimeFault:
             return False
         return True

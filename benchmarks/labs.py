@@ -164,12 +164,12 @@ def _name(command: Sequence[str]) -> str:
 
 def set_up(page: LivePage) -> Mapping[str, Any]:
     """Take the station and set it up; its state when it is ready."""
-    page.wait(lambda state: state["state"] != "disconnected", 60.0, "waiting for the station")
+    page.wait(lambda state: state["state_is"]["connected"], 60.0, "waiting for the station")
     page.claim()
     page.wait(lambda state: state["lease"]["epoch"] == page.epoch, 10.0, "waiting for the lease")
     page.command("setup")
-    ready = page.wait(lambda state: state["state"] != "setting_up", 60.0, "setting up")
-    if ready["state"] != "ready":
+    ready = page.wait(lambda state: not state["state_is"]["preparing"], 60.0, "setting up")
+    if not ready["state_is"]["ready"]:
         raise SystemExit(f"set-up ended {ready['state']}: {ready['reason']}")
     return ready
 

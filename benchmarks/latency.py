@@ -121,7 +121,7 @@ def _run(lab: RunningLab, seconds: float) -> tuple[dict[str, Any], list[float], 
         set_up(page)
         watching = watch(lab.visitor, seconds + 2 * _MARGIN_S, reading=VIEWERS)
         page.command("run")
-        page.wait(lambda state: state["state"] == "running", 10.0, "starting the run")
+        page.wait(lambda state: state["state_is"]["going"], 10.0, "starting the run")
         time.sleep(_MARGIN_S)
         page.renewals.clear()
         processors, end = Processors(lab.process), time.monotonic() + seconds
@@ -129,12 +129,12 @@ def _run(lab: RunningLab, seconds: float) -> tuple[dict[str, Any], list[float], 
             pressed, answered = page.press("halt")
             presses.append(pressed)
             commands.append(answered - pressed)
-            page.wait(lambda state: state["state"] == "holding", 10.0, "halting")
+            page.wait(lambda state: state["state_is"]["held"], 10.0, "halting")
             resumes.append(_resume(page))
             time.sleep(_RUNS_S)
         percent, renewals = processors.percent(), list(page.renewals)
         page.command("stop")
-        page.wait(lambda state: state["state"] == "ready", 20.0, "stopping")
+        page.wait(lambda state: state["state_is"]["ready"], 20.0, "stopping")
         watching.communicate()
     ways = {"command_ms": commands, "renew_ms": renewals, "rest_ms": resumes}
     return {name: _ms(values) for name, values in ways.items()}, presses, percent
@@ -144,7 +144,7 @@ def _resume(page: LivePage) -> float:
     begun = time.monotonic()
     page.command("resume")
     taken = time.monotonic() - begun
-    page.wait(lambda state: state["state"] == "running", 10.0, "resuming")
+    page.wait(lambda state: state["state_is"]["going"], 10.0, "resuming")
     return taken
 
 

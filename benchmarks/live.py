@@ -56,7 +56,7 @@ def _run(visitor: Visitor, seconds: float, viewers: int) -> Mapping[str, Any]:
         found = _viewers(visitor, seconds, reading=viewers) if viewers else _wait(seconds)
         state = page.wait(lambda state: True, 10, "looking")
         page.command("stop")
-        page.wait(lambda state: state["state"] == "ready", 10, "stopping")
+        page.wait(lambda state: state["state_is"]["ready"], 10, "stopping")
         visitor.post(f"stations/{STATION}/lease", {"action": "give_up", "page": page.page})
     _void(visitor, trial)
     return {**found, "control": state["control"]}

@@ -97,15 +97,15 @@ def _run(
         watching = watch(lab.visitor, seconds + 2 * _MARGIN_S, reading=VIEWERS)
         loops = [_sleeper(arguments, lab.environment) for arguments in sleepers]
         shared.command("run")
-        shared.wait(lambda state: state["state"] == "running", 10.0, "starting the run")
+        shared.wait(lambda state: state["state_is"]["going"], 10.0, "starting the run")
         processors, scheduler = (
             Processors(lab.process),
             Scheduling(lab.process, "runtime.processes.control.process"),
         )
-        state = shared.wait(lambda state: state["state"] != "running", seconds + 30.0, "the run")
+        state = shared.wait(lambda state: not state["state_is"]["going"], seconds + 30.0, "the run")
         percent, scheduled = processors.percent(), scheduler.figures()
         watching.communicate()
-    if state["state"] != "ready":
+    if not state["state_is"]["ready"]:
         raise SystemExit(f"the run ended {state['state']}: {state['reason']}")
     beside = [json.loads(loop.communicate()[0]) for loop in loops]
     return state, beside, {"cpu_percent": percent, "scheduled": scheduled}

@@ -76,9 +76,9 @@ def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], lis
     while (now := time.monotonic()) < end or not ages:
         lab.client.renew()
         status = lab.client.status(30.0)
-        if status["state"] != "running":
+        if not status["state_is"]["going"]:
             held.append(status["reason"])
-        if status["state"] == "holding":
+        if status["state_is"]["held"]:
             with suppress(Refused):  # not yet: again with the next look
                 lab.client.command("resume")
         if now >= min(look_at, end):

@@ -97,7 +97,7 @@ def _await_idle(client: StationClient, family: subprocess.Popen[bytes], folder: 
     until = time.monotonic() + _PATIENCE_S
     while time.monotonic() < until and family.poll() is None:
         try:
-            if client.status(_POLL_S * 10)["state"] == "idle":
+            if client.status(_POLL_S * 10)["state_is"]["idle"]:
                 return
         except RuntimeFault:
             time.sleep(_POLL_S)

@@ -20,6 +20,7 @@ from evaweb.binary_frames import plain
 from evaweb.errors import StationGone
 from evaweb.stations.runtime_client import StationWire, wire_to
 from runtime.ipc.bus import CodecError, Subscriber
+from runtime.ipc.session_state import with_meaning
 
 log = logging.getLogger(__name__)
 EVENTS_KEPT = 2000
@@ -171,7 +172,7 @@ def _whole(state: Any) -> dict[str, Any]:
     missing = [key for key in _NEEDED if not isinstance(state, Mapping) or key not in state]
     if missing:
         raise ValueError(f"a snapshot without {', '.join(missing)}: {state!r:.200}")
-    return dict(plain(state))
+    return with_meaning(plain(state))
 
 
 class _Pictures(_Reader):

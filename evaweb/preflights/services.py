@@ -30,6 +30,7 @@ from evaweb.trials.models import Checkpoint
 from runtime.config import loader as deployment
 from runtime.config.loader import ConfigurationError, server_of
 from runtime.ipc.messages import Command
+from runtime.ipc.session_state import with_meaning
 
 log = logging.getLogger(__name__)
 _LOOK_S = 0.5  # how long another station may take to say which server it uses
@@ -132,9 +133,12 @@ def _require_free(server: str, besides: Station) -> None:
             ack = wire_to(other.name).request(Command(str(uuid4()), "policy_server"), timeout=_LOOK_S)
         except StationGone:
             continue
-        if ack.data.get("server") == server and ack.data["state_is"]["at_work"]:
+        if ack.data.get("server") != server:
+            continue
+        state_is = with_meaning(ack.data)["state_is"]
+        if state_is["at_work"]:
             raise Conflict(
-                f"{other} is {ack.data['state_is']['label']} with the same policy server: a preflight would "
+                f"{other} is {state_is['label']} with the same policy server: a preflight would "
                 "disturb it; wait until its run is over"
             )
 

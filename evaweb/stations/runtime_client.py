@@ -24,6 +24,7 @@ from runtime.ipc.bus import CodecError, CommandClient, Endpoints, Key, Transport
 from runtime.ipc.estop_client import NoAnswer as Unanswered
 from runtime.ipc.estop_client import NotSent, urgent
 from runtime.ipc.messages import Ack, Command
+from runtime.ipc.session_state import with_meaning
 
 _CLOCK_KNOWN_S = 60.0  # how long the difference of two computers' clocks is believed
 
@@ -88,8 +89,7 @@ class StationWire:
 
     def status(self, timeout: float | None = None) -> dict[str, Any]:
         """The newest snapshot, as JSON may carry it; raises StationGone."""
-        found: dict[str, Any] = plain(self.request(Command(str(uuid4()), "status"), timeout=timeout).data)
-        return found
+        return with_meaning(plain(self.request(Command(str(uuid4()), "status"), timeout=timeout).data))
 
     def events_since(self, number: int, timeout: float | None = None) -> tuple[str, list[dict[str, Any]]]:
         """The runtime's boot id and its events after `number`, as JSON may carry them; raises StationGone."""

@@ -18,6 +18,7 @@ from runtime.ipc.endpoints import account
 from runtime.ipc.estop_client import urgent
 from runtime.ipc.estop_requests import kept
 from runtime.ipc.messages import Ack, Command
+from runtime.ipc.session_state import with_meaning
 
 RENEW_S = 1.0
 
@@ -48,7 +49,7 @@ class StationClient:
     def status(self, timeout: float = 2.0) -> dict[str, Any]:
         """The station's snapshot; raises TransportError where it does not answer."""
         asked = time.monotonic()
-        data = dict(self._send(Command(str(uuid.uuid4()), "status"), timeout).data)
+        data = with_meaning(self._send(Command(str(uuid.uuid4()), "status"), timeout).data)
         self._boot, self._sequence = data["boot"], data["sequence"]
         self._clock_offset = data["clock"] - asked
         return data

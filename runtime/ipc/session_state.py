@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from enum import StrEnum
 from typing import Any, Literal
 
@@ -47,6 +48,12 @@ class Meaning:
         """Whether a run waits until it is resumed or stopped."""
         return self.run_open and not self.moving
 
+    def told(self) -> dict[str, Any]:
+        """The row and what follows from it, as the snapshot has it under "state_is"."""
+        return asdict(self) | {
+            name: getattr(self, name) for name in ("at_work", "idle", "ready", "going", "held")
+        }
+
 
 class SessionState(StrEnum):
     """The session's state; one word each, the same everywhere."""
@@ -65,11 +72,8 @@ class SessionState(StrEnum):
         return MEANINGS[self]
 
     def told(self) -> dict[str, Any]:
-        """The row and what follows from it, as the snapshot has it under "state_is"."""
-        row = self.meaning
-        return asdict(row) | {
-            name: getattr(row, name) for name in ("at_work", "idle", "ready", "going", "held")
-        }
+        """What it means, as the snapshot has it under "state_is"."""
+        return self.meaning.told()
 
     @classmethod
     def of(cls, word: str) -> Meaning | None:
@@ -87,3 +91,16 @@ MEANINGS: dict[SessionState, Meaning] = {
     S.HOLDING: Meaning("holding", "warn", set_up=True, run_open=True),
     S.FAULTED: Meaning("faulted", "danger", latched=True),
 }
+
+
+def with_meaning(said: Mapping[str, Any]) -> dict[str, Any]:
+    """`said` of a station of whatever version, its "state_is" whole: what it leaves out follows from its "state".
+
+    A state that is not known here is neutral: nothing goes on, and that it is idle only the station may say.
+    """
+    word, told = str(said["state"]), said.get("state_is") or {}
+    row = SessionState.of(word)
+    unknown = {} if row else {"idle": False}
+    row = row or Meaning(word.replace("_", " "), "neutral")
+    row = replace(row, **{field.name: told[field.name] for field in fields(row) if field.name in told})
+    return {**said, "state_is": {**row.told(), **unknown, **told}}

@@ -11,6 +11,7 @@ from typing import Any
 from uuid import uuid4
 
 import numpy as np
+import pytest
 import zmq
 
 from runtime.ipc.bus import CommandServer, Endpoints, EventLog, Key, Publisher
@@ -133,7 +134,7 @@ class StandIn:
         before = self.session.state
         if self.session.observe(happening, reason):
             text = f"{before} -> {self.session.state}: {reason}"
-            data = {"state": str(self.session.state), "state_is": self.session.state.told()}
+            data = {"state": str(self.session.state), "state_is": self.session.told()}
             self.events.append(Event("state", text, time.monotonic(), data=data))
 
     def _run(self, ended: threading.Event) -> None:
@@ -187,3 +188,11 @@ class StandIn:
         joints = np.full(DIM, 0.1, np.float32)
         self._streams.publish("joints", {"step": 1, "measured": joints, "commanded": joints, "engaged": True})
         self._cameras.publish("camera/cam_high", b"\xff\xd8 a picture")
+
+
+def before_an_upgrade(station: StandIn, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was started when states did not say what they mean."""
+    today = station.snapshot
+    monkeypatch.setattr(
+        station, "snapshot", lambda: {key: said for key, said in today().items() if key != "state_is"}
+    )

@@ -9,6 +9,7 @@ from typing import Any
 
 from runtime.clients.client import StationClient
 from runtime.clients.terminal.figures import line
+from runtime.ipc.session_state import with_meaning
 
 _SHOW_S = 0.5
 _PATIENCE_S = 2.0
@@ -20,8 +21,10 @@ def watch(client: StationClient, as_json: bool) -> int:
     boot, seen, shown = status["boot"], status["newest_event"], 0.0
     subscriber = client.subscribe("state")
     while True:
-        status = subscriber.receive(_PATIENCE_S).get("state", {})
-        if not status:
+        heard = subscriber.receive(_PATIENCE_S)
+        if "state" in heard:
+            status = with_meaning(heard["state"])
+        else:
             status = client.status()  # raises a sentence where the station is gone
             subscriber.close()
             subscriber = client.subscribe("state")  # a restarted one has other sockets

@@ -214,8 +214,8 @@ class Coordinator:
         before, run = self.session.state, self.runs.open
         if self.session.observe(happening, reason):
             text = f"{before} -> {self.session.state}: {reason}"
-            state = self.session.state
-            data = {"state": str(state), "state_is": state.told(), **self._unbegun(run)}
+            state, told = str(self.session.state), self.session.told()
+            data = {"state": state, "state_is": told, **self._unbegun(run)}
             self.say(Event("state", text, self.clock.now(), data=data))
 
     def _unbegun(self, run: Run | None) -> dict[str, Any]:

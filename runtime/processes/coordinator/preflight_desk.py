@@ -20,7 +20,6 @@ from runtime.station.preflight_child import Preflights
 from runtime.station.spec import StationSpec
 
 PREFLIGHT_QUERIES = ("preflight", "preflight_report", "policy_server")
-_AT_WORK = (SessionState.SETTING_UP, SessionState.RUNNING, SessionState.HOLDING)
 
 
 class PreflightDesk:
@@ -76,12 +75,12 @@ class PreflightDesk:
     def _require_free(self, asked: PreflightRequest) -> None:
         """A server that serves one at a time would be taken from a station that is ready to run with it."""
         state = self._state()
-        if state in _AT_WORK:
+        if state.meaning.at_work:
             raise RuntimeFault(
                 f"preflight is not allowed while {state}: the station's machine and policy are at work; allowed while "
-                f"{', '.join(other for other in SessionState if other not in _AT_WORK)}"
+                f"{', '.join(other for other in SessionState if not other.meaning.at_work)}"
             )
-        if state is not SessionState.READY:
+        if not state.meaning.ready:
             return
         settings = changed(self._own.resolved, asked.changes, "preflight").deployment
         exclusive = getattr(variants("runtime.policies")[settings.policy.kind], "EXCLUSIVE", False)

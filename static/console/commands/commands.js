@@ -30,7 +30,7 @@ export class Commands {
     store.on("ack", (ack) => ack.kind !== "estop" && this.acknowledged(ack));
     document.addEventListener("click", (event) => this.#clicked(event));
     store.on(["snapshot", "link", "open", "second"], () => this.gate());
-    document.body.addEventListener("htmx:afterSettle", () => this.gate());
+    for (const moment of ["htmx:afterSwap", "htmx:afterSettle"]) document.body.addEventListener(moment, () => this.gate());
     this.gate();
   }
 
@@ -109,11 +109,19 @@ export class Commands {
   /** Enable and disable every button that gives a command; a disabled one says why. */
   gate() {
     for (const button of document.querySelectorAll("[data-command], [data-gate]")) {
-      const kind = button.dataset.command ?? button.dataset.gate;
-      const own = "settling" in button.dataset ? "it has just come up: look, then press again" : (button.dataset.blocked ?? "");
-      setReason(button, own || (AT_THE_DESK.includes(kind) ? this.#deskReason() : this.reason(kind)));
-      if (button.dataset.onlyWhile) button.hidden = !this.#store.snapshot?.state_is[button.dataset.onlyWhile];
+      try {
+        this.#gateOne(button);
+      } catch (error) {
+        reportError(error); // one button that fails must not keep Stop disabled
+      }
     }
+  }
+
+  #gateOne(button) {
+    const kind = button.dataset.command ?? button.dataset.gate;
+    const own = "settling" in button.dataset ? "it has just come up: look, then press again" : (button.dataset.blocked ?? "");
+    setReason(button, own || (AT_THE_DESK.includes(kind) ? this.#deskReason() : this.reason(kind)));
+    if (button.dataset.onlyWhile) button.hidden = !this.#store.snapshot?.state_is[button.dataset.onlyWhile];
   }
 
   async #clicked(event) {

@@ -44,14 +44,13 @@ export class EStopState {
 
   /** News of the station; those that others of the same boot have overtaken say nothing. */
   snapshot(news, now) {
-    const { boot = "", clock = now, state, state_is: is } = news;
+    const { boot = "", clock = now, state_is: is } = news;
     if (boot === this.#boot && clock < this.#clock) return;
     this.#ahead = Math.max(boot === this.#boot ? this.#ahead : -Infinity, clock - now);
     this.#boot = boot;
     this.#clock = clock;
-    const latched = is?.latched ?? state === "faulted"; // a station that was started before an upgrade says no more
-    const released = this.#latched && !latched;
-    this.#latched = latched;
+    const released = this.#latched && !is.latched;
+    this.#latched = is.latched;
     for (const [uuid, press] of [...this.#waiting]) {
       if (this.#latched) press.latched ||= this.#isAfter(press.at);
       else if (press.latched) this.#waiting.delete(uuid);

@@ -20,7 +20,7 @@ const ADVICE = {
 
 /** What a state asks of the person at the bench; undefined where the station can be left alone. */
 export function advice({ connected, held, latched }) {
-  return latched ? ADVICE.latched : held ? ADVICE.held : connected ? undefined : ADVICE.away;
+  return latched ? ADVICE.latched : held ? ADVICE.held : connected === false ? ADVICE.away : undefined;
 }
 
 /** Why the server closes the socket of a page, by its code. */

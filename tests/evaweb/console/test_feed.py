@@ -8,7 +8,9 @@ import pytest
 from django.conf import settings
 
 from evaweb.console.feed import EVENTS_KEPT, Feed, History, Link
+from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.session.transitions import SessionEvent
+from tests.evaweb.stand_in import before_an_upgrade
 
 
 class Ear:
@@ -48,6 +50,13 @@ def test_everything_that_is_published_is_heard(ear, runtime):
     ear.wait(lambda stream, content: stream == "camera/cam_high" and content.endswith(b"picture"))
     _, state = ear.wait(lambda stream, content: stream == "state")
     assert (state["boot"], state["latency"]) == (runtime.boot, None)
+
+
+def test_a_station_that_was_started_before_an_upgrade_says_what_its_state_means(ear, runtime, monkeypatch):
+    before_an_upgrade(runtime, monkeypatch)
+    runtime.enter(SessionEvent.ESTOPPED)
+    _, state = ear.wait(lambda stream, content: stream == "state" and content["state"] == "faulted")
+    assert state["state_is"] == SessionState.FAULTED.told()
 
 
 def test_events_are_complete_also_those_from_before(runtime):

@@ -490,6 +490,12 @@ def test_no_value_is_a_gap_to_the_plot() -> None:
     assert run("curves/curve_kinds.js", "return m.blank([1, NaN, 2])") == [1, None, 2]
 
 
+def test_a_state_asks_for_the_robots_picture_only_where_it_says_that_there_is_none() -> None:
+    states = [{"label": "limp"}, {"connected": True}, {"connected": False}]
+    body = "return given.map((is) => m.advice(is)?.title ?? null)"
+    assert run("live/words.js", body, states) == [None, None, "No complete picture of the robot"]
+
+
 def test_an_event_is_said_in_words_with_its_weight() -> None:
     events = [
         {"kind": "state", "text": "setting_up -> ready: 50 rows", "data": standing("ready")},

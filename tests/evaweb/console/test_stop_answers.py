@@ -300,9 +300,33 @@ def test_a_button_that_is_pressed_before_its_first_press_is_answered_says_so_and
     ) == ["pressed", "Set up: pressed already, and not answered yet", 1, "accepted", "pressed", 2]
 
 
-def test_a_station_that_was_started_before_an_upgrade_is_seen_latched_and_released() -> None:
-    body = """
-        const old = (state, clock) => { store.snapshot = { state, clock, boot: "b1" }; store.take(); };
-        old("idle", 1); await look(); old("faulted", 2); await look(); old("idle", 3); await look();
+GATED = (
+    STOPS
+    + """
+    Object.assign(store, { fresh: true, role: "operator", lease: "mine" });
+    Object.assign(store.snapshot, { allowed: ["stop"] });
+    const happens = {};
+    document.body.addEventListener = (moment, act) => { happens[moment] = act; };
+    const gated = (command) => ({
+      dataset: { command }, mark: "true", getAttribute() { return this.mark; }, setAttribute(_, to) { this.mark = to; },
+    });
+    const stop = gated("stop"), setup = gated("setup"), reported = [];
+    new Commands(store, socket, way);
     """
-    assert pressing(body) == ["rest", "stopped", "rest"]
+)
+
+
+def test_a_button_of_a_fragment_that_came_can_be_pressed_at_once() -> None:
+    body = 'document.querySelectorAll = () => [stop]; happens["htmx:afterSwap"](); return stop.mark;'
+    assert run("../site/identity.js", GATED + body) == "false"
+
+
+def test_a_button_whose_reason_cannot_be_found_does_not_keep_stop_disabled() -> None:
+    body = """
+    globalThis.reportError = (error) => reported.push(error.name);
+    document.querySelectorAll = () => [setup, stop];
+    delete store.snapshot.state_is;
+    happens["htmx:afterSettle"]();
+    return [setup.mark, stop.mark, reported];
+    """
+    assert run("../site/identity.js", GATED + body) == ["true", "false", ["TypeError"]]

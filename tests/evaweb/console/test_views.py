@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -34,6 +35,7 @@ from evaweb.trials.models import (
 pytestmark = pytest.mark.django_db
 NASTY = '<script>alert("x")</script>'
 ESCAPED = "&lt;script&gt;alert(&quot;x&quot;)&lt;/script&gt;"
+TEMPLATES = Path(__file__).parents[3] / "templates"
 PAGES = ("/", "/stations/bench-1/", "/stations/bench-1/debug/", "/stations/bench-1/eval/")
 FRAGMENTS = ("/stations/bench-1/eval/panel", "/stations/bench-1/lease")
 
@@ -113,6 +115,29 @@ def buttons(html: str, kind: str) -> list[str]:
     """The tags of the buttons among the steps that give a command."""
     steps = html[html.index('id="steps"') :]
     return re.findall(rf'<button[^>]*data-command="{kind}"[^>]*>', steps)
+
+
+def test_what_gives_a_command_can_be_pressed_only_once_the_pages_script_says_so() -> None:
+    texts = {path.name: path.read_text("utf-8") for path in TEMPLATES.rglob("*.html")}
+    gated = re.compile(r'data-(?:command|gate)="[^"]*"(?P<mark> aria-disabled="true")?')
+    found = [(name, one["mark"]) for name, text in texts.items() for one in gated.finditer(text)]
+    assert len(found) > 20
+    assert [name for name, mark in found if mark is None] == []
+
+
+def test_the_e_stop_can_be_pressed_from_the_start(browser: Client, station: Station) -> None:
+    page = text_of(browser, "/stations/bench-1/debug/")
+    (button,) = re.findall(r'<button[^>]*id="estop"[^>]*>', page)
+    assert "disabled" not in button
+
+
+def test_the_name_of_a_camera_that_is_cut_can_be_read(browser: Client, station: Station) -> None:
+    named = re.findall(
+        r'<span class="camera-name[^"]*" title="([^"]+)">([^<]+)<',
+        text_of(browser, "/stations/bench-1/debug/"),
+    )
+    assert named
+    assert all(title == name for title, name in named)
 
 
 # --- who ---------------------------------------------------------------------------------------------------

@@ -67,6 +67,7 @@ class Runtime:
     state: str = "idle"
     server: str = "127.0.0.1:8000"
     refuses: str = ""
+    old: bool = False  # it was started before states said what they mean
     gone: Exception | None = None
     lost: set[str] = field(default_factory=set)  # kinds whose answers never come
     told: dict[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -86,7 +87,8 @@ class Runtime:
 
             raise NoAnswer(f"no answer to {command.kind}")
         if command.kind == "policy_server":
-            return Ack(command.uuid, "done", data={"server": self.server, **standing(self.state)})
+            said = {"state": self.state} if self.old else standing(self.state)
+            return Ack(command.uuid, "done", data={"server": self.server, **said})
         if command.kind == "preflight":
             if self.refuses:
                 return Ack(command.uuid, "refused", self.refuses)

@@ -111,8 +111,9 @@ def test_a_station_that_hangs_is_no_reason_for_another_way(ask, runtime):
 
 
 @pytest.mark.parametrize("state", ["setting_up", "running", "holding"])
-def test_a_server_that_another_station_is_at_work_with_is_left_alone(ask, runtimes, other, state):
-    runtimes[other.name] = Runtime(state=state)
+@pytest.mark.parametrize("old", [False, True])
+def test_a_server_that_another_station_is_at_work_with_is_left_alone(ask, runtimes, other, state, old):
+    runtimes[other.name] = Runtime(state=state, old=old)
     with pytest.raises(Conflict, match=r"bench-2 is .* with the same policy server"):
         ask()
     runtimes[other.name].server = "127.0.0.1:8001"

@@ -12,12 +12,20 @@ from django.conf import settings
 from evaweb.errors import NotFound, StationGone
 from evaweb.stations.runtime_client import NoAnswer, wire_to
 from runtime.ipc.messages import Command
+from runtime.ipc.session_state import SessionState
+from tests.evaweb.stand_in import before_an_upgrade
 
 
 def test_status_is_the_snapshot_as_json_may_carry_it(runtime):
     status = wire_to(runtime.name).status()
     assert status["station"] == runtime.name
     assert status["latency"] is None
+
+
+def test_a_station_that_was_started_before_an_upgrade_says_what_its_state_means(runtime, monkeypatch):
+    before_an_upgrade(runtime, monkeypatch)
+    runtime.ready()
+    assert wire_to(runtime.name).status()["state_is"] == SessionState.READY.told()
 
 
 def test_a_station_that_was_never_started_is_not_asked():

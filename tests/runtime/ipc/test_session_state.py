@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runtime.ipc.session_state import MEANINGS, SessionState
+from runtime.ipc.session_state import MEANINGS, SessionState, with_meaning
 
 S = SessionState
 
@@ -39,3 +39,28 @@ def test_every_state_has_a_row_and_a_snapshot_has_all_of_it() -> None:
 def test_a_word_that_is_no_state_means_nothing() -> None:
     assert SessionState.of("holding") is S.HOLDING.meaning
     assert SessionState.of("dancing") is None
+
+
+@pytest.mark.parametrize("state", S)
+def test_a_station_that_was_started_before_an_upgrade_says_as_much_as_one_of_today(
+    state: SessionState,
+) -> None:
+    assert with_meaning({"state": str(state), "reason": "so"}) == {
+        "state": str(state),
+        "reason": "so",
+        "state_is": state.told(),
+    }
+
+
+def test_what_a_station_says_of_its_state_stands_and_what_it_leaves_out_follows_from_it() -> None:
+    said = {"label": "on the move", "tone": "active", "run_open": True, "moving": True, "asleep": False}
+    found = with_meaning({"state": "calibrating", "state_is": said})["state_is"]
+    assert found == {**MEANINGS[S.IDLE].told(), **said, "at_work": True, "idle": False, "going": True}
+
+
+def test_a_state_that_is_not_known_is_neutral_and_not_idle() -> None:
+    assert with_meaning({"state": "parked_by_night"})["state_is"] == {
+        **S.IDLE.told(),
+        "label": "parked by night",
+        "idle": False,
+    }

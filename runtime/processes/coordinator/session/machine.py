@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from runtime.core.errors import RuntimeFault
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 LEASE_COMMANDS = ("lease_claim", "lease_renew", "lease_give_up")
 ANSWERS_KEPT = 5000
+_OF_THE_LINK = (SessionEvent.CONNECTED, SessionEvent.INCOMPLETE, SessionEvent.LINK_LOST)
 
 
 class SessionMachine:
@@ -42,6 +44,7 @@ class SessionMachine:
         self.state = SessionState.DISCONNECTED
         self.reason = "waiting for the first observation"
         self.sequence = 0
+        self._connected = False  # complete observations arrive, by what was noticed last
         self._answers: dict[str, Ack] = {}
 
     def remember(self, answers: dict[str, Ack]) -> None:
@@ -55,7 +58,7 @@ class SessionMachine:
         return {
             "sequence": self.sequence,
             "state": str(self.state),
-            "state_is": self.state.told(),
+            "state_is": self.told(),
             "reason": self.reason,
             "allowed": self.allowed(),
             "guarded": self.guarded(),
@@ -113,11 +116,18 @@ class SessionMachine:
         first = self._answers.get(command.uuid)
         return first if first is not None and first.kind in ("", command.kind) else None
 
+    def told(self) -> dict[str, Any]:
+        """What the state means as a snapshot has it; it is not connected while observations are missing."""
+        row = self.state.meaning
+        return replace(row, connected=row.connected and self._connected).told()
+
     def observe(self, happening: SessionEvent, reason: str = "") -> bool:
         """Tell the session what happened; True where the state changed.
 
         A RuntimeFault of an effect passes through, with the state as it was: nobody is there to be refused.
         """
+        if happening in _OF_THE_LINK:
+            self._connected = happening is SessionEvent.CONNECTED
         after = EVENT_TRANSITIONS.get((happening, self.state))
         if happening is SessionEvent.LEASE_ENDED and self.state in MOVED_BY_HAND:
             self._effects.hold(reason)

@@ -207,6 +207,12 @@ def test_another_blind_plan_of_the_same_checkpoint_hides_the_results(revealed, o
     plan_close(user=owner, plan=again, reason="not now")
 
 
+def test_what_is_wide_on_the_labs_page_scrolls_by_itself(plan, bench, carry_out, as_):
+    carry_out(plan, 1)
+    page = as_(bench.operator).get("/result/lab/").content.decode()
+    assert 0 < page.count("<table") == page.count('<div class="table-scroll"><table')
+
+
 def test_lab_and_wall_name_no_checkpoint_of_a_blind_plan(plan, bench, carry_out, as_):
     carry_out(plan, 3)
     client = as_(bench.operator)

@@ -33,6 +33,13 @@ def test_watching_goes_on_after_a_restart_with_the_events_of_the_new_start(capsy
     assert [row["text"] for row in shown if "text" in row] == ["event 1"]
 
 
+def test_a_station_that_was_started_before_an_upgrade_is_watched(capsys):
+    old = {key: value for key, value in status("running").items() if key != "state_is"}
+    with pytest.raises(KeyboardInterrupt):
+        watching.watch(Script(streams=[{"state": old}, KeyboardInterrupt()]), False)
+    assert capsys.readouterr().out.startswith("RUNNING (continuous): set up")
+
+
 def test_a_lease_is_named_where_somebody_else_holds_it(capsys):
     theirs = status(lease={"holder": "anna", "expires_in": 1.0})
     with pytest.raises(KeyboardInterrupt):

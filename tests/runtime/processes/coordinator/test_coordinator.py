@@ -8,6 +8,7 @@ import pytest
 from runtime.core.errors import SetupError
 from runtime.ipc.messages import UNHEARD, Command, EpisodeOpened, Event, encode
 from runtime.ipc.session_state import SessionState
+from runtime.ipc.shared_state import EStop
 from tests.runtime.lockstep_station import STANDS, Station, ramp, stubbed
 
 
@@ -92,6 +93,10 @@ def test_cameras_that_send_nothing_are_named(tmp_path: Path) -> None:
     sequence = station.coordinator.session.sequence
     station.go(30)
     assert station.coordinator.session.sequence == sequence  # told once: nothing grows stale by it
+    station.shared.set_estop(EStop.LATCHED)
+    station.go(10)
+    told = station.coordinator.snapshot()["state_is"]
+    assert (told["latched"], told["connected"]) == (True, False)
     station.close()
 
 

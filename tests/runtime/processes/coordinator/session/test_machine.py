@@ -227,6 +227,22 @@ def test_what_carries_out_a_command_is_a_method_of_the_actions_or_of_one_of_thei
     assert callable(getattr(carries_out, method))
 
 
+def test_a_session_is_connected_while_complete_observations_arrive_whatever_its_state_is():
+    bench = Bench(S.DISCONNECTED)
+
+    def after(*happenings):
+        for happening in happenings:
+            bench.session.observe(happening)
+        told = bench.session.told()
+        return [name for name in ("connected", "latched", "idle") if told[name]]
+
+    assert after(H.ESTOPPED) == ["latched"]
+    assert after(H.CONNECTED) == ["connected", "latched"]
+    assert after(H.INCOMPLETE, H.RELEASED) == []
+    assert after(H.CONNECTED) == ["connected", "idle"]
+    assert after(H.ESTOPPED, H.LINK_LOST) == ["latched"]
+
+
 def test_a_refusal_names_the_state_or_what_the_guard_says():
     bench = Bench(S.IDLE)
     assert bench.give("step").reason.startswith("step is not allowed while idle (")
