@@ -28,7 +28,7 @@ def test_who_knows_the_old_one_gets_a_new_one_and_stays_logged_in(client, ann):
 @pytest.mark.parametrize(("old", "again"), [("guessed", NEW), ("the-old-one-2", "another")])
 def test_a_mistake_changes_nothing_and_is_named(client, ann, old, again):
     answer = change(client, ann, old, again)
-    assert 'class="field-error"' in answer.content.decode()
+    assert '<p class="bad small" role="alert">' in answer.content.decode()
     assert not User.objects.get().check_password(NEW)
 
 

@@ -44,7 +44,7 @@ export class Distribution {
   #drawn = "";
 
   constructor() {
-    this.element.className = "distribution";
+    this.element.className = "stack close distribution";
     this.#picture.setAttribute("preserveAspectRatio", "none");
     this.#picture.setAttribute("aria-hidden", "true");
     this.#ends.className = "row spread muted";
