@@ -47,10 +47,11 @@ _GHOST_S = 0.1  # the clock of a run that never began stood at a few hundredths 
 @restores
 def restore(kept: Kept) -> int:
     """Make the trial of a run and its scores, where they are not there; how many rows that were."""
-    lines = _judgements(kept)
+    asked = recorded_in(journal_folder(kept.uuid)).trial if kept.recorded else {}
+    lines = _judgements(kept, asked)
     if not lines and Trial.objects.filter(episode_id=kept.uuid).exclude(status__in=_BEHIND).exists():
         return 0
-    facts = _facts(kept, lines)
+    facts = _facts(lines, asked)
     episode = Episode.objects.filter(uuid=kept.uuid).first()
     if facts is None or not (lines or (episode is not None and episode.status in CLOSED)):
         return 0
@@ -73,26 +74,30 @@ def _never_ran(trial: Trial) -> str:
     return why and f"trial {trial.pk} is scored and never ran, {why}: void it with a reason"
 
 
-def _judgements(kept: Kept) -> list[ScoreLine | VoidLine]:
-    """What its lines say; of a score that was given once more, as the database did not take it, the last."""
+def _judgements(kept: Kept, asked: Mapping[str, Any]) -> list[ScoreLine | VoidLine]:
+    """What its lines say; of a score that was given once more, as the database did not take it, the last.
+
+    Those of another trial than its recording, in a copy of another file, are left out.
+    """
     lines = [line for line in kept.lines if isinstance(line, ScoreLine | VoidLine)]
+    own = asked.get("uuid", "")
+    foreign = [str(line.trial.uuid) for line in lines if kept.recorded and str(line.trial.uuid) != own]
+    if foreign:
+        kept.say(
+            f"run {kept.uuid}: {len(foreign)} of its scores are of trial {', '.join(dict.fromkeys(foreign))}, "
+            f"its recording is of {f'trial {own}' if own else 'no trial'}: left out"
+        )
+    lines = [line for line in lines if str(line.trial.uuid) not in foreign]
     last = {line.uuid: line for line in lines if isinstance(line, ScoreLine)}
     return [line for line in lines if isinstance(line, VoidLine) or line is last[line.uuid]]
 
 
-def _facts(kept: Kept, lines: Sequence[ScoreLine | VoidLine]) -> TrialRecord | None:
+def _facts(lines: Sequence[ScoreLine | VoidLine], asked: Mapping[str, Any]) -> TrialRecord | None:
     """The newest line knows most of its trial; without one it is as its run was asked for."""
-    asked = recorded_in(journal_folder(kept.uuid)).trial if kept.recorded else {}
     named = {line.trial.uuid for line in lines}
     if len(named) > 1:
         raise EvaError(f"its scores are of several trials: {', '.join(sorted(map(str, named)))}")
-    if not lines:
-        return asked_trial(asked)
-    if kept.recorded and asked.get("uuid") != str(lines[-1].trial.uuid):
-        raise EvaError(
-            f"its scores are of trial {lines[-1].trial.uuid}, its recording is of {asked.get('uuid', 'no trial')}"
-        )
-    return lines[-1].trial
+    return lines[-1].trial if lines else asked_trial(asked)
 
 
 # --- the trial ---------------------------------------------------------------------------------------------
