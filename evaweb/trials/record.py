@@ -13,7 +13,7 @@ from datetime import datetime
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from uuid import UUID
 
-from pydantic import Field, StrictBool
+from pydantic import Field, StrictBool, field_validator
 
 from evaweb.blinding import HIDDEN, Sight, code_of
 from evaweb.journal import From, Journal, Line, Moment, Person, checked, value_at
@@ -199,6 +199,13 @@ class ScoreLine(Line):
     reason: str = ""
     source: Score.Source = Score.Source.HUMAN
     milestones: Annotated[tuple[OutcomeLine, ...], From("outcomes__all")] = ()
+
+    @field_validator("milestones")
+    @classmethod
+    def _once(cls, milestones: tuple[OutcomeLine, ...]) -> tuple[OutcomeLine, ...]:
+        if len({each.order for each in milestones}) < len(milestones):
+            raise ValueError("allowed: each milestone once")
+        return milestones
 
 
 class VoidLine(Line):

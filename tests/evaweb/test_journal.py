@@ -159,6 +159,7 @@ TRIAL = SCORE["trial"]
         ({**SCORE, "at": "2026-01-01T00:00:00"}, "with a time zone"),
         ({**SCORE, "at": 5}, "score.at is 5"),
         ({**SCORE, "score": True}, "score.score is True"),
+        ({**SCORE, "milestones": 2 * SCORE["milestones"]}, "allowed: each milestone once"),
         ({**SCORE, "score": "0.5"}, "score.score is '0.5'"),
         ({**SCORE, "score": float("nan")}, "score.score is nan"),
         ({**SCORE, "trial": {**TRIAL, "id": 2**53}}, "score.trial.id is 9007199254740992"),

@@ -179,7 +179,7 @@ def test_runs_go_to_who_understands_them_and_a_stranger_is_told(
     assert report.problems[:3] == (
         f"{data / 'scores' / 'notes.jsonl'} is no file of scores: its name is no uuid in lower case with dashes",
         f"{file}: line 2 was left out: [1]: Input should be an object",
-        f"{file}: line 4 is not whole and was left out: expected ident",
+        f"{file}: line 4 is not whole and was left out: EOF while parsing a value",
     )
     assert report.problems[3].startswith(f"{file}: line 6 was left out: {{'a': 1}}: Unable to extract tag")
 
