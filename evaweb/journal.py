@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum
 from functools import cache
+from io import FileIO
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, TypeVar, Union
 from uuid import UUID
@@ -241,44 +242,43 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
     the line was taken back.
     """
     text = json.dumps(line, allow_nan=False, separators=(",", ":"))  # ASCII: no character in it ends a line
-    written: list[int] = []
+    done = "nothing was changed"
     try:
-        _written(path, text.encode() + b"\n", written)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab+", buffering=0) as file:
+            before = file.seek(0, os.SEEK_END)
+            try:
+                _written(file, text.encode() + b"\n")
+            except OSError:
+                done = _taken_back(file, before)
+                raise
     except OSError as error:
-        done = "nothing was changed" if _taken_back(path, written) else _THERE
         raise NotKept(f"not kept: {error.strerror} ({path}); {done}") from error
 
 
-_THERE = "what was written could not be taken back: the next reconcile may take it for said"
+def _written(file: FileIO, payload: bytes) -> None:
+    new = file.tell() == 0
+    if not new:
+        file.seek(-1, os.SEEK_END)
+        payload = payload if file.read(1) == b"\n" else b"\n" + payload
+    while payload:
+        payload = payload[file.write(payload) :]
+    os.fsync(file.fileno())
+    if new:
+        folder = Path(file.name).parent
+        _sync_folder(folder)
+        _sync_folder(folder.parent)
 
 
-def _written(path: Path, payload: bytes, before: list[int]) -> None:
-    """Add it; `before` gets the length that the file had, once there is one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("ab+", buffering=0) as file:
-        before.append(file.tell())
-        if before[0]:
-            file.seek(-1, os.SEEK_END)
-            payload = payload if file.read(1) == b"\n" else b"\n" + payload
-        while payload:
-            payload = payload[file.write(payload) :]
-        os.fsync(file.fileno())
-    if not before[0]:
-        _sync_folder(path.parent)
-        _sync_folder(path.parent.parent)
-
-
-def _taken_back(path: Path, before: Sequence[int]) -> bool:
-    """Give the file the length that it had, if it was opened at all; whether it has it on the disk too."""
+def _taken_back(file: FileIO, before: int) -> str:
+    """Give the file the length that it had; what became of the line, in words."""
     try:
-        for size in before:
-            with path.open("rb+") as file:
-                file.truncate(size)
-                os.fsync(file.fileno())
+        file.truncate(before)
+        os.fsync(file.fileno())
     except OSError:
-        log.exception("%s could not be made as long as it was", path)
-        return False
-    return True
+        log.exception("%s could not be made as long as it was", file.name)
+        return "what was written could not be taken back: the next reconcile may take it for said"
+    return "nothing was changed"
 
 
 def _sync_folder(folder: Path) -> None:

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 _SCORES: Journal[Any] = Journal("scores")  # of all kinds: those of the apps above
 _OF_ONE_RUN = (
     *(RecordingError, EvaError, DataError, IntegrityError),
-    *(OverflowError, RecursionError, UnicodeEncodeError),  # of what no record has declared
+    *(OverflowError, RecursionError, ValueError),  # of what no record has declared
 )
 
 
@@ -114,18 +114,18 @@ def _folders() -> tuple[list[UUID], list[str]]:
     """The episodes that there are, and what else lies there."""
     root, problems = episodes_dir(), list[str]()
     there = (path for path in root.iterdir() if path.is_dir()) if root.is_dir() else ()
-    return sorted(_named(there, "no episode", problems)), problems
+    return sorted(_named(there, "", "no episode", problems)), problems
 
 
-def _named(paths: Iterable[Path], otherwise: str, problems: list[str]) -> set[UUID]:
+def _named(paths: Iterable[Path], suffix: str, otherwise: str, problems: list[str]) -> set[UUID]:
     """What they are named by: a uuid as this program writes it, or it would not be found again."""
     found = set()
     for path in sorted(paths):
         try:
-            uuid = UUID(path.stem)
+            uuid = UUID(path.name.removesuffix(suffix))
         except ValueError:
             uuid = None
-        if uuid is None or path.name != f"{uuid}{path.suffix}":
+        if uuid is None or path.name != f"{uuid}{suffix}":
             problems.append(f"{path} is {otherwise}: its name is no uuid in lower case with dashes")
         else:
             found.add(uuid)
@@ -135,7 +135,7 @@ def _named(paths: Iterable[Path], otherwise: str, problems: list[str]) -> set[UU
 def _restored(read: Sequence[UUID], problems: list[str]) -> int:
     """Give every run to its readers, one reader after the other; what cannot be restored is added to `problems`."""
     files = {
-        folder: _named((data_dir() / folder).glob("*.jsonl"), f"no file of {folder}", problems)
+        folder: _named((data_dir() / folder).glob("*.jsonl"), ".jsonl", f"no file of {folder}", problems)
         for folder in folders()
     }
     recorded, scored = set(read), files.get(_SCORES.folder, set())

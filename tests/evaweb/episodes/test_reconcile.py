@@ -114,6 +114,10 @@ def test_what_cannot_be_read_is_told_and_keeps_no_other(
     put()
     damaged = put("interrupted")
     (damaged / "manifest.json").write_bytes(b"\0\0\0")
+    nested = damaged.with_name("c86a888b-6d03-4355-9e03-66fd3445e50b")
+    nested.mkdir()
+    (nested / "manifest.json").write_bytes(b"[" * 200_000)
+    shutil.copytree(nested, nested.with_name(f"{nested.name}.bak"))
     (data / "episodes" / "notes").mkdir()
     broken = data / "datasets" / "other" / "meta"
     broken.mkdir(parents=True)
@@ -124,7 +128,9 @@ def test_what_cannot_be_read_is_told_and_keeps_no_other(
     assert Episode.objects.count() == 1
     told = " ".join(report.problems)
     assert f"{damaged / 'manifest.json'} is not a whole JSON document" in told
-    assert f"{data / 'episodes' / 'notes'} is no episode: its name is no uuid" in told
+    assert f"{nested / 'manifest.json'} is not a whole JSON document" in told
+    for name in ("notes", f"{nested.name}.bak"):
+        assert f"{data / 'episodes' / name} is no episode: its name is no uuid" in told
     assert "is a dataset of version 'v9'" in told
     assert ".other.draft-x" not in told
 
@@ -137,6 +143,15 @@ def test_a_manifest_of_another_episode_is_not_taken_for_this_one(
     report = reconcile()
     assert f"is of episode {other.name}, not of {folder.name}" in report.problems[0]
     assert [str(row.uuid) for row in Episode.objects.all()] == [other.name]
+
+
+def test_half_a_character_in_a_manifest_is_left_out(put: Callable[..., Path], station: Station) -> None:
+    folder = put()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"task": "put \ud800it"}))
+    resealed(folder)
+    assert reconcile().problems == ()
+    assert Episode.objects.get().task == "put it"
 
 
 def test_a_damaged_folder_leaves_the_row_that_was_read_before(
