@@ -89,9 +89,9 @@ def _plan(
     plan_freeze(user=plan.owner, plan=plan)
     _trials(plan, chance, operators, stations, _BEGIN + timedelta(days=3 * i), 0.7 if running else 1.0)
     if not running:
-        Plan.objects.filter(pk=plan.pk).update(
-            state=PlanState.REVEALED, revealed_at=_BEGIN + timedelta(days=3 * i + 2)
-        )
+        row, at = Plan.objects.filter(pk=plan.pk), _BEGIN + timedelta(days=3 * i + 2)
+        row.update(state=PlanState.CLOSED, closed_at=at)
+        row.update(state=PlanState.REVEALED, revealed_at=at)
         plan.refresh_from_db()
     return plan
 

@@ -6,13 +6,13 @@ table's when a migration rebuilds it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from django.apps import AppConfig
 from django.db import connections
-from django.db.models import AutoField, Model
+from django.db.models import Model
 from django.db.models.signals import post_migrate
 
 
@@ -21,24 +21,35 @@ class AppendOnly:
     """What of a model's rows is never changed: all columns `but` some, or `columns` alone; nor is a row removed.
 
     `message` is what whoever tries is told. `only`: SQL about OLD, which rows that holds for; all where it is empty.
+    `moves`: of these columns, what may follow each value; from one that is not named everything may. `never`: SQL about
+    OLD and NEW that no change of any row makes true. `late`: SQL about NEW, which rows are never added.
     """
 
     message: str
     columns: tuple[str, ...] = ()
     but: tuple[str, ...] = ()
     only: str = ""
+    moves: Mapping[str, Mapping[str, Sequence[str]]] = field(default_factory=dict)
+    never: tuple[str, ...] = ()
+    late: str = ""
 
     def guard(self, model: type[Model]) -> Guard:
         """The same as the database knows it."""
-        for name in (*self.columns, *self.but):
+        for name in (*self.columns, *self.but, *self.moves):
             model._meta.get_field(name)  # or FieldDoesNotExist
         columns = tuple(
             field.column
             for field in model._meta.concrete_fields
-            if (field.name in self.columns if self.columns else field.name not in self.but)
-            and not isinstance(field, AutoField)
+            if field.primary_key
+            or (field.name in self.columns if self.columns else field.name not in self.but)
         )
-        return Guard(model._meta.db_table, columns, self.message, self.only)
+        moved = tuple(
+            f'OLD."{name}" = \'{before}\' AND NEW."{name}" NOT IN ({", ".join(map(repr, (before, *after)))})'
+            for name, table in self.moves.items()
+            for before, after in table.items()
+        )
+        never = (*moved, *self.never)
+        return Guard(model._meta.db_table, columns, self.message, self.only, never, self.late)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +60,28 @@ class Guard:
     columns: tuple[str, ...]
     message: str
     only: str = ""  # SQL about OLD: which rows are kept; all where it is empty
+    never: tuple[str, ...] = ()  # SQL about OLD and NEW: what no change may be
+    late: str = ""  # SQL about NEW: which rows are not added
 
     @property
-    def names(self) -> tuple[str, str]:
-        """Its triggers: against changes, against removal."""
-        return (f"{self.table}_kept", f"{self.table}_never_removed")
+    def names(self) -> Mapping[str, str]:
+        """Its triggers, by what they are against."""
+        names = {
+            "UPDATE": "kept",
+            "DELETE": "never_removed",
+            "INSERT": "complete",
+            "TRUNCATE": "never_emptied",
+        }
+        return {event: f"{self.table}_{name}" for event, name in names.items()}
+
+    def refused(self, different: str) -> Mapping[str, str]:
+        """SQL about OLD and NEW, by event: what is refused. `different`: the operator that also compares NULL."""
+        changed = " OR ".join(f'OLD."{column}" {different} NEW."{column}"' for column in self.columns)
+        kept = f"({self.only or 'TRUE'}) AND ({changed})"
+        update = " OR ".join(f"({each})" for each in (kept, *self.never))
+        return {"UPDATE": update, "DELETE": self.only or "TRUE"} | (
+            {"INSERT": self.late} if self.late else {}
+        )
 
 
 def install(connection: Any, guards: Iterable[Guard]) -> None:
@@ -86,29 +114,30 @@ def guards(app: AppConfig) -> tuple[Guard, ...]:
 def removal(connection: Any, guard: Guard) -> list[str]:
     """What takes the triggers of a guard away."""
     of = f" ON {guard.table}" if connection.vendor == "postgresql" else ""
-    return [f"DROP TRIGGER IF EXISTS {name}{of}" for name in guard.names]
+    return [f"DROP TRIGGER IF EXISTS {name}{of}" for name in guard.names.values()]
 
 
 def _sqlite(guard: Guard) -> list[str]:
-    refusal = f"BEGIN SELECT RAISE(ABORT, '{guard.message}'); END"
-    changed = " OR ".join(f'OLD."{column}" IS NOT NEW."{column}"' for column in guard.columns)
-    kept = f"({guard.only}) AND ({changed})" if guard.only else changed
-    removed = f" WHEN {guard.only}" if guard.only else ""
+    """REPLACE removes a row too: settings has recursive_triggers, with which that is refused."""
     return [
-        f"CREATE TRIGGER {guard.names[0]} BEFORE UPDATE ON {guard.table} WHEN {kept} {refusal}",
-        f"CREATE TRIGGER {guard.names[1]} BEFORE DELETE ON {guard.table}{removed} {refusal}",
+        f"CREATE TRIGGER {guard.names[event]} BEFORE {event} ON {guard.table} WHEN {refused} "
+        f"BEGIN SELECT RAISE(ABORT, '{guard.message}'); END"
+        for event, refused in guard.refused("IS NOT").items()
     ]
 
 
 def _postgresql(guard: Guard) -> list[str]:
-    changed = " OR ".join(f'OLD."{column}" IS DISTINCT FROM NEW."{column}"' for column in guard.columns)
-    kept = f"({guard.only}) AND ({changed})" if guard.only else changed
-    removed = f" WHEN ({guard.only})" if guard.only else ""
+    """A function for each trigger: the conditions of triggers themselves know no other rows."""
+    refused = {**guard.refused("IS DISTINCT FROM"), "TRUNCATE": "TRUE"}
     return [
-        "CREATE OR REPLACE FUNCTION eva_kept() RETURNS trigger LANGUAGE plpgsql AS $$ "
-        "BEGIN RAISE EXCEPTION USING ERRCODE = 'integrity_constraint_violation', MESSAGE = TG_ARGV[0]; END $$",
-        f"CREATE TRIGGER {guard.names[0]} BEFORE UPDATE ON {guard.table} FOR EACH ROW WHEN ({kept}) "
-        f"EXECUTE FUNCTION eva_kept('{guard.message}')",
-        f"CREATE TRIGGER {guard.names[1]} BEFORE DELETE ON {guard.table} FOR EACH ROW{removed} "
-        f"EXECUTE FUNCTION eva_kept('{guard.message}')",
+        statement
+        for event, condition in refused.items()
+        for statement in (
+            f"CREATE OR REPLACE FUNCTION {guard.names[event]}() RETURNS trigger LANGUAGE plpgsql AS $$ "
+            f"BEGIN IF {condition} THEN RAISE EXCEPTION USING "
+            f"ERRCODE = 'integrity_constraint_violation', MESSAGE = '{guard.message}'; END IF; "
+            f"RETURN {'OLD' if event == 'DELETE' else 'NEW'}; END $$",
+            f"CREATE TRIGGER {guard.names[event]} BEFORE {event} ON {guard.table} "
+            f"FOR EACH {'STATEMENT' if event == 'TRUNCATE' else 'ROW'} EXECUTE FUNCTION {guard.names[event]}()",
+        )
     ]

@@ -7,24 +7,36 @@ is made of. A `Journal` is a folder of files of lines, a file for each episode, 
 from __future__ import annotations
 
 import json
+import logging
+import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum
+from functools import cache
+from io import FileIO
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Generic, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, Union
 from uuid import UUID
 
 from django.conf import settings
 from django.db.models import Model
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+)
 
 from evaweb.errors import EvaError
 from evaweb.roles import known_person
 from runtime.recording.files import RecordingError
 
-Person = Annotated[str, Field(min_length=1, max_length=150)]
+log = logging.getLogger(__name__)
 
 
 class NotKept(EvaError):
@@ -53,11 +65,40 @@ class From:
     path: str
 
 
+def _moment(given: Any) -> datetime:
+    """A time as `plain` writes it: ISO 8601, with its zone, in years that every zone has."""
+    found = datetime.fromisoformat(given) if isinstance(given, str) else None
+    if found is None or found.tzinfo is None or not 1900 <= found.year <= 9998:
+        raise ValueError("allowed: date and time of ISO 8601 with a time zone, in the years 1900 to 9998")
+    return found
+
+
+def _storable(value: Any) -> Any:
+    """The same, which both databases can keep; ValueError."""
+    if isinstance(value, str) and "\x00" in value:
+        raise ValueError("it contains the character U+0000, which no database keeps")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("it contains a number that is not finite")
+    inner = (*value, *value.values()) if isinstance(value, dict) else value
+    for each in inner if isinstance(inner, list | tuple) else ():
+        _storable(each)
+    return value
+
+
+Person = Annotated[str, Field(min_length=1, max_length=150)]
+Moment = Annotated[datetime, PlainValidator(_moment)]
+
+
 class Line(BaseModel):
     """A record in plain JSON, as this program wrote it. What came later has a default; what is unknown is left."""
 
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
     ELSEWHERE: ClassVar[frozenset[str]] = frozenset({"kind"})  # what is in no column of the row
+
+    @field_validator("*")
+    @classmethod
+    def _kept(cls, value: Any) -> Any:
+        return _storable(value)
 
     @classmethod
     def path_of(cls, name: str) -> str:
@@ -133,24 +174,15 @@ def absent(model: type[Model], lines: Sequence[AnyLine], **owner: Model) -> list
 
 # --- the files ---------------------------------------------------------------------------------------------
 
-
-@dataclass(frozen=True, slots=True)
-class LinesRead:
-    """The whole lines of a file, oldest first, and the numbers of those that are not, from 1."""
-
-    lines: tuple[Mapping[str, Any], ...]
-    torn: tuple[int, ...]
+_kinds: dict[str, tuple[type[Line], ...]] = {}  # of each folder; several journals may write into its files
 
 
 class Journal(Generic[AnyLine]):
-    """DATA/`folder`/<uuid>.jsonl. `whose` is what errors call such a file; `shared`: others have their kinds in it."""
+    """DATA/`folder`/<uuid>.jsonl, and the kinds of lines that are written there."""
 
-    def __init__(self, folder: str, whose: str, *kinds: type[AnyLine], shared: bool = False) -> None:
-        self.folder, self._whose, self._shared = folder, whose, shared
-        self._several = len(kinds) > 1
-        self._kinds = {
-            kind: model for model in kinds for kind in get_args(model.model_fields["kind"].annotation)
-        }
+    def __init__(self, folder: str, *kinds: type[AnyLine]) -> None:
+        self.folder = folder
+        _kinds[folder] = (*_kinds.get(folder, ()), *kinds)
 
     def path(self, uuid: UUID) -> Path:
         """The file of one episode, trial or session."""
@@ -160,62 +192,93 @@ class Journal(Generic[AnyLine]):
         """Add one line and wait until it is on the disk; the caller holds a row. Raises NotKept."""
         append_line(self.path(uuid), line)
 
-    def read(self, uuid: UUID) -> list[AnyLine]:
-        """What the file says, oldest first; a torn line never counted. EvaError names one that is wrong."""
-        return self.parsed(uuid, read_lines(self.path(uuid)).lines)
+    def read(self, uuid: UUID, say: Callable[[str], None]) -> list[AnyLine]:
+        """What the file says, oldest first, also what other journals of the folder have written.
 
-    def parsed(self, uuid: UUID, lines: Iterable[Mapping[str, Any]]) -> list[AnyLine]:
-        """The same of lines that were read; without those of other kinds where the file is shared."""
-        found = (self._line(uuid, line, number) for number, line in enumerate(lines, start=1))
-        return [line for line in found if line is not None]
+        A line that is not whole, or that is none of theirs, is left out: `say` is told file, line and field.
+        """
+        path, found, lines = self.path(uuid), [], _reader(_kinds[self.folder])
+        for number, line in numbered(path):
+            try:
+                found.append(lines.validate_json(line))
+            except ValidationError as error:
+                say(f"{path}: line {number} {_wrong(error)}")
+        return found
 
-    def _line(self, uuid: UUID, content: Mapping[str, Any], number: int) -> AnyLine | None:
-        kind, what = content.get("kind"), f"line {number} of {self._whose.format(uuid=uuid)}"
-        model = self._kinds.get(kind) if isinstance(kind, str) else None
-        if model is not None:
-            return checked(
-                model, content, f"{what}: {kind}." if self._several and not self._shared else f"{what}: "
-            )
-        if self._shared:
-            return None
-        raise EvaError(f"{what}: kind is {kind!r:.80}; allowed: {', '.join(self._kinds)}")
+
+@cache
+def _reader(kinds: tuple[type[Line], ...]) -> TypeAdapter[Any]:
+    either = Union[kinds]  # noqa: UP007  made of a list
+    return TypeAdapter(Annotated[either, Field(discriminator="kind")] if len(kinds) > 1 else either)
+
+
+def folders() -> list[str]:
+    """The folders of all journals."""
+    return sorted(_kinds)
 
 
 def checked(model: type[AnyLine], content: Mapping[str, Any], what: str) -> AnyLine:
     """`content` as that model; EvaError says after `what` the first thing that is wrong with it."""
     try:
-        return model.model_validate(content)
+        return model.model_validate_json(json.dumps(content))
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise EvaError(f"{what}{place} is {first['input']!r:.80}: {first['msg']}") from None
+        raise EvaError(f"{what} {_wrong(error)}") from None
+
+
+def _wrong(error: ValidationError) -> str:
+    """The first thing that is wrong with a line, after its name."""
+    first = error.errors()[0]
+    if first["type"] == "json_invalid":
+        why, _, _ = first["ctx"]["error"].partition(" at line ")
+        return f"is not whole and was left out: {why}"
+    place = ".".join(map(str, first["loc"]))
+    return f"was left out: {place}{' is ' if place else ''}{first['input']!r:.80}: {first['msg']}"
 
 
 def append_line(path: Path, line: Mapping[str, Any]) -> None:
     """Add one line and wait until it is on the disk; a line torn by a crash before it stays a line of its own.
 
-    The caller holds a row of the database, so that there is one writer at a time. Raises NotKept.
+    The caller holds a row of the database, so that there is one writer at a time. Raises NotKept, which says whether
+    the line was taken back.
     """
     text = json.dumps(line, allow_nan=False, separators=(",", ":"))  # ASCII: no character in it ends a line
+    done = "nothing was changed"
     try:
-        _written(path, text.encode() + b"\n")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab+", buffering=0) as file:
+            before = file.seek(0, os.SEEK_END)
+            try:
+                _written(file, text.encode() + b"\n")
+            except OSError:
+                done = _taken_back(file, before)
+                raise
     except OSError as error:
-        raise NotKept(f"not kept: {error.strerror} ({path}); nothing was changed") from error
+        raise NotKept(f"not kept: {error.strerror} ({path}); {done}") from error
 
 
-def _written(path: Path, payload: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("ab+") as file:
-        new = file.tell() == 0
-        if not new:
-            file.seek(-1, os.SEEK_END)
-            payload = payload if file.read(1) == b"\n" else b"\n" + payload
-        file.write(payload)
-        file.flush()
-        os.fsync(file.fileno())
+def _written(file: FileIO, payload: bytes) -> None:
+    new = file.tell() == 0
+    if not new:
+        file.seek(-1, os.SEEK_END)
+        payload = payload if file.read(1) == b"\n" else b"\n" + payload
+    while payload:
+        payload = payload[file.write(payload) :]
+    os.fsync(file.fileno())
     if new:
-        _sync_folder(path.parent)
-        _sync_folder(path.parent.parent)
+        folder = Path(file.name).parent
+        _sync_folder(folder)
+        _sync_folder(folder.parent)
+
+
+def _taken_back(file: FileIO, before: int) -> str:
+    """Give the file the length that it had; what became of the line, in words."""
+    try:
+        file.truncate(before)
+        os.fsync(file.fileno())
+    except OSError:
+        log.exception("%s could not be made as long as it was", file.name)
+        return "what was written could not be taken back: the next reconcile may take it for said"
+    return "nothing was changed"
 
 
 def _sync_folder(folder: Path) -> None:
@@ -226,22 +289,14 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def read_lines(path: Path) -> LinesRead:
-    """Read a file, an absent one as empty; a line torn by a power cut never counted. RecordingError if unreadable."""
+def numbered(path: Path) -> Iterator[tuple[int, bytes]]:
+    """The lines of a file with their numbers, from 1; none of an absent one. RecordingError if it is unreadable."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        return LinesRead((), ())
+        return
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-    found = {number: _parsed(line) for number, line in enumerate(data.split(b"\n"), start=1) if line.strip()}
-    lines = tuple(content for content in found.values() if content is not None)
-    return LinesRead(lines, tuple(number for number, content in found.items() if content is None))
-
-
-def _parsed(line: bytes) -> Mapping[str, Any] | None:
-    try:
-        content = json.loads(line)
-    except ValueError:
-        return None
-    return content if isinstance(content, dict) else None
+    for number, line in enumerate(data.split(b"\n"), start=1):
+        if line.strip():
+            yield number, line

@@ -16,12 +16,18 @@ def refusal_of(fault: BaseException | None) -> tuple[str, int] | None:
         return None
     text = str(fault).lower()
     if getattr(fault, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or any(word in text for word in _FULL):
-        return "the disk of the lab is full: nothing was changed. Make room there, and try again", 507
+        return (
+            "the disk of the lab is full: the database was not changed. Make room there, and try again",
+            507,
+        )
     if getattr(fault, "errno", None) == errno.EROFS or any(word in text for word in _READ_ONLY):
-        return f"the lab's data cannot be written ({fault}): nothing was changed. Ask an administrator", 503
+        return (
+            f"the lab's data cannot be written ({fault}): the database was not changed. Ask an administrator",
+            503,
+        )
     if isinstance(fault, OperationalError | InterfaceError | InternalError) or type(fault) is DatabaseError:
         return (
-            "the database is busy or gone: nothing was changed, try again",
+            "the database is busy or gone: it was not changed, try again",
             503,
         )  # where it is, the log says
     return None

@@ -68,6 +68,8 @@ class SessionEvent(models.Model):
     by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
     at = models.DateTimeField(default=timezone.now)
 
+    append_only = AppendOnly("what happened to a session is never changed or removed")
+
     class Meta:
         ordering = ("at", "pk")
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AwareDatetime, Field
+from pydantic import Field
 
 from evaweb.collect.models import SessionEvent
-from evaweb.journal import From, Journal, Line, Person
+from evaweb.journal import From, Journal, Line, Moment, Person
+from evaweb.stations.models import STATION_NAME
 
 _OPENED = ("station", "dataset", "task", "setup")  # what never changes
 
@@ -19,10 +20,10 @@ class EventLine(Line):
 
     kind: Literal["opened", "closed", "resumed", "target", "published"]
     by: Annotated[Person, From("by__username")]
-    at: AwareDatetime
+    at: Moment
     text: str = ""
     target: Annotated[Annotated[int, Field(ge=1, lt=2**31)] | None, From("session__target")] = None
-    station: Annotated[str, From("session__station__name")] = ""
+    station: Annotated[str, Field(pattern=STATION_NAME), From("session__station__name")] = ""
     dataset: Annotated[str, From("session__dataset")] = ""
     task: Annotated[str, From("session__task")] = ""
     setup: Annotated[dict[str, Any], From("session__setup")] = Field(default_factory=dict)
@@ -34,4 +35,4 @@ class EventLine(Line):
         return {name: value for name, value in super().written(row).items() if name not in without}
 
 
-SESSIONS = Journal("sessions", "session {uuid}", EventLine)
+SESSIONS = Journal("sessions", EventLine)

@@ -40,7 +40,7 @@ def restore(kept: Kept) -> int:
     with transaction.atomic():
         session, made = CollectSession.objects.filter(pk=uuid).first(), 0
         if session is None:
-            session, made = _session(uuid, episode), 1
+            session, made = _session(uuid, episode, kept), 1
         fresh = not Demonstration.objects.filter(pk=episode.pk).exists()
         demonstration = demonstration_bound(episode=episode, session=session)
         assert demonstration is not None
@@ -48,9 +48,9 @@ def restore(kept: Kept) -> int:
     return made + fresh
 
 
-def _session(uuid: UUID, episode: Episode) -> CollectSession:
+def _session(uuid: UUID, episode: Episode, kept: Kept) -> CollectSession:
     """From its own file, else from the manifest of the first episode that is met: without target and history then."""
-    events = SESSIONS.read(uuid)
+    events = SESSIONS.read(uuid, kept.say)
     first = next((event for event in events if event.kind == "opened"), None)
     if first is None:
         return _from_manifest(uuid, episode)

@@ -93,7 +93,11 @@ def _end(path: Path, outcome: Mapping[str, Any]) -> dict[str, Any]:
 
 def _text(table: Mapping[str, Any], key: str, longest: int | None = None) -> str:
     value = table.get(key)
-    return value.replace("\x00", "")[:longest] if isinstance(value, str) else ""
+    if not isinstance(value, str):
+        return ""
+    return (
+        value.encode("utf-8", "ignore").decode().replace("\x00", "")[:longest]
+    )  # JSON has halves of characters
 
 
 def _table(table: Mapping[str, Any], key: str) -> dict[str, Any]:

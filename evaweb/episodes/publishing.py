@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
 from evaweb.episodes.manifest import Recorded
-from evaweb.journal import read_lines
+from evaweb.journal import numbered
 from runtime.recording.files import RecordingError
 
 DATASET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -16,9 +17,15 @@ _ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 def success_of(path: Path) -> bool | None:
     """Success by the newest score; None without a score. To void a trial changes no score."""
     success = None
-    for line in read_lines(path).lines:
-        if line.get("kind", "score") == "score" and isinstance(line.get("success"), bool):
-            success = line["success"]
+    for _, line in numbered(path):
+        try:
+            said = json.loads(line)
+        except (ValueError, RecursionError):  # it never counted
+            continue
+        if not isinstance(said, dict) or said.get("kind", "score") != "score":
+            continue
+        if isinstance(said.get("success"), bool):
+            success = said["success"]
     return success
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 from uuid import UUID
 
@@ -12,18 +13,24 @@ from django.db import DataError, IntegrityError
 
 from evaweb.episodes import services
 from evaweb.episodes.dataset_membership import places_read
-from evaweb.episodes.folders import episodes_dir, scores_dir, scores_file
+from evaweb.episodes.folders import data_dir, episodes_dir
 from evaweb.episodes.models import Episode
 from evaweb.errors import EvaError
-from evaweb.journal import read_lines
+from evaweb.journal import Journal, folders
 from runtime.recording.files import RecordingError
 
 log = logging.getLogger(__name__)
 
+_SCORES: Journal[Any] = Journal("scores")  # of all kinds: those of the apps above
+_OF_ONE_RUN = (
+    *(RecordingError, EvaError, DataError, IntegrityError),
+    *(OverflowError, RecursionError, ValueError),  # of what no record has declared
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """Data on the disk of one run: its folder, if `recorded`, and the whole `lines` of its scores file.
+    """Data on the disk of one run: its folder, if `recorded`, and the `lines` of its scores file that say something.
 
     `uuid` is the episode's; of a run that was not recorded, whatever the writers of its lines named it by. `say` takes
     a sentence about what a person should look at.
@@ -31,7 +38,7 @@ class Kept:
 
     uuid: UUID
     recorded: bool
-    lines: Sequence[Mapping[str, Any]]
+    lines: Sequence[Any]
     say: Callable[[str], None] = field(default=log.warning, compare=False)
 
 
@@ -43,11 +50,23 @@ _restorers: list[Restorer] = []
 def restores(function: Restorer) -> Restorer:
     """Declare the reader of scores and the `trial` of a manifest: an app above this one, from its `ready`.
 
-    It is given every run once, makes the rows that are not there, and returns how many. EvaError says what
-    could not be restored.
+    It is given every run once, after the readers before it were, makes the rows that are not there, and returns how
+    many. EvaError says what could not be restored.
     """
     if function not in _restorers:
         _restorers.append(function)
+    return function
+
+
+Conclusion = Callable[[], Iterable[str]]
+
+_conclusions: list[Conclusion] = []
+
+
+def concludes(function: Conclusion) -> Conclusion:
+    """Declare what says, once all runs were read, what a person should look at: an app above this one."""
+    if function not in _conclusions:
+        _conclusions.append(function)
     return function
 
 
@@ -78,6 +97,7 @@ def reconcile() -> Report:
     missing = services.missing_marked()
     problems += places_read()
     restored = _restored(read, problems)
+    problems += [sentence for conclude in _conclusions for sentence in conclude()]
     for problem in problems:
         log.warning("%s", problem)
     return Report(
@@ -92,49 +112,47 @@ def reconcile() -> Report:
 
 def _folders() -> tuple[list[UUID], list[str]]:
     """The episodes that there are, and what else lies there."""
-    root = episodes_dir()
-    folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
-    found, problems = [], []
-    for folder in folders:
+    root, problems = episodes_dir(), list[str]()
+    there = (path for path in root.iterdir() if path.is_dir()) if root.is_dir() else ()
+    return sorted(_named(there, "", "no episode", problems)), problems
+
+
+def _named(paths: Iterable[Path], suffix: str, otherwise: str, problems: list[str]) -> set[UUID]:
+    """What they are named by: a uuid as this program writes it, or it would not be found again."""
+    found = set()
+    for path in sorted(paths):
         try:
-            uuid = UUID(folder.name)
+            uuid = UUID(path.name.removesuffix(suffix))
         except ValueError:
             uuid = None
-        if uuid is None or str(uuid) != folder.name:
-            problems.append(f"{folder} is no episode: its name is no uuid")
+        if uuid is None or path.name != f"{uuid}{suffix}":
+            problems.append(f"{path} is {otherwise}: its name is no uuid in lower case with dashes")
         else:
-            found.append(uuid)
-    return found, problems
-
-
-def _restored(read: Sequence[UUID], problems: list[str]) -> int:
-    """Give every run to its readers; what cannot be restored is added to `problems`."""
-    recorded = set(read)
-    in_order = Episode.objects.order_by("started_at").values_list("uuid", flat=True)
-    scored = _scored(problems)
-    restored = 0
-    for uuid in (*(uuid for uuid in in_order if uuid in recorded), *sorted(scored - recorded)):
-        try:
-            lines = _lines(uuid, problems) if uuid in scored else ()
-            kept = Kept(uuid, uuid in recorded, lines, problems.append)
-            restored += sum(restore(kept) for restore in _restorers)
-        except (RecordingError, EvaError, DataError, IntegrityError) as error:
-            problems.append(f"run {uuid}: {error}")
-    return restored
-
-
-def _scored(problems: list[str]) -> set[UUID]:
-    """The runs that have a file of scores."""
-    found = set()
-    for file in sorted(scores_dir().glob("*.jsonl")):
-        try:
-            found.add(UUID(file.stem))
-        except ValueError:
-            problems.append(f"{file} is no file of scores: its name is no uuid")
+            found.add(uuid)
     return found
 
 
-def _lines(uuid: UUID, problems: list[str]) -> Sequence[Mapping[str, Any]]:
-    found = read_lines(scores_file(uuid))
-    problems += [f"{scores_file(uuid)}: line {number} is not whole and was left out" for number in found.torn]
-    return found.lines
+def _restored(read: Sequence[UUID], problems: list[str]) -> int:
+    """Give every run to its readers, one reader after the other; what cannot be restored is added to `problems`."""
+    files = {
+        folder: _named((data_dir() / folder).glob("*.jsonl"), ".jsonl", f"no file of {folder}", problems)
+        for folder in folders()
+    }
+    recorded, scored = set(read), files.get(_SCORES.folder, set())
+    in_order = Episode.objects.order_by("started_at").values_list("uuid", flat=True)
+    runs = []
+    for uuid in (*(uuid for uuid in in_order if uuid in recorded), *sorted(scored - recorded)):
+        try:
+            lines = _SCORES.read(uuid, problems.append)
+            runs.append(Kept(uuid, uuid in recorded, lines, problems.append))
+        except RecordingError as error:
+            problems.append(f"run {uuid}: {error}")
+    return sum(_made(restore, kept, problems) for restore in _restorers for kept in runs)
+
+
+def _made(restore: Restorer, kept: Kept, problems: list[str]) -> int:
+    try:
+        return restore(kept)
+    except _OF_ONE_RUN as error:
+        problems.append(f"run {kept.uuid}: {error}")
+        return 0

@@ -3,19 +3,24 @@
 Before the reveal every user is blind who has not looked. Its owner and administrators may look, by an act that is
 recorded, as far as they do not run its trials: a user who has been handed one of them sees nothing, one who has looked
 is handed none. Which comes first decides, so that also the only user of a lab can do either, but not both.
+
+Where a plan is lost with the database, and its trials came back from the disk, every user is blind.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from django.db import transaction
+from django.db.models import Count, Q, QuerySet
 
 from evaweb.blinding import EVERYTHING, Sight, declare, masked
+from evaweb.episodes.reconcile import concludes
 from evaweb.errors import NotAllowed
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState
 from evaweb.roles import Role, role_of
-from evaweb.trials.models import Checkpoint
+from evaweb.trials.models import Checkpoint, Evaluation, Trial
 from evaweb.trials.selectors import UNFINISHED
 
 
@@ -57,17 +62,21 @@ def hidden_from(user: Any) -> Sight:
         plans = plans.exclude(looks__user=user)
     # Names as they were frozen too: recordings keep the name that a checkpoint had.
     found = list(plans.values_list("pk", "title", "version", "document__checkpoints"))
-    if not found:
+    lost = list(_lost().values_list("pk", "name", "version"))
+    if not (found or lost):
         return EVERYTHING
     keys = [pk for pk, *_ in found]
-    hidden = dict(Checkpoint.objects.filter(plan__in=keys).values_list("pk", "name"))
+    orphans = Trial.objects.filter(evaluation__in=[pk for pk, *_ in lost]).order_by()
+    of_plans = Checkpoint.objects.filter(Q(plan__in=keys) | Q(pk__in=orphans.values("checkpoint")))
+    hidden = dict(of_plans.values_list("pk", "name"))
     frozen = {row["name"] for *_, rows in found for row in rows or ()}
-    handed = list(
-        Handout.objects.filter(plan__in=keys)
+    handed = [
+        *orphans.values_list("station__name", "status").distinct(),
+        *Handout.objects.filter(plan__in=keys)
         .order_by()
         .values_list("trial__station__name", "trial__status")
-        .distinct()
-    )
+        .distinct(),
+    ]
     return Sight(
         checkpoints=frozenset(hidden),
         names=frozenset({*hidden.values(), *frozen}),
@@ -77,16 +86,33 @@ def hidden_from(user: Any) -> Sight:
             Plan.objects.filter(state=PlanState.REVEALED).values_list("evaluation_id", flat=True)
         ),
         at_work=frozenset(station for station, status in handed if status in UNFINISHED),
-        plans=f"{masked(f'{title} v{version}' for _, title, version, _ in found)} is blind until it is revealed",
+        plans=f"{masked(f'{title} v{version}' for _, title, version, *_ in (*found, *lost))} is blind until it is "
+        "revealed",
     )
 
 
 declare(hidden_from)
 
 
+def _lost() -> QuerySet[Evaluation]:
+    """What plans made that are not in the database, and may have been blind: nobody can be asked who may know."""
+    return Evaluation.objects.filter(kind=Evaluation.Kind.PLAN, plan=None).exclude(trials=None).order_by("pk")
+
+
+@concludes
+def told_lost() -> Iterator[str]:
+    """A sentence for each plan that is not in the database any more, though its trials are."""
+    for row in _lost().annotate(number=Count("trials")):
+        yield (
+            f"{row.number} trials are of plan {row}, which is not in the database: what tells which checkpoint they "
+            "were of stays hidden from everybody. Put a backup of the database back, or import the plan (plans import; "
+            f"or write one named {row.name}), and freeze and reveal it as an administrator"
+        )
+
+
 def _why_not(plan: Plan, user: Any) -> str:
     if plan.owner_id != user.pk and role_of(user) is not Role.ADMIN:
         return f"{plan} is blind until its owner, {plan.owner.get_username()}, reveals it"
-    if plan.handouts.filter(trial__operator=user).exists():
+    if Trial.objects.filter(evaluation=plan.evaluation_id, operator=user).exists():
         return f"you have run trials of {plan}, which is blind: what they were of is shown after the reveal"
     return ""

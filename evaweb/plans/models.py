@@ -129,6 +129,7 @@ class Plan(models.Model):
             "frozen_at",
         ),
         only="OLD.state <> 'draft'",
+        moves={"state": {"frozen": ("closed",), "closed": ("revealed",), "revealed": ()}},
     )
 
     class Meta:
@@ -171,6 +172,8 @@ class Slot(models.Model):
         related_name="+",
         help_text="Which has taken its block.",
     )
+
+    append_only = AppendOnly("the schedule of a frozen plan is never changed: amend it", but=("station",))
 
     class Meta:
         ordering = ("plan", "index")

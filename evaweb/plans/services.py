@@ -33,7 +33,11 @@ _COPIED = (
 
 @transaction.atomic
 def plan_freeze(*, user: User, plan: Plan) -> Plan:
-    """Make a draft a document that never changes, with its schedule and commitment; trials can be handed out then."""
+    """Make a draft a document that never changes, with its schedule and commitment; trials can be handed out then.
+
+    Where the database was lost and trials of such a plan came back from the disk, they are its own, and it is closed at
+    once: their schedule and codes are gone. Administrators alone.
+    """
     held = _held(plan)
     _require_owner(held, user)
     if held.state != PlanState.DRAFT:
@@ -43,9 +47,13 @@ def plan_freeze(*, user: User, plan: Plan) -> Plan:
     held.document, held.digest, held.key = document, digest(document), new_key()
     units = _units(held)
     held.commitment = blinding.commitment(held.digest, units, bytes(held.key))
-    held.evaluation = Evaluation.objects.create(
-        name=held.name, version=held.version, kind=Evaluation.Kind.PLAN, description=held.title
+    held.evaluation, new = Evaluation.objects.get_or_create(
+        name=held.name,
+        version=held.version,
+        defaults={"kind": Evaluation.Kind.PLAN, "description": held.title},
     )
+    if not new:
+        require(user, Role.ADMIN)  # with it trials can be revealed of a plan that may have been another one's
     held.state, held.frozen_at = PlanState.FROZEN, timezone.now()
     held.save()
     _lay_out(held, units)
@@ -54,6 +62,8 @@ def plan_freeze(*, user: User, plan: Plan) -> Plan:
     _note(held, user, "frozen", "\n".join([told, *changes]))
     if held.amends and held.amends.state == PlanState.FROZEN:
         _close(held.amends, user, f"amended by version {held.version}: {held.amended_because}")
+    if not new:
+        _close(held, user, "its trials were made before the database was lost: amend it to make more")
     plan.refresh_from_db()
     return plan
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from uuid import UUID
@@ -10,10 +11,12 @@ from uuid import UUID
 from evaweb.episodes.dataset_sidecars import gives_sides
 from evaweb.reviews.record import REVIEWS, AnyReview, ReviewLine, segments_of
 
+log = logging.getLogger(__name__)
+
 
 def said_of(uuid: UUID) -> dict[str, Sequence[AnyReview]]:
     """Verdicts and annotations of the episode, by kind of side file."""
-    lines = REVIEWS.read(uuid)
+    lines = REVIEWS.read(uuid, log.warning)
     return {
         "reviews": [line for line in lines if isinstance(line, ReviewLine)],
         "annotations": segments_of(lines),

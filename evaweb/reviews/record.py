@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 from uuid import UUID
 
-from pydantic import AwareDatetime, Field
+from pydantic import Field, ValidationInfo, field_validator
 
-from evaweb.journal import From, Journal, Line, Person
+from evaweb.journal import From, Journal, Line, Moment, Person
 
 _Frame = Annotated[int, Field(ge=0, lt=2**31)]
 
@@ -21,7 +21,7 @@ class ReviewLine(Line):
     verdict: Literal["pass", "fail", "note"]
     note: str = ""
     by: Annotated[Person, From("reviewer__username")]
-    at: AwareDatetime
+    at: Moment
 
 
 class SegmentLine(Line):
@@ -34,7 +34,14 @@ class SegmentLine(Line):
     label: Annotated[str, Field(min_length=1, max_length=120)]
     milestone: Annotated[str, Field(max_length=200)] = ""
     by: Annotated[Person, From("annotator__username")]
-    at: AwareDatetime
+    at: Moment
+
+    @field_validator("last")
+    @classmethod
+    def _after_first(cls, last: int, info: ValidationInfo) -> int:
+        if last < info.data.get("first", 0):
+            raise ValueError("allowed: no frame before the first one")
+        return last
 
 
 class RemovalLine(Line):
@@ -43,11 +50,11 @@ class RemovalLine(Line):
     kind: Literal["segment_removed"] = "segment_removed"
     uuid: UUID
     by: Person
-    at: AwareDatetime
+    at: Moment
 
 
 AnyReview = ReviewLine | SegmentLine | RemovalLine
-REVIEWS: Journal[AnyReview] = Journal("reviews", "its reviews", ReviewLine, SegmentLine, RemovalLine)
+REVIEWS: Journal[AnyReview] = Journal("reviews", ReviewLine, SegmentLine, RemovalLine)
 
 
 def segments_of(lines: Sequence[AnyReview]) -> list[SegmentLine]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from uuid import UUID
 
 from django.db import transaction
 
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import Kept, restores
-from evaweb.errors import EvaError
 from evaweb.journal import absent
 from evaweb.reviews import selectors, services
 from evaweb.reviews.folders import report_file
@@ -25,12 +25,15 @@ def restore(kept: Kept) -> int:
     if episode is None:
         return 0
     _checked(episode)
-    lines = REVIEWS.read(kept.uuid)
+    left_out: list[str] = []
+    lines = REVIEWS.read(kept.uuid, left_out.append)
+    for problem in left_out:
+        kept.say(problem)
     if not lines:
         return 0
     with transaction.atomic():
         made = _reviews(episode, [line for line in lines if isinstance(line, ReviewLine)])
-        return made + _segments(episode, lines)
+        return made + _segments(episode, lines, whole=not left_out)
 
 
 def _checked(episode: Episode) -> None:
@@ -57,26 +60,26 @@ def _reviews(episode: Episode, lines: Sequence[ReviewLine]) -> int:
     return len(lost)
 
 
-def _segments(episode: Episode, lines: Sequence[AnyReview]) -> int:
-    """Bring the rows up to what the lines say; a segment is as its newest line."""
+def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> int:
+    """Bring the rows up to what the lines say; a segment is as its newest line.
+
+    Where lines were left out they may have said otherwise: rows are only added.
+    """
     wanted = {line.uuid: line for line in segments_of(lines)}
-    for line in wanted.values():
-        if line.last < line.first:
-            raise EvaError(
-                f"its segment {line.uuid} ends at frame {line.last}, before its first {line.first}"
-            )
     changed = 0
     for line in absent(Segment, list(wanted.values()), episode=episode):
         Segment.objects.create(episode=episode, **line.values())
         changed += 1
-    rows = {row.uuid: row for row in Segment.objects.filter(episode=episode)}
-    for uuid, line in wanted.items():
-        facts = line.model_dump(exclude={"kind", "uuid", "by"})
-        if any(getattr(rows[uuid], name) != value for name, value in facts.items()):
-            Segment.objects.filter(pk=uuid).update(**facts)
-            changed += 1
-    gone = [uuid for uuid in rows if uuid not in wanted]
-    Segment.objects.filter(pk__in=gone).delete()
+    gone: list[UUID] = []
+    if whole:
+        rows = {row.uuid: row for row in Segment.objects.filter(episode=episode)}
+        for uuid, line in wanted.items():
+            facts = line.model_dump(exclude={"kind", "uuid", "by"})
+            if any(getattr(rows[uuid], name) != value for name, value in facts.items()):
+                Segment.objects.filter(pk=uuid).update(**facts)
+                changed += 1
+        gone = [uuid for uuid in rows if uuid not in wanted]
+        Segment.objects.filter(pk__in=gone).delete()
     if changed or gone:
         services.standing_changed(episode=episode)
     return changed + len(gone)

@@ -47,6 +47,7 @@ MOVES: dict[tuple[TrialStatus, Move], TrialStatus] = {
 
 OPEN = (_S.PREPARED, _S.RUNNING, _S.PAUSED)
 UNDER_WAY = (_S.RUNNING, _S.PAUSED)
+JUDGED = (_S.SCORED, _S.VOIDED)
 REPEATED = (_S.INTERRUPTED, _S.VOIDED, _S.ABANDONED)
 """What does not count: the next trial of the same kind is another attempt of the same number."""
 

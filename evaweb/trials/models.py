@@ -218,6 +218,9 @@ _TONES = {
 }
 
 
+_JUDGED = "OLD.status IN ('scored', 'voided')"
+
+
 class Trial(models.Model):
     """One attempt of one checkpoint at one position of a scene; a repetition is a new attempt, never a new score."""
 
@@ -282,7 +285,7 @@ class Trial(models.Model):
     changed_at = models.DateTimeField(auto_now=True)
 
     append_only = AppendOnly(
-        "of a scored trial it is never changed what was tried, where and by whom",
+        "of a scored trial it is never changed what was tried, where, by whom, and what was said of it",
         (
             *(
                 "uuid",
@@ -294,9 +297,25 @@ class Trial(models.Model):
                 "number",
                 "attempt",
             ),
-            *("station", "operator", "instruction", "strategy", "seed"),
+            *("station", "operator", "instruction", "strategy", "seed", "time_limit_s"),
+            *("prepared_at", "started_at", "ended_at"),
         ),
-        only="OLD.status = 'scored'",
+        only=_JUDGED,
+        moves={"status": {"scored": ("voided",), "voided": ()}},
+        never=(
+            # What was not known yet when it was judged is told once.
+            f"{_JUDGED} AND OLD.episode_id IS NOT NULL "
+            "AND (NEW.episode_id IS NULL OR NEW.episode_id <> OLD.episode_id)",
+            f"{_JUDGED} AND OLD.truth IS NOT NULL AND (NEW.truth IS NULL OR NEW.truth <> OLD.truth)",
+            f"{_JUDGED} AND COALESCE(NEW.duration_s, -1) <> COALESCE(OLD.duration_s, -1) AND NOT EXISTS ("
+            "SELECT 1 FROM episodes_episode WHERE uuid = NEW.episode_id AND duration_s = NEW.duration_s)",
+            "OLD.status = 'voided' AND (NEW.reason <> OLD.reason OR "
+            "COALESCE(NEW.voided_by_id, 0) <> COALESCE(OLD.voided_by_id, 0))",
+            # A verdict is one of its own scores, and gives way to a later one alone.
+            "COALESCE(NEW.verdict_id, 0) <> COALESCE(OLD.verdict_id, 0) AND NOT EXISTS ("
+            "SELECT 1 FROM trials_score WHERE id = NEW.verdict_id AND trial_id = NEW.id "
+            "AND id > COALESCE(OLD.verdict_id, 0))",
+        ),
     )
 
     class Meta:
@@ -380,7 +399,12 @@ class MilestoneOutcome(models.Model):
     at_s = models.FloatField(null=True, blank=True, help_text="When, after the start of the run [s].")
 
     append_only = AppendOnly(
-        "what was scored is never changed or removed: a correction is another score", but=("milestone",)
+        "what was scored is never changed or removed: a correction is another score",
+        but=("milestone",),
+        # They are added with their score, before it counts or is corrected.
+        late="EXISTS (SELECT 1 FROM trials_trial WHERE verdict_id = NEW.score_id) OR EXISTS (SELECT 1 FROM "
+        "trials_score own, trials_score later WHERE own.id = NEW.score_id AND later.trial_id = own.trial_id "
+        "AND later.id > own.id)",
     )
 
     class Meta:

@@ -13,16 +13,17 @@ from datetime import datetime
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from uuid import UUID
 
-from pydantic import AwareDatetime, Field, StrictBool
+from pydantic import Field, StrictBool, field_validator
 
 from evaweb.blinding import HIDDEN, Sight, code_of
-from evaweb.journal import From, Journal, Line, Person, checked, value_at
+from evaweb.journal import From, Journal, Line, Moment, Person, checked, value_at
+from evaweb.stations.models import STATION_NAME
 from evaweb.trials.models import Evaluation, Score, Trial, TrialStatus
 
 Name = Annotated[str, Field(min_length=1, max_length=120)]
 _Count = Annotated[int, Field(ge=0, lt=2**31)]
 _Small = Annotated[int, Field(ge=0, lt=2**15)]
-_Seconds = Annotated[float, Field(allow_inf_nan=False)]
+_Seconds = Annotated[float, Field(ge=0, le=1e9)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,14 +57,14 @@ class Column(From):
 class TrialRecord(Line):
     """A trial, its columns in the order in which they are shown; what is not written is empty where it was read."""
 
-    id: Annotated[Annotated[int, Field(gt=0, lt=2**63)] | None, Column("pk", open=True, type=int)] = None
+    id: Annotated[Annotated[int, Field(gt=0, lt=2**53)] | None, Column("pk", open=True, type=int)] = None
     uuid: Annotated[UUID, Column(open=True)]
     evaluation: Annotated[Name, Column("evaluation__name", open=True, table=False)]
     evaluation_kind: Annotated[
         Evaluation.Kind, Column("evaluation__kind", open=True, api="never", table=False)
     ] = Evaluation.Kind.OPEN_BENCH
     version: Annotated[_Count, Column("evaluation_version", open=True, table=False)]
-    station: Annotated[str, Field(min_length=1, max_length=63), Column("station__name", open=True)]
+    station: Annotated[str, Field(pattern=STATION_NAME), Column("station__name", open=True)]
     simulated: Annotated[StrictBool, Column("station__simulated", open=True, api="never", table=False)] = (
         False
     )
@@ -92,9 +93,9 @@ class TrialRecord(Line):
     seed: Annotated[_Count | None, Column(open=True, table=False)] = None
     strategy: Annotated[dict[str, Any] | None, Column(api="never", table=False)] = None
     time_limit_s: Annotated[_Seconds | None, Column(open=True, table=False)] = None
-    prepared_at: Annotated[AwareDatetime | None, Column(open=True, table=False, type=datetime)] = None
-    started_at: Annotated[AwareDatetime | None, Column(open=True, written="after")] = None
-    ended_at: Annotated[AwareDatetime | None, Column(open=True, written="after")] = None
+    prepared_at: Annotated[Moment | None, Column(open=True, table=False, type=datetime)] = None
+    started_at: Annotated[Moment | None, Column(open=True, written="after")] = None
+    ended_at: Annotated[Moment | None, Column(open=True, written="after")] = None
     episode: Annotated[UUID | None, Column("episode_id", open=True, written="never")] = None
     truth: Annotated[dict[str, Any] | None, Column(open=True, written="after", api="detail", table=False)] = (
         None
@@ -142,7 +143,7 @@ def _shown_as(annotation: Any) -> Any:
         return _shown_as(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
         return Union[tuple(map(_shown_as, get_args(annotation)))]  # noqa: UP007  made of a list
-    return datetime if annotation is AwareDatetime else annotation
+    return annotation
 
 
 HINTS: Mapping[str, Any] = {
@@ -190,7 +191,7 @@ class ScoreLine(Line):
     uuid: UUID
     trial: TrialRecord
     rater: Annotated[Person, From("rater__username")]
-    at: Annotated[AwareDatetime, From("scored_at")]
+    at: Annotated[Moment, From("scored_at")]
     success: StrictBool
     score: Annotated[float, Field(ge=0, le=1)]
     note: str = ""
@@ -198,6 +199,13 @@ class ScoreLine(Line):
     reason: str = ""
     source: Score.Source = Score.Source.HUMAN
     milestones: Annotated[tuple[OutcomeLine, ...], From("outcomes__all")] = ()
+
+    @field_validator("milestones")
+    @classmethod
+    def _once(cls, milestones: tuple[OutcomeLine, ...]) -> tuple[OutcomeLine, ...]:
+        if len({each.order for each in milestones}) < len(milestones):
+            raise ValueError("allowed: each milestone once")
+        return milestones
 
 
 class VoidLine(Line):
@@ -207,7 +215,7 @@ class VoidLine(Line):
     trial: TrialRecord
     by: Annotated[Person, From("voided_by__username")]
     reason: str
-    at: Annotated[AwareDatetime, From("voided_at")]
+    at: Annotated[Moment, From("voided_at")]
 
     @classmethod
     def written(cls, row: Trial, **given: Any) -> dict[str, Any]:
@@ -215,7 +223,7 @@ class VoidLine(Line):
         return super().written(row, trial=TrialRecord.written(row), **given)
 
 
-JUDGEMENTS: Journal[ScoreLine | VoidLine] = Journal("scores", "its scores", ScoreLine, VoidLine, shared=True)
+JUDGEMENTS: Journal[ScoreLine | VoidLine] = Journal("scores", ScoreLine, VoidLine)
 
 
 def file_of(trial: Trial) -> UUID:
@@ -225,4 +233,4 @@ def file_of(trial: Trial) -> UUID:
 
 def asked_trial(asked: Mapping[str, Any]) -> TrialRecord | None:
     """The trial that a manifest names; None where its run was none of ours."""
-    return checked(TrialRecord, asked, "the manifest's trial: ") if "uuid" in asked else None
+    return checked(TrialRecord, asked, "the manifest's trial") if "uuid" in asked else None

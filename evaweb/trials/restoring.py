@@ -35,23 +35,23 @@ from evaweb.trials.models import (
     Trial,
     TrialStatus,
 )
-from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, TrialRecord, VoidLine, asked_trial
+from evaweb.trials.record import OutcomeLine, ScoreLine, TrialRecord, VoidLine, asked_trial
 from runtime.recording.reader import read_events
 
 log = logging.getLogger(__name__)
 
 _BEHIND = (*lifecycle.OPEN, TrialStatus.ABANDONED)  # what a trial with a closed recording cannot be
 _GHOST_S = 0.1  # the clock of a run that never began stood at a few hundredths of a second
-_JUDGED = (TrialStatus.SCORED, TrialStatus.VOIDED)
 
 
 @restores
 def restore(kept: Kept) -> int:
     """Make the trial of a run and its scores, where they are not there; how many rows that were."""
-    lines = _judgements(kept)
+    asked = recorded_in(journal_folder(kept.uuid)).trial if kept.recorded else {}
+    lines = _judgements(kept, asked)
     if not lines and Trial.objects.filter(episode_id=kept.uuid).exclude(status__in=_BEHIND).exists():
         return 0
-    facts = _facts(kept, lines)
+    facts = _facts(lines, asked)
     episode = Episode.objects.filter(uuid=kept.uuid).first()
     if facts is None or not (lines or (episode is not None and episode.status in CLOSED)):
         return 0
@@ -74,21 +74,30 @@ def _never_ran(trial: Trial) -> str:
     return why and f"trial {trial.pk} is scored and never ran, {why}: void it with a reason"
 
 
-def _judgements(kept: Kept) -> list[ScoreLine | VoidLine]:
-    """What its lines say; of a score that was given once more, as the database did not take it, the last."""
-    lines = JUDGEMENTS.parsed(kept.uuid, kept.lines)
+def _judgements(kept: Kept, asked: Mapping[str, Any]) -> list[ScoreLine | VoidLine]:
+    """What its lines say; of a score that was given once more, as the database did not take it, the last.
+
+    Those of another trial than its recording, in a copy of another file, are left out.
+    """
+    lines = [line for line in kept.lines if isinstance(line, ScoreLine | VoidLine)]
+    own = asked.get("uuid", "")
+    foreign = [str(line.trial.uuid) for line in lines if kept.recorded and str(line.trial.uuid) != own]
+    if foreign:
+        kept.say(
+            f"run {kept.uuid}: {len(foreign)} of its scores are of trial {', '.join(dict.fromkeys(foreign))}, "
+            f"its recording is of {f'trial {own}' if own else 'no trial'}: left out"
+        )
+    lines = [line for line in lines if str(line.trial.uuid) not in foreign]
     last = {line.uuid: line for line in lines if isinstance(line, ScoreLine)}
     return [line for line in lines if isinstance(line, VoidLine) or line is last[line.uuid]]
 
 
-def _facts(kept: Kept, lines: Sequence[ScoreLine | VoidLine]) -> TrialRecord | None:
+def _facts(lines: Sequence[ScoreLine | VoidLine], asked: Mapping[str, Any]) -> TrialRecord | None:
     """The newest line knows most of its trial; without one it is as its run was asked for."""
     named = {line.trial.uuid for line in lines}
     if len(named) > 1:
         raise EvaError(f"its scores are of several trials: {', '.join(sorted(map(str, named)))}")
-    if lines:
-        return lines[-1].trial
-    return asked_trial(recorded_in(journal_folder(kept.uuid)).trial) if kept.recorded else None
+    return lines[-1].trial if lines else asked_trial(asked)
 
 
 # --- the trial ---------------------------------------------------------------------------------------------
@@ -105,9 +114,10 @@ def _trial(facts: TrialRecord, kept: Kept, episode: Episode | None) -> tuple[Tri
         for name, value in _course(facts, _episode(facts, kept, episode)).items():
             setattr(trial, name, value)
         log.warning("trial %s was behind its recording: it is %s now", trial.pk, trial.status)
-    elif trial.episode is None:
-        trial.episode = _episode(facts, kept, episode)
-    trial.save()
+        trial.save()
+    elif trial.episode is None and (found := _episode(facts, kept, episode)):
+        trial.episode = found
+        trial.save()
     return trial, False
 
 
@@ -232,7 +242,7 @@ def _judged(trial: Trial, lines: Sequence[ScoreLine | VoidLine]) -> None:
         for name, value in {"status": TrialStatus.VOIDED, **void.values()}.items():
             setattr(trial, name, value)
         trial.save()
-    elif lines and trial.status not in _JUDGED:
+    elif lines and trial.status not in lifecycle.JUDGED:
         trial.status = TrialStatus.SCORED
         trial.save()
 
@@ -240,7 +250,7 @@ def _judged(trial: Trial, lines: Sequence[ScoreLine | VoidLine]) -> None:
 def _publish(trial: Trial, *, made: bool) -> None:
     """Have it published where that may not have been done: the job is lost with the database."""
     episode = trial.episode
-    if trial.status not in _JUDGED or episode is None or episode.status not in CLOSED:
+    if trial.status not in lifecycle.JUDGED or episode is None or episode.status not in CLOSED:
         return
     if not made or episode.dataset_index is None:
         episodes.publish_asked(episode=episode)

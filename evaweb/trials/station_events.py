@@ -186,7 +186,7 @@ def _truth_told(station: Station, event: Mapping[str, Any]) -> Trial | None:
     """Note the state of the simulated bench at the end of an episode."""
     data = dict(event.get("data") or {})
     trial = _held(station=station, episode_id=_uuid(data.get("episode")))
-    if trial is None or trial.truth == data:
+    if trial is None or trial.truth == data or (trial.truth is not None and trial.status in lifecycle.JUDGED):
         return None
     trial.truth = data
     trial.save()
@@ -205,7 +205,7 @@ def _episode_closed(station: Station, event: Mapping[str, Any]) -> Trial | None:
     if trial.episode is not None and trial.episode.duration_s is not None:
         trial.duration_s = trial.episode.duration_s
     trial.save()
-    if trial.episode is not None and trial.status in (TrialStatus.SCORED, TrialStatus.VOIDED):
+    if trial.episode is not None and trial.status in lifecycle.JUDGED:
         publish_asked(episode=trial.episode)  # it was judged before its recording was on disk
     return trial
 

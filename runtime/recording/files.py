@@ -201,7 +201,7 @@ def read_document(path: Path) -> dict[str, object]:
         value = json.loads(path.read_bytes())
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise RecordingError(f"{path} is not a whole JSON document: {error}") from error
     if not isinstance(value, dict):
         raise RecordingError(f"{path} holds {type(value).__name__}, must hold one JSON object")

@@ -79,6 +79,6 @@ def _read(line: str) -> Label | None:
         label = Label(
             float(row["time"]), str(row["by"]), row["result"], str(row["note"]), row["discarded"] is True
         )
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
     return label if label.result is None or label.result in get_args(Result) else None

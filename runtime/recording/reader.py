@@ -97,7 +97,7 @@ def read_events(path: Path) -> EventsRead:
 def _is_object(line: bytes) -> bool:
     try:
         return isinstance(json.loads(line), dict)
-    except ValueError:
+    except (ValueError, RecursionError):
         return False
 
 

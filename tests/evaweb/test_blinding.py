@@ -14,7 +14,10 @@ from django.urls import reverse
 from evaweb.api.tokens import token_create
 from evaweb.blinding import sight_of
 from evaweb.plans.blinding_rules import look
+from evaweb.plans.models import Handout, Look, PlanEvent, Slot
 from evaweb.plans.services import plan_reveal
+from evaweb.preflights.models import Preflight
+from evaweb.trials.models import Checkpoint
 from tests.evaweb.blind_lab import LATENCY, NAMES, SECRETS, Lab
 from tests.evaweb.crawling import QUERIES, crawled, leaks, told_apart, whispers
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
@@ -65,6 +68,29 @@ def test_nothing_that_an_operator_can_reach_tells_before_the_reveal(lab):
     assert shown["checkpoint"] == lab.trial.checkpoint.name
     assert shown["code"]
     assert LATENCY in whispers(lab, lab.operator)
+
+
+def test_a_plan_that_was_lost_with_the_database_goes_on_hiding(lab, alma):
+    """What comes back from the disk are its trials alone; an administrator may look behind none of them either."""
+    for stage in STAGES[1:]:
+        getattr(lab, stage)()
+    lose(lab.plan)
+    for user in (lab.operator, lab.owner, alma):
+        client = Client()
+        client.force_login(user)
+        assert list(leaks(lab, client, QUERIES)) == [], user
+        assert whispers(lab, user) == [], user
+
+
+def lose(plan):
+    """As after a database that was lost: no plan, no hand-outs, no codes; its trials are there."""
+    with unguarded("plans"):
+        for model in (Look, PlanEvent, Handout, Slot):
+            model.objects.filter(plan=plan).delete()
+        plan.delete()
+        for row in Checkpoint.objects.filter(trials=None):  # on no disk
+            Preflight.objects.filter(checkpoint=row).delete()
+            row.delete()
 
 
 def test_who_has_looked_is_told_everything(lab):

@@ -77,7 +77,7 @@ def test_pages_say_what_still_works(ask):
     *pages, alive = ask(*(("GET", path, "", PAGE) for path in (*paths, "/healthz")))
     assert [page["status"] for page in pages] == [503] * len(paths)
     for page in pages:
-        assert "the database is busy or gone: nothing was changed, try again" in page["body"]
+        assert "the database is busy or gone: it was not changed, try again" in page["body"]
         assert "python -m runtime.ctl STATION estop" in page["body"]
         assert "127.0.0.1" not in page["body"], "where the database is, strangers are not told"
     assert (alive["status"], alive["body"]) == (200, "ok\n")

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
-from pydantic import AwareDatetime, Field, StrictBool
+from pydantic import Field, StrictBool
 
-from evaweb.journal import From, Journal, Line, Person
+from evaweb.journal import From, Journal, Line, Moment, Person
 from evaweb.results.models import Preference, Rating
 from evaweb.trials.record import Name, TrialRecord
 
@@ -23,7 +23,7 @@ class RatingLine(Line):
     uuid: UUID
     trial: TrialRecord
     rater: Annotated[Person, From("rater__username")]
-    at: AwareDatetime
+    at: Moment
     success: StrictBool
     score: Annotated[float, Field(ge=0, le=1)]
     milestones: tuple[tuple[str, StrictBool], ...] = ()
@@ -47,7 +47,7 @@ class PreferenceLine(Line):
     first: TrialRecord
     second: TrialRecord
     rater: Annotated[Person, From("rater__username")]
-    at: AwareDatetime
+    at: Moment
     outcome: Preference.Outcome
     why: str
     blind: StrictBool
@@ -59,6 +59,4 @@ class PreferenceLine(Line):
         return super().written(row, **pair, **given)
 
 
-RATINGS: Journal[RatingLine | PreferenceLine] = Journal(
-    "scores", "its scores", RatingLine, PreferenceLine, shared=True
-)
+RATINGS: Journal[RatingLine | PreferenceLine] = Journal("scores", RatingLine, PreferenceLine)

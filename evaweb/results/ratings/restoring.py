@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 
-from django.db import transaction
+from django.db import DataError, IntegrityError, transaction
 
 from evaweb.episodes.reconcile import Kept, restores
 from evaweb.errors import EvaError
 from evaweb.plans.models import Plan
 from evaweb.results.models import Preference, Rating
-from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
+from evaweb.results.ratings.record import PreferenceLine, RatingLine
 from evaweb.trials.models import Trial
 from evaweb.trials.record import TrialRecord
 
@@ -20,8 +20,16 @@ log = logging.getLogger(__name__)
 @restores
 def restore(kept: Kept) -> int:
     """Make the rows that are not there; how many that were. The trials themselves were restored before."""
-    lines = RATINGS.parsed(kept.uuid, kept.lines)
-    return sum(_rating(line) if isinstance(line, RatingLine) else _preference(line) for line in lines)
+    made = 0
+    for line in kept.lines:
+        try:
+            if isinstance(line, RatingLine):
+                made += _rating(line)
+            elif isinstance(line, PreferenceLine):
+                made += _preference(line)
+        except (EvaError, DataError, IntegrityError) as error:
+            kept.say(f"run {kept.uuid}: its {line.kind} {line.uuid}: {error}")
+    return made
 
 
 @transaction.atomic

@@ -64,6 +64,18 @@ def test_sessions_and_labels_come_back_from_the_disk(
     assert reconcile().restored == 0
 
 
+def test_a_torn_line_of_a_session_is_named_when_it_comes_back(
+    session: CollectSession, demonstrate: Demonstrate
+) -> None:
+    demonstrate("success")
+    path = SESSIONS.path(session.pk)
+    path.write_bytes(path.read_bytes() + b'{"kind": "clos')
+    lost()
+    (problem,) = reconcile().problems
+    assert problem == f"{path}: line 2 is not whole and was left out: EOF while parsing a string"
+    assert CollectSession.objects.get().closed_at is None
+
+
 def test_without_its_own_file_a_session_is_what_its_episodes_say(
     session: CollectSession, demonstrate: Demonstrate
 ) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from django.contrib.auth.models import User
-from django.db import IntegrityError, connection
+from django.db import IntegrityError, connection, transaction
 
 from evaweb.collect import selectors, services
 from evaweb.collect.models import CollectSession
@@ -101,8 +101,10 @@ def test_a_changed_set_up_is_not_resumed_and_every_difference_is_listed(
 
 
 def test_the_database_keeps_what_a_session_is(session: CollectSession) -> None:
-    with pytest.raises(IntegrityError, match="open another one"):
+    with pytest.raises(IntegrityError, match="open another one"), transaction.atomic():
         CollectSession.objects.filter(pk=session.pk).update(task="something else")
+    with pytest.raises(IntegrityError, match="never changed or removed"), transaction.atomic():
+        session.events.update(text="something else")
     assert connection.vendor in ("sqlite", "postgresql")
 
 

@@ -25,6 +25,9 @@ from tests.runtime.recording.samples import resealed
 
 pytestmark = pytest.mark.django_db
 
+_BEFORE = Path(__file__).parents[1] / "data_of_before" / "disk" / "scores"
+SCORE = _BEFORE / "00000000-0000-0000-0000-000000000066.jsonl"
+
 
 @pytest.fixture(autouse=True)
 def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,7 +47,7 @@ def test_a_lost_database_comes_back_with_stations_previews_and_datasets(
         episode = closed(status)
         scores = data / "scores" / f"{episode.uuid}.jsonl"
         scores.parent.mkdir(exist_ok=True)
-        scores.write_text('{"kind": "score", "success": true}\n')
+        scores.write_bytes(SCORE.read_bytes())
         services.publish_asked(episode=episode)
     jobs.work("lab")
     before = {row.uuid: row for row in Episode.objects.all()}
@@ -67,6 +70,30 @@ def test_a_lost_database_comes_back_with_stations_previews_and_datasets(
     assert everything() == found
 
 
+def test_one_reader_has_seen_all_runs_before_the_next_one_begins(
+    put: Callable[..., Path], station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A preference names two trials. What is wrong with one run keeps no other."""
+    first, second = sorted((put().name, put("interrupted").name))
+    seen: list[tuple[str, str]] = []
+
+    def trials(kept: Kept) -> int:
+        seen.append(("trials", str(kept.uuid)))
+        if str(kept.uuid) == first:
+            raise OverflowError("date value out of range")
+        return 1
+
+    def preferences(kept: Kept) -> int:
+        seen.append(("preferences", str(kept.uuid)))
+        return 1
+
+    monkeypatch.setattr(reconciling, "_restorers", [trials, preferences])
+    report = reconcile()
+    assert [reader for reader, _ in seen] == ["trials", "trials", "preferences", "preferences"]
+    assert {run for _, run in seen} == {first, second}
+    assert (report.restored, report.problems) == (3, (f"run {first}: date value out of range",))
+
+
 def test_a_folder_that_comes_back_is_not_missing_any_more(
     closed: Callable[..., Episode], data: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -87,6 +114,10 @@ def test_what_cannot_be_read_is_told_and_keeps_no_other(
     put()
     damaged = put("interrupted")
     (damaged / "manifest.json").write_bytes(b"\0\0\0")
+    nested = damaged.with_name("c86a888b-6d03-4355-9e03-66fd3445e50b")
+    nested.mkdir()
+    (nested / "manifest.json").write_bytes(b"[" * 200_000)
+    shutil.copytree(nested, nested.with_name(f"{nested.name}.bak"))
     (data / "episodes" / "notes").mkdir()
     broken = data / "datasets" / "other" / "meta"
     broken.mkdir(parents=True)
@@ -97,7 +128,9 @@ def test_what_cannot_be_read_is_told_and_keeps_no_other(
     assert Episode.objects.count() == 1
     told = " ".join(report.problems)
     assert f"{damaged / 'manifest.json'} is not a whole JSON document" in told
-    assert f"{data / 'episodes' / 'notes'} is no episode: its name is no uuid" in told
+    assert f"{nested / 'manifest.json'} is not a whole JSON document" in told
+    for name in ("notes", f"{nested.name}.bak"):
+        assert f"{data / 'episodes' / name} is no episode: its name is no uuid" in told
     assert "is a dataset of version 'v9'" in told
     assert ".other.draft-x" not in told
 
@@ -110,6 +143,15 @@ def test_a_manifest_of_another_episode_is_not_taken_for_this_one(
     report = reconcile()
     assert f"is of episode {other.name}, not of {folder.name}" in report.problems[0]
     assert [str(row.uuid) for row in Episode.objects.all()] == [other.name]
+
+
+def test_half_a_character_in_a_manifest_is_left_out(put: Callable[..., Path], station: Station) -> None:
+    folder = put()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"task": "put \ud800it"}))
+    resealed(folder)
+    assert reconcile().problems == ()
+    assert Episode.objects.get().task == "put it"
 
 
 def test_a_damaged_folder_leaves_the_row_that_was_read_before(
@@ -140,16 +182,21 @@ def test_runs_go_to_who_understands_them_and_a_stranger_is_told(
     recorded, alone = UUID(put().name), UUID("c86a888b-6d03-4355-9e03-66fd3445e50b")
     (data / "scores").mkdir()
     file = data / "scores" / f"{alone}.jsonl"
-    file.write_text('{"success": true}\n[1]\n\n{"success": fal\n{"a": 1}\n')
+    lines = [json.loads(line) for line in SCORE.read_text().splitlines()]
+    whole = [json.dumps(line) for line in lines]
+    file.write_text("\n".join([whole[0], "[1]", "", '{"success": fal', whole[1], '{"a": 1}', ""]))
     (data / "scores" / "notes.jsonl").write_text("{}\n")
     report = reconcile()
     assert report.restored == 2
-    assert given == [Kept(recorded, True, ()), Kept(alone, False, ({"success": True}, {"a": 1}))]
-    assert report.problems == (
-        f"{data / 'scores' / 'notes.jsonl'} is no file of scores: its name is no uuid",
-        f"{file}: line 2 is not whole and was left out",
-        f"{file}: line 4 is not whole and was left out",
+    assert [(kept.uuid, kept.recorded) for kept in given] == [(recorded, True), (alone, False)]
+    assert given[0].lines == []
+    assert [str(line.uuid) for line in given[1].lines] == [line["uuid"] for line in lines]
+    assert report.problems[:3] == (
+        f"{data / 'scores' / 'notes.jsonl'} is no file of scores: its name is no uuid in lower case with dashes",
+        f"{file}: line 2 was left out: [1]: Input should be an object",
+        f"{file}: line 4 is not whole and was left out: EOF while parsing a value",
     )
+    assert report.problems[3].startswith(f"{file}: line 6 was left out: {{'a': 1}}: Unable to extract tag")
 
 
 def test_what_cannot_be_restored_is_told_and_keeps_no_other(

@@ -3,14 +3,15 @@ from collections import Counter
 import pytest
 from django.db import IntegrityError, transaction
 
-from evaweb.blinding import sight_of
+from evaweb.blinding import HIDDEN, sight_of
+from evaweb.episodes.reconcile import reconcile
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import give_back, hand_out, progress
 from evaweb.plans.blinding_rules import look, sealed_for
 from evaweb.plans.canonical import digest
 from evaweb.plans.commitment import commitment, schedule_digest
 from evaweb.plans.documents import conditions_of
-from evaweb.plans.models import Look, Plan, PlanState
+from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.schedule import schedule
 from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
 from evaweb.stations.models import Station
@@ -69,6 +70,52 @@ def test_only_its_owner_or_an_administrator_freezes_it(draft):
     with pytest.raises(NotAllowed, match="needs an operator"):
         plan_freeze(user=builders.user("vera", "viewer"), plan=draft)
     assert plan_freeze(user=builders.user("adam", "admin"), plan=draft).state == PlanState.FROZEN
+
+
+def test_a_plan_that_was_lost_is_frozen_again_by_an_administrator_and_revealed(bench, plan, draft):
+    """Its trials are its own again, more are made with an amendment alone."""
+    adam, again = (
+        builders.user("adam", "admin"),
+        {"name": plan.name, "title": plan.title, "owner": draft.owner},
+    )
+    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    done(bench, trial)
+    chosen = {name: list(getattr(plan, name).all()) for name in ("checkpoints", "positions")}
+    with unguarded("plans"):
+        for model in (PlanEvent, Handout, Slot):
+            model.objects.all().delete()
+        plan.delete()
+    (told,) = (each for each in reconcile().problems if " of plan " in each)
+    assert told.startswith("1 trials are of plan blocks v1, which is not in the database: ")
+    assert all(sight_of(user).hides(trial) for user in (bench.operator, draft.owner, adam))
+    assert sight_of(bench.operator).label(trial) == HIDDEN
+    made = Plan.objects.create(**again)
+    for name, rows in chosen.items():
+        getattr(made, name).set(rows)
+    with pytest.raises(NotAllowed):
+        plan_freeze(user=draft.owner, plan=made)
+    plan_freeze(user=adam, plan=made)
+    assert (made.state, made.evaluation_id) == (PlanState.CLOSED, trial.evaluation_id)
+    assert sight_of(draft.owner).hides(trial)
+    Plan.objects.update(owner=bench.operator)
+    with pytest.raises(NotAllowed, match="you have run trials"):
+        look(made, bench.operator)
+    plan_reveal(user=adam, plan=made)
+    assert not sight_of(bench.operator).hides(trial)
+    assert not any(" of plan " in each for each in reconcile().problems)
+
+
+def test_what_a_frozen_plan_foresees_and_where_it_stands_is_never_changed_back(plan, owner):
+    for change in ({"checkpoint": plan.second}, {"position": plan.slots.last().position}, {"repetition": 9}):
+        with pytest.raises(IntegrityError, match="never"), transaction.atomic():
+            plan.slots.update(**change)
+    for state in ("draft", "revealed"):
+        with pytest.raises(IntegrityError, match="never"), transaction.atomic():
+            Plan.objects.filter(pk=plan.pk).update(state=state)
+    plan_close(user=owner, plan=plan, reason="enough")
+    plan_reveal(user=owner, plan=plan)
+    with pytest.raises(IntegrityError, match="never"), transaction.atomic():
+        Plan.objects.filter(pk=plan.pk).update(state="frozen")
 
 
 def test_trials_come_in_the_order_of_the_plan_each_under_a_code_of_its_own(bench, plan):

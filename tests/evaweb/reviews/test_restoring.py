@@ -77,12 +77,23 @@ def test_a_row_that_the_disk_knows_better_is_brought_up_to_it(spoken):
 def test_a_torn_line_never_counted_and_a_wrong_one_is_named(spoken, data):
     path = data / "reviews" / f"{spoken.uuid}.jsonl"
     before = everything()
+    number = path.read_bytes().count(b"\n") + 1
     path.write_bytes(path.read_bytes() + b'{"kind": "review", "uu')
-    assert reconcile().problems == ()
+    assert reconcile().problems == (
+        f"{path}: line {number} is not whole and was left out: EOF while parsing a string",
+    )
     assert everything() == before
     path.write_text(json.dumps({"kind": "review", "uuid": str(spoken.uuid), "verdict": "perhaps"}) + "\n")
     (problem,) = reconcile().problems
-    assert "line 1 of its reviews: review.verdict is 'perhaps'" in problem
+    assert problem.startswith(f"{path}: line 1 was left out: review.verdict is 'perhaps'")
+
+
+def test_a_line_that_cannot_be_read_takes_nothing_from_the_database(spoken, data):
+    path = data / "reviews" / f"{spoken.uuid}.jsonl"
+    before = everything()
+    path.write_bytes(path.read_bytes().replace(b'"label":"reach"', b'"label":5'))
+    assert len(reconcile().problems) == 2
+    assert everything() == before
 
 
 def test_a_line_that_is_there_twice_is_one_review_and_the_last_counts(spoken, data):

@@ -160,12 +160,8 @@ def counted():
 
 
 def everything():
-    """All rows of this app but when they were written."""
-    rows = {model: list(model.objects.order_by("pk").values()) for model in (*RECORDS, *CHOICES)}
-    return {
-        model: [{name: value for name, value in row.items() if name != "changed_at"} for row in found]
-        for model, found in rows.items()
-    }
+    """All rows of this app, and when they were changed last."""
+    return {model: list(model.objects.order_by("pk").values()) for model in (*RECORDS, *CHOICES)}
 
 
 @pytest.fixture
@@ -351,7 +347,8 @@ def test_a_row_from_an_old_backup_is_brought_up_to_the_disk(lab):
     trial = lab.run()
     lab.score(trial, True, True, True)
     lose(MilestoneOutcome, Score)
-    Trial.objects.update(status="running", episode=None, ended_at=None, duration_s=None)
+    with unguarded("trials"):
+        Trial.objects.update(status="running", episode=None, ended_at=None, duration_s=None)
     assert reconcile().restored == 1
     found = Trial.objects.get(pk=trial.pk)
     assert (found.status, found.episode_id) == ("scored", trial.episode_id)
@@ -397,7 +394,7 @@ def test_a_line_cut_in_half_is_left_out_and_told(lab):
     file.write_bytes(first + b"\n" + second[: len(second) // 2])
     lose(*RECORDS)
     report = reconcile()
-    assert report.problems == (f"{file}: line 2 is not whole and was left out",)
+    assert report.problems == (f"{file}: line 2 is not whole and was left out: EOF while parsing a string",)
     found = Trial.objects.get()
     assert (found.status, found.verdict.success, found.scores.count()) == ("scored", False, 1)
 
@@ -405,14 +402,16 @@ def test_a_line_cut_in_half_is_left_out_and_told(lab):
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("success", "yes", "line 1 of its scores: success is 'yes'"),
-        ("score", 1.5, "line 1 of its scores: score is 1.5"),
-        ("at", "2026-01-31T08:00:00", "line 1 of its scores: at is '2026-01-31T08:00:00'"),
-        ("trial", {}, "line 1 of its scores: trial.uuid is {}"),
+        ("success", "yes", "score.success is 'yes'"),
+        ("score", 1.5, "score.score is 1.5"),
+        ("at", "0001-01-01T00:00:00+14:00", "score.at is '0001-01-01T00:00:00+14:00'"),
+        ("trial", {}, "score.trial.uuid is {}"),
         ("failure", "x" * 61, "at most 60 characters"),
+        ("kind", "scorE", "Input tag 'scorE'"),
+        ("note", "\ud800", "unexpected end of hex escape"),
     ],
 )
-def test_a_line_that_says_what_cannot_be_is_told_and_keeps_no_other_run(lab, name, value, words):
+def test_a_line_that_says_what_cannot_be_is_told_and_keeps_nothing_else(lab, name, value, words):
     damaged = lab.run()
     lab.score(damaged, True, True, True)
     whole = lab.run()
@@ -421,9 +420,9 @@ def test_a_line_that_says_what_cannot_be_is_told_and_keeps_no_other_run(lab, nam
     file.write_text(json.dumps(json.loads(file.read_text()) | {name: value}) + "\n")
     lose(*RECORDS)
     (problem,) = reconcile().problems
-    assert problem.startswith(f"run {damaged.episode_id}: ")
+    assert problem.startswith(f"{file}: line 1 ")
     assert words in problem
-    assert [trial.uuid for trial in Trial.objects.all()] == [whole.uuid]
+    assert dict(Trial.objects.values_list("uuid", "status")) == {damaged.uuid: "ended", whole.uuid: "scored"}
 
 
 def test_lines_of_several_trials_in_one_file_are_told(lab):
@@ -435,8 +434,62 @@ def test_lines_of_several_trials_in_one_file_are_told(lab):
     other.write_bytes(other.read_bytes() + JUDGEMENTS.path(first.episode_id).read_bytes())
     lose(*RECORDS)
     (problem,) = reconcile().problems
-    assert f"run {second.episode_id}: its scores are of several trials" in problem
+    assert problem == (
+        f"run {second.episode_id}: 1 of its scores are of trial {first.uuid}, its recording is of trial {second.uuid}: "
+        "left out"
+    )
+    assert set(Trial.objects.values_list("uuid", "status")) == {
+        (one.uuid, "scored") for one in (first, second)
+    }
+
+
+def test_lines_of_several_trials_without_a_recording_are_told(lab):
+    first, second = lab.bench.unrecorded(), lab.bench.unrecorded()
+    other = JUDGEMENTS.path(second.uuid)
+    other.write_bytes(other.read_bytes() + JUDGEMENTS.path(first.uuid).read_bytes())
+    lose(*RECORDS)
+    (problem,) = reconcile().problems
+    assert f"run {second.uuid}: its scores are of several trials" in problem
     assert Trial.objects.get().uuid == first.uuid
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_a_copy_of_the_scores_of_another_trial_takes_it_from_nobody(lab, recorded):
+    if recorded:
+        first = lab.run()
+        lab.score(first, True, False, False)
+    else:  # a run from Debug: its recording is of no trial
+        lab.station.running(6)
+        lab.station.stop()
+        lab.listen()
+        first = None
+    second = lab.run()
+    lab.score(second, True, True, True)
+    early = Episode.objects.order_by("started_at")[0].uuid
+    shutil.copy(JUDGEMENTS.path(second.episode_id), JUDGEMENTS.path(early))
+    lose(*RECORDS)
+    (problem,) = reconcile().problems
+    own = f"trial {first.uuid}" if first else "no trial"
+    assert (
+        problem
+        == f"run {early}: 1 of its scores are of trial {second.uuid}, its recording is of {own}: left out"
+    )
+    found = set(Trial.objects.values_list("uuid", "episode", "status"))
+    assert found == {(second.uuid, second.episode_id, "scored")} | (
+        {(first.uuid, early, "ended")} if first else set()
+    )
+
+
+@pytest.mark.parametrize("name", [lambda uuid: str(uuid).upper(), lambda uuid: uuid.hex])
+def test_a_file_that_would_not_be_found_by_its_name_is_told(lab, name):
+    trial = lab.run()
+    lab.score(trial, True, True, True)
+    file = JUDGEMENTS.path(trial.episode_id)
+    moved = file.rename(file.with_name(f"{name(trial.episode_id)}.jsonl"))
+    lose(*RECORDS)
+    assert reconcile().problems == (
+        f"{moved} is no file of scores: its name is no uuid in lower case with dashes",
+    )
 
 
 def test_a_verdict_outlives_its_recording(lab):

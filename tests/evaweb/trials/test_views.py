@@ -1,11 +1,9 @@
 import re
-from uuid import uuid4
 
 import pytest
 from django.test import Client
 
 from evaweb.episodes.models import Episode
-from evaweb.episodes.services import episode_opened
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Score, Trial
 from tests.evaweb.trials import builders
@@ -57,8 +55,7 @@ def test_smoothness_is_missing_where_it_was_not_measured_and_says_of_how_many_it
     for smooth in (-5.0, -6.0, None):
         trial = bench.scored(True)
         if smooth is not None:
-            episode = Episode.objects.create(station=bench.station, status="finished", smoothness=smooth)
-            Trial.objects.filter(pk=trial.pk).update(episode=episode)
+            Episode.objects.filter(trial=trial).update(status="finished", smoothness=smooth)
     assert "−5.50 [−11.85, 0.85], 2 of 3 trials" in page(browser, "/result/")
 
 
@@ -137,12 +134,10 @@ def test_a_trial_shows_its_facts_scores_commands_and_attempts(bench, browser, wi
 
 def test_its_videos_are_there_once_they_can_be_played(bench, browser, settings):
     trial = bench.scored()
-    uuid = uuid4()
-    episode = episode_opened(station=bench.station, uuid=uuid)
+    episode, uuid = trial.episode, trial.episode_id
     episode.status, episode.cameras, episode.frames = "finished", ["front", "left_wrist"], 90
     episode.control = {"missed": 0, "lateness_p99_ms": 0.123456}
     episode.save()
-    Trial.objects.filter(pk=trial.pk).update(episode=episode)
     assert "<video" not in page(browser, f"/result/trials/{trial.pk}/")
     (settings.DATA_DIR / "previews" / str(uuid)).mkdir(parents=True)
     text = page(browser, f"/result/trials/{trial.pk}/")

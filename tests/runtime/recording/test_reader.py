@@ -54,8 +54,10 @@ def test_a_folder_that_is_no_episode_is_an_error(tmp_path: Path) -> None:
 
 
 def test_torn_and_strange_lines_are_counted(tmp_path: Path) -> None:
-    (tmp_path / "events.jsonl").write_bytes(b'{"a": 1}\nnull\n{"b": \n{"c": 3}\n{"d"')
+    (tmp_path / "events.jsonl").write_bytes(
+        b'{"a": 1}\nnull\n{"b": \n{"c": 3}\n' + b"[" * 200_000 + b'\n{"d"'
+    )
     found = read_events(tmp_path / "events.jsonl")
     assert found.lines == (b'{"a": 1}', b'{"c": 3}')
-    assert found.torn == 3
+    assert found.torn == 4
     assert read_events(tmp_path / "absent").lines == ()

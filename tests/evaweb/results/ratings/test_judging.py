@@ -192,7 +192,7 @@ def test_nothing_is_kept_that_the_disk_does_not_take(plan, carry_out, rater, ben
     carry_out(plan, 16)
     handout, pair = judging.to_rate(rater).found, judging.to_prefer(rater).found
 
-    def full(path, payload):
+    def full(file, payload):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(lines, "_written", full)

@@ -7,7 +7,7 @@ import pytest
 from evaweb.episodes.folders import scores_file
 from evaweb.episodes.publishing import success_of
 from evaweb.episodes.reconcile import reconcile
-from evaweb.journal import read_lines
+from evaweb.journal import numbered
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.agreement import agreement_of, preferences_of
 from evaweb.results.models import Preference, Rating
@@ -68,7 +68,7 @@ def test_what_the_database_has_is_left_alone(judged):
 def test_a_line_whose_row_was_never_made_is_taken_unless_the_same_was_said_again(judged):
     rating = Rating.objects.order_by("pk").first()
     file = scores_file(rating.trial.episode_id)
-    line = next(row for row in read_lines(file).lines if row["kind"] == "rating")
+    line = next(row for _, text in numbered(file) if (row := json.loads(text))["kind"] == "rating")
     again = {**line, "uuid": "9d0f5b41-3d2c-4a27-8a4e-8ed4e7d3b0aa"}
     with file.open("a") as lines:
         lines.write(json.dumps(again) + "\n")
@@ -96,4 +96,4 @@ def test_a_line_that_is_none_is_named(judged):
     with file.open("a") as lines:
         lines.write('{"kind": "rating", "uuid": "no"}\n')
     problems = reconcile().problems
-    assert any(" of its scores: uuid is 'no'" in problem for problem in problems), problems
+    assert any(": rating.uuid is 'no'" in problem for problem in problems), problems
