@@ -8,9 +8,9 @@ from tests.processes import eventually
 class BenchPage:
     """One browser window of one logged-in person; `errors` collects what its scripts complain of."""
 
-    def __init__(self, browser, demo, username, size):
+    def __init__(self, browser, demo, username, size, **screen):
         self.demo = demo
-        self.context = browser.new_context(viewport=size, ignore_https_errors=True)
+        self.context = browser.new_context(viewport=size, ignore_https_errors=True, **screen)
         self.page = self.context.new_page()
         self.page.set_default_timeout(30_000)
         self.errors = []

@@ -12,6 +12,19 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 SIZES = [WIDE, {"width": 1280, "height": 800}, TABLET, {"width": 820, "height": 1180}]
 TABS = ["eval", "debug", "collect"]
 FAULTS = (Path(__file__).parent / "layout_faults.js").read_text("utf-8")
+# What lies on top at three places of the e-stop's button, as far as these are on the screen and not only on the page.
+ON_TOP = """() => {
+  const { left, right, top, bottom } = document.getElementById("estop").getBoundingClientRect();
+  const seen = (y) => right <= visualViewport.width && y < visualViewport.height;
+  return [0.1, 0.5, 0.9].map((part) => top + (bottom - top) * part)
+    .map((y) => seen(y) && document.elementFromPoint((left + right) / 2, y).id);
+}"""
+NOBODY_ANSWERED = """() => {
+  document.getElementById("estop-area").dataset.kind = "failed";
+  const note = document.getElementById("estop-note");
+  note.innerHTML = "USE THE HARDWARE STOP <span class=estop-detail></span>";
+  note.lastChild.textContent = "no answer from the web server within 2.5 s. ".repeat(4);
+}"""
 FAULTY = """
 <style>
   body { margin: 0; font: 16px/20px monospace }
@@ -70,3 +83,16 @@ def test_a_page_of_a_station_is_whole_at_every_size_also_while_its_e_stop_is_lat
     assert faults(page) == {}
     page.close()
     tidy(admin)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "phone"), [(390, 844, True), (320, 640, True), (512, 300, False)]
+)
+def test_the_e_stop_is_on_every_screen_and_can_be_pressed_again(browser, patient, width, height, phone):
+    size = {"width": width, "height": height}
+    page = BenchPage(browser, patient, "ann", size, is_mobile=phone, has_touch=phone)
+    page.open(f"/stations/{STATION}/debug/").at_rest()
+    assert page.page.evaluate(ON_TOP) == ["estop"] * 3
+    page.page.evaluate(NOBODY_ANSWERED)
+    assert page.page.evaluate(ON_TOP) == ["estop"] * 3
+    page.close()
