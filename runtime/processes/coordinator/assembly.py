@@ -57,7 +57,7 @@ def assemble(
         return coordinator.session.state
 
     def reception() -> ReceptionReport:
-        return coordinator.reception_report
+        return coordinator.inbox.reception_report
 
     boot, people = str(uuid.uuid4()), people or clock
     lease, orders = Lease(spec.deployment.lease.ttl_s), ControlQueue(shared)

@@ -14,30 +14,22 @@ from runtime.ipc.bus import EventLog
 from runtime.ipc.estop_requests import why_of
 from runtime.ipc.identity import named
 from runtime.ipc.messages import (
-    HEARD,
-    UNHEARD,
     Ack,
-    ChunkMerged,
     Command,
-    EpisodeClosed,
-    EpisodeOpened,
     Event,
-    MediaReport,
-    Message,
-    ReceptionReport,
-    decode,
     encode,
 )
-from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop, SharedState
 from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.processes.coordinator.demonstrations import Demonstrations
 from runtime.processes.coordinator.health_monitor import HealthMonitor
+from runtime.processes.coordinator.inbox import Inbox
 from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.operations import SessionActions
-from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
+from runtime.processes.coordinator.preflight_desk import PreflightDesk
+from runtime.processes.coordinator.queries import QUERIES, Queries
 from runtime.processes.coordinator.runs import Runs
 from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
 from runtime.processes.coordinator.session.transitions import SessionEvent
@@ -50,9 +42,6 @@ from runtime.station.run import Run
 from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
-_TO_MAIN = ("control_events", "reception_events", "media_events")  # rings
-# Control's own reasons to hold, as events of these kinds.
-_HOLDS = ("refusals", "implausible", "unmeasured", "family", "orphaned", "too_far", "moved_away")
 
 
 @dataclass(eq=False)
@@ -81,17 +70,8 @@ class Coordinator:
     session: SessionMachine
 
     def __post_init__(self) -> None:
-        self.media_report = MediaReport(0.0, 0, "", 0)
-        self.reception_report = ReceptionReport(0.0)
-        self.unheard: dict[str, str] = {}  # as by Sink.unheard
-        self._take_over()
-
-    def _take_over(self) -> None:
-        """Keep the events from before there was a coordinator, or since one died; act on nothing told to that one."""
-        for ring in _TO_MAIN:
-            for payload in self.shared.rings[ring].drain():
-                if isinstance(message := decode(payload), Event):
-                    self._note(message)
+        self.inbox = Inbox(self)
+        self.queries = Queries(self.boot, self.events, self.manual, self.preflights)
 
     @property
     def spec(self) -> StationSpec:
@@ -106,13 +86,11 @@ class Coordinator:
     def pump(self) -> None:
         """Hear the family, notice what happened, advance set-up and inference."""
         self.shared.beat("coordinator", self.clock.now())
-        for ring in _TO_MAIN:
-            for payload in self.shared.rings[ring].drain():
-                self._hear(decode(payload))
+        self.inbox.read()
         for noticed in self.health.notice(self.session.state, self.runs.open):
-            self._observe(*noticed)
+            self.observe(*noticed)
         if missed := self.collecting.look(self.session.state):
-            self._observe(*missed)
+            self.observe(*missed)
         for event in self.timing.look(self.clock.now()):
             self.say(event)
         self.runs.pump()
@@ -126,85 +104,23 @@ class Coordinator:
 
     def finish(self, reason: str) -> None:
         """The run is over, says who simulates what it is about."""
-        self._observe(SessionEvent.RUN_ENDED, reason)
-
-    # --- what the family says ------------------------------------------------------------------------------
-
-    def _hear(self, message: Message) -> None:
-        if isinstance(message, Event):
-            self._hear_event(message)
-        elif isinstance(message, ChunkMerged):
-            self.inference.merged(message)
-            if message.dropped:
-                text = f"chunk {message.chunk_id} dropped: {message.dropped}"
-                self.say(Event("chunk_dropped", text, self.clock.now(), message.arrival_step))
-        elif isinstance(message, EpisodeOpened):
-            self._episode_opened(message)
-        elif isinstance(message, EpisodeClosed):
-            self.say(self.runs.closed(message))
-            self.collecting.closed(message)
-        elif isinstance(message, MediaReport):
-            self.media_report = message
-        elif isinstance(message, ReceptionReport):
-            self.reception_report = message
-            self.runs.saw(message.truth, self.session.state is SessionState.RUNNING)
-
-    def _unlock(self) -> None:
-        """A control that was restarted, or obeys the e-stop, knows of no locks, another may: none, in any case."""
-        try:
-            self.manual.unlock()
-        except RuntimeFault as error:
-            log.error("grippers may still be locked: %s", error)
-
-    def _hear_event(self, event: Event) -> None:
-        self._note(event)
-        self.setup.heard(event)
-        settings = self.spec.deployment
-        if event.kind == "motion_done":
-            self.runs.arrived()
-        if event.kind == "starved":
-            self.inference.metrics.count_starved()
-        if event.kind == "starvation":
-            trouble = self.inference.trouble
-            stops = settings.faults.starvation == "stop"
-            why = f"{event.text}: {trouble}" if trouble else event.text
-            self._observe(SessionEvent.RUN_FAILED if stops else SessionEvent.HELD, why)
-        elif event.kind in _HOLDS or (
-            event.kind == "recording_failed" and settings.recording.on_failure == "hold"
-        ):
-            self._observe(SessionEvent.HELD, event.text)
-        elif event.kind == "displaced":
-            self._observe(SessionEvent.DISPLACED, event.text)
-
-    def _note(self, event: Event) -> None:
-        self._log(event)  # the others write their own events into the episode
-        if event.kind in (UNHEARD, HEARD):
-            self.unheard = dict(event.data["unheard"])
-
-    def _episode_opened(self, opened: EpisodeOpened) -> None:
-        if opened.error:
-            self.say(Event("recording_failed", opened.error, self.clock.now()))
-        elif opened.uuid:
-            self.say(Event("episode_opened", f"recording {opened.uuid}", self.clock.now()))
-        failure = self.runs.opened(opened, self.session.state is SessionState.RUNNING)
-        if failure:
-            self.collecting.unopened()
-            self._observe(SessionEvent.RUN_FAILED, failure)
+        self.observe(SessionEvent.RUN_ENDED, reason)
 
     def say(self, event: Event) -> None:
         """An event of the coordinator's own: to the log, to clients, into the episode."""
-        self._log(event)
+        self.log(event)
         self.runs.note(event)
 
-    def _log(self, event: Event) -> None:
+    def log(self, event: Event) -> None:
+        """An event of another process, which it writes into the episode itself."""
         self.events.append(event)
         log.info("%s: %s", event.kind, event.text)
 
-    def _observe(self, happening: SessionEvent, reason: str, process: str = "") -> None:
+    def observe(self, happening: SessionEvent, reason: str, process: str = "") -> None:
         """Tell the session; `process` is the one that was restarted."""
         if happening is SessionEvent.FAMILY_DIED:
             self.say(Event("family_died", reason, self.clock.now()))
-            self.unheard = {}  # a control that is started anew says so again
+            self.inbox.forget_unheard()
             self.runs.lost(process, reason)
         if happening is SessionEvent.ESTOPPED:
             self.runs.interrupt_alone(reason)
@@ -222,6 +138,13 @@ class Coordinator:
         """Data for the event of a `run` that is over and never began; {} for any other."""
         return {} if run is None or run is self.runs.open else run.unbegun
 
+    def _unlock(self) -> None:
+        """A control that was restarted, or obeys the e-stop, knows of no locks, another may: none, in any case."""
+        try:
+            self.manual.unlock()
+        except RuntimeFault as error:
+            log.error("grippers may still be locked: %s", error)
+
     # --- what goes on ----------------------------------------------------------------------------------------
 
     def _advance_setup(self) -> None:
@@ -233,12 +156,12 @@ class Coordinator:
         except RuntimeFault as error:
             self.setup.fail()
             self.orders.give("hold")
-            self._observe(SessionEvent.SETUP_FAILED, str(error))
+            self.observe(SessionEvent.SETUP_FAILED, str(error))
             return
         if self.setup.stage is not stage:
             self.say(Event("setup", str(self.setup.stage), self.clock.now()))
         if done:
-            self._observe(SessionEvent.SETUP_DONE, self.setup.outcome)
+            self.observe(SessionEvent.SETUP_DONE, self.setup.outcome)
 
     def _advance_inference(self) -> None:
         try:
@@ -261,7 +184,7 @@ class Coordinator:
         if answer == "slow" and self.inference.retries(error):
             return
         self.say(Event("policy_lost" if lost else "policy_failed", str(error), self.clock.now()))
-        self._observe(SessionEvent.RUN_FAILED if answer == "stop" else SessionEvent.HELD, str(error))
+        self.observe(SessionEvent.RUN_FAILED if answer == "stop" else SessionEvent.HELD, str(error))
 
     # --- commands ------------------------------------------------------------------------------------------
 
@@ -275,12 +198,8 @@ class Coordinator:
             )
         if refusal := self._beyond_rights(command):
             return Ack(command.uuid, "refused", refusal, boot=self.boot, sequence=self.session.sequence)
-        if command.kind == "events_since":
-            return self._events_since(command)
-        if command.kind == "aim":
-            return self._aim(command)
-        if command.kind in PREFLIGHT_QUERIES:
-            return self.preflights.handle(command, self.boot)
+        if command.kind in QUERIES:
+            return self.queries.answer(command)
         before, sequence, run = self.session.state, self.session.sequence, self.runs.open
         ack = self.session.handle(command)
         if ack.status == "accepted" and command.kind in ("setup", "run"):
@@ -315,23 +234,6 @@ class Coordinator:
         except RuntimeFault as fault:
             return str(fault)
         return ""
-
-    def _events_since(self, command: Command) -> Ack:
-        number = command.args.get("number", 0)
-        if not isinstance(number, int):
-            return Ack(command.uuid, "refused", f"events_since number = {number!r}: must be a whole number")
-        return Ack(command.uuid, "done", boot=self.boot, data={"events": self.events.since(number)})
-
-    def waits(self, command: Command) -> bool:
-        """True if its answer needs what is still being loaded, so that it is to be handled in a moment."""
-        return command.kind == "aim" and self.manual.waits(command.args)
-
-    def _aim(self, command: Command) -> Ack:
-        """Preview of where the robot would go; nothing moves, and any client may ask."""
-        try:
-            return Ack(command.uuid, "done", boot=self.boot, data=self.manual.aim(command.args))
-        except RuntimeFault as error:
-            return Ack(command.uuid, "refused", str(error))
 
     def close(self) -> None:
         """Let go of the policy."""

@@ -111,7 +111,7 @@ class CommandService:
                 self._server.answer(call, first)
             elif refusal := forged(command) or lacking(command):
                 self._refuse(call, command, refusal)
-            elif self._coordinator.waits(command):
+            elif self._coordinator.queries.waits(command):
                 self._keep(call, command)
             else:
                 fresh.append((command, self._coordinator.handle(command), call))

@@ -23,7 +23,7 @@ def snapshot(of: Coordinator) -> dict[str, Any]:
     """
     spec, settings = of.spec, of.spec.deployment
     now, people = of.clock.now(), of.people.now()
-    media, reception = of.media_report, of.reception_report
+    media, reception = of.inbox.media_report, of.inbox.reception_report
     return {
         "boot": of.boot,
         "clock": people,
@@ -140,7 +140,7 @@ def control_figures(shared: SharedState, rate: float) -> dict[str, Any]:
 
 
 def _link(of: Coordinator, now: float) -> dict[str, Any]:
-    record, reception = of.shared.observation.read(), of.reception_report
+    record, reception = of.shared.observation.read(), of.inbox.reception_report
     never = int(record["sequence"]) == 0
     ages = {"joints": math.inf if never else now - float(record["joints_captured"])}
     for index, camera in enumerate(of.shared.layout.cameras):
@@ -151,7 +151,7 @@ def _link(of: Coordinator, now: float) -> dict[str, Any]:
         "rates": dict(reception.rates),
         "faults": dict(reception.faults),
         "cameras": {key: dict(told) for key, told in reception.cameras.items()},
-        "unheard": dict(of.unheard),
+        "unheard": dict(of.inbox.unheard),
         "age_ms": dict(reception.age_ms),
         "scheduling": reception.scheduling,
     }

@@ -233,7 +233,7 @@ def test_events_from_before_main_was_there_are_kept_and_nothing_that_was_told_is
         "displaced",
         "source_frozen_cam_high",
     ]
-    assert station.coordinator.unheard == told["unheard"]
+    assert station.coordinator.inbox.unheard == told["unheard"]
     assert station.state is SessionState.DISCONNECTED  # as it begins, until it has looked itself
     assert station.reason == "waiting for the first observation"
     station.close()

@@ -265,7 +265,7 @@ def test_who_sets_up_while_a_recording_is_closed_finds_the_same_as_who_comes_lat
     while client.station.media.closing:
         ticks += client.turn()
     assert ticks == 0
-    report = client.station.coordinator.media_report
+    report = client.station.coordinator.inbox.media_report
     assert (report.recording, report.time) == ("", client.station.clock.now())  # before the first tick of it
     client.close()
 

@@ -1,0 +1,43 @@
+"""Queries of clients that the coordinator answers: nothing moves, and no lease is needed."""
+
+from __future__ import annotations
+
+from runtime.core.errors import RuntimeFault
+from runtime.ipc.bus import EventLog
+from runtime.ipc.messages import Ack, Command
+from runtime.processes.coordinator.manual.manual_control import ManualControl
+from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
+
+QUERIES = ("events_since", "aim", *PREFLIGHT_QUERIES)
+
+
+class Queries:
+    """Answers to QUERIES; any client that may ask at all may ask them."""
+
+    def __init__(self, boot: str, events: EventLog, manual: ManualControl, preflights: PreflightDesk) -> None:
+        self._boot, self._events, self._manual, self._preflights = boot, events, manual, preflights
+
+    def answer(self, command: Command) -> Ack:
+        """The answer to one of QUERIES."""
+        if command.kind == "events_since":
+            return self._events_since(command)
+        if command.kind == "aim":
+            return self._aim(command)
+        return self._preflights.handle(command, self._boot)
+
+    def waits(self, command: Command) -> bool:
+        """True if its answer needs what is still being loaded, so that it is to be asked again in a moment."""
+        return command.kind == "aim" and self._manual.waits(command.args)
+
+    def _events_since(self, command: Command) -> Ack:
+        number = command.args.get("number", 0)
+        if not isinstance(number, int):
+            return Ack(command.uuid, "refused", f"events_since number = {number!r}: must be a whole number")
+        return Ack(command.uuid, "done", boot=self._boot, data={"events": self._events.since(number)})
+
+    def _aim(self, command: Command) -> Ack:
+        """Preview of where the robot would go."""
+        try:
+            return Ack(command.uuid, "done", boot=self._boot, data=self._manual.aim(command.args))
+        except RuntimeFault as error:
+            return Ack(command.uuid, "refused", str(error))
