@@ -24,6 +24,7 @@ from runtime.core.clock import Clock, VirtualClock
 from runtime.core.errors import RuntimeFault, SetupError
 from runtime.processes.lockstep.lockstep import Peers
 from runtime.processes.lockstep.server import ServedLockstep
+from runtime.processes.reception.process import make_source
 from runtime.sim import serve, standin, surroundings
 from runtime.sim.link import Link
 from runtime.sim.node import Node
@@ -62,7 +63,9 @@ def linked(made: StationSpec, clock: Clock, around: Surroundings, options: argpa
             f"transport.kind = {transport.kind!r} with a bench in lockstep; allowed: zmq with simulated = true"
         )
     link = Link(Node(made.robot, options, clock, around), made.robot, clock)
-    return Peers(source=lambda spec, clock: link, sink=lambda spec, clock: link)
+    return Peers(
+        source=lambda spec, clock: make_source(spec, clock, lambda *of: link), sink=lambda spec, clock: link
+    )
 
 
 def station(

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
+from robots import Robot
 from runtime.core import malloc as heap
 from runtime.core import realtime
 from runtime.core.clock import Clock, MonotonicClock
@@ -130,16 +132,19 @@ class Reception:
             log.warning("the coordinator does not read: %s lost", type(message).__name__)
 
 
-def make_source(spec: StationSpec, clock: Clock) -> Source:
+def make_source(
+    spec: StationSpec, clock: Clock, build: Callable[[Any, Robot, Clock], Source] | None = None
+) -> Source:
     """The observations, not yet connected: the transport's, with the cameras of the deployment's own.
 
     The transport is told of a robot without these: it must not wait for them. What it leaves out itself stays.
+    `build` stands in for that of the transport's kind.
     """
     settings = spec.deployment
     own = settings.cameras.keys() & set(delivered(settings, spec.robot))
     robot = replace(spec.robot, cameras=tuple(c for c in spec.robot.cameras if c.key not in own))
-    transport = variants("runtime.transports")[settings.transport.kind]
-    source: Source = transport.source(settings.transport, robot, clock)
+    build = build or variants("runtime.transports")[settings.transport.kind].source
+    source = build(settings.transport, robot, clock)
     if not settings.cameras:
         return source
     from runtime.cameras.attaching import attached

@@ -55,14 +55,14 @@ def file_camera(path: Path, **settings: str) -> list[str]:
 
 def test_a_video_is_recorded_at_its_own_pace_beside_the_nodes_joints(tmp_path: Path) -> None:
     film = movie(tmp_path / "film.mp4", pictures=10, rate=10, size=(640, 480))
-    with served("tabletop", 1, tmp_path, [*RECORDED, *file_camera(film)]) as (made, station):
+    with served("tabletop", 1, tmp_path, [*RECORDED, *file_camera(film)]) as (_, station):
         ready(station)
         station.command("run")
         go(station, 2.0)
         status = station.coordinator.snapshot()["link"]["cameras"][CAMERA]
         assert (status["kind"], status["condition"], status["losses"]) == ("file", "live", 0)
         episode = stop(station)
-        assert made.cameras == tuple(episode.videos), "all others come from the node"
+        assert station.spec.cameras == tuple(episode.videos), "all others come from the node"
     captured = column(episode.rows, f"capture_time.{CAMERA}")
     joints = column(episode.rows, "capture_time.joints")
     repeated = column(episode.rows, f"repeated.{CAMERA}")

@@ -20,6 +20,7 @@ from robots import Robot
 from runtime.config import loader
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import PolicyLostError
+from runtime.core.plugins import variants
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.station.checks import checked_spec
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
@@ -46,8 +47,9 @@ def built(shown: dict[str, Any], **policy: Any) -> tuple[Any, Robot]:
         "policy": shown["policy"] | policy,
     }
     made = checked_spec(loader.resolve(tree, {}, "policies.md"))
-    found = made.policy.build(made.deployment.policy, made.robot, MonotonicClock(), made.rate)
-    return found, made.robot
+    settings = made.deployment.policy
+    build = variants("runtime.policies")[settings.kind].build
+    return build(settings, made.robot, MonotonicClock(), made.rate), made.robot
 
 
 @contextlib.contextmanager
