@@ -15,7 +15,7 @@ import pytest
 from runtime.clients.client import StationClient
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import DEAD, STATION, WIDE
-from tests.e2e.remote import SKILLED, page_of, refusal, tidy, visitor
+from tests.e2e.remote import SKILLED, opened, page_of, refusal, tidy, visitor
 from tests.processes import eventually
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -121,7 +121,7 @@ def test_a_web_that_is_killed_mid_run_comes_back_and_the_page_goes_on(demo, benc
     with closing(bench.again()) as page:
         kept = page.renewed()
         if not kept:  # the web was away for longer than the lease lives
-            page = page.again()
+            page = opened(bench.visitor, bench.page)
             page.holds(trial)
             page.take()
             page.resume(trial)
@@ -137,7 +137,7 @@ def test_a_web_that_stays_away_leaves_a_robot_that_holds_until_the_operator_resu
         os.kill(demo.pid("serve"), signal.SIGKILL)
         held = station.wait(lambda status: status["state"] == "holding", 30)
         assert "lease" in held["reason"]
-    with closing(bench.again()) as page:
+    with closing(opened(bench.visitor, bench.page)) as page:
         assert "lease" in page.holds(trial)
         page.take()
         page.resume(trial)
