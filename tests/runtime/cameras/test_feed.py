@@ -56,11 +56,12 @@ def test_of_a_stream_without_stamps_that_is_read_too_slowly_what_has_waited_is_p
     server = MjpegServer(rate=1e6)  # as fast as it is taken
     url = server.start()
     feed = Feed(Address(url, url, "mpjpeg", stamped=False), 2.0, 2.0)
-    for _ in range(10):
+    read = 0
+    while server.sent - read < 100:  # so many were sent and not shown; a busy machine takes longer for it
         assert feed.read() is not None
+        read += 1
     feed.close()
     server.close()
-    assert server.sent > 100
 
 
 def test_of_a_file_no_picture_is_passed_over_however_fast_it_is_read(tmp_path: Path) -> None:
