@@ -11,6 +11,7 @@ from evaweb.results.analysis.analysis import Analysis, Comparison
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.presentation.addresses import compare_address
 from evaweb.results.presentation.drawings import rates
+from evaweb.results.presentation.headline import headline
 from evaweb.results.presentation.wording import evidence_words, missed, points, probability, verdict
 
 
@@ -37,9 +38,11 @@ def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
 
 
 def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[str, Any]:
-    """The sentence, and each question that a comparison answers."""
+    """The sentence, and each question that a comparison answers; of the planned one its design says the sentence."""
+    planned = headline(plan) if found is primary_of(plan, analysis) else None
     return {
-        "sentence": comparison_sentence(analysis, found),
+        "sentence": planned.sentence if planned else comparison_sentence(analysis, found),
+        "headline": planned,
         "facts": [*_of_the_rates(analysis, found), *_of_the_evidence(analysis, found), *_beyond(found)],
         "notes": found.notes,
         "reversed": bool(found.stratified and found.stratified.reversed),

@@ -74,7 +74,6 @@ def carry_out(bench):
 
 @pytest.fixture
 def revealed(plan, owner, carry_out):
-    """All of it carried out, closed and revealed."""
+    """All of it carried out, which closes it, and revealed."""
     carry_out(plan, 16)
-    plan_close(user=owner, plan=plan, reason="all made")
     return plan_reveal(user=owner, plan=plan)

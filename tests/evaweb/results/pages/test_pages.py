@@ -96,7 +96,7 @@ def test_the_owner_looks_by_an_act_of_their_own(plan, owner, bench, carry_out, a
 
 
 def test_closed_and_revealed_on_the_page(plan, owner, carry_out, as_, viewer):
-    carry_out(plan, 16)
+    carry_out(plan, 14)
     client = as_(owner)
     refused = client.post(f"{PLAN}reveal")
     assert refused.status_code == 409
@@ -241,7 +241,7 @@ def test_queries_do_not_grow_with_trials(plan, owner, carry_out, as_):
 
     carry_out(plan, 4)
     few = asked()
-    carry_out(plan, 12)
+    carry_out(plan, 10)
     assert asked() == few
     assert max(few) <= 30
 
