@@ -3,7 +3,7 @@ import pytest
 from evaweb.episodes.folders import preview_folder
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.plans.services import plan_freeze, plan_reveal
 from evaweb.results.analysis import caching
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint
