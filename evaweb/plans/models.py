@@ -26,8 +26,8 @@ class StoppingRule(models.TextChoices):
 
     NONE = "none", "fixed: all trials are made, one test at the end"
     EVIDENCE = "evidence", "anytime: an e-process, looked at after every pair"
-    LATE = "late", "group sequential, late: nearly the power of fixed, ends early where much differs"
-    EARLY = "early", "group sequential, early: fewer trials, a little less power"
+    LATE = "late", "group sequential late: nearly the power of fixed, ends early where much differs"
+    EARLY = "early", "group sequential early: fewer trials, a little less power"
 
 
 class PrimaryOutcome(models.TextChoices):

@@ -60,9 +60,9 @@ class Migration(migrations.Migration):
                     ("evidence", "anytime: an e-process, looked at after every pair"),
                     (
                         "late",
-                        "group sequential, late: nearly the power of fixed, ends early where much differs",
+                        "group sequential late: nearly the power of fixed, ends early where much differs",
                     ),
-                    ("early", "group sequential, early: fewer trials, a little less power"),
+                    ("early", "group sequential early: fewer trials, a little less power"),
                 ],
                 default="none",
                 max_length=8,
