@@ -50,7 +50,8 @@ def carry_out(operator: Visitor, station: str, plan: str, count: int, tell: Tell
 
 def revealed(owner: Visitor, plan: str, made: list[Made]) -> dict[str, Any]:
     """Close and reveal the plan: what was committed to, its key, and the trials with the names of their checkpoints."""
-    owner.post(f"plans/{plan}/close", {"reason": f"{len(made)} trials were made"})
+    if owner.get(f"plans/{plan}")["state"] == "frozen":  # else its design has ended it
+        owner.post(f"plans/{plan}/close", {"reason": f"{len(made)} trials were made"})
     told = owner.post(f"plans/{plan}/reveal", {})
     trials = [{**asdict(one), "checkpoint": owner.get(f"trials/{one.trial}")["checkpoint"]} for one in made]
     return {

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from evaweb.statistics.base import StatisticsError, check_alpha, check_share
 
@@ -117,17 +117,36 @@ class Boundary:
         The first is taken at 40,000 rates; the second holds between them too: along the angle of which the rate is the
         squared sine, the angle of a probability turns by at most the square root of the trials (Cauchy and Schwarz).
         """
-        import numpy as np
 
         null = _Null(self.margin, _FINE)
-        total = np.zeros(_FINE)
-        for look, mass in self._walk((0.5, 0.5)):
-            for cells, even, counts in _portions(mass, look, self.margin):
-                total += null.mass(cells, even, *counts).sum(axis=0)
+        total = self._over_margin(null) if self.margin is not None else self._over_equal(null)
         highest = float(total.max())
         trials = self.looks[-1].first + self.looks[-1].second
         turned = math.asin(math.sqrt(min(1.0, highest))) + math.sqrt(trials) * null.gap / 2
         return highest, math.sin(min(turned, math.pi / 2)) ** 2
+
+    def _over_equal(self, null: _Null) -> NDArray[np.float64]:
+        """Probability of a stop at each pair of equal rates: only the successes of both arms together count."""
+        import numpy as np
+
+        gone, trials = np.zeros(1), 0
+        for look, mass in self._walk((0.5, 0.5)):
+            for _ in range(look.first + look.second - trials):
+                gone = 0.5 * (np.append(gone, 0.0) + np.append(0.0, gone))
+            trials = look.first + look.second
+            gone += np.bincount(
+                np.indices(mass.shape).sum(axis=0).ravel(), mass.ravel(), minlength=trials + 1
+            )
+        return null.total((np.arange(trials + 1), np.zeros(trials + 1)), gone, (trials, 0))
+
+    def _over_margin(self, null: _Null) -> NDArray[np.float64]:
+        import numpy as np
+
+        total = np.zeros(_FINE)
+        for look, mass in self._walk((0.5, 0.5)):
+            cells = np.nonzero(mass)
+            total += null.total(cells, mass[cells], (look.first, look.second))
+        return total
 
     def _walk(self, rates: tuple[float, float]) -> Iterator[tuple[Look, NDArray[np.float64]]]:
         """Each look with the probability of stopping there at each table: float64 [first + 1, second + 1]."""
@@ -218,33 +237,28 @@ class _Null:
             self._logs = [np.log(2 * rate) for rate in (first, 1 - first, second, 1 - second)]
 
     def mass(
-        self, cells: tuple[NDArray[np.intp], ...], even: NDArray[np.float64], n: int, m: int
+        self, cells: tuple[NDArray[Any], ...], even: NDArray[np.float64], trials: tuple[int, int]
     ) -> NDArray[np.float64]:
         """Probabilities of tables whose probability at rates of a half is `even` [cells]: float64 [cells, rates]."""
         import numpy as np
 
-        a, b = (of[:, None].astype(float) for of in cells)
+        (a, b), (n, m) = (of[:, None].astype(float) for of in cells), trials
         one, not_one, other, not_other = self._logs
-        return np.asarray(
-            np.exp(np.log(even)[:, None] + a * one + (n - a) * not_one + b * other + (m - b) * not_other)
-        )
+        with np.errstate(divide="ignore"):
+            weights = np.log(even)[:, None]
+        return np.asarray(np.exp(weights + a * one + (n - a) * not_one + b * other + (m - b) * not_other))
 
+    def total(
+        self, cells: tuple[NDArray[Any], ...], even: NDArray[np.float64], trials: tuple[int, int]
+    ) -> NDArray[np.float64]:
+        """Their sum: float64 [rates]."""
+        import numpy as np
 
-def _portions(
-    mass: NDArray[np.float64], look: Look, margin: float | None
-) -> Iterator[tuple[tuple[NDArray[np.intp], ...], NDArray[np.float64], tuple[int, int]]]:
-    """The tables with any of `mass`, some at a time; where both rates are one, only their successes together count."""
-    import numpy as np
-
-    n, m = look.first, look.second
-    if margin is None:
-        together = np.indices(mass.shape).sum(axis=0).ravel()
-        mass = np.asarray(np.bincount(together, mass.ravel()), dtype=np.float64)[:, None]
-        n, m = n + m, 0
-    cells = np.nonzero(mass)
-    for start in range(0, len(cells[0]), _CELLS):
-        part = tuple(of[start : start + _CELLS] for of in cells)
-        yield part, mass[part], (n, m)
+        total = np.zeros(len(self._logs[0]))
+        for start in range(0, len(even), _CELLS // 8):
+            part = slice(start, start + _CELLS // 8)
+            total += self.mass((cells[0][part], cells[1][part]), even[part], trials).sum(axis=0)
+        return total
 
 
 def _checked(looks: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -301,7 +315,7 @@ def _taken(
     for start in range(0, len(order), _CELLS):
         part = slice(start, start + _CELLS)
         cells = np.unravel_index(order[part], alive.shape)
-        errors = so_far + np.cumsum(null.mass(cells, alive[cells], *look), axis=0)
+        errors = so_far + np.cumsum(null.mass(cells, alive[cells], look), axis=0)
         within = errors.max(axis=1) <= most
         allowed = len(within) if within.all() else int(np.argmin(within))
         whole = np.flatnonzero(ends[part][:allowed])
