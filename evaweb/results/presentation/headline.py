@@ -29,7 +29,8 @@ def headline(plan: Plan) -> Headline | None:
     at_reveal = [(one, other) for one, other in plan.at_reveal["pairs"]] if plan.at_reveal else now
     sentence = _sentence(plan, found, conclusion, at_reveal)
     later = _sentence(plan, found, conclude(found, now), now) if now != at_reveal else ""
-    return Headline(sentence, f"{plan.get_stopping_display()}; alpha {found.alpha:g}", later)
+    design = str(plan.get_stopping_display()).partition(":")[0]
+    return Headline(sentence, f"{design}, alpha {found.alpha:g}", later)
 
 
 def _sentence(plan: Plan, found: Design, conclusion: Conclusion, pairs: list[tuple[float, float]]) -> str:
@@ -44,7 +45,7 @@ def _sentence(plan: Plan, found: Design, conclusion: Conclusion, pairs: list[tup
         claim = f"{first} is {'' if conclusion.winner else 'not shown to be '}not worse than {second}"
         return f"{claim} by {100 * found.margin:g} points or more: {counts}"
     if conclusion.winner is None:
-        return f"no significant difference between {first} and {second}: {counts}"
+        return f"No significant difference between {first} and {second}: {counts}"
     better, worse = (first, second) if conclusion.winner == "first" else (second, first)
     what = "succeeded more often" if found.outcome == SUCCESS else "reached higher scores"
     return f"{better} {what} than {worse}: {counts}"
