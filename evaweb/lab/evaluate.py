@@ -35,12 +35,18 @@ class Made:
 
 
 def carry_out(operator: Visitor, station: str, plan: str, count: int, tell: Tell) -> list[Made]:
-    """The next `count` trials of a plan; VisitFailed where one does not come about, or tells what it is of."""
+    """The next `count` trials of a plan, or fewer where its design ends it.
+
+    VisitFailed where one does not come about, or tells what it is of.
+    """
     made = []
     with closing(LivePage(operator, station)) as page:
         take(page)
         operator.post(f"stations/{station}/cameras", {"first": True})
         for number in range(1, count + 1):
+            if operator.get(f"plans/{plan}")["state"] != "frozen":
+                tell(f"the plan's design has ended after {number - 1} trials")
+                break
             one = _made(operator, page, station, plan)
             made.append(one)
             verdict = "success" if one.success else "no success"
@@ -50,7 +56,8 @@ def carry_out(operator: Visitor, station: str, plan: str, count: int, tell: Tell
 
 def revealed(owner: Visitor, plan: str, made: list[Made]) -> dict[str, Any]:
     """Close and reveal the plan: what was committed to, its key, and the trials with the names of their checkpoints."""
-    owner.post(f"plans/{plan}/close", {"reason": f"{len(made)} trials were made"})
+    if owner.get(f"plans/{plan}")["state"] == "frozen":  # else its design has ended it
+        owner.post(f"plans/{plan}/close", {"reason": f"{len(made)} trials were made"})
     told = owner.post(f"plans/{plan}/reveal", {})
     trials = [{**asdict(one), "checkpoint": owner.get(f"trials/{one.trial}")["checkpoint"]} for one in made]
     return {

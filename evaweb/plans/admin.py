@@ -16,6 +16,7 @@ from django.utils.html import format_html_join
 from django.utils.safestring import SafeString, mark_safe
 
 from evaweb.errors import EvaError
+from evaweb.plans.design import looks_of
 from evaweb.plans.exchange import exported, exported_with_pictures, imported
 from evaweb.plans.models import Plan, PlanEvent, PlanState
 from evaweb.plans.references import LARGEST, unpacked
@@ -34,6 +35,9 @@ _FROZEN = (
     "strategy",
     "blind",
     "stopping",
+    "outcome",
+    "margin",
+    "look_after",
     "alpha",
     "first",
     "second",
@@ -54,6 +58,13 @@ class PlanForm(forms.ModelForm):
     def clean_strategy(self) -> Any:
         """An empty field is no strategy of the plan's own."""
         return self.cleaned_data["strategy"] or None
+
+    def clean_look_after(self) -> list[int]:
+        """An empty field is a look after every pair."""
+        try:
+            return looks_of(self.cleaned_data["look_after"] or [])
+        except EvaError as error:
+            raise forms.ValidationError(str(error)) from None
 
 
 class Conditions(forms.ModelMultipleChoiceField):
@@ -117,6 +128,7 @@ class PlanAdmin(admin.ModelAdmin):
                     "blind",
                     ("first", "second"),
                     ("stopping", "alpha"),
+                    ("outcome", "margin", "look_after"),
                     "second_rater_share",
                     "match_gate",
                 )

@@ -16,6 +16,7 @@ from evaweb.errors import Conflict, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans.blinding_rules import has_looked
 from evaweb.plans.canonical import digest
+from evaweb.plans.design import conclusion_of, ended_because
 from evaweb.plans.documents import checkpoint_of, scene_of
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
 from evaweb.roles import Role, require
@@ -51,6 +52,7 @@ def hand_out(*, user: User, station: Station, plan: Plan) -> Handout:
     require(user, Role.OPERATOR)
     held = Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
     _check(held, user, station)
+    _check_goes_on(held)
     slot, before = _next(held, station)
     _check_unchanged(held, slot)
     if slot.station_id is None:
@@ -102,6 +104,14 @@ def _check(plan: Plan, user: User, station: Station) -> None:
     allowed = list(plan.stations.values_list("name", flat=True))
     if allowed and station.name not in allowed:
         raise Conflict(f"{plan} is for {', '.join(sorted(allowed))}, not for {station.name}")
+
+
+def _check_goes_on(plan: Plan) -> None:
+    found = conclusion_of(plan)
+    if found is not None and found.ended == "boundary":
+        raise Conflict(
+            f"{plan} has ended: {ended_because(found)}; it is closed once its last trial is scored"
+        )
 
 
 def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:

@@ -12,9 +12,10 @@ class PlansConfig(AppConfig):
     def ready(self) -> None:
         from evaweb.append_only import protect
 
-        # They declare what is hidden from whom, and what is asked before a trial of a plan runs.
+        # They declare what is hidden from whom, what is asked before a trial of a plan runs, and what ends a plan.
         from evaweb.plans import bench_checks as bench  # noqa: F401
         from evaweb.plans import blinding_rules as sight  # noqa: F401
+        from evaweb.plans import services  # noqa: F401
         from evaweb.plans import setup_padding as pacing  # noqa: F401
 
         protect(self)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
+from evaweb.plans.design import drafted
 from evaweb.plans.models import Plan
 from evaweb.plans.schedule import Condition
+from evaweb.statistics.designs import table
 from evaweb.trials.models import Checkpoint, Position, Scene
 
-FORMAT = 2
+FORMAT = 3  # 2 had no outcome, margin, looks or boundary
 
 
 def document_of(plan: Plan) -> dict[str, Any]:
@@ -31,10 +33,20 @@ def document_of(plan: Plan) -> dict[str, Any]:
         "mode": "continuous",
         "strategy": plan.strategy,
         "blind": plan.blind,
-        "stopping": {"rule": plan.stopping, "alpha": plan.alpha},
+        "stopping": {"rule": plan.stopping, "alpha": plan.alpha, **_design(plan)},
         "comparison": [plan.first.name, plan.second.name] if plan.first and plan.second else None,
         "second_rater_share": plan.second_rater_share,
         "match_gate": plan.match_gate,
+    }
+
+
+def _design(plan: Plan) -> dict[str, Any]:
+    found = drafted(plan)
+    return {
+        "outcome": plan.outcome,
+        "margin": plan.margin,
+        "pairs": found.pairs if found else None,
+        "boundary": table(found.boundary) if found and found.boundary else None,
     }
 
 

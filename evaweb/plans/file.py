@@ -80,6 +80,9 @@ class PlanTable(Table):
     strategy: dict[str, Any] | None = None
     blind: bool = True
     stopping: str = "none"
+    outcome: str = "success"
+    margin: float | None = None
+    look_after: list[int] = []
     alpha: float = 0.05
     comparison: list[str] = Field(default=[], max_length=2)
     second_rater_share: float = 0.0

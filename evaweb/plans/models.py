@@ -22,10 +22,19 @@ class PlanState(models.TextChoices):
 
 
 class StoppingRule(models.TextChoices):
-    """When the trials of a plan end before they are all made."""
+    """Design of a plan's comparison: when it is looked at, and what ends it; see evaweb.statistics.designs."""
 
-    NONE = "none", "never: all trials are made"
-    EVIDENCE = "evidence", "when the evidence suffices, however often one looks"
+    NONE = "none", "fixed: all trials are made, one test at the end"
+    EVIDENCE = "evidence", "anytime: an e-process, looked at after every pair"
+    LATE = "late", "group sequential late: nearly the power of fixed, ends early where much differs"
+    EARLY = "early", "group sequential early: fewer trials, a little less power"
+
+
+class PrimaryOutcome(models.TextChoices):
+    """What the comparison is about."""
+
+    SUCCESS = "success", "success"
+    SCORE = "score", "score (partial credit)"
 
 
 class Plan(models.Model):
@@ -60,7 +69,21 @@ class Plan(models.Model):
         null=True, blank=True, help_text="The [strategy] table for all trials; empty: as each station has it."
     )
     blind = models.BooleanField(default=True, help_text="Operators are not told which checkpoint runs.")
-    stopping = models.CharField(max_length=8, choices=StoppingRule, default=StoppingRule.NONE)
+    stopping = models.CharField("design", max_length=8, choices=StoppingRule, default=StoppingRule.NONE)
+    outcome = models.CharField(max_length=8, choices=PrimaryOutcome, default=PrimaryOutcome.SUCCESS)
+    margin = models.FloatField(
+        null=True,
+        blank=True,
+        validators=[MinValueValidator(0.001), MaxValueValidator(0.999)],
+        help_text="Asks whether the first checkpoint's success rate is not lower than the second's by this much "
+        "or more (0.1: ten points). Empty: whether the two differ.",
+    )
+    look_after = models.JSONField(
+        default=list,
+        blank=True,
+        help_text="With a group sequential design: after which pairs it is looked at, such as [20, 40, 60]. "
+        "Empty: after every pair.",
+    )
     alpha = models.FloatField(default=0.05, validators=[MinValueValidator(0.0001), MaxValueValidator(0.5)])
     first = models.ForeignKey(
         Checkpoint,
@@ -100,6 +123,12 @@ class Plan(models.Model):
     frozen_at = models.DateTimeField(null=True, blank=True, editable=False)
     closed_at = models.DateTimeField(null=True, blank=True, editable=False)
     closed_because = models.TextField(blank=True, editable=False)
+    at_reveal = models.JSONField(
+        null=True,
+        blank=True,
+        editable=False,
+        help_text="The comparison as it stood at the reveal; see evaweb.plans.design.",
+    )
     revealed_at = models.DateTimeField(null=True, blank=True, editable=False)
     revealed_by = models.ForeignKey(
         settings.AUTH_USER_MODEL,
@@ -121,6 +150,9 @@ class Plan(models.Model):
                 "repetitions",
                 "blind",
                 "stopping",
+                "outcome",
+                "margin",
+                "look_after",
                 "alpha",
                 "first",
                 "second",
@@ -130,6 +162,7 @@ class Plan(models.Model):
         ),
         only="OLD.state <> 'draft'",
         moves={"state": {"frozen": ("closed",), "closed": ("revealed",), "revealed": ()}},
+        never=("OLD.at_reveal IS NOT NULL AND (NEW.at_reveal IS NULL OR OLD.at_reveal <> NEW.at_reveal)",),
     )
 
     class Meta:

@@ -10,7 +10,7 @@ from evaweb.errors import NotFound
 from evaweb.plans.models import Handout, Plan, PlanState
 from evaweb.roles import Role, role_of
 from evaweb.stations.models import Station
-from evaweb.trials.models import Trial
+from evaweb.trials.models import Trial, TrialStatus
 
 
 def plan_list(*, user: Any) -> QuerySet[Plan]:
@@ -38,6 +38,12 @@ def plans_open(*, station: Station) -> list[Plan]:
     """Those of which trials are handed out at this station."""
     rows = Plan.objects.filter(state=PlanState.FROZEN).select_related("owner")
     return list(rows.filter(Q(stations=None) | Q(stations=station)).distinct().order_by("title", "-version"))
+
+
+def remaining(plan: Plan) -> int:
+    """Number of trials that a plan foresees and that do not count yet."""
+    counted = plan.handouts.filter(trial__status=TrialStatus.SCORED).values("slot")
+    return plan.slots.exclude(pk__in=counted).count()
 
 
 def handout_of(*, trial: Trial) -> Handout | None:

@@ -9,13 +9,16 @@ from django.utils import timezone
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans.canonical import difference, digest
+from evaweb.plans.design import at_the_reveal, conclusion_of, drafted, ended_because
 from evaweb.plans.documents import conditions_of, document_of
-from evaweb.plans.models import Plan, PlanEvent, PlanState, Slot, StoppingRule
+from evaweb.plans.models import Plan, PlanEvent, PlanState, PrimaryOutcome, Slot, StoppingRule
 from evaweb.plans.schedule import Unit, schedule
 from evaweb.plans.seeded_draws import new_key
+from evaweb.plans.selectors import handout_of, remaining
 from evaweb.roles import Role, require, role_of
 from evaweb.trials.lifecycle import OPEN
 from evaweb.trials.models import Evaluation, Trial, TrialStatus
+from evaweb.trials.services import declare_settled
 
 _COPIED = (
     "name",
@@ -25,6 +28,9 @@ _COPIED = (
     "strategy",
     "blind",
     "stopping",
+    "outcome",
+    "margin",
+    "look_after",
     "alpha",
     "second_rater_share",
     "match_gate",
@@ -123,6 +129,7 @@ def plan_reveal(*, user: User, plan: Plan) -> Plan:
             f"{held}: document, schedule and key are not those of the commitment {held.commitment}: "
             "somebody has changed the database; nothing was revealed"
         )
+    held.at_reveal = at_the_reveal(held)
     held.state, held.revealed_at, held.revealed_by = PlanState.REVEALED, timezone.now(), user
     held.save()
     _note(held, user, "revealed", f"key {bytes(held.key or b'').hex()}; commitment verified")
@@ -130,15 +137,43 @@ def plan_reveal(*, user: User, plan: Plan) -> Plan:
     return plan
 
 
-def _close(plan: Plan, user: User, why: str) -> None:
-    unfinished = Trial.objects.filter(
-        handout__plan=plan, status__in=(*OPEN, TrialStatus.ENDED, TrialStatus.INTERRUPTED), verdict=None
+@transaction.atomic
+def plan_end(*, user: User, plan: Plan) -> None:
+    """Close a running plan whose design has ended, as soon as none of its trials is unfinished.
+
+    The reason says that a boundary was crossed or that all pairs are made: never for which checkpoint.
+    """
+    held = _held(plan)
+    found = conclusion_of(held) if held.state == PlanState.FROZEN else None
+    if found is None or not found.ended or _unfinished(held):
+        return
+    if found.ended == "boundary" or not remaining(held):
+        _close(held, user, ended_because(found))
+
+
+def _looked_at(trial: Trial, user: User) -> None:
+    handout = handout_of(trial=trial)
+    if handout is not None:
+        plan_end(user=user, plan=handout.plan)
+
+
+declare_settled(_looked_at)
+
+
+def _unfinished(plan: Plan) -> list[Trial]:
+    return list(
+        Trial.objects.filter(
+            handout__plan=plan, status__in=(*OPEN, TrialStatus.ENDED), verdict=None
+        ).select_related("handout", "station")
     )
-    settled = [trial for trial in unfinished if trial.status != TrialStatus.INTERRUPTED]
-    if settled:
-        trial = settled[0]
+
+
+def _close(plan: Plan, user: User, why: str) -> None:
+    unfinished = _unfinished(plan)
+    if unfinished:
+        trial = unfinished[0]
         raise Conflict(
-            f"{len(settled)} trials of {plan} are not finished, {trial.handout.code} on {trial.station.name} "
+            f"{len(unfinished)} trials of {plan} are not finished, {trial.handout.code} on {trial.station.name} "
             f"is {trial.get_status_display()}: score or abandon them first"
         )
     plan.state, plan.closed_at, plan.closed_because = PlanState.CLOSED, timezone.now(), why
@@ -162,8 +197,14 @@ def _check(plan: Plan) -> None:
     for row in compared:
         if row.pk not in chosen:
             raise EvaError(f"the comparison is about {row}, which is none of the plan's checkpoints")
-    if plan.stopping == StoppingRule.EVIDENCE and not compared:
-        raise EvaError("stopping on evidence needs the comparison that it is evidence for")
+    asked = (
+        plan.stopping != StoppingRule.NONE
+        or plan.margin is not None
+        or plan.outcome != PrimaryOutcome.SUCCESS
+    )
+    if asked and not compared:
+        raise EvaError("a design with looks, a margin or a score needs the comparison that it is about")
+    drafted(plan)
 
 
 def _units(plan: Plan) -> list[Unit]:

@@ -40,6 +40,7 @@ from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, Verdict, verdi
 __all__ = [
     "checked",
     "declare_check",
+    "declare_settled",
     "open_bench",
     "run_changed",
     "trial_abandon",
@@ -52,12 +53,18 @@ __all__ = [
 HIGHEST_SEED = 2**31 - 1
 Check = Callable[[str, Trial, Any], None]
 _checks: list[Check] = []
+_settled: list[Callable[[Trial, Any], None]] = []
 _TRIES = 5  # to get a number that nobody else takes at the same moment
 
 
 def declare_check(check: Check) -> None:
     """`check` is asked before a trial is "run" or "voided", with the trial and the user; it raises EvaError."""
     _checks.append(check)
+
+
+def declare_settled(told: Callable[[Trial, Any], None]) -> None:
+    """`told` hears of each trial that was scored, voided or abandoned, with the user, in the same transaction."""
+    _settled.append(told)
 
 
 def checked(what: str, trial: Trial, user: Any) -> None:
@@ -261,6 +268,7 @@ def trial_score(
         score = Score(uuid=identity_of(uuid), trial=held, success=found.success, score=found.score, **said)
         _keep(held, score, found)
         _publish(held)
+        _tell(held, user)
     trial.refresh_from_db()
     return score
 
@@ -279,6 +287,7 @@ def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
         JUDGEMENTS.append(file_of(held), VoidLine.written(held))
         held.save()
         _publish(held)
+        _tell(held, user)
     trial.refresh_from_db()
     return trial
 
@@ -295,6 +304,7 @@ def trial_abandon(*, user: User, trial: Trial, reason: str = "") -> Trial:
         lifecycle.apply(held, Move.ABANDON)
         held.reason = why
         held.save()
+        _tell(held, user)
     trial.refresh_from_db()
     return trial
 
@@ -303,6 +313,11 @@ def _publish(trial: Trial) -> None:
     """Have its episode written into the dataset with what counts now."""
     if trial.episode is not None:
         publish_asked(episode=trial.episode)
+
+
+def _tell(trial: Trial, user: Any) -> None:
+    for told in _settled:
+        told(trial, user)
 
 
 def _held(trial: Trial) -> Trial:

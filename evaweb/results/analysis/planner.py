@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from evaweb.errors import EvaError
-from evaweb.statistics.planning import approximate_power, detectable, exact_power, trials_needed
+from evaweb.statistics.boundaries import MOST
+from evaweb.statistics.courses import course, pairs_needed
+from evaweb.statistics.designs import RULES
+from evaweb.statistics.planning import detectable
 
-EXACT = 100  # trials an arm up to which the exact power is computed while somebody waits
 LEAST = 0.001  # difference of rates: some four million trials an arm
-_GAINS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
+_GAINS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,23 +73,42 @@ def question_of(given: Mapping[str, str]) -> Question:
 
 
 def table_of(q: Question) -> dict[str, Any]:
-    """Numbers of the question, by the normal law, and by Barnard's own power where that can be computed."""
-    n = trials_needed(q.rate, q.better, q.power, q.alpha)
+    """What each design needs for the question, what the time there is for finds, and the gains that it finds."""
+    comparisons = q.checkpoints * (q.checkpoints - 1) // 2
+    alpha = q.alpha / comparisons
     affordable = int(q.hours * 3600 * q.stations / q.cycle_s / q.checkpoints)
+    tried = min(affordable, MOST)
     return {
-        "n": n,
-        "total": n * q.checkpoints,
-        "robot_hours": n * q.checkpoints * q.cycle_s / 3600,
-        "hours": n * q.checkpoints * q.cycle_s / 3600 / q.stations,
-        "exact": exact_power(n, q.rate, q.better, q.alpha) if n <= EXACT else None,
-        "most": EXACT,
+        "comparisons": comparisons,
+        "alpha": alpha,
+        "most": MOST,
+        "designs": [_needed(q, rule, alpha) for rule in RULES],
         "affordable": affordable,
-        "detectable": detectable(affordable, q.rate, q.power, q.alpha) if affordable else None,
-        "chance": approximate_power(affordable, q.rate, q.better, q.alpha) if affordable else 0.0,
-        "gains": [
-            (gain, needed, needed * q.checkpoints * q.cycle_s / 3600 / q.stations)
-            for gain in _GAINS
-            if q.rate + gain <= 1
-            for needed in [trials_needed(q.rate, q.rate + gain, q.power, q.alpha)]
-        ],
+        "tried": tried,
+        "chances": [asdict(course(rule, tried, q.rate, q.better, alpha)) for rule in RULES] if tried else [],
+        "gains": [_curve(q, gain, tried, alpha) for gain in _GAINS if q.rate + gain <= 1] if tried else [],
+        "detectable": detectable(affordable, q.rate, q.power, alpha) if affordable else None,
+    }
+
+
+def _needed(q: Question, rule: str, alpha: float) -> dict[str, Any]:
+    """A design that has the power that is asked for: its trials at worst and on average, with hours at the robots."""
+    found = pairs_needed(rule, q.rate, q.better, q.power, alpha)
+    if found is None:
+        return {"rule": rule, "pairs": None}
+    hour = q.checkpoints * q.cycle_s / 3600
+    return {
+        **asdict(found),
+        "total": found.pairs * q.checkpoints,
+        "robot_hours": found.pairs * hour,
+        "mean_hours": found.mean * hour,
+        "hours": found.pairs * hour / q.stations,
+    }
+
+
+def _curve(q: Question, gain: float, pairs: int, alpha: float) -> dict[str, Any]:
+    """Power of each design of so many pairs against a gain over the weaker rate."""
+    return {
+        "gain": gain,
+        "powers": [course(rule, pairs, q.rate, round(q.rate + gain, 9), alpha).power for rule in RULES],
     }

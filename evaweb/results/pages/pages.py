@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from evaweb.errors import EvaError
-from evaweb.plans.models import Plan, StoppingRule
+from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import Chosen, choices
@@ -16,6 +16,7 @@ from evaweb.results.presentation.addresses import compare_address, trials_addres
 from evaweb.results.presentation.drawings import conditions, courses, rates
 from evaweb.results.presentation.drawings.svg import Drawing
 from evaweb.results.presentation.facts import comparison_facts, comparison_sentence, missed_words, primary_of
+from evaweb.results.presentation.headline import headline
 from evaweb.results.presentation.listings import MOST_PAIRS, arm_rows, pair_rows, scene_rows
 from evaweb.results.presentation.wording import evidence_words
 
@@ -121,10 +122,9 @@ def _evidence(plan: Plan, at: Hashable) -> dict[str, Any]:
         "foreseen": foreseen,
         "meter": courses.evidence(found.evidence, found.first, found.second, foreseen),
         "score_meter": courses.evidence(found.score_evidence, found.first, found.second, foreseen),
+        "headline": headline(plan),
         "words": evidence_words(found.evidence),
         "score_words": evidence_words(found.score_evidence),
-        "stop": found.evidence.stop is not None and plan.stopping == StoppingRule.EVIDENCE,
-        "winner": {"first": found.first, "second": found.second}.get(found.evidence.winner or "", ""),
         "wanted": 2 / plan.alpha,
         "missed": missed_words(analysis, found),
     }

@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from evaweb.plans.models import Plan
+from evaweb.plans.models import Plan, StoppingRule
 from evaweb.results.analysis.analysis import Analysis, Comparison
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.presentation.addresses import compare_address
 from evaweb.results.presentation.drawings import rates
+from evaweb.results.presentation.headline import headline
 from evaweb.results.presentation.wording import evidence_words, missed, points, probability, verdict
 
 
@@ -37,10 +38,12 @@ def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
 
 
 def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[str, Any]:
-    """The sentence, and each question that a comparison answers."""
+    """The sentence, and each question that a comparison answers; of the planned one its design says the sentence."""
+    planned = headline(plan) if found is primary_of(plan, analysis) else None
     return {
-        "sentence": comparison_sentence(analysis, found),
-        "facts": [*_of_the_rates(analysis, found), *_of_the_evidence(analysis, found), *_beyond(found)],
+        "sentence": planned.sentence if planned else comparison_sentence(analysis, found),
+        "headline": planned,
+        "facts": [*_of_the_rates(plan, analysis, found), *_of_the_evidence(analysis, found), *_beyond(found)],
         "notes": found.notes,
         "reversed": bool(found.stratified and found.stratified.reversed),
         "missed": missed_words(analysis, found),
@@ -49,11 +52,12 @@ def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[
     }
 
 
-def _of_the_rates(analysis: Analysis, found: Comparison) -> Iterator[Fact]:
+def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator[Fact]:
+    fixed = "n as planned" if plan.stopping == StoppingRule.NONE else "as if n had been fixed"
     yield Fact("How much better?", "Newcombe, 95 %", points(found.difference))
     corrected = f", Holm {probability(found.corrected)}" if len(analysis.comparisons) > 1 else ""
     chance = f"p = {probability(found.test.p)}{corrected}"
-    yield Fact("Could it be chance?", "Barnard, two-sided, n as planned", chance)
+    yield Fact("Could it be chance?", f"Barnard, two-sided, {fixed}", chance)
     if found.paired:
         split = (
             f"only {found.first} {found.paired.first_only}, only {found.second} {found.paired.second_only}"

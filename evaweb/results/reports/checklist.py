@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from django.db.models import Count, F, Min
 
-from evaweb.plans.models import Look, Plan, StoppingRule
+from evaweb.plans.design import conclusion_of
+from evaweb.plans.models import Look, Plan
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.models import Rating
 from evaweb.trials.models import Score, Trial, TrialStatus
@@ -101,12 +102,13 @@ def _blind(plan: Plan) -> Item:
 def _complete(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
     foreseen, counted = plan.slots.count(), trials.filter(status=TrialStatus.SCORED).count()
     rule = plan.get_stopping_display()
-    kept = "yes" if counted == foreseen or plan.stopping == StoppingRule.EVIDENCE else "partly"
+    conclusion = conclusion_of(plan)
+    kept = "yes" if counted == foreseen or (conclusion is not None and conclusion.ended) else "partly"
     closed = f"; closed because: {plan.closed_because}" if plan.closed_because else ""
     return Item(
         "As many trials as planned, or a rule to stop",
         kept,
-        f"{counted} of {foreseen} count; stops {rule}{closed}",
+        f"{counted} of {foreseen} count; {rule}{closed}",
     )
 
 

@@ -14,6 +14,7 @@ from django.template.loader import render_to_string
 from django.utils import timezone
 
 from evaweb.errors import EvaError
+from evaweb.plans.design import conclusion_of
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import agreement_of, preferences_of
@@ -83,18 +84,29 @@ def numbers_of(plan: Plan, analysis: Analysis) -> dict[str, Any]:
     words = ("reason", "groups")
     return {
         **analysis_document(analysis),
+        "primary": _primary(plan),
         "agreement": agreement_of(plan),
         "preferences": preferred and {name: value for name, value in preferred.items() if name not in words},
     }
 
 
-def seal_of(plan: Plan) -> dict[str, str]:
+def _primary(plan: Plan) -> dict[str, Any] | None:
+    """What the plan's design says."""
+    found, names = conclusion_of(plan), (plan.document or {})["comparison"]
+    if found is None:
+        return None
+    winner = {"first": names[0], "second": names[1], None: None}[found.winner]
+    return {"pairs": found.pairs, "at": found.at, "winner": winner, "p": found.p}
+
+
+def seal_of(plan: Plan) -> dict[str, Any]:
     """Digest and commitment, and the key once it was revealed."""
     shown = plan.state == PlanState.REVEALED
     return {
         "digest": plan.digest,
         "commitment": plan.commitment,
         "key": bytes(plan.key or b"").hex() if shown else "",
+        "at_reveal": plan.at_reveal,
     }
 
 

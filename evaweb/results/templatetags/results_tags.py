@@ -11,7 +11,7 @@ from django.urls import reverse
 from django.utils.html import format_html, format_html_join
 from django.utils.safestring import SafeString
 
-from evaweb.plans.models import Plan, PlanState
+from evaweb.plans.models import Plan, PlanState, StoppingRule
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.analysis.outcomes import Outcome
 from evaweb.results.presentation import wording
@@ -30,6 +30,12 @@ _TONES = {
 def plan_tone(plan: Plan) -> str:
     """The colour of a plan's state, by the name the style sheets have for it."""
     return _TONES[PlanState(plan.state)]
+
+
+@register.filter
+def design_words(rule: str) -> str:
+    """A design in one or two words."""
+    return str(StoppingRule(rule).label).partition(":")[0]
 
 
 @register.filter

@@ -67,8 +67,16 @@ def test_other_entities_in_all_formats(asked, what):
 
 def test_the_planner(asked, client):
     found = client.get("/api/v1/planner?rate=0.6&better=0.9").json()
-    assert found["n"] == 32
+    by_rule = {row["rule"]: row for row in found["designs"]}
+    assert by_rule["none"]["pairs"] in (31, 32, 33)
+    assert by_rule["early"]["mean"] < by_rule["none"]["pairs"] <= by_rule["late"]["pairs"]
+    assert by_rule["evidence"]["pairs"] > by_rule["late"]["pairs"]
+    assert found["comparisons"] == 1
+    several = client.get("/api/v1/planner?rate=0.3&better=0.9&checkpoints=3").json()
+    assert (several["comparisons"], several["alpha"]) == (3, pytest.approx(0.05 / 3))
+    assert several["designs"][0]["total"] == 3 * several["designs"][0]["pairs"]
     assert client.get("/api/v1/planner?rate=3").status_code == 422
     near = client.get("/api/v1/planner?rate=0&better=1e-170")
     assert (near.status_code, "at least 0.001" in near.json()["error"]) == (400, True)
-    assert client.get("/api/v1/planner?rate=0.5&better=0.501").json()["exact"] is None
+    small = client.get("/api/v1/planner?rate=0.5&better=0.501&hours=1").json()
+    assert {row["pairs"] for row in small["designs"]} == {None}

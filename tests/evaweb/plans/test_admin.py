@@ -28,6 +28,7 @@ def form_of(plan, **changed):
         "strategy": "",
         "blind": "on",
         "stopping": "none",
+        "outcome": "success",
         "alpha": "0.05",
         "second_rater_share": "0",
         "events-TOTAL_FORMS": 0,

@@ -127,7 +127,10 @@ def test_trials_come_in_the_order_of_the_plan_each_under_a_code_of_its_own(bench
     assert [h.slot.index for h in handed] == list(range(12))
     assert len({h.code for h in handed}) == 12
     assert [h.trial.checkpoint_id for h in handed] == list(plan.slots.values_list("checkpoint_id", flat=True))
-    with pytest.raises(Conflict, match="all 12 trials of Blocks v1 are made"):
+    plan.refresh_from_db()
+    assert plan.state == PlanState.CLOSED
+    assert plan.closed_because == "all pairs of its comparison are made, after 6 pairs"
+    with pytest.raises(Conflict, match="Blocks v1 is closed: no trial of it is handed out"):
         hand_out(user=bench.operator, station=bench.station, plan=plan)
     assert (progress(plan).counted, progress(plan).attempts) == (12, 12)
 

@@ -3,7 +3,7 @@ import pytest
 from evaweb.episodes.folders import preview_folder
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.plans.services import plan_freeze, plan_reveal
 from evaweb.results.analysis import caching
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint
@@ -74,7 +74,6 @@ def carry_out(bench):
 
 @pytest.fixture
 def revealed(plan, owner, carry_out):
-    """All of it carried out, closed and revealed."""
+    """All of it carried out, which closes it, and revealed."""
     carry_out(plan, 16)
-    plan_close(user=owner, plan=plan, reason="all made")
     return plan_reveal(user=owner, plan=plan)

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from .designs import error, primary
 from .judged import agreement, preferences, score_alpha
 from .numbers import Drawn, Trial, numbers
 from .sealed import faults
@@ -28,9 +29,11 @@ def main() -> int:
         json.loads((data / name).read_text("utf-8")) for name in ("plan.json", "seal.json", "numbers.json")
     )
     rows, ratings, preferred = (_rows(data / f"{name}.csv") for name in ("trials", "ratings", "preferences"))
-    wrong = faults(seal, plan, rows)
+    wrong = [*faults(seal, plan, rows), *_boundary(plan)]
+    trials = [_trial(row) for row in rows]
     found = {
-        **numbers([_trial(row) for row in rows], plan),
+        **numbers(trials, plan),
+        "primary": primary(trials, plan, seal["at_reveal"]),
         "agreement": _agreement(rows, ratings),
         "preferences": preferences(
             [(row["first_checkpoint"], row["second_checkpoint"], row["outcome"]) for row in preferred]
@@ -48,6 +51,16 @@ def main() -> int:
     kept = "with its key, schedule and codes" if seal["key"] else "by its digest"
     print(f"{seen} numbers from {len(rows)} trials, and the plan {kept}: {len(wrong)} do not come out")
     return 1 if wrong else 0
+
+
+def _boundary(plan: dict[str, Any]) -> list[str]:
+    """What is wrong with the boundary of the plan's design, if it has one."""
+    said = plan["stopping"]
+    if not said.get("boundary"):
+        return []
+    found = error(plan)
+    print(f"the boundary stops wrongly with probability at most {found:.5f}; alpha is {said['alpha']:g}")
+    return [] if found <= said["alpha"] else [f"boundary: {found:.5f} is more than alpha, {said['alpha']:g}"]
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

@@ -1,0 +1,108 @@
+"""The design of a plan's comparison: as it is drafted, as it is frozen, and what it says of the trials there are.
+
+Blocks enter in the order of the schedule, never in that in which they were finished: the first one that lacks a scored
+trial of either checkpoint ends what is looked at. A station that is fast cannot choose what counts.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from itertools import takewhile
+from typing import Any
+
+from evaweb.errors import EvaError
+from evaweb.plans.canonical import digest
+from evaweb.plans.models import Plan, Slot
+from evaweb.statistics.base import StatisticsError
+from evaweb.statistics.designs import SUCCESS, Conclusion, Design, conclude, design, of_table
+from evaweb.trials.models import TrialStatus
+
+ENDED = {
+    "boundary": "a boundary of its design was crossed",
+    "full": "all pairs of its comparison are made",
+}
+
+
+def drafted(plan: Plan) -> Design | None:
+    """The design of a draft, computed now; None without a comparison. EvaError says what cannot be."""
+    if not (plan.first and plan.second):
+        return None
+    pairs = plan.positions.count() * plan.repetitions
+    try:
+        return design(
+            rule=plan.stopping,
+            pairs=pairs,
+            alpha=plan.alpha,
+            margin=plan.margin,
+            outcome=plan.outcome,
+            looks=looks_of(plan.look_after),
+        )
+    except StatisticsError as error:
+        raise EvaError(str(error)) from None
+
+
+def frozen(document: Mapping[str, Any]) -> Design | None:
+    """The design of a frozen plan, also of one from before there were boundaries; None without a comparison."""
+    if not document["comparison"]:
+        return None
+    said = {"outcome": SUCCESS, "margin": None, "boundary": None, **document["stopping"]}
+    positions = sum(len(scene["positions"]) for scene in document["scenes"])
+    rows, alpha, margin = said["boundary"], said["alpha"], said["margin"]
+    return Design(
+        said["rule"],
+        positions * document["repetitions"],
+        alpha,
+        margin,
+        said["outcome"],
+        of_table(rows, alpha, margin) if rows else None,
+    )
+
+
+def pairs_of(plan: Plan) -> list[tuple[float, float]]:
+    """What counts of the compared checkpoints, block by block as scheduled, up to the first block that is not made."""
+    document = plan.document or {}
+    found = frozen(document)
+    if found is None:
+        return []
+    names = document["comparison"]
+    value = "trial__verdict__success" if found.outcome == SUCCESS else "trial__verdict__score"
+    blocks: dict[int, dict[str, float]] = defaultdict(dict)
+    counted = plan.handouts.filter(trial__status=TrialStatus.SCORED, slot__checkpoint__name__in=names)
+    for block, name, outcome in counted.order_by("number").values_list(
+        "slot__block", "slot__checkpoint__name", value
+    ):
+        blocks[block][name] = float(outcome)
+    scheduled = Slot.objects.filter(plan=plan).order_by("block").values_list("block", flat=True).distinct()
+    made = takewhile(lambda block: len(blocks.get(block, ())) == len(names), scheduled)
+    return [(blocks[block][names[0]], blocks[block][names[1]]) for block in made]
+
+
+def conclusion_of(plan: Plan) -> Conclusion | None:
+    """What the frozen design says: of a revealed plan as it stood at the reveal, else of the trials there are now."""
+    found = frozen(plan.document) if plan.document else None
+    if found is None:
+        return None
+    return conclude(found, plan.at_reveal["pairs"] if plan.at_reveal else pairs_of(plan))
+
+
+def ended_because(found: Conclusion) -> str:
+    """Reason why a design has ended, which tells nothing of either checkpoint."""
+    return f"{ENDED[found.ended]}, after {found.at} pairs"
+
+
+def at_the_reveal(plan: Plan) -> dict[str, Any] | None:
+    """The pairs that count, kept with their digest: what is corrected later makes no other headline."""
+    if frozen(plan.document or {}) is None:
+        return None
+    pairs = [list(pair) for pair in pairs_of(plan)]
+    return {"pairs": pairs, "digest": digest({"plan": plan.digest, "pairs": pairs})}
+
+
+def looks_of(given: Any) -> list[int]:
+    """Pairs after which a design is looked at; EvaError where `given` is no list of numbers."""
+    if not isinstance(given, list) or not all(
+        isinstance(at, int) and not isinstance(at, bool) for at in given
+    ):
+        raise EvaError(f"looks = {given!r:.80}; allowed: a list of numbers of pairs, such as [20, 40, 60]")
+    return given

@@ -1,0 +1,66 @@
+"""The headline of an evaluation: what the design of its plan says, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from evaweb.plans.design import conclusion_of, frozen, pairs_of
+from evaweb.plans.models import Plan, PlanState
+from evaweb.results.presentation.wording import points, probability
+from evaweb.statistics.designs import SUCCESS, Conclusion, Design, conclude
+from evaweb.statistics.difference import newcombe
+
+
+@dataclass(frozen=True, slots=True)
+class Headline:
+    """One sentence, how it was decided, and what it would be with scores that were corrected after the reveal."""
+
+    sentence: str
+    method: str
+    corrected: str = ""
+
+
+def headline(plan: Plan) -> Headline | None:
+    """That of a frozen plan; None where it has no comparison."""
+    found, conclusion = frozen(plan.document or {}) if plan.document else None, conclusion_of(plan)
+    if found is None or conclusion is None:
+        return None
+    now = pairs_of(plan)
+    at_reveal = [(one, other) for one, other in plan.at_reveal["pairs"]] if plan.at_reveal else now
+    sentence = _sentence(plan, found, conclusion, at_reveal)
+    later = _sentence(plan, found, conclude(found, now), now) if now != at_reveal else ""
+    design = str(plan.get_stopping_display()).partition(":")[0]
+    return Headline(sentence, f"{design}, alpha {found.alpha:g}", later)
+
+
+def _sentence(plan: Plan, found: Design, conclusion: Conclusion, pairs: list[tuple[float, float]]) -> str:
+    first, second = (plan.document or {})["comparison"]
+    if not conclusion.ended:
+        made = f"{conclusion.pairs} of {found.pairs} pairs"
+        if plan.state == PlanState.FROZEN:
+            return f"{first} and {second} are not compared yet: {made} are made, and the design goes on"
+        return f"{first} and {second} were not compared: closed after {made}, before the design ended"
+    counts = _counts(found, conclusion, pairs[: conclusion.at])
+    if found.margin is not None:
+        claim = f"{first} is {'' if conclusion.winner else 'not shown to be '}not worse than {second}"
+        return f"{claim} by {100 * found.margin:g} points or more: {counts}"
+    if conclusion.winner is None:
+        return f"No significant difference between {first} and {second}: {counts}"
+    better, worse = (first, second) if conclusion.winner == "first" else (second, first)
+    what = "succeeded more often" if found.outcome == SUCCESS else "reached higher scores"
+    return f"{better} {what} than {worse}: {counts}"
+
+
+def _counts(found: Design, conclusion: Conclusion, pairs: list[tuple[float, float]]) -> str:
+    n = len(pairs)
+    one, other = sum(a for a, _ in pairs), sum(b for _, b in pairs)
+    if found.outcome != SUCCESS:
+        return f"mean scores {one / n:.2f} and {other / n:.2f} after {n} pairs"
+    words = f"{one:.0f}/{n} against {other:.0f}/{n}"
+    if (
+        conclusion.p is not None
+    ):  # of a fixed number of pairs: an interval of the difference means what it says
+        words += (
+            f", difference {points(newcombe(int(one), n, int(other), n))}, p = {probability(conclusion.p)}"
+        )
+    return f"{words}, after {n} of {found.pairs} pairs"

@@ -1,0 +1,207 @@
+"""What the plan's design says of its trials, and how often its boundary stops wrongly, counted in whole numbers."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import takewhile
+from typing import Any, Protocol
+
+from . import methods
+
+Pair = tuple[float, float]
+
+
+class Row(Protocol):
+    """What is needed of a trial."""
+
+    block: str
+    checkpoint: str
+    status: str
+    success: bool
+    score: float
+
+
+def primary(
+    trials: Sequence[Row], plan: Mapping[str, Any], at_reveal: Mapping[str, Any] | None
+) -> dict[str, Any] | None:
+    """What the design says: of the pairs as the reveal kept them, where there was one; None without a comparison."""
+    if not plan["comparison"]:
+        return None
+    return conclusion(at_reveal["pairs"] if at_reveal else pairs_of(trials, plan), plan)
+
+
+def pairs_of(trials: Sequence[Row], plan: Mapping[str, Any]) -> list[Pair]:
+    """Outcomes of the compared checkpoints by block, in the schedule's order, up to the first that is not made."""
+    names, by_score = plan["comparison"], plan["stopping"].get("outcome") == "score"
+    blocks: dict[int, dict[str, float]] = defaultdict(dict)
+    for trial in trials:
+        if trial.status == "scored" and trial.checkpoint in names:
+            blocks[int(trial.block)][trial.checkpoint] = trial.score if by_score else float(trial.success)
+    made = takewhile(lambda block: len(blocks.get(block, ())) == 2, range(_foreseen(plan)))
+    return [(blocks[block][names[0]], blocks[block][names[1]]) for block in made]
+
+
+def conclusion(pairs: Sequence[Pair], plan: Mapping[str, Any]) -> dict[str, Any]:
+    """After how many pairs the design ended, for which checkpoint, and the p of a fixed number's one test."""
+    said, names = plan["stopping"], plan["comparison"]
+    foreseen = _foreseen(plan)
+    given = list(pairs[:foreseen])
+    at, winner, p = len(given) if len(given) == foreseen else None, "", None
+    if said.get("boundary"):
+        for look in said["boundary"]:
+            if look[0] > len(given):
+                break
+            side = _side(look, *_sums(given[: look[0]]), said.get("margin"))
+            if side is not None:
+                at, winner = look[0], names[side]
+                break
+    elif said["rule"] == "evidence":
+        at, winner = _evidence(given, said, names, at)
+    elif at is not None:
+        first, second = _sums(given)
+        p = methods.barnard(int(first), at, int(second), at)[1]
+        winner = names[0 if first > second else 1] if p <= said["alpha"] else ""
+    return {"pairs": len(given), "at": at, "winner": winner or None, "p": p}
+
+
+def error(plan: Mapping[str, Any]) -> float:
+    """A bound of how often the boundary stops where it must not; with a margin, the largest of 400 rates.
+
+    Every order of outcomes that leads to a table is as likely as any other: their number is counted exactly.
+    """
+    said = plan["stopping"]
+    margin = said.get("margin")
+    if margin is not None:
+        return _with_margin(list(_stopped(said["boundary"], margin)), margin)
+    gone, trials = [0], 0  # orders that have stopped, by their successes
+    for n, m, tables in _stopped(said["boundary"], margin):
+        for _ in range(n + m - trials):
+            gone = [one + other for one, other in zip([*gone, 0], [0, *gone], strict=True)]
+        trials = n + m
+        for (a, b), ways in tables.items():
+            gone[a + b] += ways
+    share = [ways / math.comb(trials, x) for x, ways in enumerate(gone)]
+    rates = 80 * trials
+    gap = math.pi / 2 / (rates + 1)
+    highest = max(_mixed(share, math.sin(gap * i) ** 2) for i in range(1, rates + 1))
+    # Along the angle of which the rate is the squared sine, that of a probability turns by at most sqrt(trials).
+    turned = math.asin(math.sqrt(min(1.0, highest))) + math.sqrt(trials) * gap / 2
+    return math.sin(min(turned, math.pi / 2)) ** 2
+
+
+def _foreseen(plan: Mapping[str, Any]) -> int:
+    return int(sum(len(scene["positions"]) for scene in plan["scenes"]) * plan["repetitions"])
+
+
+def _sums(pairs: Sequence[Pair]) -> tuple[float, float]:
+    return sum(one for one, _ in pairs), sum(other for _, other in pairs)
+
+
+def _side(look: Sequence[int], first: float, second: float, margin: float | None) -> int | None:
+    """Which of the compared checkpoints (0, 1) the boundary stops for."""
+    n, m, *least = look
+    if margin is not None:  # it asks about its second arm: the first checkpoint
+        first, second = second, first
+    if not least or not _reaches((int(first), n, int(second), m), (least[0], n, least[1], m), margin):
+        return None
+    return 0 if margin is not None or first * m > second * n else 1
+
+
+def _reaches(
+    table: tuple[int, int, int, int], least: tuple[int, int, int, int], margin: float | None
+) -> bool:
+    one, other = _degree(*table, margin), _degree(*least, margin)
+    return one[0] * other[1] >= other[0] * one[1]
+
+
+def _degree(a: int, n: int, b: int, m: int, margin: float | None) -> tuple[int, int]:
+    """How extreme a table is, as a fraction: the squared pooled statistic; with a margin, that of Agresti and Caffo."""
+    if margin is None:
+        x, rest = a + b, n + m - a - b
+        return ((a * m - b * n) ** 2, x * rest) if x and rest else (0, 1)
+    a, b, n, m, scale = a + 1, b + 1, n + 2, m + 2, 10**9
+    lead = (b * n - a * m) * scale + round(margin * scale) * n * m
+    return lead * abs(lead) * n * m, (a * (n - a) * m**3 + b * (m - b) * n**3) * scale**2
+
+
+def _stopped(
+    boundary: Sequence[Sequence[int]], margin: float | None
+) -> Iterator[tuple[int, int, dict[tuple[int, int], int]]]:
+    """Each look's trials, and the tables (successes of both arms) that stop there with the orders that come to them."""
+    alive, n, m = {(0, 0): 1}, 0, 0
+    for look in boundary:
+        for arm in (0,) * (look[0] - n) + (1,) * (look[1] - m):
+            grown: dict[tuple[int, int], int] = defaultdict(int)
+            for (a, b), ways in alive.items():
+                grown[a, b] += ways
+                grown[(a + 1, b) if arm == 0 else (a, b + 1)] += ways
+            alive = grown
+        n, m, *least = look
+        gone = [
+            (a, b) for a, b in alive if least and _reaches((a, n, b, m), (least[0], n, least[1], m), margin)
+        ]
+        yield n, m, {table: alive.pop(table) for table in gone}
+
+
+def _mixed(share: Sequence[float], p: float) -> float:
+    """The mean of `share` over a binomial number of successes."""
+    n = len(share) - 1
+    middle = min(n, int(p * (n + 1)))
+    at = math.exp(
+        math.lgamma(n + 1)
+        - math.lgamma(middle + 1)
+        - math.lgamma(n - middle + 1)
+        + middle * math.log(p)
+        + (n - middle) * math.log1p(-p)
+    )
+    odds, total, mass = p / (1 - p), at * share[middle], at
+    for x in range(middle + 1, n + 1):
+        mass *= odds * (n - x + 1) / x
+        total += mass * share[x]
+        if mass < 1e-18:
+            break
+    mass = at
+    for x in range(middle, 0, -1):
+        mass *= x / (n - x + 1) / odds
+        total += mass * share[x - 1]
+        if mass < 1e-18:
+            break
+    return total
+
+
+def _with_margin(stopped: Sequence[tuple[int, int, dict[tuple[int, int], int]]], margin: float) -> float:
+    cells = [
+        (math.log(ways), a, n - a, b, m - b) for n, m, tables in stopped for (a, b), ways in tables.items()
+    ]
+    highest = 0.0
+    for i in range(1, 401):
+        high = math.sin(math.pi / 2 * i / 401) ** 2
+        p, q = margin + (1 - margin) * high, (1 - margin) * high
+        won, lost, other_won, other_lost = (math.log(rate) for rate in (p, 1 - p, q, 1 - q))
+        highest = max(
+            highest,
+            math.fsum(
+                math.exp(ways + a * won + not_a * lost + b * other_won + not_b * other_lost)
+                for ways, a, not_a, b, not_b in cells
+            ),
+        )
+    return highest
+
+
+def _evidence(
+    pairs: Sequence[Pair], said: Mapping[str, Any], names: Sequence[str], full: int | None
+) -> tuple[int | None, str]:
+    if said.get("outcome") == "score":
+        paths = [methods.score_bets([sign * (a - b) for a, b in pairs]) for sign in (1, -1)]
+    else:
+        paths = [
+            methods.success_bets([(bool(pair[1 - side]), bool(pair[side])) for pair in pairs])
+            for side in (0, 1)
+        ]
+    wanted = math.log(2 / said["alpha"])
+    for number, worth in enumerate(zip(*paths, strict=True), start=1):
+        if max(worth) >= wanted:
+            return number, names[worth.index(max(worth))]
+    return full, ""

@@ -1,0 +1,389 @@
+"""Exact boundaries for success rates of two arms that are looked at several times (group sequential designs).
+
+After so many trials of each arm, every order of the outcomes that leads to the same numbers of successes is equally
+likely, whatever the arms' rates are. The ways to each table that pass no earlier stop are therefore counted once, and
+the probability of a wrong stop follows for every common rate: no simulation, no approximation. At each look tables are
+taken into the stop from the most extreme one down, as long as the error so far is at most what may be spent by then at
+every common rate. Spending by a power of the share of trials made: Kim and DeMets (1987); growing a region under the
+largest error over the nuisance parameter: Barnard (1945).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from evaweb.statistics.base import StatisticsError, check_alpha, check_share
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+SHAPES = {"late": 6.0, "early": 1.5}  # power of the share of trials made: how late alpha may be spent
+MOST = 250  # trials of an arm
+_RATES = 400  # common rates at which an error is taken, evenly spread over the angles of which they are squared sines
+_FINE = 40_000  # the same for a bound of the error between them
+_SAFETY = 0.996  # of alpha, for what lies between two of the rates
+_CELLS = 512  # tables that are weighed at once, the most extreme first
+_TIE = 1e-9  # relative: what differs by less is compared in whole numbers
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Trials of each arm at a look, and the least extreme table (successes of each) that stops there.
+
+    `least` is None where no table stops.
+    """
+
+    first: int
+    second: int
+    least: tuple[int, int] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """How a design ends at given success rates: probabilities of stopping for each arm, and after how many trials.
+
+    `median` is of the trials of both arms, over all runs, those that never stop counted with all their trials; `mean`
+    likewise. `stops` [looks] is the probability of stopping at each look.
+    """
+
+    first_better: float
+    second_better: float
+    median: int
+    mean: float
+    stops: tuple[float, ...]
+
+    @property
+    def power(self) -> float:
+        """Probability of stopping, for either arm."""
+        return self.first_better + self.second_better
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """The looks of a design with what stops it.
+
+    Two questions: without a `margin`, whether the rates differ, in either direction together at `alpha`; with one,
+    whether the second arm's rate is not lower than the first's by `margin` or more, at `alpha` in that direction.
+    """
+
+    looks: tuple[Look, ...]
+    alpha: float
+    margin: float | None = None
+
+    def winner(self, look: int, first: int, second: int) -> str | None:
+        """The arm ("first" or "second") for which the design stops at that look (0 is the first) with so many
+        successes of each; None where it goes on. With a margin it stops for the second alone."""
+        at = self.looks[look]
+        if at.least is None or not _at_least(first, second, at, self.margin):
+            return None
+        ahead = self.margin is None and first * at.second > second * at.first
+        return "first" if ahead else "second"
+
+    def course(self, p_first: float, p_second: float) -> Course:
+        """How it ends where the arms succeed at these rates."""
+        import numpy as np
+
+        check_share("p_first", p_first)
+        check_share("p_second", p_second)
+        if not self.looks:
+            raise StatisticsError("a design needs at least one look")
+        better, worse = [], []
+        for look, mass in self._walk((p_first, p_second)):
+            first, second = np.indices(mass.shape)
+            ahead = (first * look.second > second * look.first) & (self.margin is None)
+            better.append(float(mass[ahead].sum()))
+            worse.append(float(mass[~ahead].sum()))
+        stops = [one + other for one, other in zip(better, worse, strict=True)]
+        trials = [look.first + look.second for look in self.looks]
+        rest = 1.0 - math.fsum(stops)
+        so_far, median = 0.0, trials[-1]
+        for count, stop in zip(trials, stops, strict=True):
+            so_far += stop
+            if so_far >= 0.5:
+                median = count
+                break
+        mean = math.fsum(c * s for c, s in zip(trials, stops, strict=True)) + rest * trials[-1]
+        return Course(math.fsum(better), math.fsum(worse), median, mean, tuple(stops))
+
+    def error(self) -> tuple[float, float]:
+        """The largest probability of a wrong stop over all rates of the null hypothesis, and a bound of it.
+
+        The first is taken at 40,000 rates; the second holds between them too: along the angle of which the rate is the
+        squared sine, the angle of a probability turns by at most the square root of the trials (Cauchy and Schwarz).
+        """
+
+        null = _Null(self.margin, _FINE)
+        total = self._over_margin(null) if self.margin is not None else self._over_equal(null)
+        highest = float(total.max())
+        trials = self.looks[-1].first + self.looks[-1].second
+        turned = math.asin(math.sqrt(min(1.0, highest))) + math.sqrt(trials) * null.gap / 2
+        return highest, math.sin(min(turned, math.pi / 2)) ** 2
+
+    def _over_equal(self, null: _Null) -> NDArray[np.float64]:
+        """Probability of a stop at each pair of equal rates: only the successes of both arms together count."""
+        import numpy as np
+
+        gone, trials = np.zeros(1), 0
+        for look, mass in self._walk((0.5, 0.5)):
+            for _ in range(look.first + look.second - trials):
+                gone = 0.5 * (np.append(gone, 0.0) + np.append(0.0, gone))
+            trials = look.first + look.second
+            gone += np.bincount(
+                np.indices(mass.shape).sum(axis=0).ravel(), mass.ravel(), minlength=trials + 1
+            )
+        return null.total((np.arange(trials + 1), np.zeros(trials + 1)), gone, (trials, 0))
+
+    def _over_margin(self, null: _Null) -> NDArray[np.float64]:
+        import numpy as np
+
+        total = np.zeros(_FINE)
+        for look, mass in self._walk((0.5, 0.5)):
+            cells = np.nonzero(mass)
+            total += null.total(cells, mass[cells], (look.first, look.second))
+        return total
+
+    def _walk(self, rates: tuple[float, float]) -> Iterator[tuple[Look, NDArray[np.float64]]]:
+        """Each look with the probability of stopping there at each table: float64 [first + 1, second + 1]."""
+        import numpy as np
+
+        alive, before = np.ones((1, 1)), (0, 0)
+        for look, region in zip(self.looks, self._regions, strict=True):
+            alive = _grown(alive, look.first - before[0], look.second - before[1], rates)
+            before = (look.first, look.second)
+            yield look, np.where(region, alive, 0.0)
+            alive = np.where(region, 0.0, alive)
+
+    @cached_property
+    def _regions(self) -> list[NDArray[np.bool_]]:
+        return [_region(look, self.margin) for look in self.looks]
+
+
+def boundary(
+    looks: Sequence[tuple[int, int]],
+    *,
+    alpha: float = 0.05,
+    shape: str = "late",
+    margin: float | None = None,
+) -> Boundary:
+    """The boundary of a design that looks after so many trials of each arm, the last look being its end.
+
+    StatisticsError where looks do not grow, an arm has more than 250 trials, or alpha, shape or margin cannot be.
+    """
+    import numpy as np
+
+    counts = _checked(looks)
+    check_alpha(alpha)
+    if shape not in SHAPES:
+        raise StatisticsError(f"shape = {shape!r}; allowed: {', '.join(SHAPES)}")
+    if margin is not None and not 0 < margin < 1:
+        raise StatisticsError(f"margin = {margin}; allowed: above 0 and below 1")
+    null = _Null(margin, _RATES)
+    spent, total = np.zeros(_RATES), sum(counts[-1])
+    alive, before, found = np.ones((1, 1)), (0, 0), []
+    for first, second in counts:
+        alive = _grown(alive, first - before[0], second - before[1], (0.5, 0.5))
+        before = (first, second)
+        most = _SAFETY * alpha * ((first + second) / total) ** SHAPES[shape]
+        least, spent = _taken(alive, (first, second), null, spent, most)
+        look = Look(first, second, least)
+        alive = np.where(_region(look, margin), 0.0, alive)
+        found.append(look)
+    return Boundary(tuple(found), alpha, margin)
+
+
+def in_pairs(pairs: int, at: Sequence[int] | None = None) -> list[tuple[int, int]]:
+    """The looks of a design in pairs: after each one, or after those of `at` and the last."""
+    chosen = range(1, pairs + 1) if at is None else sorted({*at, pairs})
+    return [(pair, pair) for pair in chosen]
+
+
+def extremeness(first: int, n: int, second: int, m: int, margin: float | None) -> tuple[int, int]:
+    """How extreme a table is, as a fraction (numerator, denominator > 0) in whole numbers.
+
+    Without a margin: the squared pooled statistic, less what is the same for all tables of a look. With one: the
+    statistic of the difference plus margin over its standard error, one success and one failure added to each arm
+    (Agresti and Caffo 2000), squared with its sign.
+    """
+    if margin is None:
+        successes, trials = first + second, n + m
+        if successes in (0, trials):
+            return 0, 1
+        return (first * m - second * n) ** 2, successes * (trials - successes)
+    scale = 10**9
+    a, b, n, m = first + 1, second + 1, n + 2, m + 2
+    lead = (b * n - a * m) * scale + round(margin * scale) * n * m  # over scale * n * m
+    variance = a * (n - a) * m**3 + b * (m - b) * n**3  # over n**3 * m**3
+    return lead * abs(lead) * n * m, variance * scale * scale
+
+
+class _Null:
+    """Pairs of rates at which an error is one: equal ones, or those that differ by just the margin."""
+
+    def __init__(self, margin: float | None, rates: int) -> None:
+        import numpy as np
+
+        self.margin = margin
+        self.gap = math.pi / 2 / (rates + 1)
+        high = np.sin(np.linspace(0, math.pi / 2, rates + 2)[1:-1]) ** 2
+        first = high if margin is None else margin + (1 - margin) * high
+        second = high if margin is None else (1 - margin) * high
+        with np.errstate(divide="ignore"):
+            self._logs = [np.log(2 * rate) for rate in (first, 1 - first, second, 1 - second)]
+
+    def mass(
+        self, cells: tuple[NDArray[Any], ...], even: NDArray[np.float64], trials: tuple[int, int]
+    ) -> NDArray[np.float64]:
+        """Probabilities of tables whose probability at rates of a half is `even` [cells]: float64 [cells, rates]."""
+        import numpy as np
+
+        (a, b), (n, m) = (of[:, None].astype(float) for of in cells), trials
+        one, not_one, other, not_other = self._logs
+        with np.errstate(divide="ignore"):
+            weights = np.log(even)[:, None]
+        return np.asarray(np.exp(weights + a * one + (n - a) * not_one + b * other + (m - b) * not_other))
+
+    def total(
+        self, cells: tuple[NDArray[Any], ...], even: NDArray[np.float64], trials: tuple[int, int]
+    ) -> NDArray[np.float64]:
+        """Their sum: float64 [rates]."""
+        import numpy as np
+
+        total = np.zeros(len(self._logs[0]))
+        for start in range(0, len(even), _CELLS // 8):
+            part = slice(start, start + _CELLS // 8)
+            total += self.mass((cells[0][part], cells[1][part]), even[part], trials).sum(axis=0)
+        return total
+
+
+def _checked(looks: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    if not looks:
+        raise StatisticsError("a design needs at least one look")
+    before = (0, 0)
+    for look in looks:
+        if min(look) < 1 or max(look) > MOST:
+            raise StatisticsError(
+                f"a look after {look[0]} and {look[1]} trials; allowed: 1 to {MOST} of each arm"
+            )
+        if look[0] < before[0] or look[1] < before[1] or tuple(look) == before:
+            raise StatisticsError(f"a look after {look[0]} and {look[1]} trials follows one after {before}")
+        before = (look[0], look[1])
+    return [(first, second) for first, second in looks]
+
+
+def _grown(
+    alive: NDArray[np.float64], first: int, second: int, rates: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Probabilities after so many more trials of each arm."""
+    import numpy as np
+
+    for axis, (more, rate) in enumerate(zip((first, second), rates, strict=True)):
+        for _ in range(more):
+            wider = np.zeros([size + (at == axis) for at, size in enumerate(alive.shape)])
+            low, high = [[slice(None)] * 2 for _ in range(2)]
+            low[axis], high[axis] = slice(None, -1), slice(1, None)
+            wider[tuple(low)] += alive * (1 - rate)
+            wider[tuple(high)] += alive * rate
+            alive = wider
+    return alive
+
+
+def _taken(
+    alive: NDArray[np.float64],
+    look: tuple[int, int],
+    null: _Null,
+    spent: NDArray[np.float64],
+    most: float,
+) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
+    """The least extreme table that may stop, and the error at each rate with all that are as extreme."""
+    import numpy as np
+
+    degree = _degrees(*look, null.margin)
+    reached = np.flatnonzero((degree > 0) & (alive > 0))
+    order = reached[np.argsort(-degree.ravel()[reached], kind="stable")]
+    levels = degree.ravel()[order]
+    ends = np.append(
+        levels[1:] < levels[:-1] * (1 - _TIE), True
+    )  # at the last one of those that are as extreme
+    least: tuple[int, int] | None = None
+    so_far = spent
+    for start in range(0, len(order), _CELLS):
+        part = slice(start, start + _CELLS)
+        cells = np.unravel_index(order[part], alive.shape)
+        errors = so_far + np.cumsum(null.mass(cells, alive[cells], look), axis=0)
+        within = errors.max(axis=1) <= most
+        allowed = len(within) if within.all() else int(np.argmin(within))
+        whole = np.flatnonzero(ends[part][:allowed])
+        if len(whole):
+            spent = errors[whole[-1]]
+            least = _least(order[: start + whole[-1] + 1], levels, alive.shape, look, null.margin)
+        if allowed < len(within):
+            break
+        so_far = errors[-1]
+    return least, spent
+
+
+def _least(
+    order: NDArray[np.intp],
+    levels: NDArray[np.float64],
+    shape: tuple[int, ...],
+    look: tuple[int, int],
+    margin: float | None,
+) -> tuple[int, int]:
+    """Of those in `order` that are as extreme as the last one but for rounding, the least extreme table."""
+    import numpy as np
+
+    alike = order[levels[: len(order)] <= levels[len(order) - 1] * (1 + _TIE)]
+    tables = [tuple(int(at) for at in np.unravel_index(index, shape)) for index in alike]
+
+    def degree(table: tuple[int, ...]) -> Fraction:
+        return Fraction(*extremeness(table[0], look[0], table[1], look[1], margin))
+
+    first, second = min(sorted(tables), key=degree)
+    return first, second
+
+
+def _at_least(first: int, second: int, look: Look, margin: float | None) -> bool:
+    assert look.least is not None
+    over, under = extremeness(first, look.first, second, look.second, margin)
+    least_over, least_under = extremeness(look.least[0], look.first, look.least[1], look.second, margin)
+    return over * least_under >= least_over * under
+
+
+def _region(look: Look, margin: float | None) -> NDArray[np.bool_]:
+    """Tables that stop at a look: bool [first + 1, second + 1].
+
+    Those that rounding could misplace are compared in whole numbers.
+    """
+    import numpy as np
+
+    degree = _degrees(look.first, look.second, margin)
+    if look.least is None:
+        return np.zeros(degree.shape, dtype=bool)
+    level = degree[look.least]
+    region = degree > level * (1 + _TIE)
+    for first, second in np.argwhere(np.abs(degree - level) <= _TIE * level):
+        region[first, second] = _at_least(int(first), int(second), look, margin)
+    return np.asarray(region)
+
+
+def _degrees(n: int, m: int, margin: float | None) -> NDArray[np.float64]:
+    """`extremeness` of all tables of a look: float64 [n + 1, m + 1]."""
+    import numpy as np
+
+    a: NDArray[np.float64] = np.arange(n + 1.0)[:, None]
+    b: NDArray[np.float64] = np.arange(m + 1.0)[None, :]
+    if margin is None:
+        successes = a + b
+        under = successes * (n + m - successes)
+        return np.asarray(
+            np.divide((a * m - b * n) ** 2, under, out=np.zeros((n + 1, m + 1)), where=under > 0)
+        )
+    p, q = (a + 1) / (n + 2), (b + 1) / (m + 2)
+    lead = q - p + margin
+    return np.asarray(lead * np.abs(lead) / (p * (1 - p) / (n + 2) + q * (1 - q) / (m + 2)))
