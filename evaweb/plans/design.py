@@ -59,8 +59,11 @@ def frozen(document: Mapping[str, Any]) -> Design | None:
     )
 
 
-def pairs_of(plan: Plan) -> list[tuple[float, float]]:
-    """What counts of the compared checkpoints, block by block as scheduled, up to the first block that is not made."""
+def pairs_of(plan: Plan, voided: bool = False) -> list[tuple[float, float]]:
+    """What counts of the compared checkpoints, block by block as scheduled, up to the first block that is not made.
+
+    `voided`: as if no trial had been voided that had a score: of each slot its first scored attempt counts.
+    """
     document = plan.document or {}
     found = frozen(document)
     if found is None:
@@ -68,11 +71,14 @@ def pairs_of(plan: Plan) -> list[tuple[float, float]]:
     names = document["comparison"]
     value = "trial__verdict__success" if found.outcome == SUCCESS else "trial__verdict__score"
     blocks: dict[int, dict[str, float]] = defaultdict(dict)
-    counted = plan.handouts.filter(trial__status=TrialStatus.SCORED, slot__checkpoint__name__in=names)
+    status = [TrialStatus.SCORED, TrialStatus.VOIDED] if voided else [TrialStatus.SCORED]
+    counted = plan.handouts.filter(
+        trial__status__in=status, trial__verdict__isnull=False, slot__checkpoint__name__in=names
+    )
     for block, name, outcome in counted.order_by("number").values_list(
         "slot__block", "slot__checkpoint__name", value
     ):
-        blocks[block][name] = float(outcome)
+        blocks[block].setdefault(name, float(outcome))
     scheduled = Slot.objects.filter(plan=plan).order_by("block").values_list("block", flat=True).distinct()
     made = takewhile(lambda block: len(blocks.get(block, ())) == len(names), scheduled)
     return [(blocks[block][names[0]], blocks[block][names[1]]) for block in made]

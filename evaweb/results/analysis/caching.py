@@ -50,7 +50,7 @@ def fingerprint(plan: Plan) -> Hashable:
     counted["seconds"] = steady(counted["seconds"])
     names = plan.checkpoints.order_by("pk").values_list("pk", "name")
     scenes = Scene.objects.filter(positions__plan=plan.pk).order_by("pk").distinct().values_list("pk", "name")
-    return (*counted.values(), *names, *scenes)
+    return (plan.state, *counted.values(), *names, *scenes)
 
 
 def runs_of(plan: Plan, at: Hashable = None) -> Runs:

@@ -11,6 +11,7 @@ from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import Chosen, choices
+from evaweb.results.analysis.integrity import changes_of
 from evaweb.results.analysis.outcomes import by_checkpoint
 from evaweb.results.presentation.addresses import compare_address, trials_address
 from evaweb.results.presentation.drawings import conditions, courses, rates
@@ -52,6 +53,7 @@ def _summary(plan: Plan, only: Chosen, at: Hashable) -> dict[str, Any]:
             if found is not primary
         ],
         "missed": [missed_words(analysis)] if analysis.arms else [],
+        "changes": changes_of(plan),
     }
 
 

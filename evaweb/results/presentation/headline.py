@@ -13,11 +13,16 @@ from evaweb.statistics.difference import newcombe
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """One sentence, how it was decided, and what it would be with scores that were corrected after the reveal."""
+    """One sentence, how it was decided, and what else it could be.
+
+    `corrected`: with the scores that were corrected after the reveal. `unvoided`: had no scored trial been voided.
+    Each is empty where it is made of the same pairs.
+    """
 
     sentence: str
     method: str
     corrected: str = ""
+    unvoided: str = ""
 
 
 def headline(plan: Plan) -> Headline | None:
@@ -28,9 +33,11 @@ def headline(plan: Plan) -> Headline | None:
     now = pairs_of(plan)
     at_reveal = [(one, other) for one, other in plan.at_reveal["pairs"]] if plan.at_reveal else now
     sentence = _sentence(plan, found, conclusion, at_reveal)
+    whole = pairs_of(plan, voided=True)
     later = _sentence(plan, found, conclude(found, now), now) if now != at_reveal else ""
+    unvoided = _sentence(plan, found, conclude(found, whole), whole) if whole != now else ""
     design = str(plan.get_stopping_display()).partition(":")[0]
-    return Headline(sentence, f"{design}, alpha {found.alpha:g}", later)
+    return Headline(sentence, f"{design}, alpha {found.alpha:g}", later, unvoided)
 
 
 def _sentence(plan: Plan, found: Design, conclusion: Conclusion, pairs: list[tuple[float, float]]) -> str:

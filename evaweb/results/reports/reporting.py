@@ -20,6 +20,7 @@ from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import agreement_of, preferences_of
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import Chosen
+from evaweb.results.analysis.integrity import changes_of
 from evaweb.results.models import Rating
 from evaweb.results.presentation import facts, listings
 from evaweb.results.presentation.drawings import conditions, courses, rates
@@ -124,6 +125,7 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         "analysis": analysis,
         "styles": "\n".join(_style(name) for name in _STYLES),
         "made": timezone.now(),
+        "changes": changes_of(plan),
         "primary": primary and facts.comparison_facts(plan, analysis, primary),
         "table": listings.arm_rows(plan, analysis, Chosen()),
         "others": [

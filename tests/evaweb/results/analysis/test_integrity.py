@@ -1,0 +1,78 @@
+"""What was voided, repeated and corrected stands beside the headline, by checkpoint."""
+
+import pytest
+
+from evaweb.plans.allocation import hand_out
+from evaweb.plans.services import plan_close, plan_reveal
+from evaweb.results.analysis.filters import Chosen
+from evaweb.results.analysis.integrity import changes_of
+from evaweb.results.pages.pages import summary_page
+from evaweb.results.presentation.headline import headline
+from evaweb.trials import services
+from evaweb.trials.models import TrialStatus
+from tests.evaweb.trials import builders
+
+NEW, OLD = "pi0-new", "pi0-block"
+
+
+@pytest.fixture
+def tried(bench, plan):
+    """Makes the next trial and scores it."""
+
+    def one(success, **said):
+        trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+        builders.over(trial, 9.0)
+        ticks = bench.ticks(True, success, success)
+        services.trial_score(user=bench.operator, trial=trial, milestones=ticks, **said)
+        trial.refresh_from_db()
+        return trial
+
+    return one
+
+
+def test_failures_of_one_checkpoint_that_were_voided_are_told_and_what_they_change(bench, plan, tried):
+    while plan.slots.count() > plan.handouts.filter(trial__status=TrialStatus.SCORED).count():
+        trial = tried(success=False)
+        if trial.checkpoint.name == NEW and trial.attempt == 1:
+            services.trial_void(user=bench.operator, trial=trial, reason="the plate had slipped")
+            tried(success=True)
+    found = {row.checkpoint: row for row in changes_of(plan)}
+    assert (found[NEW].voided_failures, found[NEW].voided_successes, found[NEW].voided) == (8, 0, 8)
+    assert (found[OLD].voided, found[OLD].attempts, found[OLD].counted) == (0, 8, 8)
+    assert (found[NEW].attempts, found[NEW].counted) == (16, 8)
+    said = headline(plan)
+    assert said.sentence.startswith(f"{NEW} succeeded more often than {OLD}: 8/8 against 0/8")
+    assert said.unvoided.startswith(f"No significant difference between {NEW} and {OLD}: 0/8 against 0/8")
+
+
+def test_where_nothing_was_voided_there_is_one_sentence(plan, tried):
+    tried(success=True)
+    assert headline(plan).unvoided == ""
+
+
+def test_corrections_are_told_by_their_direction_and_late_ones_apart(bench, plan, owner, tried):
+    first, second = tried(success=True), tried(success=False)
+    ticks = bench.ticks(True, False, False)
+    services.trial_score(user=bench.operator, trial=first, milestones=ticks, reason="it had slipped off")
+    plan_close(user=owner, plan=plan, reason="enough")
+    plan_reveal(user=owner, plan=plan)
+    ticks = bench.ticks(True, True, True)
+    services.trial_score(user=bench.operator, trial=second, milestones=ticks, reason="seen on the video")
+    plan.refresh_from_db()
+    rows = {row.checkpoint: row for row in changes_of(plan)}
+    one, other = rows[first.checkpoint.name], rows[second.checkpoint.name]
+    assert (one.to_failure, one.to_success, one.late) == (1, 0, 0)
+    assert (other.to_failure, other.to_success, other.late) == (0, 1, 1)
+    assert len(one.operators) == len(one.stations) == 1
+
+
+def test_the_page_says_that_the_plan_was_closed_as_soon_as_it_is(plan, owner, tried):
+    def sentence():
+        return summary_page(plan, Chosen())["primary"]["sentence"]
+
+    tried(success=True)
+    tried(success=False)
+    assert "the design goes on" in sentence()
+    plan_close(user=owner, plan=plan, reason="enough")
+    assert "closed after 1 of 8 pairs, before the design ended" in sentence()
+    assert [row.attempts for row in summary_page(plan, Chosen())["changes"]] == [1, 1]
