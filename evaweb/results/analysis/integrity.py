@@ -14,8 +14,8 @@ from evaweb.trials.models import Score, Trial, TrialStatus
 class Changes:
     """Of one checkpoint: attempts, and those that do not count.
 
-    Voided trials are told apart by what their score said before (`voided_unscored`: there was none). Corrections are those
-    of scores: `to_success`, `to_failure`, and `late` those made after the reveal.
+    Voided trials are told apart by what their score said before (`voided_unscored`: there was none). Scores that were
+    corrected: `to_success`, `to_failure`, and `late` those after the reveal.
     """
 
     checkpoint: str
