@@ -1,6 +1,7 @@
 """kill -9 of a station whose policy server is behind a tunnel: no ssh is left, and nobody else's is touched."""
 
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -27,16 +28,10 @@ def children(pid, name):
 
 def up_through_a_tunnel(lab, ssh_server):
     """A station that is set up; the process of its tunnel."""
-    settings = ssh_server.settings()
-    lab.up(
-        *(
-            f"policy.tunnel.{key}={value if isinstance(value, int | float) else repr(value)}"
-            for key, value in settings.items()
-        ),
-        "recording.enabled=false",
-        "control.orphan_hold_s=0.5",
-    )
-    lab.ready()
+    tunnel = {
+        key: str(value) if isinstance(value, Path) else value for key, value in ssh_server.settings().items()
+    }
+    lab.ready(policy={"tunnel": tunnel})
     [ssh] = children(lab.pids()["coordinator"], "ssh")
     return ssh
 
@@ -73,12 +68,13 @@ def bystander(ssh_server):
 @pytest.mark.parametrize(
     "victims",
     [
-        ["supervisor"],
         ["coordinator"],
+        ["supervisor"],
         ["supervisor", "coordinator", "control", "reception", "media", "guard"],
     ],
 )
-def test_no_tunnel_outlives_what_was_killed(lab, ssh_server, bystander, victims):
+def test_no_tunnel_outlives_what_was_killed(station, ssh_server, bystander, victims):
+    lab = station.rest(kills=1)
     ssh = up_through_a_tunnel(lab, ssh_server)
     assert alive(ssh)
     for process in victims:
@@ -86,7 +82,8 @@ def test_no_tunnel_outlives_what_was_killed(lab, ssh_server, bystander, victims)
     eventually(lambda: not alive(ssh), 10, "the end of ssh")
     if victims == ["coordinator"]:  # another one makes its own at the next set-up
         eventually(lab.answers, 10, "the station answers again")
-        lab.ready()
+        lab.reach("idle")
+        up_through_a_tunnel(lab, ssh_server)
         [again] = children(lab.pids()["coordinator"], "ssh")
         assert again != ssh
     assert bystander.poll() is None
