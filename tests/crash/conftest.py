@@ -1,5 +1,6 @@
 import pytest
 
+from runtime.core.errors import RuntimeFault
 from tests.crash.lab import Lab
 
 
@@ -15,7 +16,12 @@ def shared(tmp_path_factory):
 def station(shared, request):
     """The shared station, at rest; none that a test failed on."""
     failed = request.session.testsfailed
-    yield shared.rest()
+    try:
+        shared.rest()
+    except RuntimeFault:
+        shared.end()
+        raise
+    yield shared
     if request.session.testsfailed > failed:
         shared.end()
 

@@ -126,6 +126,7 @@ class Lab:
             self.node()
         if not self.supervisor:
             return self.up()
+        self.client.claim()
         self.client.wait(lambda status: seen_since(status, begun), self.patience)
         for kind in ("release", "stop"):
             if kind in self.client.status()["allowed"]:
@@ -135,7 +136,6 @@ class Lab:
         while self.client.status()["state"] != "idle":
             self.client.command("setup")
             self.client.command("stop")  # which cancels it
-        self.client.claim()
         self.client.give_up()
         return self
 
