@@ -180,9 +180,8 @@ def test_the_e_stop_works_while_main_is_stuck_and_outlives_a_restart_of_the_stat
 
 def test_a_stall_of_half_a_second_is_no_burst(station):
     lab = station.running(0.5)
-    episode, missed = (
-        lab.client.status()[of][what] for of, what in (("recording", "uuid"), ("control", "missed"))
-    )
+    status = lab.client.status()
+    episode, missed = status["recording"]["uuid"], status["control"]["missed"]
     control = lab.pids()["control"]
     os.kill(control, signal.SIGSTOP)
     time.sleep(0.5)
@@ -251,27 +250,11 @@ def test_a_file_that_may_not_grow_ends_the_recording_and_holds_the_robot(station
 # --- stations of their own -----------------------------------------------------------------------------------
 
 
-def test_a_station_without_node_and_policy_server_says_what_it_waits_for(lab):
-    ends = {end: f"tcp://127.0.0.1:{free_port()}" for end in ("obs_endpoint", "action_endpoint")}
-    lab.addresses.pop("server")
-    lab.addresses["node"] = lab.own["node"] = ends
-    lab.station()
-    status = lab.client.status()
-    assert status["state"] == "disconnected"
-    assert "observation" in status["reason"]
-    with pytest.raises(Refused, match="setup is not allowed while disconnected"):
-        lab.client.command("setup")
-    lab.node()
-    lab.reach("idle")
-    assert_setup_fails(lab, "no policy server listens at ws://127.0.0.1:1", "start it")
-
-
 def test_an_expiring_lease_makes_the_robot_hold_and_its_holder_may_resume(lab):
     lab.up("lease.ttl_s=1.0").running(0.5)
-    time.sleep(1.5)  # nobody renews
-    status = lab.client.status()
-    assert status["state"] == "holding"
-    assert "lease" in status["reason"]
+    # nobody renews
+    eventually(lambda: lab.client.status()["state"] == "holding", 2, "the end of the lease")
+    assert "lease" in lab.client.status()["reason"]
     lab.client.command("resume")
     lab.client.wait(lambda s: s["state"] == "running" and s["control"]["remaining"] > 0, 60)
     lab.client.command("stop")
@@ -280,12 +263,24 @@ def test_an_expiring_lease_makes_the_robot_hold_and_its_holder_may_resume(lab):
     assert {"policy", "hold"} <= set(sources)
 
 
-def test_too_little_room_refuses_the_run_before_anything_moves(lab):
-    lab.up("recording.min_free_bytes=1000000000000000").ready()
+def test_a_station_that_lacks_node_policy_server_and_room_says_so_one_after_the_other(lab):
+    server = lab.addresses.pop("server")["url"]
+    ends = {end: f"tcp://127.0.0.1:{free_port()}" for end in ("obs_endpoint", "action_endpoint")}
+    lab.addresses["node"] = lab.own["node"] = ends
+    lab.station("recording.min_free_bytes=1000000000000000")
+    status = lab.client.status()
+    assert status["state"] == "disconnected"
+    assert "observation" in status["reason"]
+    with pytest.raises(Refused, match="setup is not allowed while disconnected"):
+        lab.client.command("setup")
+    lab.node()
+    lab.reach("idle")
+    assert_setup_fails(lab, "no policy server listens at ws://127.0.0.1:1", "start it")
+    lab.ready(policy={"url": server})
     with pytest.raises(
         Refused, match=rf"room to record in {lab.data}/episodes: \d+ bytes free, at least 10{{15}} wanted"
     ):
-        lab.client.command("run")
+        lab.client.command("run")  # before anything moves
     assert lab.client.status()["state"] == "ready"
     assert lab.episodes() == []
 

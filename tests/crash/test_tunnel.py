@@ -1,7 +1,6 @@
 """kill -9 of a station whose policy server is behind a tunnel: no ssh is left, and nobody else's is touched."""
 
 import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -28,10 +27,7 @@ def children(pid, name):
 
 def up_through_a_tunnel(lab, ssh_server):
     """A station that is set up; the process of its tunnel."""
-    tunnel = {
-        key: str(value) if isinstance(value, Path) else value for key, value in ssh_server.settings().items()
-    }
-    lab.ready(policy={"tunnel": tunnel})
+    lab.ready(policy={"tunnel": ssh_server.settings()})
     [ssh] = children(lab.pids()["coordinator"], "ssh")
     return ssh
 
