@@ -255,6 +255,7 @@ def test_an_expiring_lease_makes_the_robot_hold_and_its_holder_may_resume(lab):
     # nobody renews
     eventually(lambda: lab.client.status()["state"] == "holding", 2, "the end of the lease")
     assert "lease" in lab.client.status()["reason"]
+    eventually(lambda: lab.client.status()["control"]["behaviour"] == "hold", 15, "the hold")
     lab.client.command("resume")
     lab.client.wait(lambda s: s["state"] == "running" and s["control"]["remaining"] > 0, 60)
     lab.client.command("stop")

@@ -56,8 +56,9 @@ def one_is_killed(lab, process, state):
     eventually(lambda: lab.pids()[process] != before[process], 10, f"a restart of {process}")
     restarted_at = time.monotonic()
     eventually(lab.answers, 10, "the station answers again")
-    # else a set-up ends with the link that is lost yet
-    lab.client.wait(lambda s: seen_since(s, restarted_at), 15)
+    step = lab.client.status()["control"]["step"]
+    # else a set-up ends with the link that is lost yet, or with joints that a new control has not seen for long enough
+    lab.client.wait(lambda s: seen_since(s, restarted_at) and s["control"]["step"] > step + 10, 15)
     lab.reach("idle", seconds=15)
     assert before | {process: 0} == lab.pids() | {process: 0}
     if state == "recording":
