@@ -107,6 +107,11 @@ class Lab:
         except RuntimeFault:
             return None
 
+    def answers_again(self):
+        """Wait for a station that was hurt; the lease is held again, which ends with a coordinator that is killed."""
+        eventually(self.answers, 10, "the station answers again")
+        self.client.claim()
+
     def up(self, *assignments):
         """Node, server and station, connected and idle."""
         if "node" not in self.addresses:

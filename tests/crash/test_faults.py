@@ -147,7 +147,7 @@ def test_a_stale_command_is_refused_and_a_repeated_one_gets_its_first_answer(sta
     assert client.status()["run"]["number"] == runs
     lab.kill("coordinator")
     eventually(lab.answers, 10, "a new coordinator")
-    lab.reach("idle")
+    eventually(lambda: client.status()["state"] == "idle", 15, "the end of the run")
     replayed = client._command("run", 2.0, identity=identity)
     assert replayed.status == "accepted"  # its first answer, from the journal
     assert client.status()["state"] == "idle"  # and nothing else
@@ -251,9 +251,9 @@ def test_a_file_that_may_not_grow_ends_the_recording_and_holds_the_robot(station
 
 
 def test_an_expiring_lease_makes_the_robot_hold_and_its_holder_may_resume(lab):
-    lab.up("lease.ttl_s=1.0").running(0.5)
+    lab.up("lease.ttl_s=2.5").running(0.5)
     # nobody renews
-    eventually(lambda: lab.client.status()["state"] == "holding", 2, "the end of the lease")
+    eventually(lambda: lab.client.status()["state"] == "holding", 5, "the end of the lease")
     assert "lease" in lab.client.status()["reason"]
     eventually(lambda: lab.client.status()["control"]["behaviour"] == "hold", 15, "the hold")
     lab.client.command("resume")

@@ -55,7 +55,7 @@ def one_is_killed(lab, process, state):
     lab.kill(process)
     eventually(lambda: lab.pids()[process] != before[process], 10, f"a restart of {process}")
     restarted_at = time.monotonic()
-    eventually(lab.answers, 10, "the station answers again")
+    lab.answers_again()
     step = lab.client.status()["control"]["step"]
     # else a set-up ends with the link that is lost yet, or with joints that a new control has not seen for long enough
     lab.client.wait(lambda s: seen_since(s, restarted_at) and s["control"]["step"] > step + 10, 15)
@@ -91,7 +91,7 @@ def test_a_recording_without_a_run_is_never_left_half_open_by_a_kill(station, pr
     before = lab.pids()
     lab.kill(process)
     eventually(lambda: lab.pids()[process] != before[process], 10, "a restart")
-    eventually(lab.answers, 10, "the station answers again")
+    lab.answers_again()
     lab.reach("idle", seconds=15)
     lab.ready()
     if process == "guard":  # it held nothing of the recording

@@ -77,7 +77,7 @@ def test_no_tunnel_outlives_what_was_killed(station, ssh_server, bystander, vict
         lab.kill(process)
     eventually(lambda: not alive(ssh), 10, "the end of ssh")
     if victims == ["coordinator"]:  # another one makes its own at the next set-up
-        eventually(lab.answers, 10, "the station answers again")
+        lab.answers_again()
         lab.reach("idle")
         up_through_a_tunnel(lab, ssh_server)
         [again] = children(lab.pids()["coordinator"], "ssh")
