@@ -85,6 +85,7 @@ class StationClient:
     def give_up(self) -> None:
         """End the lease before its time."""
         self._command("lease_give_up", 2.0, epoch=self._epoch)
+        self._epoch = 0
 
     def command(self, kind: str, timeout: float = 2.0, identity: str = "", **arguments: Any) -> Ack:
         """Give one command with its arguments under the lease.

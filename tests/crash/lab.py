@@ -1,20 +1,29 @@
 """Whole stations of real processes, and the means to kill each of them."""
 
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 from runtime.clients.client import StationClient
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.bus import Endpoints
+from runtime.processes.supervisor.supervisor import MOST_RESTARTS
 from tests.processes import eventually
 
 ROOT = Path(__file__).parents[2]
 ROBOT = "agilex_piper"
 FREE = "tcp://127.0.0.1:0"
+
+
+def seen_since(status, moment):
+    """Joints and every camera have been seen anew since then [monotonic]."""
+    ages = [math.inf if age is None else age for age in status["link"]["ages"].values()]
+    return max(ages) < time.monotonic() - moment
 
 
 class Lab:
@@ -31,6 +40,7 @@ class Lab:
         self.addresses = dict(addresses or {})
         self.own = {}  # addresses of what this lab started: another one of a name is started where the first was
         self.supervisor = self.client = None
+        self.killed = 0  # of the processes of this start of the station
 
     def start(self, name, module, *arguments, stdout=subprocess.PIPE):
         child = subprocess.Popen(
@@ -75,7 +85,7 @@ class Lab:
             "recording.min_free_bytes=0",
             "recording.export=false",
             "bus.preview_rate=0",
-            "control.orphan_hold_s=0.5",
+            "control.orphan_hold_s=0.2",
             "safety.joint_age_s=1.0",  # of a machine that is busy with something else
             "safety.picture_age_s=2.0",
             *assignments,
@@ -86,6 +96,7 @@ class Lab:
             stderr=(self.folder / "station.log").open("a"),
             cwd=ROOT,
         )
+        self.killed = 0
         self.client = StationClient(self.data / "stations" / "demo", holder="test")
         eventually(self.answers, self.patience, "the station answers")
         return self
@@ -96,6 +107,11 @@ class Lab:
         except RuntimeFault:
             return None
 
+    def answers_again(self):
+        """Wait for a station that was hurt; the lease is held again, which ends with a coordinator that is killed."""
+        eventually(self.answers, 10, "the station answers again")
+        self.client.claim()
+
     def up(self, *assignments):
         """Node, server and station, connected and idle."""
         if "node" not in self.addresses:
@@ -104,6 +120,28 @@ class Lab:
             self.server()
         self.station(*assignments)
         self.reach("idle")
+        return self
+
+    def rest(self, kills=0):
+        """Idle, nothing recorded, no lease held: the same station if so many more of its processes may be killed."""
+        if self.supervisor and (self.supervisor.poll() is not None or self.killed + kills > MOST_RESTARTS):
+            self.end()
+        begun = time.monotonic()
+        if "node" not in self.children:
+            self.node()
+        if not self.supervisor:
+            return self.up()
+        self.client.claim()
+        self.client.wait(lambda status: seen_since(status, begun), self.patience)
+        for kind in ("release", "stop"):
+            if kind in self.client.status()["allowed"]:
+                self.client.command(kind)
+        self.reach("idle", "ready")
+        self.client.wait(lambda status: not status["recording"]["uuid"], self.patience)
+        while self.client.status()["state"] != "idle":
+            self.client.command("setup")
+            self.client.command("stop")  # which cancels it
+        self.client.give_up()
         return self
 
     def reach(self, *states, seconds=None):
@@ -134,6 +172,8 @@ class Lab:
         os.kill(pid, signal.SIGKILL)
         if process == "supervisor":
             self.supervisor.wait()
+        else:
+            self.killed += 1
 
     def events(self, kind):
         return [event for event in self.client.events_since(0) if event["kind"] == kind]
@@ -148,12 +188,17 @@ class Lab:
         )
         return json.loads(path.read_text())
 
-    def close(self):
+    def end(self):
+        """End the station; node and policy server stay."""
         if self.client:
             self.client.close()
         if self.supervisor and self.supervisor.poll() is None:
             self.supervisor.send_signal(signal.SIGTERM)
             self.supervisor.wait(self.ending)
+        self.supervisor = self.client = None
+
+    def close(self):
+        self.end()
         for child in self.children.values():
             child.stdin.close()
             child.wait(10)

@@ -14,9 +14,9 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory, peers):
+def bench(tmp_path_factory, shared):
     """A station with a tabletop, and beside the deployment's own policy server another one."""
-    lab = Lab(tmp_path_factory.mktemp("bench"), peers).node("--bench", "tabletop")
+    lab = Lab(tmp_path_factory.mktemp("bench"), shared.addresses).node("--bench", "tabletop")
     own = lab.addresses["server"]["url"]
     other = lab.start(
         *("other", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--port", "0"),

@@ -5,14 +5,16 @@ import resource
 import signal
 import subprocess
 import time
+import uuid
 
 import numpy as np
 import pytest
 
 from runtime.clients.client import Refused, StationClient
 from runtime.core.errors import TransportError
+from runtime.policies.tunnel.process import free_port
 from runtime.recording.reader import open_episode
-from tests.crash.lab import Lab
+from tests.crash.lab import ROBOT
 from tests.processes import eventually
 
 pytestmark = pytest.mark.slow
@@ -38,33 +40,19 @@ def assert_holds(lab, *words, seconds=15):
 # --- the policy server -------------------------------------------------------------------------------------
 
 
-def test_policy_server_absent(lab):
-    lab.addresses.pop("server")
-    lab.station()
-    lab.reach("idle")
-    assert_setup_fails(lab, "no policy server listens at ws://127.0.0.1:1", "start it")
-
-
-@pytest.fixture(scope="module")
-def station(tmp_path_factory, peers):
-    """One station, set up with one policy server after the other."""
-    made = Lab(tmp_path_factory.mktemp("served"), peers).node()  # which obeys one station at a time
-    yield made.up("policy.connect_deadline=1.0", "policy.inference_deadline=1.0")
-    made.close()
-
-
 @pytest.fixture
 def served(station):
-    """That station, and how it is given a server that fails so; at rest afterwards."""
+    """The shared station, and how a set-up asks for a policy server that fails so."""
 
     def by(*arguments):
-        station.server(*arguments)
-        return {"policy": {"url": station.addresses["server"]["url"]}}
+        address = station.start(
+            *("failing", "runtime.sim.serve", "openpi", "--robot", ROBOT, "--port", "0"),
+            *("--latency-ms", "20", *arguments),
+        )
+        return {"policy": {"url": address["url"], "connect_deadline": 1.0, "inference_deadline": 1.0}}
 
     yield station, by
-    if "stop" in station.client.status()["allowed"]:
-        station.client.command("stop")
-    server = station.children.pop("server")
+    server = station.children.pop("failing")
     server.stdin.close()
     server.wait(10)
 
@@ -111,38 +99,29 @@ def test_policy_answering_nan(served):
 # --- the execution node ------------------------------------------------------------------------------------
 
 
-def test_node_absent(lab):
-    lab.addresses.pop("node")
-    lab.station()
-    status = lab.client.status()
-    assert status["state"] == "disconnected"
-    assert "observation" in status["reason"]
-    with pytest.raises(Refused, match="setup is not allowed while disconnected"):
-        lab.client.command("setup")
+def test_node_dying_in_the_middle_of_a_run(station):
+    station.running(0.5)
+    station.children.pop("node").kill()
+    assert_holds(station, "10 actions refused in a row", "old")
 
 
-def test_node_dying_in_the_middle_of_a_run(lab):
-    lab.node().up().running(0.5)
-    lab.children.pop("node").kill()
-    assert_holds(lab, "10 actions refused in a row", "old")
-
-
-def test_node_restarted_with_a_smaller_clock_is_noticed_and_seen_again(lab):
-    lab.node().up()
-    lab.children.pop("node").kill()
-    lab.reach("disconnected")
-    lab.node("--clock-offset", "-100000")
-    lab.reach("idle")
-    eventually(lambda: lab.events("source_clock_backwards"), 5, "the event")
-    assert lab.client.status()["link"]["ages"]["joints"] < 0.5
-    lab.ready()
+def test_node_restarted_with_a_smaller_clock_is_noticed_and_seen_again(station):
+    told = len(station.events("source_clock_backwards"))
+    station.children.pop("node").kill()
+    station.reach("disconnected")
+    station.node("--clock-offset", "-100000")
+    station.reach("idle")
+    eventually(lambda: len(station.events("source_clock_backwards")) > told, 5, "the event")
+    assert station.client.status()["link"]["ages"]["joints"] < 0.5
+    station.ready()
+    station.children.pop("node").kill()
 
 
 # --- commands and leases -----------------------------------------------------------------------------------
 
 
-def test_two_commanders_the_second_is_refused_and_told_who_holds_the_lease(lab):
-    lab.up().ready()
+def test_two_commanders_the_second_is_refused_and_told_who_holds_the_lease(station):
+    lab = station.ready()
     second = StationClient(lab.data / "stations" / "demo", holder="somebody else")
     with pytest.raises(Refused, match="test holds the lease"):
         second.command("run")
@@ -152,45 +131,31 @@ def test_two_commanders_the_second_is_refused_and_told_who_holds_the_lease(lab):
     second.close()
 
 
-def test_a_stale_command_is_refused_and_a_repeated_one_gets_its_first_answer(lab):
-    lab.up().ready()
-    client = lab.client
+def test_a_stale_command_is_refused_and_a_repeated_one_gets_its_first_answer(station):
+    lab = station.rest(kills=1).ready()
+    client, identity = lab.client, str(uuid.uuid4())
     client.claim()
     client.status()
     old = client._sequence
-    first = client.command("run", identity="11111111-1111-4111-8111-111111111111")
+    first = client.command("run", identity=identity)
     client._sequence = old
     with pytest.raises(Refused, match="stale"):
         client._command("run", 2.0, epoch=client._epoch)
     runs = client.status()["run"]["number"]
-    again = client._command("run", 2.0, epoch=client._epoch, identity="11111111-1111-4111-8111-111111111111")
+    again = client._command("run", 2.0, epoch=client._epoch, identity=identity)
     assert (again.status, again.sequence) == (first.status, first.sequence)
     assert client.status()["run"]["number"] == runs
     lab.kill("coordinator")
     eventually(lab.answers, 10, "a new coordinator")
-    lab.reach("idle")
-    replayed = client._command("run", 2.0, identity="11111111-1111-4111-8111-111111111111")
+    eventually(lambda: client.status()["state"] == "idle", 15, "the end of the run")
+    replayed = client._command("run", 2.0, identity=identity)
     assert replayed.status == "accepted"  # its first answer, from the journal
     assert client.status()["state"] == "idle"  # and nothing else
 
 
-def test_an_expiring_lease_makes_the_robot_hold_and_its_holder_may_resume(lab):
-    lab.up("lease.ttl_s=1.0").running(0.5)
-    time.sleep(1.5)  # nobody renews
-    status = lab.client.status()
-    assert status["state"] == "holding"
-    assert "lease" in status["reason"]
-    lab.client.command("resume")
-    lab.client.wait(lambda s: s["state"] == "running" and s["control"]["remaining"] > 0, 60)
-    lab.client.command("stop")
-    episode = open_episode(eventually(lambda: lab.outcome() and lab.episodes()[0], 10, "an episode"))
-    sources = episode.rows["control_source"].to_pylist()
-    assert {"policy", "hold"} <= set(sources)
-
-
-def test_the_e_stop_works_while_main_is_stuck_and_outlives_a_restart_of_the_station(lab):
-    lab.up().running(0.5)
-    main = lab.pids()["coordinator"]
+def test_the_e_stop_works_while_main_is_stuck_and_outlives_a_restart_of_the_station(station):
+    lab = station.running(0.5)
+    main, episode = lab.pids()["coordinator"], lab.client.status()["recording"]["uuid"]
     os.kill(main, signal.SIGSTOP)
     try:
         ack = lab.client.estop("main is stuck")
@@ -198,10 +163,8 @@ def test_the_e_stop_works_while_main_is_stuck_and_outlives_a_restart_of_the_stat
     finally:
         os.kill(main, signal.SIGCONT)
     lab.reach("faulted")
-    assert lab.outcome()["status"] == "interrupted"
-    lab.supervisor.send_signal(signal.SIGTERM)
-    lab.supervisor.wait(20)
-    lab.client.close()
+    assert lab.outcome(episode)["status"] == "interrupted"
+    lab.end()
     lab.station()
     status = lab.reach("faulted")
     assert "main is stuck" in status["reason"]
@@ -215,18 +178,20 @@ def test_the_e_stop_works_while_main_is_stuck_and_outlives_a_restart_of_the_stat
 # --- the machine -------------------------------------------------------------------------------------------
 
 
-def test_a_stall_of_half_a_second_is_no_burst(lab):
-    lab.up().running(1.0)
+def test_a_stall_of_half_a_second_is_no_burst(station):
+    lab = station.running(0.5)
+    status = lab.client.status()
+    episode, missed = status["recording"]["uuid"], status["control"]["missed"]
     control = lab.pids()["control"]
     os.kill(control, signal.SIGSTOP)
     time.sleep(0.5)
     os.kill(control, signal.SIGCONT)
     before = lab.client.status()["run"]["elapsed"]
     lab.client.wait(lambda s: s["run"]["elapsed"] > before + 1.0 or s["state"] != "running", 60)
-    assert lab.client.status()["control"]["missed"] >= 10
+    assert lab.client.status()["control"]["missed"] - missed >= 10
     lab.client.command("stop")
-    lab.outcome()
-    ticks = open_episode(lab.episodes()[0]).ticks
+    lab.outcome(episode)
+    ticks = open_episode(lab.data / "episodes" / episode).ticks
     sent = np.array(ticks["sent"].to_pylist())
     steps = np.array(ticks["step"].to_pylist())
     stall = int(np.argmax(np.diff(sent)))
@@ -237,22 +202,21 @@ def test_a_stall_of_half_a_second_is_no_burst(lab):
 
 
 @pytest.fixture
-def small_disk(lab):
-    """The episodes on a disk of 1 MiB of their own."""
-    folder = lab.data / "episodes"
-    folder.mkdir(parents=True)
+def small_disk(station):
+    """The shared station, whose episodes are on a disk of 1 MiB of their own."""
+    folder = station.data / "episodes"
+    folder.mkdir(parents=True, exist_ok=True)
     mounted = subprocess.run(
         ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)], capture_output=True, text=True
     )
     if mounted.returncode:
         pytest.skip(f"no disk can be mounted here: {mounted.stderr.strip()}")
-    yield lab
-    lab.close()
-    subprocess.run(["umount", str(folder)], check=True)
+    yield station
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)  # where the test failed, files may be open
 
 
 def test_a_full_disk_ends_the_recording_with_a_sentence_and_holds_the_robot(small_disk):
-    lab = small_disk.up().running(0.5)
+    lab = small_disk.running(0.5)
     media = lab.pids()["media"]
     assert_holds(lab, "disk full while writing", "bytes free", seconds=60)
     assert lab.pids()["media"] == media
@@ -271,22 +235,53 @@ def test_a_full_disk_ends_the_recording_with_a_sentence_and_holds_the_robot(smal
     assert lab.pids()["media"] == media
 
 
-def test_a_file_that_may_not_grow_ends_the_recording_and_holds_the_robot(lab):
-    lab.up().running(1.0)
-    media = lab.pids()["media"]
-    resource.prlimit(media, resource.RLIMIT_FSIZE, (20_000, 20_000))
-    assert_holds(lab, "too large while writing")
-    assert lab.pids()["media"] == media
-    assert lab.outcome()["status"] == "failed"
-    assert open_episode(lab.episodes()[0]).frames > 15
+def test_a_file_that_may_not_grow_ends_the_recording_and_holds_the_robot(station):
+    station.running(1.0)
+    media, episode = station.pids()["media"], station.client.status()["recording"]["uuid"]
+    _, most = resource.prlimit(media, resource.RLIMIT_FSIZE)
+    resource.prlimit(media, resource.RLIMIT_FSIZE, (20_000, most))
+    assert_holds(station, "too large while writing")
+    assert station.pids()["media"] == media
+    assert station.outcome(episode)["status"] == "failed"
+    assert open_episode(station.data / "episodes" / episode).frames > 15
+    resource.prlimit(media, resource.RLIMIT_FSIZE, (most, most))
 
 
-def test_too_little_room_refuses_the_run_before_anything_moves(lab):
-    lab.up("recording.min_free_bytes=1000000000000000").ready()
+# --- stations of their own -----------------------------------------------------------------------------------
+
+
+def test_an_expiring_lease_makes_the_robot_hold_and_its_holder_may_resume(lab):
+    lab.up("lease.ttl_s=2.5").running(0.5)
+    # nobody renews
+    eventually(lambda: lab.client.status()["state"] == "holding", 5, "the end of the lease")
+    assert "lease" in lab.client.status()["reason"]
+    eventually(lambda: lab.client.status()["control"]["behaviour"] == "hold", 15, "the hold")
+    lab.client.command("resume")
+    lab.client.wait(lambda s: s["state"] == "running" and s["control"]["remaining"] > 0, 60)
+    lab.client.command("stop")
+    episode = open_episode(eventually(lambda: lab.outcome() and lab.episodes()[0], 10, "an episode"))
+    sources = episode.rows["control_source"].to_pylist()
+    assert {"policy", "hold"} <= set(sources)
+
+
+def test_a_station_that_lacks_node_policy_server_and_room_says_so_one_after_the_other(lab):
+    server = lab.addresses.pop("server")["url"]
+    ends = {end: f"tcp://127.0.0.1:{free_port()}" for end in ("obs_endpoint", "action_endpoint")}
+    lab.addresses["node"] = lab.own["node"] = ends
+    lab.station("recording.min_free_bytes=1000000000000000")
+    status = lab.client.status()
+    assert status["state"] == "disconnected"
+    assert "observation" in status["reason"]
+    with pytest.raises(Refused, match="setup is not allowed while disconnected"):
+        lab.client.command("setup")
+    lab.node()
+    lab.reach("idle")
+    assert_setup_fails(lab, "no policy server listens at ws://127.0.0.1:1", "start it")
+    lab.ready(policy={"url": server})
     with pytest.raises(
         Refused, match=rf"room to record in {lab.data}/episodes: \d+ bytes free, at least 10{{15}} wanted"
     ):
-        lab.client.command("run")
+        lab.client.command("run")  # before anything moves
     assert lab.client.status()["state"] == "ready"
     assert lab.episodes() == []
 

@@ -19,9 +19,9 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory, peers):
+def lab(tmp_path_factory, shared):
     """One station for all that is looked at."""
-    made = Lab(tmp_path_factory.mktemp("live"), peers).node("--width", "640", "--height", "480")
+    made = Lab(tmp_path_factory.mktemp("live"), shared.addresses).node("--width", "640", "--height", "480")
     yield made.up("bus.preview_rate=15.0")
     made.close()
 

@@ -11,7 +11,7 @@ import zmq
 from benchmarks.fuzzing.bodies import body
 from runtime.core import msgpack_arrays
 from runtime.safety.settings import SafetySettings
-from tests.crash.lab import FREE, ROBOT
+from tests.crash.lab import FREE, ROBOT, Lab
 from tests.processes import eventually
 
 pytestmark = pytest.mark.slow
@@ -61,15 +61,16 @@ class Tap:
         self._onward.close()
 
 
-@pytest.fixture
-def tap(lab):
-    lab.node()
+@pytest.fixture(scope="module")
+def tapped(tmp_path_factory, shared):
+    """A station, and the tap between it and its node."""
+    lab = Lab(tmp_path_factory.mktemp("tapped"), shared.addresses).node()
     ends = lab.addresses["node"]
-    made = Tap(ends["action_endpoint"])
-    ends["action_endpoint"] = made.endpoint
-    yield made
+    tap = Tap(ends["action_endpoint"])
+    lab.addresses["node"] = ends | {"action_endpoint": tap.endpoint}
+    yield lab.up("recording.enabled=false"), tap
     lab.close()
-    made.close()
+    tap.close()
 
 
 def within_limits(targets):
@@ -91,8 +92,11 @@ def within_limits(targets):
 
 
 @pytest.mark.parametrize("what", ["run", "motion"])
-def test_a_control_that_is_killed_while_the_robot_moves_goes_on_holding_where_that_was(lab, tap, what):
-    lab.up("recording.enabled=false").ready()
+def test_a_control_that_is_killed_while_the_robot_moves_goes_on_holding_where_that_was(tapped, what):
+    lab, tap = tapped
+    lab.rest(kills=1)
+    tap.controls.clear()
+    lab.ready()
     if what == "run":
         lab.client.command("run")
     else:

@@ -19,6 +19,63 @@ from tests.processes import alive, eventually
 pytestmark = pytest.mark.slow
 
 
+def leftover(lab, *names):
+    """Copies of an episode that a station without its supervisor has ended, without how; the station is ended."""
+    lab.running(0.5)
+    episode = lab.data / "episodes" / lab.client.status()["recording"]["uuid"]
+    pids = lab.pids().values()
+    lab.kill("supervisor")
+    eventually(lambda: not any(map(alive, pids)), 10, "the end of the family")
+    lab.client.close()
+    (episode / "outcome.json").unlink()
+    copies = [episode.with_name(name) for name in names]
+    for copy in copies:
+        shutil.copytree(episode, copy)
+    return [episode, *copies]
+
+
+def test_leftovers_that_cannot_be_repaired_do_not_keep_the_station_from_starting(station):
+    before, after = "00000000-0000-4000-8000-000000000000", "ffffffff-ffff-4fff-8fff-ffffffffffff"
+    unlike = "88888888-8888-4888-8888-888888888888"
+    manifest, *good, events = leftover(station, before, after, unlike)
+    (manifest / "manifest.json").write_text(json.dumps({"station": "demo"}))
+    (events / "events.jsonl").unlink()
+    (events / "events.jsonl").mkdir()
+    station.station()
+    station.reach("idle")
+    for episode in good:
+        eventually((episode / "outcome.json").exists, 10, "the repair of the others")
+        assert open_episode(episode).frames > 5
+    for bad in (manifest, events):
+        assert not (bad / "outcome.json").exists()
+        assert bad.name in (station.folder / "station.log").read_text()
+    station.running(0.5)
+    for bad in (manifest, events):
+        shutil.rmtree(bad)
+
+
+def test_many_leftovers_do_not_delay_the_start(station):
+    episodes = leftover(station, *(f"22222222-2222-4222-8222-{number:012}" for number in range(50)))
+    station.station()
+    station.reach("idle", seconds=10)
+    station.ready()
+    media = station.pids()["media"]
+    eventually(lambda: all((episode / "outcome.json").exists() for episode in episodes), 30, "all repairs")
+    assert station.pids()["media"] == media
+
+
+def test_a_set_up_that_waits_for_a_mute_server_is_cancelled_at_once(station):
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        policy = {"url": f"ws://127.0.0.1:{mute.getsockname()[1]}", "connect_deadline": 100.0}
+        station.client.command("setup", policy=policy)
+        assert station.client.status()["state"] == "setting_up"
+        station.client.command("stop")  # answered within its two seconds
+        assert station.client.status()["state"] == "idle"
+        station.client.command("setup", policy=policy)  # and the worker is free for the next one
+        with mute.accept()[0], mute.accept()[0]:
+            station.client.command("stop")
+
+
 @pytest.fixture
 def small_disk(lab):
     """All of the station's files on a disk of 2 MiB of their own."""
@@ -33,67 +90,27 @@ def small_disk(lab):
     subprocess.run(["umount", str(lab.data)], check=True)
 
 
-@pytest.mark.parametrize("process", ["media", "coordinator", "guard"])
-def test_a_process_is_restarted_although_the_disk_is_full_and_found_when_there_is_room(small_disk, process):
+def test_a_process_is_restarted_although_the_disk_is_full_and_found_when_there_is_room(small_disk):
     lab = small_disk.up("recording.enabled=false")
-    before = lab.pids()
     filler = lab.data / "filler"
-    with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
-        while True:
-            file.write(bytes(4096))
-    lab.kill(process)
     log = lab.folder / "station.log"
-    text = f"clients cannot find the process {process} until the disk takes its file"
-    eventually(lambda: text in log.read_text(), 10, "the sentence in the log")
-    assert lab.supervisor.poll() is None
-    filler.unlink()
-    eventually(lambda: lab.pids()[process] != before[process], 10, "the new process ids")
-    eventually(lab.answers, 10, "the station answers")
-    lab.ready()
-
-
-@pytest.mark.parametrize("ending", ["manifest", "events"])
-def test_a_leftover_that_cannot_be_repaired_does_not_keep_the_station_from_starting(lab, ending):
-    lab.up("control.orphan_hold_s=0.5").running(0.5)
-    pids = lab.pids().values()
-    lab.kill("supervisor")
-    eventually(lambda: not any(map(alive, pids)), 10, "the end of the family")
-    lab.client.close()
-    (bad,) = lab.episodes()
-    (bad / "outcome.json").unlink()
-    good = bad.with_name("22222222-2222-4222-8222-222222222222")
-    shutil.copytree(bad, good)
-    if ending == "manifest":
-        (bad / "manifest.json").write_text(json.dumps({"station": "demo"}))
-    else:
-        (bad / "events.jsonl").unlink()
-        (bad / "events.jsonl").mkdir()
-    lab.station()
-    lab.reach("idle")
-    eventually((good / "outcome.json").exists, 10, "the repair of the other one")
-    assert not (bad / "outcome.json").exists()
-    assert open_episode(good).frames > 5
-    assert bad.name in (lab.folder / "station.log").read_text()
-    lab.running(0.5)
-
-
-def test_many_leftovers_do_not_delay_the_start(lab):
-    lab.up("control.orphan_hold_s=0.5").running(0.5)
-    pids = lab.pids().values()
-    lab.kill("supervisor")
-    eventually(lambda: not any(map(alive, pids)), 10, "the end of the family")
-    lab.client.close()
-    (left,) = lab.episodes()
-    (left / "outcome.json").unlink()
-    copies = [left.with_name(f"22222222-2222-4222-8222-{number:012}") for number in range(50)]
-    for copy in copies:
-        shutil.copytree(left, copy)
-    lab.station()
-    lab.reach("idle", seconds=10)
-    lab.ready()
-    media = lab.pids()["media"]
-    eventually(lambda: all((copy / "outcome.json").exists() for copy in copies), 30, "all repairs")
-    assert lab.pids()["media"] == media
+    for process in ("media", "coordinator", "guard"):
+        before = lab.pids()
+        with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
+            while True:
+                file.write(bytes(4096))
+        lab.kill(process)
+        text = f"clients cannot find the process {process} until the disk takes its file"
+        eventually(lambda text=text: text in log.read_text(), 10, "the sentence in the log")
+        assert lab.supervisor.poll() is None
+        filler.unlink()
+        eventually(
+            lambda process=process, before=before: lab.pids()[process] != before[process],
+            *(10, f"the new process id of {process}"),
+        )
+        lab.answers_again()
+        lab.reach("idle")
+        lab.ready()
 
 
 @contextlib.contextmanager
@@ -146,20 +163,6 @@ def test_a_terminal_that_takes_no_more_stops_neither_commands_nor_the_e_stop(lab
         lab.close()  # ends in time, although its last lines go nowhere
 
 
-def test_a_set_up_that_waits_for_a_mute_server_is_cancelled_at_once(lab):
-    with socket.create_server(("127.0.0.1", 0)) as mute:
-        lab.addresses["server"] = {"url": f"ws://127.0.0.1:{mute.getsockname()[1]}"}
-        lab.station("policy.connect_deadline=100.0")
-        lab.reach("idle")
-        lab.client.command("setup")
-        assert lab.client.status()["state"] == "setting_up"
-        lab.client.command("stop")  # answered within its two seconds
-        assert lab.client.status()["state"] == "idle"
-        lab.client.command("setup")  # and the worker is free for the next one
-        with mute.accept()[0], mute.accept()[0]:
-            lab.client.command("stop")
-
-
 def headless(lab, *assignments):
     node, server = lab.addresses["node"], lab.addresses["server"]
     settings = [
@@ -200,12 +203,12 @@ def test_a_headless_run_that_cannot_begin_says_why_and_waits_for_no_episode(lab)
 
 
 def test_a_headless_run_says_how_it_went_and_nothing_that_nobody_asked(lab):
-    done = headless(lab, "run.duration_s=2.0")
+    done = headless(lab, "run.duration_s=1.0")
     assert done.returncode == 0, done.stderr
     assert "INFO" not in done.stderr
     told = done.stdout.partition("How it went")[2]
     for word in (
-        "ended     the run's 2 s are over",
+        "ended     the run's 1 s are over",
         "recorded",
         "policy    p50",
         "control",

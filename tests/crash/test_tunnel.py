@@ -27,16 +27,7 @@ def children(pid, name):
 
 def up_through_a_tunnel(lab, ssh_server):
     """A station that is set up; the process of its tunnel."""
-    settings = ssh_server.settings()
-    lab.up(
-        *(
-            f"policy.tunnel.{key}={value if isinstance(value, int | float) else repr(value)}"
-            for key, value in settings.items()
-        ),
-        "recording.enabled=false",
-        "control.orphan_hold_s=0.5",
-    )
-    lab.ready()
+    lab.ready(policy={"tunnel": ssh_server.settings()})
     [ssh] = children(lab.pids()["coordinator"], "ssh")
     return ssh
 
@@ -73,20 +64,22 @@ def bystander(ssh_server):
 @pytest.mark.parametrize(
     "victims",
     [
-        ["supervisor"],
         ["coordinator"],
+        ["supervisor"],
         ["supervisor", "coordinator", "control", "reception", "media", "guard"],
     ],
 )
-def test_no_tunnel_outlives_what_was_killed(lab, ssh_server, bystander, victims):
+def test_no_tunnel_outlives_what_was_killed(station, ssh_server, bystander, victims):
+    lab = station.rest(kills=1)
     ssh = up_through_a_tunnel(lab, ssh_server)
     assert alive(ssh)
     for process in victims:
         lab.kill(process)
     eventually(lambda: not alive(ssh), 10, "the end of ssh")
     if victims == ["coordinator"]:  # another one makes its own at the next set-up
-        eventually(lab.answers, 10, "the station answers again")
-        lab.ready()
+        lab.answers_again()
+        lab.reach("idle")
+        up_through_a_tunnel(lab, ssh_server)
         [again] = children(lab.pids()["coordinator"], "ssh")
         assert again != ssh
     assert bystander.poll() is None

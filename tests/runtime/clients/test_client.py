@@ -214,6 +214,13 @@ def test_waiting_ends_with_the_first_status_that_will_do_and_keeps_the_lease(cli
     assert client.wait(lambda status: "lease_renew" in station.kinds(), 2.0)["state"] == "ready"
 
 
+def test_waiting_does_not_renew_a_lease_that_was_given_up(client, station):
+    client.claim()
+    client.give_up()
+    client._renewed -= 1.0
+    assert client.wait(lambda status: station.kinds().count("status") > 1, 2.0)["state"] == "ready"
+
+
 def test_waiting_in_vain_says_what_the_station_was_doing(client):
     with pytest.raises(TransportError, match=r"not reached within 0.01 s; the station is ready: waiting"):
         client.wait(lambda status: False, 0.01)
