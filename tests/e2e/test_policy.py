@@ -143,7 +143,9 @@ def crawled(windows, seeds):
     while waiting:
         path = waiting.pop(0)
         name = resolve(urlsplit(path).path).view_name
-        of_each, kind = (1, (name, "_popup" in path)) if name.startswith("admin:") else (OF_EACH, (name, False))
+        of_each, kind = (
+            (1, (name, "_popup" in path)) if name.startswith("admin:") else (OF_EACH, (name, False))
+        )
         if path in asked or len(seen.get(kind, [])) >= of_each:
             continue
         window = next(turns)
