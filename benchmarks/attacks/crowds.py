@@ -7,7 +7,7 @@ import base64
 import os
 from collections import Counter
 from collections.abc import Awaitable, Callable
-from functools import partial
+from contextlib import suppress
 
 from benchmarks.attacks.target import Target
 from benchmarks.estop_lab import PRESSED
@@ -15,20 +15,20 @@ from benchmarks.estop_lab import PRESSED
 _PINGS, _HANDSHAKES, _PAGES, _CLIENTS = 60, 3000, 600, 400
 _PING = b"\x89\x80\x00\x00\x00\x00" * 500  # masked, of no bytes
 _PATIENCE_S = 20.0
-_BEGUN_S = 2.0
+_BEGUN_S = 2.0  # at most, until each of a crowd has had an answer
 _AGAIN_S = 0.1
-_Ask = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[str]]
+_Then = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[object]]  # once it is answered
 
 
 def pings(target: Target) -> Counter[str]:
     """Sockets of people who are logged in that ping as fast as they are read; those that are closed come again."""
-    return asyncio.run(_crowd(target, _PINGS, partial(_pings, _head(target, _socket(target)))))
+    return asyncio.run(_crowd(target, _PINGS, _head(target, _socket(target)), _pings))
 
 
 def handshakes(target: Target) -> Counter[str]:
     """Handshakes of websockets by nobody in particular, each closed as soon as it is answered."""
     head = _head(target, f"{_socket(target, 'made-up')}")
-    return asyncio.run(_crowd(target, _HANDSHAKES, partial(_answered, head)))
+    return asyncio.run(_crowd(target, _HANDSHAKES, head, _no_more))
 
 
 def pages(target: Target) -> Counter[str]:
@@ -36,7 +36,7 @@ def pages(target: Target) -> Counter[str]:
     head = _head(
         target, f"GET /stations/{PRESSED}/debug/ HTTP/1.1\r\n{_session(target)}Connection: close\r\n"
     )
-    return asyncio.run(_crowd(target, _PAGES, partial(_whole, head)))
+    return asyncio.run(_crowd(target, _PAGES, head, _whole))
 
 
 def rest_clients(target: Target) -> Counter[str]:
@@ -44,7 +44,7 @@ def rest_clients(target: Target) -> Counter[str]:
     head = _head(
         target, f"GET /api/v1/stations/{PRESSED} HTTP/1.1\r\n{_session(target)}Connection: close\r\n"
     )
-    return asyncio.run(_crowd(target, _CLIENTS, partial(_whole, head)))
+    return asyncio.run(_crowd(target, _CLIENTS, head, _whole))
 
 
 def _session(target: Target, key: str = "") -> str:
@@ -64,11 +64,14 @@ def _head(target: Target, lines: str) -> bytes:
     return f"{lines}Host: {target.address[0]}:{target.address[1]}\r\n\r\n".encode()
 
 
-async def _crowd(target: Target, size: int, ask: _Ask) -> Counter[str]:
+async def _crowd(target: Target, size: int, head: bytes, then: _Then) -> Counter[str]:
     """So many connections at once, each followed by another one; how often which answer came."""
     done: Counter[str] = Counter()
-    tasks = [asyncio.create_task(_over_and_over(target, ask, done)) for _ in range(target.part(size))]
-    await asyncio.sleep(_BEGUN_S)
+    answered = [asyncio.Event() for _ in range(target.part(size))]
+    tasks = [asyncio.create_task(_over_and_over(target, head, then, done, one)) for one in answered]
+    with suppress(TimeoutError):
+        async with asyncio.timeout(_BEGUN_S):
+            await asyncio.gather(*(one.wait() for one in answered))
     target.begun()
     await asyncio.to_thread(target.ended.wait)
     for task in tasks:
@@ -76,13 +79,19 @@ async def _crowd(target: Target, size: int, ask: _Ask) -> Counter[str]:
     return done
 
 
-async def _over_and_over(target: Target, ask: _Ask, done: Counter[str]) -> None:
+async def _over_and_over(
+    target: Target, head: bytes, then: _Then, done: Counter[str], answered: asyncio.Event
+) -> None:
     while True:
         try:
             async with asyncio.timeout(_PATIENCE_S):
                 reader, writer = await asyncio.open_connection(*target.address)
                 try:
-                    done[await ask(reader, writer)] += 1
+                    writer.write(head)
+                    status = (await reader.readexactly(12))[9:].decode()
+                    answered.set()
+                    await then(reader, writer)
+                    done[status] += 1
                 finally:
                     writer.close()
         except (OSError, asyncio.IncompleteReadError) as fault:
@@ -90,19 +99,15 @@ async def _over_and_over(target: Target, ask: _Ask, done: Counter[str]) -> None:
             await asyncio.sleep(_AGAIN_S)
 
 
-async def _answered(head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
-    writer.write(head)
-    return (await reader.readexactly(12))[9:].decode()
+async def _no_more(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """The answer is all."""
 
 
-async def _whole(head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
-    status = await _answered(head, reader, writer)
+async def _whole(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     await reader.read()
-    return status
 
 
-async def _pings(head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
-    await _answered(head, reader, writer)
+async def _pings(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     reading = asyncio.create_task(_read_all(reader))
     try:
         while not reading.done():
@@ -110,7 +115,6 @@ async def _pings(head: bytes, reader: asyncio.StreamReader, writer: asyncio.Stre
             await writer.drain()
     finally:
         reading.cancel()
-    return "closed"
 
 
 async def _read_all(reader: asyncio.StreamReader) -> None:

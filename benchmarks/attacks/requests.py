@@ -8,7 +8,7 @@ import socket
 import threading
 from collections import Counter
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from itertools import count
 
@@ -21,7 +21,7 @@ _BODY, _CHUNK = 200_000_000, bytes(1_000_000)
 _PARTS = 20_000
 _HALF = b"POST /login/ HTTP/1.1\r\nHost: localhost\r\nContent-Le"
 _ANSWER_S = 30.0
-_OPENING_S = 5.0
+_OPENING_S = 5.0  # at most, until all connections stand
 
 
 def half_open(target: Target) -> Counter[str]:
@@ -31,8 +31,11 @@ def half_open(target: Target) -> Counter[str]:
 
 async def _half_open(target: Target) -> Counter[str]:
     opened: Counter[str] = Counter()
-    tries = [asyncio.create_task(_one(target, number, opened)) for number in range(target.part(_CONNECTIONS))]
-    await asyncio.wait(tries, timeout=_OPENING_S)
+    tried = [asyncio.Event() for _ in range(target.part(_CONNECTIONS))]
+    tries = [asyncio.create_task(_one(target, number, opened, one)) for number, one in enumerate(tried)]
+    with suppress(TimeoutError):
+        async with asyncio.timeout(_OPENING_S):
+            await asyncio.gather(*(one.wait() for one in tried))
     target.begun()
     await asyncio.to_thread(target.ended.wait)
     for task in tries:
@@ -40,13 +43,14 @@ async def _half_open(target: Target) -> Counter[str]:
     return opened
 
 
-async def _one(target: Target, number: int, opened: Counter[str]) -> None:
+async def _one(target: Target, number: int, opened: Counter[str], tried: asyncio.Event) -> None:
     while True:
         try:
             reader, writer = await asyncio.open_connection(*target.address)
             opened["opened"] += 1
             if number % 2:
                 writer.write(_HALF)
+            tried.set()
             await reader.read()
             writer.close()
         except OSError:

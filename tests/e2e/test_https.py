@@ -27,13 +27,22 @@ def lab(tmp_path_factory):
     assert demo.end() == 0, (folder / "demo.log").read_text()[-2000:]
 
 
-@pytest.fixture
-def page(browser, lab):
-    window = BenchPage(browser, lab, "operator", WIDE).open(f"/stations/{STATION}/eval/")
-    window.at_rest()
-    window.page.locator(f"{AREA}[data-second-way]").wait_for()
+@pytest.fixture(scope="module")
+def window(browser, lab):
+    """The operator's browser, who has logged in."""
+    window = BenchPage(browser, lab, "operator", WIDE)
     yield window
     window.close()
+
+
+@pytest.fixture
+def page(window):
+    """The page, loaded anew."""
+    window.errors.clear()
+    window.open(f"/stations/{STATION}/eval/")
+    window.at_rest()
+    window.page.locator(f"{AREA}[data-second-way]").wait_for()
+    return window
 
 
 def released(lab, page):

@@ -1,34 +1,42 @@
-"""One trial by command, as the README has it, and what it leaves on the disk."""
+"""One trial by command, as the README has it, and then a blind plan on the same data: what each leaves on the disk."""
 
 import json
 import socket
+import sqlite3
 import subprocess
 import sys
-from pathlib import Path
+from contextlib import closing, contextmanager
 
 import pytest
 
+from tests.e2e.conftest import SETS
 from tests.e2e.lab import ROOT, environment
+from tests.processes import eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 READER = ROOT / "tests" / "conformance" / "read_lerobot_v21.py"
 MANAGE = [sys.executable, "manage.py", "demo"]
 
 
-def once(folder, *options):
-    """Run the command to its end; its result."""
+PLACES = """
+SELECT episode.dataset, episode.dataset_index, episode.frames FROM trials_trial AS trial
+JOIN episodes_episode AS episode ON episode.uuid = trial.episode_id WHERE trial.id IN (?, ?) ORDER BY trial.id
+"""
+
+
+def run(folder, *options, timeout=180):
+    """Run the command to its end; what it wrote as its result, and how it ended."""
     out = folder / "out.json"
     done = subprocess.run(
-        [*MANAGE, "--once", "--json", str(out), "--port", "0", *options],
+        [*MANAGE, "--json", str(out), "--port", "0", *options],
         cwd=ROOT,
         env=environment(folder / "data"),
         capture_output=True,
         text=True,
-        timeout=180,
+        timeout=timeout,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert json.loads(done.stdout) == json.loads(out.read_text())
-    return json.loads(out.read_text())
+    return json.loads(out.read_text()), done
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +46,42 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def first(folder):
-    return once(folder)
+    """One trial in a home that has nothing."""
+    found, done = run(folder, "--once")
+    assert json.loads(done.stdout) == found
+    return found
 
 
 @pytest.fixture(scope="module")
-def second(folder, first):
-    return once(folder, "--position", "2")
+def evaluated(folder, first):
+    """Two trials of a blind plan on the same data, and what was said of them."""
+    return run(folder, "--evaluate", "2", *SETS, timeout=350)
+
+
+@pytest.fixture(scope="module")
+def places(folder, evaluated):
+    """Where the episodes of the blind trials are: dataset, index, and how many frames they have.
+
+    Whatever waited when the command ended is done by the next worker.
+    """
+    trials = [trial["trial"] for trial in evaluated[0]["trials"]]
+
+    def published():
+        with closing(sqlite3.connect(folder / "data" / "eva.sqlite3")) as database:
+            found = database.execute(PLACES, trials).fetchall()
+        return None if None in [index for _, index, _ in found] else found
+
+    with working(folder):
+        return eventually(published, 60, "the episodes are in a dataset")
+
+
+@contextmanager
+def working(folder):
+    """A worker on that data, without a lab."""
+    line = [sys.executable, "manage.py", "worker", "--lifeline"]
+    with subprocess.Popen(line, cwd=ROOT, env=environment(folder / "data"), stdin=subprocess.PIPE) as worker:
+        yield
+        worker.stdin.close()
 
 
 def read(dataset):
@@ -110,18 +148,40 @@ def test_a_taken_port_is_named_and_its_holder_lives(folder):
             assert call.recv(1) == b""
 
 
-def test_another_trial_on_the_same_data_comes_after_the_first(first, second, folder):
-    assert second["trial"] > first["trial"]
-    assert second["dataset"] == first["dataset"]
-    assert (first["dataset_index"], second["dataset_index"]) == (0, 1)
-    for result in (first, second):
-        assert Path(folder, "data", "episodes", result["episode"], "outcome.json").exists()
+def test_two_blind_trials_are_made_revealed_and_compared(evaluated):
+    found, done = evaluated
+    trials = found["trials"]
+    assert {trial["checkpoint"] for trial in trials} == {
+        "pick-place-40k-by-script",
+        "pick-place-8k-by-script",
+    }
+    assert len({trial["code"] for trial in trials}) == 2
+    assert len({trial["position"] for trial in trials}) == 1  # one block: the same condition for both
+    assert found["lockstep"] is True
+    for trial in trials:  # its own time: whole ticks of 30 Hz, and nothing was reached after its end
+        assert trial["duration_s"] * 30 == pytest.approx(round(trial["duration_s"] * 30), abs=1e-6)
+        assert all(0 < at <= trial["duration_s"] for at in trial["times"].values())
+        assert trial["success"] == ("placed" in trial["times"])
+    assert found["commitment"] in done.stderr
+    assert len(bytes.fromhex(found["key"])) == 32
+    assert [arm["success"]["n"] for arm in found["analysis"]["arms"]] == [1, 1]
+    assert "Barnard p" in done.stdout
+    assert not any(trial["checkpoint"] in done.stderr for trial in trials)
 
 
-def test_a_second_process_that_knows_only_the_format_reads_both(first, second, folder):
+def test_other_trials_on_the_same_data_come_after_the_first(first, evaluated, places, folder):
+    assert min(trial["trial"] for trial in evaluated[0]["trials"]) > first["trial"]
+    assert [dataset for dataset, _, _ in places] == [first["dataset"]] * 2
+    assert [first["dataset_index"], *sorted(index for _, index, _ in places)] == [0, 1, 2]
+    outcomes = (folder / "data" / "episodes").glob("*/outcome.json")
+    assert len(list(outcomes)) == 3
+
+
+def test_a_second_process_that_knows_only_the_format_reads_all(first, places, folder):
     found = read(folder / "data" / first["dataset"])
     assert found["broken"] == []
-    assert [episode["length"] for episode in found["episodes"]] == [first["frames"], second["frames"]]
+    lengths = {first["dataset_index"]: first["frames"]} | {index: frames for _, index, frames in places}
+    assert [episode["length"] for episode in found["episodes"]] == [lengths[index] for index in range(3)]
     for episode in found["episodes"]:
         assert episode["tasks"] == ["put the block on the plate"]
         for brightness in episode["brightness"].values():

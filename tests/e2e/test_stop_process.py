@@ -50,15 +50,22 @@ def admin(demo):
     return visitor(demo, "admin")
 
 
+@pytest.fixture(scope="module")
+def window(browser, demo):
+    """The browser of a viewer who has logged in."""
+    window = BenchPage(browser, demo, "visitor", WIDE)
+    yield window
+    window.close()
+
+
 @pytest.fixture
-def page(browser, demo, admin):
-    """The page of somebody who has the station's e-stop before them, both ways to which stand."""
-    tidy(admin)
-    window = BenchPage(browser, demo, "visitor", WIDE).open(f"/stations/{STATION}/eval/")
+def page(window, admin):
+    """The page of somebody who has the station's e-stop before them, both ways to which stand; loaded anew."""
+    window.errors.clear()
+    window.open(f"/stations/{STATION}/eval/")
     window.at_rest()
     window.page.locator(f"{AREA}[data-second-way]").wait_for()
     yield window
-    window.close()
     tidy(admin)
 
 
@@ -146,3 +153,4 @@ def test_a_page_whose_session_has_ended_still_presses(demo, page):
     demo.python(ENDED.format(user=demo.rows("SELECT id FROM auth_user WHERE username = 'visitor'")[0][0]))
     page.reaches("LOGGED OUT")
     pressed(demo, page)
+    page.log_in("visitor")  # the window is that of other tests too
