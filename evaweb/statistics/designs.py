@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from evaweb.statistics.base import StatisticsError, check_alpha
 from evaweb.statistics.boundaries import MOST, SHAPES, Boundary, Look, boundary, in_pairs
 from evaweb.statistics.difference import barnard
+from evaweb.statistics.permutation import sign_flips
 from evaweb.statistics.sequential import score_evidence, success_evidence
 
 FIXED, ANYTIME = "none", "evidence"  # as plans have named them since there are plans
@@ -119,9 +120,19 @@ def conclude(found: Design, values: Sequence[Values]) -> Conclusion:
         return Conclusion(len(given), evidence.stop or full, evidence.winner)
     if full is None:
         return Conclusion(len(given), None, None)
-    first, second = _successes(given)
-    p = barnard(first, full, second, full).p
-    return Conclusion(full, full, _ahead(first, second) if p <= found.alpha else None, p)
+    p, lead = _scored(given) if found.outcome == SCORE else _succeeded(given)
+    return Conclusion(full, full, _ahead(lead, 0) if p <= found.alpha else None, p)
+
+
+def _succeeded(values: Sequence[Values]) -> tuple[float, float]:
+    """Probability of the one test of a fixed number of pairs, and by how much the first is ahead."""
+    first, second = _successes(values)
+    return barnard(first, len(values), second, len(values)).p, first - second
+
+
+def _scored(values: Sequence[Values]) -> tuple[float, float]:
+    flips = sign_flips([one - other for one, other in values])
+    return flips.p, flips.value
 
 
 def _of_successes(values: Sequence[Values], alpha: float):  # type: ignore[no-untyped-def]

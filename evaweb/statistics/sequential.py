@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from evaweb.statistics.base import check_alpha, check_share
 
 ALPHA = 0.05
-_CAUTION = 0.5  # of what could be lost with one pair, how much is ever bet
+_STAKES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of all that a gambler has, on each pair
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,20 +89,14 @@ def score_evidence(pairs: Iterable[tuple[float, float]], alpha: float = ALPHA) -
 
 
 def _bets(differences: Sequence[float]) -> list[float]:
-    """Log worth after each of `differences` (-1 to 1) of a gambler who bets that their mean is above 0."""
-    log_e, path = 0.0, []
-    total, squares = (
-        0.5,
-        0.25,
-    )  # one made-up observation at the middle, with the largest variance there can be
-    for t, d in enumerate(differences, start=1):
-        mean, variance = total / t, squares / t  # of what was before: a bet must not know its outcome
-        x, edge = (d + 1) / 2, mean - 0.5
-        stake = min(max(edge / (variance + edge * edge), 0.0), _CAUTION / 0.5)
-        log_e += math.log1p(stake * (x - 0.5))
-        path.append(log_e)
-        total += x
-        squares += (x - total / (t + 1)) ** 2
+    """Log worth after each of `differences` (-1 to 1) of gamblers who bet that their mean is above 0, each a stake of
+    its own, with equal shares of the money: which stake is good need not be guessed from what came before.
+    """
+    worths, path = [0.0] * len(_STAKES), []
+    for d in differences:
+        worths = [worth + math.log1p(stake * d) for worth, stake in zip(worths, _STAKES, strict=True)]
+        most = max(worths)
+        path.append(most + math.log(math.fsum(math.exp(worth - most) for worth in worths) / len(worths)))
     return path
 
 

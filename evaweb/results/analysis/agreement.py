@@ -10,22 +10,24 @@ from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.preference import Comparison, NotIdentifiedError, preferences
 from evaweb.statistics.proportions import proportion
 from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha
-from evaweb.trials.models import TrialStatus
+from evaweb.trials.models import Score, TrialStatus
 
 OUTCOMES = {"first", "second", "tie"}
 
 
 def agreement_of(plan: Plan) -> dict[str, Any] | None:
-    """Of first and second raters, on success and on each milestone; None without second ratings."""
+    """Of first and second raters, on success and on each milestone; None without second ratings.
+
+    Each second rating is held against the score that stood when it was made: what was corrected since may follow it.
+    """
     rows = list(
         Rating.objects.filter(trial__evaluation=plan.evaluation_id, trial__status=TrialStatus.SCORED)
-        .select_related("trial__verdict")
-        .prefetch_related("trial__verdict__outcomes")
+        .prefetch_related("trial__scores__outcomes")
         .order_by("trial_id", "pk")
     )
     if not rows:
         return None
-    verdicts = [(row.trial.verdict, row) for row in rows if row.trial.verdict]
+    verdicts = [(_stood(row), row) for row in rows]
     return {
         "trials": len({row.trial_id for row in rows}),
         "ratings": len(rows),
@@ -49,7 +51,13 @@ def agreement(pairs: list[tuple[bool, bool]]) -> dict[str, Any]:
     }
 
 
-def _milestones(verdicts: list[tuple[Any, Rating]]) -> dict[str, Any]:
+def _stood(rating: Rating) -> Score:
+    """The newest score of its trial when it was made; the first one where a clock that was set back says none was."""
+    scores = list(rating.trial.scores.all())
+    return next((score for score in reversed(scores) if score.scored_at <= rating.at), scores[0])
+
+
+def _milestones(verdicts: list[tuple[Score, Rating]]) -> dict[str, Any]:
     pairs: dict[str, list[tuple[bool, bool]]] = {}
     for verdict, rating in verdicts:
         again = {text: bool(reached) for text, reached in rating.milestones}

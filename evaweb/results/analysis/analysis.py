@@ -18,6 +18,7 @@ from evaweb.statistics.difference import Difference, ExactTest, barnard, newcomb
 from evaweb.statistics.many import holm, letters
 from evaweb.statistics.means import Average, average
 from evaweb.statistics.paired import McNemar, cluster_bootstrap, mcnemar
+from evaweb.statistics.permutation import Flips, sign_flips
 from evaweb.statistics.progress import Step, funnel
 from evaweb.statistics.proportions import Posterior, Proportion, clopper_pearson, posterior, proportion
 from evaweb.statistics.rates import Rate, rate
@@ -70,7 +71,8 @@ class Comparison:
     """Two checkpoints: the first minus the second.
 
     `test` is Barnard's and `corrected` its probability after Holm's correction for all pairs of the evaluation; valid
-    for a number of trials fixed beforehand. `evidence` and `score_evidence` may be looked at any time.
+    for a number of trials fixed beforehand, as is `scored`, of the pairs' scores. `evidence` and `score_evidence` may
+    be looked at any time.
     """
 
     first: str
@@ -81,6 +83,7 @@ class Comparison:
     better: float
     pairs: int
     paired: McNemar | None
+    scored: Flips | None
     clustered: Difference | None
     stratified: strata.Stratified | None
     evidence: Evidence
@@ -211,6 +214,7 @@ def _comparison(
         probability_better(*counts),
         len(pairs),
         mcnemar([(p.first.success, p.second.success) for p in pairs]) if pairs else None,
+        sign_flips([p.first.score - p.second.score for p in pairs]) if pairs else None,
         _said(notes, lambda: _clustered(first, second)),
         _said(notes, lambda: _stratified(first, second)),
         success_evidence([(p.first.success, p.second.success) for p in pairs], alpha),

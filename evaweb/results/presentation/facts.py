@@ -64,13 +64,21 @@ def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator
         )
         of_pairs = f"p = {probability(found.paired.p)} of {found.pairs} pairs ({split})"
         yield Fact("The same, pair by pair?", "McNemar, exact", of_pairs)
+    if found.scored:
+        gain = f"{100 * found.scored.value:+.0f} points".replace("-", "−")
+        of_scores = f"{gain} of the score, p = {probability(found.scored.p)} of {found.pairs} pairs"
+        yield Fact("With partial credit, n as planned?", "sign flips within pairs, exact", of_scores)
     if found.clustered:
         yield Fact("Other initial conditions?", "bootstrap over conditions, 95 %", points(found.clustered))
 
 
 def _of_the_evidence(analysis: Analysis, found: Comparison) -> Iterator[Fact]:
     yield Fact("May one stop?", f"e-process, alpha {analysis.alpha:g}", evidence_words(found.evidence))
-    yield Fact("With partial credit?", "betting e-process on scores", evidence_words(found.score_evidence))
+    yield Fact(
+        "With partial credit, at any time?",
+        "betting e-process on scores",
+        evidence_words(found.score_evidence),
+    )
 
 
 def _beyond(found: Comparison) -> Iterator[Fact]:

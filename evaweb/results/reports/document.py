@@ -79,6 +79,8 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
             "pairs": found.paired.pairs,
             "p": found.paired.p,
         },
+        "scores": found.scored
+        and {"pairs": found.scored.pairs, "value": found.scored.value, "p": found.scored.p},
         "over_conditions": _clustered(found.clustered),
         "over_scenes": found.stratified
         and {

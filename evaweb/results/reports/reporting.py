@@ -27,8 +27,8 @@ from evaweb.results.presentation.drawings import conditions, courses, rates
 from evaweb.results.reports import bench_photos as laid_out
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.document import analysis_document
-from evaweb.results.reports.tables import COLUMNS, outcome_pages
-from evaweb.tabular_export import csv_lines
+from evaweb.results.reports.tables import COLUMNS, milestones_of, outcome_pages
+from evaweb.tabular_export import csv_lines, in_pages
 from evaweb.trials.models import Score
 
 _STYLES = (
@@ -48,7 +48,9 @@ _PREFERENCES = (
     "blind",
     "at",
 )
-_SCORES = ("trial", "rater", "source", "success", "score", "failure", "note", "reason", "scored_at")
+_SCORES = (
+    *("trial", "rater", "source", "success", "score", "milestones", "failure", "note", "reason", "scored_at"),
+)
 
 
 def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> Path:
@@ -177,8 +179,14 @@ def _style(name: str) -> str:
 
 def _scores(plan: Plan) -> Iterator[list[dict[str, Any]]]:
     rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
-    fields = [{"trial": "trial_id", "rater": "rater__username"}.get(name, name) for name in _SCORES]
-    yield [dict(zip(_SCORES, row, strict=True)) for row in rows.values_list(*fields)]
+    known = {"trial": "trial_id", "rater": "rater__username", "milestones": "pk"}
+    fields = [known.get(name, name) for name in _SCORES]
+    for page in in_pages(dict(zip(_SCORES, row, strict=True)) for row in rows.values_list(*fields)):
+        reached = milestones_of([row["milestones"] for row in page])
+        yield [
+            {**row, "milestones": json.dumps(reached.get(row["milestones"], []), ensure_ascii=False)}
+            for row in page
+        ]
 
 
 def _ratings(plan: Plan) -> Iterator[list[dict[str, Any]]]:

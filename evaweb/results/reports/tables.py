@@ -92,14 +92,15 @@ def _attempts(plan: Plan, which: Chosen | None) -> QuerySet[Trial]:
 def _rows(attempts: QuerySet[Trial]) -> list[dict[str, Any]]:
     rows = attempts.values_list(*_FIELDS)
     found = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
-    reached = _milestones([row["milestones"] for row in found if row["milestones"]])
+    reached = milestones_of([row["milestones"] for row in found if row["milestones"]])
     for row in found:
         row["milestones"] = json.dumps(reached.get(row["milestones"], []), ensure_ascii=False)
         row |= {name: str(row[name]) for name in _TEXTS if row[name] is not None}
     return found
 
 
-def _milestones(scores: list[int]) -> dict[int, list[tuple[str, bool]]]:
+def milestones_of(scores: list[int]) -> dict[int, list[tuple[str, bool]]]:
+    """Of each score, by its key, which milestones were reached, in their order."""
     found: dict[int, list[tuple[str, bool]]] = defaultdict(list)
     rows = MilestoneOutcome.objects.filter(score__in=scores).order_by("score_id", "order")
     for score, text, reached in rows.values_list("score_id", "text", "reached"):

@@ -54,6 +54,16 @@ def test_scores_end_it_where_success_alone_would_not():
     assert conclude(made("evidence", 60), [(0.0, 0.0)] * 60).winner is None
 
 
+def test_a_fixed_number_of_scores_is_tested_by_scores_not_by_whether_they_are_above_0():
+    found = made("none", 20, outcome="score")
+    ended = conclude(found, [(0.9, 0.2)] * 20)
+    assert (ended.at, ended.winner) == (20, "first")
+    assert ended.p == pytest.approx(2 / 2**20)
+    assert conclude(found, [(0.2, 0.9)] * 20).winner == "second"
+    # Seldom above 0, but then far: success alone would call the second better.
+    assert conclude(found, [(0.5, 0.4)] * 10 + [(0.0, 0.1)] * 10).winner is None
+
+
 def test_not_worse_by_the_margin_is_asked_of_the_first():
     found = made("late", 60, margin=0.2)
     assert conclude(found, [BETTER] * 60).winner == "first"

@@ -8,6 +8,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from .sealed import faults
 _SHOWN = 40
 _CLOSE = 1e-6  # relative: both ways to a number end in the last bits of different sums
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
+Rows = list[dict[str, str]]
 _TAIL = 0.015  # of what was drawn anew, how much more or less than 2.5 % may lie beyond an end: six standard errors
 
 
@@ -28,13 +30,15 @@ def main() -> int:
     plan, seal, shown = (
         json.loads((data / name).read_text("utf-8")) for name in ("plan.json", "seal.json", "numbers.json")
     )
-    rows, ratings, preferred = (_rows(data / f"{name}.csv") for name in ("trials", "ratings", "preferences"))
+    rows, scores, ratings, preferred = (
+        _rows(data / f"{name}.csv") for name in ("trials", "scores", "ratings", "preferences")
+    )
     wrong = [*faults(seal, plan, rows), *_boundary(plan)]
     trials = [_trial(row) for row in rows]
     found = {
         **numbers(trials, plan),
         "primary": primary(trials, plan, seal["at_reveal"]),
-        "agreement": _agreement(rows, ratings),
+        "agreement": _agreement(rows, scores, ratings),
         "preferences": preferences(
             [(row["first_checkpoint"], row["second_checkpoint"], row["outcome"]) for row in preferred]
         ),
@@ -63,15 +67,17 @@ def _boundary(plan: dict[str, Any]) -> list[str]:
     return [] if found <= said["alpha"] else [f"boundary: {found:.5f} is more than alpha, {said['alpha']:g}"]
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
+def _rows(path: Path) -> Rows:
     with path.open(encoding="utf-8", newline="") as file:
         return [{name: _text(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
 
-def _agreement(rows: list[dict[str, str]], ratings: list[dict[str, str]]) -> dict[str, Any] | None:
-    """Of the scores that count and what second raters said of the same trials."""
-    first = {row["trial"]: row for row in rows if row["status"] == "scored"}
-    pairs = [(first[row["trial"]], row) for row in ratings if row["trial"] in first]
+def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None:
+    """Of trials that count: what second raters said, and the score that stood then."""
+    given: dict[str, Rows] = {row["trial"]: [] for row in rows if row["status"] == "scored"}
+    for score in scores:
+        given.get(score["trial"], []).append(score)
+    pairs = [(_stood(given[row["trial"]], row["at"]), row) for row in ratings if row["trial"] in given]
     if not pairs:
         return None
     milestones: dict[str, list[tuple[bool, bool]]] = {}
@@ -88,6 +94,14 @@ def _agreement(rows: list[dict[str, str]], ratings: list[dict[str, str]]) -> dic
         "milestones": {text: agreement(found) for text, found in milestones.items()},
         "score_alpha": score_alpha([(float(a["score"]), float(b["score"])) for a, b in pairs]),
     }
+
+
+def _stood(scores: Rows, at: str) -> dict[str, str]:
+    """The last of a trial's scores that was not later; the first where a clock that was set back leaves none."""
+    then = datetime.fromisoformat(at)
+    return next(
+        (score for score in reversed(scores) if datetime.fromisoformat(score["scored_at"]) <= then), scores[0]
+    )
 
 
 def _text(cell: str) -> str:

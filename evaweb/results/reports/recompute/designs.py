@@ -61,7 +61,10 @@ def conclusion(pairs: Sequence[Pair], plan: Mapping[str, Any]) -> dict[str, Any]
         at, winner = _evidence(given, said, names, at)
     elif at is not None:
         first, second = _sums(given)
-        p = methods.barnard(int(first), at, int(second), at)[1]
+        if said.get("outcome") == "score":
+            p = methods.sign_flips([one - other for one, other in given])
+        else:
+            p = methods.barnard(int(first), at, int(second), at)[1]
         winner = names[0 if first > second else 1] if p <= said["alpha"] else ""
     return {"pairs": len(given), "at": at, "winner": winner or None, "p": p}
 

@@ -277,16 +277,39 @@ def success_bets(pairs: Sequence[tuple[bool, bool]]) -> list[float]:
 
 
 def score_bets(differences: Sequence[float]) -> list[float]:
-    """Log e after each difference of scores, of a bet that their mean is above 0."""
-    log_e, path, seen, squares = 0.0, [], [0.5], 0.25
+    """Log e after each difference of scores, of a bet that their mean is above 0.
+
+    Five gamblers with equal money and a stake each are one whose stake is the mean of theirs, weighed by what they own.
+    """
+    log_e, path, owned = 0.0, [], {stake / 10: 0.2 for stake in (1, 3, 5, 7, 9)}
     for difference in differences:
-        x, mean, variance = (difference + 1) / 2, sum(seen) / len(seen), squares / len(seen)
-        edge = mean - 0.5
-        log_e += math.log1p(min(max(edge / (variance + edge * edge), 0.0), 1.0) * (x - 0.5))
+        gain = 1 + difference * sum(stake * share for stake, share in owned.items())
+        owned = {stake: share * (1 + difference * stake) / gain for stake, share in owned.items()}
+        log_e += math.log(gain)
         path.append(log_e)
-        seen.append(x)
-        squares += (x - sum(seen) / len(seen)) ** 2
     return path
+
+
+def sign_flips(differences: Sequence[float], widest: float = 1.0) -> float:
+    """Two-sided probability of so large a sum of differences, had each the other sign as likely.
+
+    In whole numbers: the coefficients of the product of all (1 + x^d), side by side in one long number.
+    """
+    units: list[int] = []
+    for parts in (25_200, 2_520, 420, 60, 12):
+        units = [unit for unit in (round(d / widest * parts) for d in differences) if unit]
+        common = math.gcd(*units) or 1
+        units = [unit // common for unit in units]
+        if sum(map(abs, units)) * len(units) <= 10_000_000:
+            break
+    observed, total, bits = abs(sum(units)), sum(map(abs, units)), len(units) + 2
+    if not observed:
+        return 1.0
+    ways = 1
+    for unit in units:
+        ways += ways << (bits * abs(unit))
+    below = ways & ((1 << bits * ((total - observed) // 2 + 1)) - 1)
+    return 2 * (below % ((1 << bits) - 1)) / 2 ** len(units)
 
 
 def separated(names: Sequence[str], p: dict[frozenset[str], float], alpha: float) -> set[frozenset[str]]:

@@ -208,6 +208,7 @@ def _comparison(one: str, other: str, first: Trials, second: Trials, alpha: floa
         }
         if pairs
         else None,
+        "scores": _scores([a.score - b.score for a, b in pairs]) if pairs else None,
         "over_conditions": _clustered(first, second),
         "over_scenes": _stratified(first, second),
         "evidence": _evidence(
@@ -222,6 +223,11 @@ def _comparison(one: str, other: str, first: Trials, second: Trials, alpha: floa
         ),
         "log_rank": _log_rank(first, second),
     }
+
+
+def _scores(differences: Sequence[float]) -> dict[str, Any]:
+    value = math.fsum(differences) / len(differences)
+    return {"pairs": len(differences), "value": value, "p": methods.sign_flips(differences)}
 
 
 def _pairs(first: Trials, second: Trials) -> list[tuple[Trial, Trial]]:

@@ -1,3 +1,5 @@
+from datetime import timedelta
+
 import pytest
 
 from evaweb import journal as lines
@@ -10,8 +12,10 @@ from evaweb.plans.services import plan_freeze
 from evaweb.results.analysis.agreement import agreement_of, preferences_of
 from evaweb.results.models import Preference, Rating
 from evaweb.results.ratings import judging
+from evaweb.trials import services
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders
+from tests.evaweb.unguarded import unguarded
 
 
 @pytest.fixture
@@ -44,6 +48,52 @@ def test_a_second_rating_changes_no_score(plan, carry_out, rater, bench):
     assert handout.trial.verdict_id == before
     with pytest.raises(Conflict, match="already"):
         judging.rate(user=rater, plan=plan, code=handout.code, milestones=bench.ticks(True, True, True))
+
+
+def rated_the_other_way_round(plan, rater, bench):
+    """A second rating of every trial of the sample that contradicts the operator; the trials in this order."""
+    trials = []
+    while (handout := judging.to_rate(rater).found) is not None:
+        reached = not handout.trial.verdict.success
+        ticks = bench.ticks(True, reached, reached)
+        judging.rate(user=rater, plan=plan, code=handout.code, milestones=ticks)
+        trials.append(handout.trial)
+    return trials
+
+
+def test_raters_agree_as_they_did_when_they_rated_whatever_was_corrected_since(plan, carry_out, rater, bench):
+    carry_out(plan, 16)
+    trials = rated_the_other_way_round(plan, rater, bench)
+    before = agreement_of(plan)
+    assert (before["success"]["same"], before["score_alpha"] < 0) == (0, True)
+    for trial in trials:
+        said = trial.ratings.get()
+        ticks = bench.ticks(*(reached for _, reached in said.milestones))
+        services.trial_score(user=bench.operator, trial=trial, milestones=ticks, reason="the other is right")
+        trial.refresh_from_db()
+        assert trial.verdict.success == said.success
+    assert agreement_of(plan) == before
+
+
+def test_a_correction_before_the_second_rating_is_the_score_that_it_is_held_against(
+    plan, carry_out, rater, bench
+):
+    carry_out(plan, 16)
+    trial = judging.to_rate(rater).found.trial
+    turned = not trial.verdict.success
+    ticks = bench.ticks(True, turned, turned)
+    services.trial_score(user=bench.operator, trial=trial, milestones=ticks, reason="I had looked away")
+    judging.rate(user=rater, plan=plan, code=trial.handout.code, milestones=ticks)
+    assert agreement_of(plan)["success"]["same"] == 1
+
+
+def test_a_clock_that_was_set_back_leaves_the_first_score(plan, carry_out, rater, bench):
+    carry_out(plan, 16)
+    trial = judging.to_rate(rater).found.trial
+    with unguarded("results"):
+        judging.rate(user=rater, plan=plan, code=trial.handout.code, milestones=bench.ticks(True, True, True))
+        Rating.objects.update(at=trial.verdict.scored_at - timedelta(hours=1))
+    assert agreement_of(plan)["success"]["same"] == trial.verdict.success
 
 
 def test_who_must_not_rate_is_told_why(plan, owner, carry_out, bench, rater):

@@ -10,6 +10,7 @@ from evaweb.statistics.designs import conclude, design, table
 
 RULES = [
     ("none", "success", None),
+    ("none", "score", None),
     ("none", "success", 0.2),
     ("evidence", "success", None),
     ("evidence", "score", None),

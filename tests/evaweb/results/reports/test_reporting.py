@@ -13,6 +13,7 @@ from evaweb.results.analysis.caching import analysis_of
 from evaweb.results.ratings import judging
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.reporting import write_report
+from evaweb.trials import services
 from tests.evaweb.plans.lab import jpeg
 from tests.evaweb.trials import builders
 
@@ -49,6 +50,23 @@ def test_a_program_without_us_computes_every_number_again(report):
     assert numbers["agreement"]["ratings"] == 8
     assert numbers["preferences"]["n"] == 8
     assert "schedule and codes: 0 do not come out" in found.stdout
+
+
+def test_what_was_corrected_after_the_second_rating_is_recomputed_as_it_stood(
+    report, revealed, bench, tmp_path
+):
+    for trial in [handout.trial for handout in revealed.handouts.all() if handout.trial.ratings.exists()]:
+        ticks = bench.ticks(*(reached for _, reached in trial.ratings.get().milestones))
+        services.trial_score(user=bench.operator, trial=trial, milestones=ticks, reason="the other is right")
+    call_command("eval_report", "blocks", "--out", str(tmp_path / "later"))
+    found = recompute(tmp_path / "later")
+    assert found.returncode == 0, found.stdout + found.stderr
+    earlier, later = (
+        json.loads((tmp_path / name / "data" / "numbers.json").read_text("utf-8"))["agreement"]
+        for name in ("report", "later")
+    )
+    assert later == earlier
+    assert earlier["success"]["same"] < 8
 
 
 WAYS = (
