@@ -14,10 +14,11 @@ from typing import TypeVar
 from evaweb.results.analysis.outcomes import Interruption, Outcome, Pair, by_checkpoint, paired
 from evaweb.statistics import strata
 from evaweb.statistics.base import LEVEL, Interval, StatisticsError
+from evaweb.statistics.bounded import Mean, bounded_mean
 from evaweb.statistics.difference import Difference, ExactTest, barnard, newcombe, probability_better
 from evaweb.statistics.many import holm, letters
 from evaweb.statistics.means import Average, average
-from evaweb.statistics.paired import McNemar, cluster_bootstrap, mcnemar
+from evaweb.statistics.paired import McNemar, mcnemar, over_conditions
 from evaweb.statistics.permutation import Flips, sign_flips
 from evaweb.statistics.progress import Step, funnel
 from evaweb.statistics.proportions import Posterior, Proportion, clopper_pearson, posterior, proportion
@@ -25,7 +26,7 @@ from evaweb.statistics.rates import Rate, rate
 from evaweb.statistics.sequential import Evidence, score_evidence, success_evidence
 from evaweb.statistics.success_times import Curve, RestrictedMean, incidence, restricted_mean
 
-SEED = 20_260  # of every bootstrap: the same data give the same interval
+SEED = 20_260  # of all that is drawn: the same data give the same interval
 T = TypeVar("T")
 
 
@@ -53,8 +54,8 @@ class Arm:
     success: Proportion
     exact: Interval | None
     posterior: Posterior
-    score: strata.Mean | None
-    macro: strata.Mean | None
+    score: Mean
+    macro: Mean
     scenes: dict[str, Proportion]
     cells: dict[str, Proportion]
     funnels: tuple[Funnel, ...]
@@ -203,10 +204,8 @@ def _arm(name: str, trials: list[Outcome], interruptions: list[Interruption], ti
         proportion(successes, n),
         clopper_pearson(successes, n),
         posterior(successes, n),
-        strata.macro_average({"all": [o.score for o in trials]}, seed=SEED),
-        strata.macro_average(
-            {key: [float(o.success) for o in rows] for key, rows in scenes.items()}, seed=SEED
-        ),
+        bounded_mean({"all": [o.score for o in trials]}, seed=SEED),
+        bounded_mean({key: [float(o.success) for o in rows] for key, rows in scenes.items()}, seed=SEED),
         {key: proportion(*_counts(rows)) for key, rows in scenes.items()},
         {key: proportion(*_counts(rows)) for key, rows in cells.items()},
         tuple(_funnel(scene, rows) for scene, rows in scenes.items() if rows[0].milestones),
@@ -267,7 +266,7 @@ def _clustered(first: Sequence[Outcome], second: Sequence[Outcome]) -> Differenc
         {key: [float(o.success) for o in rows] for key, rows in _grouped(arm, lambda o: o.condition).items()}
         for arm in (first, second)
     )
-    return cluster_bootstrap(ours, theirs, seed=SEED, level=LEVEL)
+    return over_conditions(ours, theirs, seed=SEED, level=LEVEL)
 
 
 def _stratified(first: Sequence[Outcome], second: Sequence[Outcome]) -> strata.Stratified | None:

@@ -68,7 +68,9 @@ def _of_the_rates(analysis: Analysis, found: Comparison) -> Iterator[Fact]:
         of_scores = f"{gain} of the score, p = {probability(found.scored.p)} of {found.pairs} pairs"
         yield Fact("With partial credit, n as planned?", "sign flips within pairs, exact", of_scores)
     if found.clustered:
-        yield Fact("Other initial conditions?", "bootstrap over conditions, 95 %", points(found.clustered))
+        yield Fact(
+            "Other initial conditions?", "conditions as a sample, Gaffke, 95 %", points(found.clustered)
+        )
 
 
 def _of_the_evidence(analysis: Analysis, found: Comparison) -> Iterator[Fact]:

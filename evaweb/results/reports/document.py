@@ -1,7 +1,7 @@
 """An analysis as plain JSON: what REST answers, what a report holds, and what its script computes again.
 
-Intervals are [low, high]; those that a bootstrap drew stand under `bootstrap`, because a new draw gets them
-only nearly. A list of curve points is [time, share that has succeeded, low, high].
+Intervals are [low, high]; those under `gaffke` were drawn: a new draw gets them only nearly. A list of curve points
+is [time, share that has succeeded, low, high].
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from typing import Any
 
 from evaweb.results.analysis.analysis import Analysis, Arm, Comparison
 from evaweb.statistics.base import Interval
+from evaweb.statistics.bounded import Mean
 from evaweb.statistics.difference import Difference
 from evaweb.statistics.means import Average
 from evaweb.statistics.proportions import Proportion
 from evaweb.statistics.rates import Rate
 from evaweb.statistics.sequential import Evidence
-from evaweb.statistics.strata import Mean
 
 
 def analysis_document(analysis: Analysis) -> dict[str, Any]:
@@ -111,8 +111,8 @@ def _ends(interval: Interval | None) -> list[float] | None:
     return None if interval is None else [interval.low, interval.high]
 
 
-def _mean(found: Mean | None) -> dict[str, Any] | None:
-    return None if found is None else {"value": found.value, "bootstrap": _ends(found.interval)}
+def _mean(found: Mean) -> dict[str, Any]:
+    return {"value": found.value, "gaffke": _ends(found.interval)}
 
 
 def _average(found: Average | None) -> dict[str, Any] | None:
@@ -120,7 +120,7 @@ def _average(found: Average | None) -> dict[str, Any] | None:
 
 
 def _clustered(found: Difference | None) -> dict[str, Any] | None:
-    return None if found is None else {"value": found.value, "bootstrap": _ends(found.interval)}
+    return None if found is None else {"value": found.value, "gaffke": _ends(found.interval)}
 
 
 def _rate(found: Rate | None) -> dict[str, Any] | None:

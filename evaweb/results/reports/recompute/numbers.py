@@ -161,17 +161,7 @@ def _arm(trials: Trials, broken: Trials, timing: Timing) -> dict[str, Any]:
 def _mean(scenes: Mapping[str, Sequence[float]]) -> dict[str, Any]:
     means = [math.fsum(values) / len(values) for values in scenes.values()]
     value = math.fsum(means) / len(means)
-    if all(min(values) == max(values) for values in scenes.values()):
-        return {"value": value, "bootstrap": None}
-    chance = random.Random(1)
-    counted = [
-        (list(Counter(values)), list(Counter(values).values()), len(values)) for values in scenes.values()
-    ]
-    drawn = [
-        sum(sum(chance.choices(levels, weights, k=n)) / n for levels, weights, n in counted) / len(counted)
-        for _ in range(DRAWS)
-    ]
-    return {"value": value, "bootstrap": Drawn(drawn, drawn)}
+    return {"value": value, "gaffke": _drawn(list(scenes.values()), 0.0, 1.0)}
 
 
 def _funnel(trials: Trials) -> list[dict[str, Any]]:
@@ -296,11 +286,10 @@ def _pairs(first: Trials, second: Trials) -> list[tuple[Trial, Trial]]:
 def _clustered(first: Trials, second: Trials) -> dict[str, Any] | None:
     ours, theirs = (_by(arm, lambda t: t.condition) for arm in (first, second))
     differences = [_rate(ours[key]) - _rate(theirs[key]) for key in ours if key in theirs]
-    if len(differences) < 2 or max(differences) - min(differences) < 1e-12:
+    if len(differences) < 2:
         return None
-    chance, k = random.Random(2), len(differences)
-    drawn = [sum(chance.choices(differences, k=k)) / k for _ in range(DRAWS)]
-    return {"value": math.fsum(differences) / k, "bootstrap": Drawn(drawn, drawn)}
+    drawn = _drawn([[(d + 1) / 2 for d in differences]], -1.0, 1.0)
+    return {"value": math.fsum(differences) / len(differences), "gaffke": drawn}
 
 
 def _stratified(first: Trials, second: Trials) -> dict[str, Any] | None:

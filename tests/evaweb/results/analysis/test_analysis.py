@@ -61,7 +61,10 @@ def test_a_comparison_has_all_its_evidence():
     assert compared.test.p == compared.corrected < 0.001
     assert compared.better < 0.001
     assert compared.pairs == compared.paired.pairs == 40
-    assert compared.clustered.interval.high < 0
+    assert compared.clustered.value == pytest.approx(compared.difference.value)
+    assert (
+        compared.clustered.interval.low < compared.difference.interval.low
+    )  # of five positions, not of 40 trials
     assert compared.stratified is None
     assert compared.evidence.winner == compared.score_evidence.winner == "second"
 
