@@ -10,6 +10,7 @@ from pathlib import Path
 from robots.broken_pipe import unread_ends
 
 _BENCHMARKS = (
+    "coverage",
     "estop",
     "ik",
     "latency",

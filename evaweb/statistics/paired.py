@@ -1,18 +1,18 @@
-"""Two arms tried from the same initial conditions: the exact test of discordant pairs, bootstrap over conditions.
+"""Two arms tried from the same initial conditions: the exact test of discordant pairs, the difference over conditions.
 
-Formulae: McNemar's test in its exact binomial form; cluster bootstrap (Davison and Hinkley 1997, 3.8), whose units are
-initial conditions, because trials from one of them are not independent of each other.
+Formulae: McNemar's test in its exact binomial form; Gaffke's interval of the conditions' differences, because trials
+from one condition are not independent of each other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
-from evaweb.statistics.base import LEVEL, Interval, StatisticsError, check_level
+from evaweb.statistics.base import LEVEL, StatisticsError
+from evaweb.statistics.bounded import DRAWS, bounded_mean
 from evaweb.statistics.difference import Difference
-
-DRAWS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ def _binomial(first: int, second: int) -> float:
     return float(binomtest(first, first + second).pvalue)
 
 
-def cluster_bootstrap(
+def over_conditions(
     first: Mapping[Hashable, Sequence[float]],
     second: Mapping[Hashable, Sequence[float]],
     *,
@@ -48,14 +48,10 @@ def cluster_bootstrap(
     level: float = LEVEL,
     draws: int = DRAWS,
 ) -> Difference:
-    """Difference of the means of both arms' outcomes, by initial condition; the interval resamples conditions.
+    """Difference of the means of both arms' outcomes (0 to 1), by initial condition, those being a sample of others.
 
-    Only conditions that both arms were tried from count, each as heavy as any other. At least two are needed, and
-    outcomes that differ somewhere: where every condition says the same, a bootstrap would claim to know without doubt.
+    Only conditions that both arms were tried from count, each as heavy as any other. At least two are needed.
     """
-    check_level(level)
-    import numpy as np
-
     shared = sorted(set(first) & set(second), key=str)
     if len(shared) < 2:
         raise StatisticsError(
@@ -65,12 +61,6 @@ def cluster_bootstrap(
         empty = [key for key in shared if not arm[key]]
         if empty:
             raise StatisticsError(f"the {name} arm has no trial at {empty[0]!r}")
-    differences = np.array([np.mean(first[key]) - np.mean(second[key]) for key in shared])
-    if np.ptp(differences) == 0:
-        raise StatisticsError(
-            f"all {len(shared)} initial conditions differ by the same {differences[0]:g}: nothing to resample"
-        )
-    drawn = np.random.default_rng(seed).integers(0, len(shared), (draws, len(shared)))
-    means = differences[drawn].mean(axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return Difference(float(differences.mean()), Interval(float(low), float(high), level))
+    differences = [fmean(first[key]) - fmean(second[key]) for key in shared]
+    found = bounded_mean({"all": differences}, seed=seed, bounds=(-1.0, 1.0), level=level, draws=draws)
+    return Difference(found.value, found.interval)

@@ -1,21 +1,14 @@
 """Two arms compared over several scenes, so that an easy scene tried more often by one arm decides nothing.
 
-Formulae: Cochran (1954), Mantel and Haenszel (1959) without continuity correction; the mean over scenes, each equally
-heavy, with a bootstrap within each arm and scene.
+Formulae: Cochran (1954), Mantel and Haenszel (1959) without continuity correction.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from evaweb.statistics.base import LEVEL, Interval, StatisticsError, check_counts, check_level
-from evaweb.statistics.paired import DRAWS
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+from evaweb.statistics.base import StatisticsError, check_counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,43 +70,3 @@ def mantel_haenszel(tables: Sequence[Table]) -> Stratified:
     return Stratified(
         ratio, p, crude, stratified, crude * stratified < 0 and min(abs(crude), abs(stratified)) > 1e-12
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Mean:
-    """A mean with its interval; None where nothing could be drawn anew."""
-
-    value: float
-    interval: Interval | None
-
-
-def macro_average(
-    scenes: Mapping[str, Sequence[float]], *, seed: int, level: float = LEVEL, draws: int = DRAWS
-) -> Mean:
-    """The mean over scenes of each scene's mean outcome (0 to 1); the interval draws trials anew within each scene.
-
-    No interval where all outcomes of every scene are the same: a bootstrap would claim to know without doubt.
-    """
-    check_level(level)
-    import numpy as np
-
-    empty = [name for name, outcomes in scenes.items() if not len(outcomes)]
-    if not scenes or empty:
-        raise StatisticsError(f"scene {empty[0]!r} has no trial" if empty else "no scene")
-    outcomes = {name: np.asarray(values, dtype=float) for name, values in scenes.items()}
-    value = float(np.mean([values.mean() for values in outcomes.values()]))
-    if all(np.ptp(values) == 0 for values in outcomes.values()):
-        return Mean(value, None)
-    random = np.random.default_rng(seed)
-    means = np.mean([_drawn_means(values, random, draws) for _, values in sorted(outcomes.items())], axis=0)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return Mean(value, Interval(float(low), float(high), level))
-
-
-def _drawn_means(values: NDArray[np.float64], random: np.random.Generator, draws: int) -> NDArray[np.float64]:
-    """Means of as many trials as there are, drawn with replacement: by how often each distinct value comes."""
-    import numpy as np
-
-    levels, counts = np.unique(values, return_counts=True)
-    n = len(values)
-    return np.asarray(random.multinomial(n, counts / n, size=draws) @ levels / n)

@@ -6,7 +6,7 @@ Methods are those of docs/evaluation.md. What cannot be computed is None with it
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TypeVar
@@ -14,18 +14,19 @@ from typing import TypeVar
 from evaweb.results.analysis.outcomes import Interruption, Outcome, Pair, by_checkpoint, paired
 from evaweb.statistics import strata
 from evaweb.statistics.base import LEVEL, Interval, StatisticsError
+from evaweb.statistics.bounded import Mean, bounded_mean
 from evaweb.statistics.difference import Difference, ExactTest, barnard, newcombe, probability_better
 from evaweb.statistics.many import holm, letters
 from evaweb.statistics.means import Average, average
-from evaweb.statistics.paired import McNemar, cluster_bootstrap, mcnemar
+from evaweb.statistics.paired import McNemar, mcnemar, over_conditions
 from evaweb.statistics.permutation import Flips, sign_flips
 from evaweb.statistics.progress import Step, funnel
 from evaweb.statistics.proportions import Posterior, Proportion, clopper_pearson, posterior, proportion
 from evaweb.statistics.rates import Rate, rate
 from evaweb.statistics.sequential import Evidence, score_evidence, success_evidence
-from evaweb.statistics.survival import Curve, RestrictedMean, kaplan_meier, log_rank, restricted_mean
+from evaweb.statistics.success_times import Curve, RestrictedMean, incidence, restricted_mean
 
-SEED = 20_260  # of every bootstrap: the same data give the same interval
+SEED = 20_260  # of all that is drawn: the same data give the same interval
 T = TypeVar("T")
 
 
@@ -44,16 +45,17 @@ class Arm:
 
     `macro` is the mean of the scenes' success rates, each equally heavy; `cells` success by initial condition;
     `speed` successes per hour of running, `interventions` how often a run was broken off. `curve` and `mean_time` are
-    of time to success [s], with trials that failed counted as cut off at their end. `smoothness` is SPARC of what was
-    measured, `commanded` of what was sent, over those trials of which there is a recording.
+    of time to success [s], up to one horizon for all arms, by which a trial that failed has not succeeded.
+    `smoothness` is SPARC of what was measured, `commanded` of what was sent, over those trials of which there is a
+    recording.
     """
 
     checkpoint: str
     success: Proportion
     exact: Interval | None
     posterior: Posterior
-    score: strata.Mean | None
-    macro: strata.Mean | None
+    score: Mean
+    macro: Mean
     scenes: dict[str, Proportion]
     cells: dict[str, Proportion]
     funnels: tuple[Funnel, ...]
@@ -72,7 +74,7 @@ class Comparison:
 
     `test` is Barnard's and `corrected` its probability after Holm's correction for all pairs of the evaluation; valid
     for a number of trials fixed beforehand, as is `scored`, of the pairs' scores. `evidence` and `score_evidence` may
-    be looked at any time.
+    be looked at any time. `sooner` is of times to success [s], pair by pair, failures counted as the horizon.
     """
 
     first: str
@@ -88,7 +90,7 @@ class Comparison:
     stratified: strata.Stratified | None
     evidence: Evidence
     score_evidence: Evidence
-    log_rank: float | None
+    sooner: Flips | None
     notes: tuple[str, ...]
 
 
@@ -118,29 +120,64 @@ def analyse(
     *,
     alpha: float = 0.05,
     primary: tuple[str, str] | None = None,
+    limits: Mapping[str, float] | None = None,
 ) -> Analysis:
     """All of it; `primary` is compared in this direction, others the better one first.
 
+    `limits` [s] are those of the evaluation's scenes that have one: the smallest is the horizon of times to success;
+    without any, the longest run.
+
     `interruptions` count for how often a checkpoint needs an operator, and for nothing else.
     """
-    arms = by_checkpoint(outcomes)
+    arms, timing = by_checkpoint(outcomes), _Timing.of(outcomes, limits or {})
     ranked = sorted(arms, key=lambda name: (-sum(o.success for o in arms[name]) / len(arms[name]), name))
     couples = [_directed(couple, primary) for couple in combinations(ranked, 2)]
     tests = [_test(arms[one], arms[other]) for one, other in couples]
     corrected = holm([test.p for test in tests])
     comparisons = tuple(
-        _comparison(one, other, arms[one], arms[other], test, p, alpha)
+        _comparison(one, other, arms[one], arms[other], test, p, alpha, timing)
         for (one, other), test, p in zip(couples, tests, corrected, strict=True)
     )
     apart = {frozenset((c.first, c.second)) for c in comparisons if c.corrected <= alpha}
     return Analysis(
         len(outcomes),
-        tuple(_arm(name, arms[name], [i for i in interruptions if i.checkpoint == name]) for name in ranked),
+        tuple(
+            _arm(name, arms[name], [i for i in interruptions if i.checkpoint == name], timing)
+            for name in ranked
+        ),
         comparisons,
         letters(ranked, apart),
         alpha,
         tuple(_imbalances(arms)),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Timing:
+    """The horizon of times to success [s], 0 where nothing has a duration, and the limits of scenes [s]."""
+
+    until: float
+    limits: Mapping[str, float]
+
+    @classmethod
+    def of(cls, outcomes: Sequence[Outcome], limits: Mapping[str, float]) -> _Timing:
+        longest = max((o.duration for o in outcomes if o.duration is not None), default=0.0)
+        return cls(min(limits.values(), default=longest), limits)
+
+    def known(self, outcome: Outcome) -> bool:
+        """True where its time is."""
+        return outcome.duration is not None and self.until > 0
+
+    def time(self, outcome: Outcome) -> float | None:
+        """When it succeeded [s], None where it did not; a run ends a moment after the limit that stopped it."""
+        if not outcome.success or outcome.duration is None:
+            return None
+        return min(outcome.duration, self.limits.get(outcome.scene, outcome.duration))
+
+    def lasted(self, outcome: Outcome) -> float:
+        """The same within the horizon, which is what a failure counts for."""
+        time = self.time(outcome)
+        return self.until if time is None else min(time, self.until)
 
 
 def _directed(couple: tuple[str, str], primary: tuple[str, str] | None) -> tuple[str, str]:
@@ -155,26 +192,25 @@ def _test(first: Sequence[Outcome], second: Sequence[Outcome]) -> ExactTest:
     return barnard(*_counts(first), *_counts(second))
 
 
-def _arm(name: str, trials: list[Outcome], interruptions: list[Interruption]) -> Arm:
+def _arm(name: str, trials: list[Outcome], interruptions: list[Interruption], timing: _Timing) -> Arm:
     successes, n = _counts(trials)
     scenes, cells = _grouped(trials, lambda o: o.scene), _grouped(trials, lambda o: o.condition)
     timed = [o for o in trials if o.duration is not None]
     durations = [o.duration for o in timed if o.duration is not None]
     succeeded = [o.success for o in timed]
+    times = [timing.time(o) for o in timed if timing.known(o)]
     return Arm(
         name,
         proportion(successes, n),
         clopper_pearson(successes, n),
         posterior(successes, n),
-        strata.macro_average({"all": [o.score for o in trials]}, seed=SEED),
-        strata.macro_average(
-            {key: [float(o.success) for o in rows] for key, rows in scenes.items()}, seed=SEED
-        ),
+        bounded_mean({"all": [o.score for o in trials]}, seed=SEED),
+        bounded_mean({key: [float(o.success) for o in rows] for key, rows in scenes.items()}, seed=SEED),
         {key: proportion(*_counts(rows)) for key, rows in scenes.items()},
         {key: proportion(*_counts(rows)) for key, rows in cells.items()},
         tuple(_funnel(scene, rows) for scene, rows in scenes.items() if rows[0].milestones),
-        kaplan_meier(durations, succeeded) if timed else None,
-        restricted_mean(durations, succeeded, max(durations)) if timed and max(durations) > 0 else None,
+        incidence(times, timing.until) if times else None,
+        restricted_mean(times, timing.until, seed=SEED) if times else None,
         rate(sum(succeeded), sum(durations)) if timed and sum(durations) > 0 else None,
         _interventions(durations, interruptions),
         tuple(Counter(o.failure for o in trials if not o.success and o.failure).most_common()),
@@ -201,6 +237,7 @@ def _comparison(
     test: ExactTest,
     corrected: float,
     alpha: float,
+    timing: _Timing,
 ) -> Comparison:
     notes: list[str] = []
     pairs = paired(first, second)
@@ -219,7 +256,7 @@ def _comparison(
         _said(notes, lambda: _stratified(first, second)),
         success_evidence([(p.first.success, p.second.success) for p in pairs], alpha),
         score_evidence([(p.first.score, p.second.score) for p in pairs], alpha),
-        _log_rank(first, second),
+        _sooner(pairs, timing),
         (*notes, *_waiting(pairs, first, second)),
     )
 
@@ -229,7 +266,7 @@ def _clustered(first: Sequence[Outcome], second: Sequence[Outcome]) -> Differenc
         {key: [float(o.success) for o in rows] for key, rows in _grouped(arm, lambda o: o.condition).items()}
         for arm in (first, second)
     )
-    return cluster_bootstrap(ours, theirs, seed=SEED, level=LEVEL)
+    return over_conditions(ours, theirs, seed=SEED, level=LEVEL)
 
 
 def _stratified(first: Sequence[Outcome], second: Sequence[Outcome]) -> strata.Stratified | None:
@@ -242,13 +279,11 @@ def _stratified(first: Sequence[Outcome], second: Sequence[Outcome]) -> strata.S
     )
 
 
-def _log_rank(first: Sequence[Outcome], second: Sequence[Outcome]) -> float | None:
-    def timed(arm: Sequence[Outcome]) -> tuple[list[float], list[bool]]:
-        known = [(o.duration, o.success) for o in arm if o.duration is not None]
-        return [d for d, _ in known], [ok for _, ok in known]
-
-    one, other = timed(first), timed(second)
-    return log_rank(one, other) if one[0] and other[0] else None
+def _sooner(pairs: Sequence[Pair], timing: _Timing) -> Flips | None:
+    known = [p for p in pairs if timing.known(p.first) and timing.known(p.second)]
+    if not known:
+        return None
+    return sign_flips([timing.lasted(p.first) - timing.lasted(p.second) for p in known], timing.until)
 
 
 def _waiting(pairs: Sequence[Pair], first: Sequence[Outcome], second: Sequence[Outcome]) -> list[str]:

@@ -69,10 +69,20 @@ def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> 
     def make() -> Analysis:
         primary = (plan.first.name, plan.second.name) if plan.first and plan.second else None
         return analyse(
-            which.apply(runs.outcomes), which.apply(runs.interruptions), alpha=plan.alpha, primary=primary
+            which.apply(runs.outcomes),
+            which.apply(runs.interruptions),
+            alpha=plan.alpha,
+            primary=primary,
+            limits=limits_of(plan),
         )
 
     return _analyses.get((plan.pk, plan.digest, which), now, make)
+
+
+def limits_of(plan: Plan) -> dict[str, float]:
+    """Time limits [s] of the frozen plan's scenes, of those that have one."""
+    scenes = (plan.document or {}).get("scenes", [])
+    return {scene["name"]: scene["time_limit_s"] for scene in scenes if scene["time_limit_s"] is not None}
 
 
 def page_of(plan: Plan, name: Hashable, at: Hashable, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:

@@ -43,7 +43,7 @@ def _summary(plan: Plan, only: Chosen, at: Hashable) -> dict[str, Any]:
         "intervals": _intervals(plan, "Success rates", analysis, order, only),
         "violins": rates.violins(analysis.arms, analysis.letters) if analysis.arms else None,
         "funnels": [drawn for scene in scenes if (drawn := _funnel(plan, analysis, scene, only))],
-        "survival": courses.survival(analysis.arms),
+        "success_times": courses.success_times(analysis.arms),
         "grid": conditions.grid(analysis.arms, _grid_links(plan, analysis, only)),
         "pareto": conditions.pareto(analysis.arms, _failure_links(plan, analysis, only)),
         "scenes": [(scene, scene_rows(plan, analysis, scene, only)) for scene in scenes],
@@ -99,7 +99,7 @@ def _compared(plan: Plan, only: Chosen, first: str, second: str, at: Hashable) -
             for scene in sorted({*arms[0].scenes, *arms[1].scenes})
             if (drawn := _funnel(plan, replace(analysis, arms=arms), scene, only))
         ],
-        "survival": courses.survival(arms),
+        "success_times": courses.success_times(arms),
         "evidence": courses.evidence(found.evidence, found.first, found.second),
         "pairs": pair_rows(runs.get(found.first, []), runs.get(found.second, []))[:MOST_PAIRS],
         "most": MOST_PAIRS,

@@ -69,7 +69,9 @@ def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator
         of_scores = f"{gain} of the score, p = {probability(found.scored.p)} of {found.pairs} pairs"
         yield Fact("With partial credit, n as planned?", "sign flips within pairs, exact", of_scores)
     if found.clustered:
-        yield Fact("Other initial conditions?", "bootstrap over conditions, 95 %", points(found.clustered))
+        yield Fact(
+            "Other initial conditions?", "conditions as a sample, Gaffke, 95 %", points(found.clustered)
+        )
 
 
 def _of_the_evidence(analysis: Analysis, found: Comparison) -> Iterator[Fact]:
@@ -88,8 +90,12 @@ def _beyond(found: Comparison) -> Iterator[Fact]:
         points_over = f"{100 * found.stratified.stratified:+.0f} points".replace("-", "−")
         chance = probability(found.stratified.p)
         yield Fact("Over scenes?", "Mantel-Haenszel", f"{points_over}, odds ratio {ratio}, p = {chance}")
-    if found.log_rank is not None:
-        yield Fact("Sooner?", "log-rank on time to success", f"p = {probability(found.log_rank)}")
+    if found.sooner:
+        ahead = found.first if found.sooner.value < 0 else found.second
+        by = f"{abs(found.sooner.value):.1f} s"
+        lead = f"{ahead} by {by}, failures counted in full" if found.sooner.value else "neither"
+        how = "sign flips of times within pairs, exact"
+        yield Fact("Sooner?", how, f"{lead}, p = {probability(found.sooner.p)} of {found.sooner.pairs} pairs")
     believed = f"{found.first} is better with probability {_chance(found.better)}"
     yield Fact("What to believe?", "uniform priors", believed)
 

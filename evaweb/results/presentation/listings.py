@@ -15,6 +15,7 @@ from evaweb.results.analysis.filters import Chosen, choices
 from evaweb.results.analysis.outcomes import Outcome, paired
 from evaweb.results.presentation.addresses import beside_address, trials_address
 from evaweb.results.presentation.wording import ends
+from evaweb.statistics.bounded import Mean
 from evaweb.statistics.proportions import Proportion
 from evaweb.trials.figures import average_words
 from evaweb.trials.models import Trial
@@ -108,11 +109,8 @@ def trial_choices(plan: Plan) -> dict[str, list[str]]:
     }
 
 
-def _mean(found: Any) -> str:
-    if found is None:
-        return ""
-    interval = f" [{ends(found.interval)}]" if found.interval else " (all alike: no interval)"
-    return f"{100 * found.value:.0f} %{interval}"
+def _mean(found: Mean) -> str:
+    return f"{100 * found.value:.0f} % [{ends(found.interval)}]"
 
 
 def _time(arm: Arm) -> str:

@@ -1,7 +1,7 @@
 """An analysis as plain JSON: what REST answers, what a report holds, and what its script computes again.
 
-Intervals are [low, high]; those that a bootstrap drew stand under `bootstrap`, because a new draw gets them
-only nearly. A list of curve points is [time, share, low, high, at risk].
+Intervals are [low, high]; those under `gaffke` were drawn: a new draw gets them only nearly. A list of curve points
+is [time, share that has succeeded, low, high].
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from typing import Any
 
 from evaweb.results.analysis.analysis import Analysis, Arm, Comparison
 from evaweb.statistics.base import Interval
+from evaweb.statistics.bounded import Mean
 from evaweb.statistics.difference import Difference
 from evaweb.statistics.means import Average
 from evaweb.statistics.proportions import Proportion
 from evaweb.statistics.rates import Rate
 from evaweb.statistics.sequential import Evidence
-from evaweb.statistics.strata import Mean
 
 
 def analysis_document(analysis: Analysis) -> dict[str, Any]:
@@ -92,7 +92,8 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
         },
         "evidence": _evidence(found.evidence),
         "score_evidence": _evidence(found.score_evidence),
-        "log_rank": found.log_rank,
+        "sooner": found.sooner
+        and {"pairs": found.sooner.pairs, "value_s": found.sooner.value, "p": found.sooner.p},
     }
 
 
@@ -110,8 +111,8 @@ def _ends(interval: Interval | None) -> list[float] | None:
     return None if interval is None else [interval.low, interval.high]
 
 
-def _mean(found: Mean | None) -> dict[str, Any] | None:
-    return None if found is None else {"value": found.value, "bootstrap": _ends(found.interval)}
+def _mean(found: Mean) -> dict[str, Any]:
+    return {"value": found.value, "gaffke": _ends(found.interval)}
 
 
 def _average(found: Average | None) -> dict[str, Any] | None:
@@ -119,7 +120,7 @@ def _average(found: Average | None) -> dict[str, Any] | None:
 
 
 def _clustered(found: Difference | None) -> dict[str, Any] | None:
-    return None if found is None else {"value": found.value, "bootstrap": _ends(found.interval)}
+    return None if found is None else {"value": found.value, "gaffke": _ends(found.interval)}
 
 
 def _rate(found: Rate | None) -> dict[str, Any] | None:
@@ -137,14 +138,15 @@ def _time(arm: Arm) -> dict[str, Any] | None:
     curve, mean = arm.curve, arm.mean_time
     if curve is None:
         return None
-    points = zip(curve.times, curve.share, curve.low, curve.high, curve.at_risk, strict=True)
+    points = zip(curve.times, curve.share, curve.low, curve.high, strict=True)
     return {
         "n": curve.n,
         "successes": curve.successes,
+        "until_s": curve.until,
         "median_s": curve.median,
         "curve": [list(point) for point in points],
         "restricted_mean": mean
-        and {"value_s": mean.value, "interval": _ends(mean.interval), "until_s": mean.until},
+        and {"value_s": mean.value, "gaffke": _ends(mean.interval), "until_s": mean.until},
     }
 
 

@@ -148,7 +148,7 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
             for scene in scenes
             if any(f.scene == scene for a in arms for f in a.funnels)
         ],
-        "survival": courses.survival(arms),
+        "success_times": courses.success_times(arms),
         "grid": conditions.grid(arms, {}),
         "pareto": conditions.pareto(arms, {}),
         "evidence": primary and courses.evidence(primary.evidence, primary.first, primary.second),

@@ -2,80 +2,65 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.rates import rate
 from evaweb.statistics.smoothness import sparc
-from evaweb.statistics.survival import kaplan_meier, log_rank, restricted_mean
+from evaweb.statistics.success_times import incidence, restricted_mean
 
-# Times of remission under 6-MP (Freireich et al. 1963), in weeks; the textbook example of censoring.
-WEEKS = [6, 6, 6, 6, 7, 9, 10, 10, 11, 13, 16, 17, 19, 20, 22, 23, 25, 32, 32, 34, 35]
-ENDED = [1, 1, 1, 0, 1, 0, 1, 0, 0, 1, 1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0]
-PLACEBO = [1, 1, 2, 2, 3, 4, 4, 5, 5, 8, 8, 8, 8, 11, 11, 12, 12, 15, 17, 22, 23]
+TIMES = st.lists(st.one_of(st.none(), st.floats(0, 60)), min_size=1, max_size=40)
 
 
-def test_the_textbook_curve():
-    found = kaplan_meier(WEEKS, list(map(bool, ENDED)))
-    at = dict(zip(found.times, found.share, strict=True))
-    assert at[6] == pytest.approx(0.857, abs=5e-4)
-    assert at[10] == pytest.approx(0.753, abs=5e-4)
-    assert at[23] == pytest.approx(0.448, abs=5e-4)
-    assert found.median == 23
-    assert (found.n, found.successes) == (21, 9)
-    assert found.at_risk[0] == 21
+def test_the_curve_counts_all_trials_at_every_time():
+    found = incidence([5.0, None, 10.0, 10.0, None], until=40.0)
+    assert found.times == (5.0, 10.0)
+    assert found.share == pytest.approx((0.2, 0.6))
+    assert (found.low[1], found.high[1]) == pytest.approx((0.2307, 0.8824), abs=1e-4)  # Wilson, 3 of 5
+    assert (found.n, found.successes, found.median) == (5, 3, 10.0)
 
 
-def test_the_textbook_comparison():
-    p = log_rank((WEEKS, list(map(bool, ENDED))), (PLACEBO, [True] * 21))
-    assert p == pytest.approx(4.17e-5, rel=0.02)
-    assert log_rank(([5.0], [False]), ([6.0], [False])) == 1.0
+def test_a_failure_counts_in_full_and_so_does_a_success_after_the_horizon():
+    found = restricted_mean([2.0, None, 9.0], until=6.0, seed=1)
+    assert found.value == pytest.approx((2 + 6 + 6) / 3)
+    assert found.interval.low < found.value < found.interval.high <= 6.0
+    assert incidence([2.0, None, 9.0], until=6.0).successes == 1
+    assert incidence([None, 9.0], until=6.0).median is None
 
 
-def test_without_cut_off_trials_the_restricted_mean_is_the_mean():
-    found = restricted_mean([2.0, 4.0, 6.0], [True] * 3, until=6.0)
-    assert found.value == pytest.approx(4.0)
-    assert found.interval.low < 4.0 < found.interval.high
-    assert restricted_mean([2.0, 4.0, 6.0], [True] * 3, until=3.0).value == pytest.approx(2 + 2 / 3)
+@given(TIMES, st.floats(1, 60))
+def test_the_restricted_mean_is_the_area_above_the_curve(times, until):
+    found, curve = restricted_mean(times, until, seed=1), incidence(times, until)
+    steps = [0.0, *curve.times, until]
+    areas = [
+        (1 - share) * (after - t)
+        for share, t, after in zip([0.0, *curve.share], steps[:-1], steps[1:], strict=True)
+    ]
+    assert found.value == pytest.approx(sum(areas), abs=1e-9)
+    assert 0 <= found.interval.low <= found.value + 1e-9
+    assert found.value - 1e-9 <= found.interval.high <= until
 
 
-@given(st.lists(st.tuples(st.floats(0.5, 60), st.booleans()), min_size=1, max_size=40))
-@example([(1.337885692909179, False), (33.75138534978009, False)])  # whose areas come to a rounding more
-def test_a_restricted_mean_is_the_area_under_the_curve(trials):
-    durations, succeeded = zip(*trials, strict=True)
-    until = max(durations)
-    found = restricted_mean(durations, succeeded, until)
-    assert 0 <= found.interval.low <= found.value <= found.interval.high <= until + 1e-9
-    curve = kaplan_meier(durations, succeeded)
-    grid = np.linspace(0, until, 20001)
-    steps = np.array([1.0, *curve.share])[np.searchsorted(curve.times, grid, side="right")]
-    assert found.value == pytest.approx(float(np.trapezoid(steps, grid)), abs=0.01)
-
-
-def test_nobody_succeeded_the_curve_stays_at_1():
-    found = kaplan_meier([10.0, 20.0], [False, False])
-    assert set(found.share) == {1.0}
-    assert found.median is None
+@given(TIMES)
+def test_at_the_horizon_the_curve_is_the_success_rate(times):
+    curve = incidence(times, until=60.0)
+    assert curve.successes == sum(t is not None for t in times)
+    assert all(one < other for one, other in zip(curve.share, curve.share[1:], strict=False))
 
 
 @pytest.mark.parametrize(
-    ("durations", "succeeded", "said"),
+    ("times", "until", "said"),
     [
-        ([], [], "no trial"),
-        ([-1.0], [True], "duration -1"),
-        ([1.0], [], "1 durations of 0"),
-        ([math.nan], [True], "nan"),
+        ([], 5.0, "no trial"),
+        ([-1.0], 5.0, "a time to success of -1"),
+        ([math.nan], 5.0, "nan"),
+        ([1.0], 0.0, r"until = 0\.0 s; allowed: above 0"),
     ],
 )
-def test_times_that_cannot_be_are_refused(durations, succeeded, said):
+def test_times_that_cannot_be_are_refused(times, until, said):
     with pytest.raises(StatisticsError, match=said):
-        kaplan_meier(durations, succeeded)
-
-
-def test_beyond_the_longest_trial_nothing_is_claimed():
-    with pytest.raises(StatisticsError, match="at most 5 s"):
-        restricted_mean([5.0, 3.0], [True, False], until=6.0)
+        incidence(times, until)
 
 
 def test_rates_have_garwoods_interval():

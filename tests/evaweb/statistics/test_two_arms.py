@@ -9,9 +9,9 @@ from scipy.stats import barnard_exact
 
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.difference import barnard, newcombe, probability_better
-from evaweb.statistics.paired import cluster_bootstrap, mcnemar
+from evaweb.statistics.paired import mcnemar, over_conditions
 from evaweb.statistics.proportions import posterior
-from evaweb.statistics.strata import Table, macro_average, mantel_haenszel
+from evaweb.statistics.strata import Table, mantel_haenszel
 
 COUNTS = st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
@@ -106,24 +106,31 @@ def test_mcnemar_looks_at_discordant_pairs_alone():
     assert mcnemar([(True, True)] * 5).p == 1.0
 
 
-def test_the_bootstrap_draws_initial_conditions_not_trials():
+def test_the_interval_over_conditions_is_of_conditions_not_of_trials():
     first = {f"position {i}": [1.0] * 10 for i in range(4)} | {"position 4": [0.0] * 10}
     second = {f"position {i}": [0.0] * 10 for i in range(5)}
-    found = cluster_bootstrap(first, second, seed=1)
+    found = over_conditions(first, second, seed=1)
     assert found.value == pytest.approx(0.8)
-    # Five clusters, however many trials: the interval is that of five.
-    assert found.interval.low == pytest.approx(0.4)
-    assert found.interval.high == pytest.approx(1.0)
-    assert cluster_bootstrap(first, second, seed=1) == found
+    # Five conditions, however many trials: differences of 0 and 1 only, on the scale from -1 to 1.
+    fewer = over_conditions(
+        {k: v[:1] for k, v in first.items()}, {k: v[:1] for k, v in second.items()}, seed=1
+    )
+    assert found == fewer
+    assert found.interval.low < 0.2
+    assert found.interval.high > 0.97
 
 
-def test_the_bootstrap_says_where_it_would_claim_too_much():
-    with pytest.raises(StatisticsError, match="nothing to resample"):
-        cluster_bootstrap({"a": [1], "b": [1]}, {"a": [0], "b": [0]}, seed=0)
+def test_two_conditions_that_say_the_same_are_little():
+    found = over_conditions({"a": [1], "b": [1]}, {"a": [0], "b": [0]}, seed=0)
+    assert (found.value, found.interval.high) == (1.0, 1.0)
+    assert found.interval.low == pytest.approx(2 * 0.025**0.5 - 1, abs=0.03)  # Clopper and Pearson's 2 of 2
+
+
+def test_conditions_that_were_not_shared_say_nothing():
     with pytest.raises(StatisticsError, match="at least 2 are needed"):
-        cluster_bootstrap({"a": [1]}, {"a": [0]}, seed=0)
+        over_conditions({"a": [1]}, {"a": [0]}, seed=0)
     with pytest.raises(StatisticsError, match="second arm has no trial at 'b'"):
-        cluster_bootstrap({"a": [1], "b": [1]}, {"a": [0], "b": []}, seed=0)
+        over_conditions({"a": [1], "b": [1]}, {"a": [0], "b": []}, seed=0)
 
 
 def test_simpsons_paradox_is_seen():
@@ -148,13 +155,3 @@ def test_one_stratum_is_a_plain_table():
 def test_no_difference_anywhere_is_no_evidence():
     found = mantel_haenszel([Table(5, 5, 7, 7)])
     assert (found.p, found.odds_ratio, found.reversed) == (1.0, None, False)
-
-
-def test_scenes_are_equally_heavy_whatever_their_trials():
-    found = macro_average({"easy": [1.0] * 30 + [0.0] * 10, "hard": [0.0, 0.0, 1.0, 0.0]}, seed=2)
-    assert found.value == pytest.approx(0.5)
-    assert found.interval is not None
-    assert found.interval.low < 0.5 < found.interval.high
-    assert macro_average({"easy": [1, 1], "hard": [0, 0]}, seed=2).interval is None
-    with pytest.raises(StatisticsError, match="'hard' has no trial"):
-        macro_average({"easy": [1], "hard": []}, seed=2)

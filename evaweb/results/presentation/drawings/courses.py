@@ -25,6 +25,7 @@ from evaweb.results.presentation.drawings.svg import (
     wrapped,
 )
 from evaweb.results.presentation.wording import evidence_words, rate_words
+from evaweb.statistics.proportions import wilson
 from evaweb.statistics.sequential import Evidence
 
 WIDTH = 600
@@ -79,12 +80,12 @@ def funnel(
     return drawing(WIDTH, height, f"Milestones of {scene}, share of all trials", said, *parts, kind="funnel")
 
 
-def survival(arms: Sequence[Arm]) -> Drawing | None:
-    """Share that has not succeeded yet over time, with pointwise bands and a tick where trials were cut off."""
+def success_times(arms: Sequence[Arm]) -> Drawing | None:
+    """Share that has succeeded over time, up to the horizon, with pointwise bands."""
     drawn = [(i, arm, arm.curve) for i, arm in enumerate(arms) if arm.curve is not None]
     if not drawn:
         return None
-    end = max(curve.times[-1] for _, _, curve in drawn)
+    end = drawn[0][2].until
     height, bottom = 300, 250
     x, y = Scale(0, end, 50, WIDTH - _LEGEND), Scale(0, 1, bottom, 14)
     parts = []
@@ -96,19 +97,26 @@ def survival(arms: Sequence[Arm]) -> Drawing | None:
     said = []
     labels: list[tuple[float, int, str]] = []
     for i, arm, curve in drawn:
-        low, high = _steps(curve.times, curve.low), _steps(curve.times, curve.high)
+        # Before the first success the band is that of none of n.
+        bands = wilson(0, curve.n)
+        low, high = (
+            _steps(curve.times, side, start, end)
+            for side, start in ((curve.low, bands.low), (curve.high, bands.high))
+        )
         parts.append(
             element("path", d=_area([(x(a), y(b)) for a, b in high], [(x(a), y(b)) for a, b in low]),
                     class_=f"shade {series(i)}")
         )  # fmt: skip
-        parts.append(line([(x(a), y(b)) for a, b in _steps(curve.times, curve.share)], f"curve {series(i)}"))
-        labels.append((y(curve.share[-1]), i, arm.checkpoint))
+        parts.append(
+            line([(x(a), y(b)) for a, b in _steps(curve.times, curve.share, 0, end)], f"curve {series(i)}")
+        )
+        labels.append((y(curve.successes / curve.n), i, arm.checkpoint))
         median = f"half within {curve.median:.1f} s" if curve.median is not None else "half never"
-        said.append(f"{arm.checkpoint}: {median}, {curve.successes} of {curve.n} succeeded")
+        said.append(f"{arm.checkpoint}: {median}, {curve.successes} of {curve.n} within {end:.1f} s")
     parts += _names(labels, x(end), bottom)
     return drawing(
-        WIDTH, height, "Time to success: share in percent that has not succeeded yet", "; ".join(said), *parts,
-        kind="survival",
+        WIDTH, height, "Time to success: share in percent that has succeeded", "; ".join(said), *parts,
+        kind="success-times",
     )  # fmt: skip
 
 
@@ -149,13 +157,15 @@ def evidence(found: Evidence, first: str, second: str, foreseen: int | None = No
     return drawing(WIDTH, 276, "Evidence (e-value) after each pair of trials", said, *parts, kind="evidence")
 
 
-def _steps(times: Sequence[float], values: Sequence[float]) -> list[tuple[float, float]]:
-    """A curve that keeps its value until the next time."""
-    points, before = [(0.0, 1.0)], 1.0
+def _steps(
+    times: Sequence[float], values: Sequence[float], start: float, end: float
+) -> list[tuple[float, float]]:
+    """A curve from time 0 to `end` that keeps its value, `start` at first, until the next time."""
+    points, before = [(0.0, start)], start
     for t, value in zip(times, values, strict=True):
         points += [(t, before), (t, value)]
         before = value
-    return points
+    return [*points, (end, before)]
 
 
 def _area(upper: Sequence[tuple[float, float]], lower: Sequence[tuple[float, float]]) -> str:

@@ -165,13 +165,11 @@ def _drawn(shown: Any, drawn: Drawn) -> str:
     if not (isinstance(shown, list) and len(shown) == 2 and all(map(_number, shown))):
         return f"{shown!r} is shown; an interval comes out"
     low, high = shown
-    n, slack = len(drawn), 1e-9
-    beyond = (sum(d < low - slack for d in drawn) / n, sum(d > high + slack for d in drawn) / n)
-    within = (sum(d <= low + slack for d in drawn) / n, sum(d >= high - slack for d in drawn) / n)
+    n, slack = len(drawn.lower), 1e-9
+    beyond = (sum(d < low - slack for d in drawn.lower) / n, sum(d > high + slack for d in drawn.upper) / n)
+    within = (sum(d <= low + slack for d in drawn.lower) / n, sum(d >= high - slack for d in drawn.upper) / n)
     if max(beyond) > 0.025 + _TAIL or min(within) < 0.025 - _TAIL:
-        return (
-            f"{shown} is shown; of {n} means drawn anew {beyond[0]:.2%} are below and {beyond[1]:.2%} above"
-        )
+        return f"{shown} is shown; of {n} drawn anew {beyond[0]:.2%} are below and {beyond[1]:.2%} above"
     return ""
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Sequence
-from itertools import combinations, pairwise
+from itertools import combinations
 from statistics import NormalDist
 
 Z = NormalDist().inv_cdf(0.975)
@@ -182,61 +181,6 @@ def letters(names: Sequence[str], apart: set[frozenset[str]]) -> dict[str, str]:
     return {
         name: "".join(s for s, column in zip(signs, columns, strict=True) if name in column) for name in names
     }
-
-
-def survival(durations: Sequence[float], succeeded: Sequence[bool]) -> list[list[float]]:
-    """Kaplan and Meier's curve: [time, share left, low, high, at risk], intervals on the scale log(-log)."""
-    ended = Counter(d for d, ok in zip(durations, succeeded, strict=True) if ok)
-    share, spread, points = 1.0, 0.0, []
-    for t in sorted(set(durations)):
-        risk = sum(d >= t for d in durations)
-        share *= 1 - ended[t] / risk
-        spread = spread + ended[t] / (risk * (risk - ended[t])) if risk > ended[t] else math.inf
-        if share >= 1:
-            low = high = 1.0
-        elif share <= 0:
-            low = high = 0.0
-        else:
-            half = Z * math.sqrt(spread) / abs(math.log(share))
-            low, high = (math.exp(math.log(share) * math.exp(s * half)) for s in (1, -1))
-        points.append([t, share, low, high, risk])
-    return points
-
-
-def restricted_mean(durations: Sequence[float], succeeded: Sequence[bool]) -> tuple[float, Ends, float]:
-    """The area below the curve up to the longest trial, its interval, and that trial's time."""
-    until = max(durations)
-    points = survival(durations, succeeded)
-
-    def area(start: float) -> float:
-        steps = [(0.0, 1.0), *((p[0], p[1]) for p in points), (until, 0.0)]
-        return math.fsum(
-            share * max(0.0, end - max(t, start)) for (t, share), (end, _) in pairwise(steps) if end > start
-        )
-
-    variance = 0.0
-    for t, _, _, _, risk in points:
-        events = sum(1 for d, ok in zip(durations, succeeded, strict=True) if ok and d == t)
-        if t < until and risk > events:
-            variance += area(t) ** 2 * events / (risk * (risk - events))
-    value, half = area(0.0), Z * math.sqrt(variance)
-    return value, [max(0.0, value - half), min(until, value + half)], until
-
-
-def log_rank(
-    first: tuple[Sequence[float], Sequence[bool]], second: tuple[Sequence[float], Sequence[bool]]
-) -> float:
-    """Two-sided probability that both curves are the same."""
-    if not any(first[1]) and not any(second[1]):
-        return 1.0
-    surplus = variance = 0.0
-    for t in sorted({d for arm in (first, second) for d, ok in zip(*arm, strict=True) if ok}):
-        n1, n2 = (sum(d >= t for d in arm[0]) for arm in (first, second))
-        d1, d2 = (sum(ok and d == t for d, ok in zip(*arm, strict=True)) for arm in (first, second))
-        n, d = n1 + n2, d1 + d2
-        surplus += d1 - d * n1 / n
-        variance += d * n1 * n2 * (n - d) / (n * n * (n - 1)) if n > 1 else 0.0
-    return math.erfc(abs(surplus) / math.sqrt(2 * variance)) if variance > 0 else 1.0
 
 
 def mantel_haenszel(tables: Sequence[tuple[int, int, int, int]]) -> dict[str, object]:

@@ -40,8 +40,35 @@ class Trial:
         return f"{self.scene}/{self.position}"
 
 
-class Drawn(list[float]):
-    """Values that a bootstrap drew, to be held against an interval that another one drew."""
+@dataclass(frozen=True)
+class Drawn:
+    """Values of which an interval's lower end has 2.5 % below it and its upper end 2.5 % above, drawn anew."""
+
+    lower: list[float]
+    upper: list[float]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The horizon of times to success, 0 where nothing has a duration, and each scene's limit."""
+
+    until: float
+    limits: Mapping[str, float]
+
+    def time(self, trial: Trial) -> float:
+        """When it succeeded, up to the horizon; the horizon where it did not."""
+        assert trial.duration is not None
+        own = min(trial.duration, self.limits.get(trial.scene, math.inf))
+        return own if self.reached(trial) else self.until
+
+    def reached(self, trial: Trial) -> bool:
+        """True where it succeeded within the horizon."""
+        own = min(trial.duration or 0.0, self.limits.get(trial.scene, math.inf))
+        return trial.success and own <= self.until
+
+    def known(self, trials: Trials) -> list[Trial]:
+        """Those with a time."""
+        return [t for t in trials if t.duration is not None] if self.until > 0 else []
 
 
 Trials = Sequence[Trial]
@@ -58,12 +85,15 @@ def numbers(trials: Trials, plan: Mapping[str, Any]) -> dict[str, Any]:
         elif trial.status == "interrupted":
             broken[trial.checkpoint].append(trial)
     names = sorted(arms, key=lambda name: (-_rate(arms[name]), name))
+    limits = {s["name"]: s["time_limit_s"] for s in plan["scenes"] if s["time_limit_s"] is not None}
+    longest = max((t.duration or 0.0 for arm in arms.values() for t in arm), default=0.0)
+    timing = Timing(min(limits.values()) if limits else longest, limits)
     wanted = plan["comparison"]
     couples = [
         tuple(wanted) if wanted and set(wanted) == set(couple) else couple
         for couple in combinations(names, 2)
     ]
-    compared = [_comparison(a, b, arms[a], arms[b], alpha) for a, b in couples]
+    compared = [_comparison(a, b, arms[a], arms[b], alpha, timing) for a, b in couples]
     for comparison, p in zip(compared, methods.holm([c["barnard"]["p"] for c in compared]), strict=True):
         comparison["barnard"]["holm"] = p
     corrected = {frozenset((c["first"], c["second"])): c["barnard"]["holm"] for c in compared}
@@ -71,7 +101,7 @@ def numbers(trials: Trials, plan: Mapping[str, Any]) -> dict[str, Any]:
         "n": sum(len(arm) for arm in arms.values()),
         "alpha": alpha,
         "letters": methods.letters(names, methods.separated(names, corrected, alpha)),
-        "arms": {name: _arm(arms[name], broken[name]) for name in names},
+        "arms": {name: _arm(arms[name], broken[name], timing) for name in names},
         "comparisons": compared,
     }
 
@@ -100,7 +130,7 @@ def _by(trials: Trials, key: Callable[[Trial], str]) -> dict[str, list[Trial]]:
     return dict(sorted(found.items()))
 
 
-def _arm(trials: Trials, broken: Trials) -> dict[str, Any]:
+def _arm(trials: Trials, broken: Trials, timing: Timing) -> dict[str, Any]:
     x, n = _counts(trials)
     scenes, cells = _by(trials, lambda t: t.scene), _by(trials, lambda t: t.condition)
     timed = [(t.duration, t.success) for t in trials if t.duration is not None]
@@ -119,7 +149,7 @@ def _arm(trials: Trials, broken: Trials) -> dict[str, Any]:
         "scenes": {name: _proportion(*_counts(rows)) for name, rows in scenes.items()},
         "positions": {name: _proportion(*_counts(rows)) for name, rows in cells.items()},
         "milestones": {name: _funnel(rows) for name, rows in scenes.items() if rows[0].milestones},
-        "time_to_success": _time([d for d, _ in timed], [ok for _, ok in timed]) if timed else None,
+        "time_to_success": _time(timing.known(trials), timing) if timing.known(trials) else None,
         "successes_per_hour": _per_hour(sum(ok for _, ok in timed), exposure),
         "interruptions_per_hour": _per_hour(len(broken), whole),
         "failures": dict(Counter(t.failure for t in trials if not t.success and t.failure)),
@@ -131,17 +161,7 @@ def _arm(trials: Trials, broken: Trials) -> dict[str, Any]:
 def _mean(scenes: Mapping[str, Sequence[float]]) -> dict[str, Any]:
     means = [math.fsum(values) / len(values) for values in scenes.values()]
     value = math.fsum(means) / len(means)
-    if all(min(values) == max(values) for values in scenes.values()):
-        return {"value": value, "bootstrap": None}
-    chance = random.Random(1)
-    counted = [
-        (list(Counter(values)), list(Counter(values).values()), len(values)) for values in scenes.values()
-    ]
-    drawn = Drawn(
-        sum(sum(chance.choices(levels, weights, k=n)) / n for levels, weights, n in counted) / len(counted)
-        for _ in range(DRAWS)
-    )
-    return {"value": value, "bootstrap": drawn}
+    return {"value": value, "gaffke": _drawn(list(scenes.values()), 0.0, 1.0)}
 
 
 def _funnel(trials: Trials) -> list[dict[str, Any]]:
@@ -158,19 +178,44 @@ def _funnel(trials: Trials) -> list[dict[str, Any]]:
     return steps
 
 
-def _time(durations: list[float], succeeded: list[bool]) -> dict[str, Any]:
-    curve = methods.survival(durations, succeeded)
-    mean = None
-    if max(durations) > 0:
-        value, interval, until = methods.restricted_mean(durations, succeeded)
-        mean = {"value_s": value, "interval": interval, "until_s": until}
+def _time(trials: Trials, timing: Timing) -> dict[str, Any]:
+    """Of trials with a time: the share that had succeeded by each of them, and the mean up to the horizon."""
+    n, ended = len(trials), sorted(timing.time(t) for t in trials if timing.reached(t))
+    curve = [[t, rank / n, *methods.wilson(rank, n)] for rank, t in enumerate(ended, start=1)]
+    last = {point[0]: point for point in curve}  # of those at the same time
+    lasted = [timing.time(t) / timing.until for t in trials]
     return {
-        "n": len(durations),
-        "successes": sum(succeeded),
-        "median_s": next((point[0] for point in curve if point[1] <= 0.5), None),
-        "curve": curve,
-        "restricted_mean": mean,
+        "n": n,
+        "successes": len(ended),
+        "until_s": timing.until,
+        "median_s": next((t for rank, t in enumerate(ended, start=1) if 2 * rank >= n), None),
+        "curve": list(last.values()),
+        "restricted_mean": {
+            "value_s": math.fsum(lasted) / n * timing.until,
+            "gaffke": _drawn([lasted], 0.0, timing.until),
+            "until_s": timing.until,
+        },
     }
+
+
+def _drawn(strata: Sequence[Sequence[float]], low: float, high: float) -> Drawn:
+    """Means over strata of outcomes from 0 to 1, with weights drawn anew, on a scale from `low` to `high`.
+
+    The weights are those of gaps between uniform numbers; one gap more goes to 0 for the lower end, to 1 for the upper.
+    """
+    chance, found = random.Random(1), Drawn([], [])
+    counted = [list(Counter(values).items()) for values in strata]
+    for _ in range(DRAWS):
+        lower = upper = 0.0
+        for levels in counted:
+            weights = [chance.gammavariate(count, 1.0) for _, count in levels]
+            more = chance.expovariate(1.0)
+            total = math.fsum(weights) + more
+            share = sum(weight * level for weight, (level, _) in zip(weights, levels, strict=True)) / total
+            lower, upper = lower + share, upper + share + more / total
+        found.lower.append(low + (high - low) * lower / len(strata))
+        found.upper.append(low + (high - low) * upper / len(strata))
+    return found
 
 
 def _per_hour(events: int, exposure: float) -> dict[str, Any] | None:
@@ -185,7 +230,9 @@ def _per_hour(events: int, exposure: float) -> dict[str, Any] | None:
     }
 
 
-def _comparison(one: str, other: str, first: Trials, second: Trials, alpha: float) -> dict[str, Any]:
+def _comparison(
+    one: str, other: str, first: Trials, second: Trials, alpha: float, timing: Timing
+) -> dict[str, Any]:
     counts = (*_counts(first), *_counts(second))
     pairs = _pairs(first, second)
     statistic, p = methods.barnard(*counts)
@@ -221,7 +268,7 @@ def _comparison(one: str, other: str, first: Trials, second: Trials, alpha: floa
             methods.score_bets([b.score - a.score for a, b in pairs]),
             alpha,
         ),
-        "log_rank": _log_rank(first, second),
+        "sooner": _sooner(pairs, timing),
     }
 
 
@@ -239,11 +286,10 @@ def _pairs(first: Trials, second: Trials) -> list[tuple[Trial, Trial]]:
 def _clustered(first: Trials, second: Trials) -> dict[str, Any] | None:
     ours, theirs = (_by(arm, lambda t: t.condition) for arm in (first, second))
     differences = [_rate(ours[key]) - _rate(theirs[key]) for key in ours if key in theirs]
-    if len(differences) < 2 or max(differences) - min(differences) < 1e-12:
+    if len(differences) < 2:
         return None
-    chance, k = random.Random(2), len(differences)
-    drawn = Drawn(sum(chance.choices(differences, k=k)) / k for _ in range(DRAWS))
-    return {"value": math.fsum(differences) / k, "bootstrap": drawn}
+    drawn = _drawn([[(d + 1) / 2 for d in differences]], -1.0, 1.0)
+    return {"value": math.fsum(differences) / len(differences), "gaffke": drawn}
 
 
 def _stratified(first: Trials, second: Trials) -> dict[str, Any] | None:
@@ -254,12 +300,13 @@ def _stratified(first: Trials, second: Trials) -> dict[str, Any] | None:
     return methods.mantel_haenszel([(*_counts(ours[key]), *_counts(theirs[key])) for key in shared])
 
 
-def _log_rank(first: Trials, second: Trials) -> float | None:
-    arms = []
-    for arm in (first, second):
-        timed = [(t.duration, t.success) for t in arm if t.duration is not None]
-        arms.append(([d for d, _ in timed], [ok for _, ok in timed]))
-    return methods.log_rank(*arms) if arms[0][0] and arms[1][0] else None
+def _sooner(pairs: Sequence[tuple[Trial, Trial]], timing: Timing) -> dict[str, Any] | None:
+    known = [pair for pair in pairs if len(timing.known(pair)) == 2]
+    if not known:
+        return None
+    gains = [timing.time(a) - timing.time(b) for a, b in known]
+    p = methods.sign_flips(gains, timing.until)
+    return {"pairs": len(gains), "value_s": math.fsum(gains) / len(gains), "p": p}
 
 
 def _evidence(first: list[float], second: list[float], alpha: float) -> dict[str, Any]:

@@ -61,9 +61,49 @@ def test_a_comparison_has_all_its_evidence():
     assert compared.test.p == compared.corrected < 0.001
     assert compared.better < 0.001
     assert compared.pairs == compared.paired.pairs == 40
-    assert compared.clustered.interval.high < 0
+    assert compared.clustered.value == pytest.approx(compared.difference.value)
+    assert (
+        compared.clustered.interval.low < compared.difference.interval.low
+    )  # of five positions, not of 40 trials
     assert compared.stratified is None
     assert compared.evidence.winner == compared.score_evidence.winner == "second"
+
+
+def timed(name, rows):
+    """Trials of one checkpoint, a block each, from (succeeded, seconds)."""
+    return [
+        Outcome(i, i, str(i), name, "cups", 1, ok, float(ok), seconds) for i, (ok, seconds) in enumerate(rows)
+    ]
+
+
+def test_nine_of_ten_are_sooner_than_five_of_ten_that_gave_up_early():
+    """Failures of B ended after 2 s: taken for successes to come, B would be the sooner one with p = 0.0002."""
+    first = timed("A", [(True, 20.0)] * 9 + [(False, 40.0)])
+    second = timed("B", [(True, 10.0)] * 5 + [(False, 2.0)] * 5)
+    found = analyse(first + second, primary=("A", "B"), limits={"cups": 40.0, "plates": 60.0})
+    assert found.arm("A").mean_time.value == pytest.approx(22.0)
+    assert found.arm("B").mean_time.value == pytest.approx(25.0)
+    sooner = found.comparisons[0].sooner
+    assert (sooner.pairs, sooner.value) == (10, pytest.approx(-3.0))
+    assert sooner.p > 0.05
+
+
+def test_one_horizon_for_all_is_the_smallest_limit_or_the_longest_run():
+    runs = timed("A", [(True, 20.0), (True, 40.02)]) + timed("B", [(True, 10.0), (False, 55.0)])
+    curves = {arm.checkpoint: arm.curve for arm in analyse(runs).arms}
+    assert {curve.until for curve in curves.values()} == {55.0}
+    limited = analyse(runs, limits={"cups": 40.0})
+    assert {arm.mean_time.until for arm in limited.arms} == {40.0}
+    assert limited.arm("A").curve.successes == 2  # it ran to its limit, and the station a moment longer
+    other = analyse(runs, limits={"cups": 60.0, "plates": 30.0})
+    assert other.arm("A").curve.successes == 1
+
+
+def test_a_time_that_is_not_known_has_no_part_in_who_is_sooner():
+    runs = timed("A", [(True, None), (True, 5.0)]) + timed("B", [(True, 9.0), (True, 9.0)])
+    found = analyse(runs, primary=("A", "B"))
+    assert (found.comparisons[0].sooner.pairs, found.comparisons[0].sooner.value) == (1, -4.0)
+    assert analyse(timed("A", [(True, None)]) + timed("B", [(True, None)])).comparisons[0].sooner is None
 
 
 def test_three_checkpoints_are_corrected_for_three_comparisons():

@@ -35,7 +35,7 @@ def figures(analysis):
         "funnel": courses.funnel(
             "s0", [(i, a.checkpoint, a.funnels[0]) for i, a in enumerate(analysis.arms)], {}
         ),
-        "survival": courses.survival(analysis.arms),
+        "success_times": courses.success_times(analysis.arms),
         "evidence": courses.evidence(found.evidence, found.first, found.second, 40),
         "grid": conditions.grid(analysis.arms, {}),
         "pareto": conditions.pareto(analysis.arms, {NASTY: "/trials/?failure=1&x=2"}),
@@ -105,7 +105,7 @@ def test_checkpoints_whose_names_begin_alike_are_told_apart_in_every_figure(anal
         "intervals": rates.intervals("Rates", [(a.checkpoint, a.success, "") for a in arms], {}),
         "violins": rates.violins(arms, letters),
         "funnel": courses.funnel("s0", [(i, a.checkpoint, a.funnels[0]) for i, a in enumerate(arms)], {}),
-        "survival": courses.survival(arms),
+        "success_times": courses.success_times(arms),
         "evidence": courses.evidence(one, *LONG),
         "grid": conditions.grid(arms, {}),
         "pareto": conditions.pareto(arms, {}),

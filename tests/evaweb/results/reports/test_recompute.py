@@ -73,9 +73,15 @@ def test_both_ways_come_to_the_same(checkpoints, n, scenes, seed):
     runs = outcomes(checkpoints, n, scenes, seed)
     primary = ("c0", "c1") if checkpoints > 1 else None
     broken = [Interruption(9000, "c0", "s0", 1, 12.5)]
-    shown = json.loads(json.dumps(analysis_document(analyse(runs, broken, primary=primary))))
+    limits = {} if seed == 2 else {f"s{scene}": 25.0 + 10 * scene for scene in range(1, scenes)}
+    analysis = analyse(runs, broken, primary=primary, limits=limits)
+    shown = json.loads(json.dumps(analysis_document(analysis)))
     rows = [*as_rows(runs), Trial(9000, "x", "c0", "s0", 1, "interrupted", False, 0.0, 12.5, "", ())]
-    plan = {"stopping": {"alpha": 0.05}, "comparison": list(primary) if primary else None}
+    plan = {
+        "stopping": {"alpha": 0.05},
+        "comparison": list(primary) if primary else None,
+        "scenes": [{"name": f"s{scene}", "time_limit_s": limits.get(f"s{scene}")} for scene in range(scenes)],
+    }
     wrong = [(where, problem) for where, problem in differences(shown, numbers(rows, plan), "") if problem]
     assert wrong == []
 

@@ -98,13 +98,13 @@ def test_a_number_that_was_changed_is_named(report):
         assert f"{name}: " in found.stdout
 
 
-def test_an_interval_of_a_bootstrap_that_was_narrowed_is_named(report):
+def test_an_interval_that_was_drawn_and_is_narrowed_is_named(report):
     path = report / "data" / "numbers.json"
     numbers = json.loads(path.read_text("utf-8"))
-    low, high = numbers["arms"]["pi0-new"]["macro"]["bootstrap"]
-    numbers["arms"]["pi0-new"]["macro"]["bootstrap"] = [low + 0.15, high]
+    low, high = numbers["arms"]["pi0-new"]["macro"]["gaffke"]
+    numbers["arms"]["pi0-new"]["macro"]["gaffke"] = [low + 0.15, high]
     path.write_text(json.dumps(numbers), "utf-8")
-    assert "arms.pi0-new.macro.bootstrap: " in recompute(report).stdout
+    assert "arms.pi0-new.macro.gaffke: " in recompute(report).stdout
 
 
 def test_a_trial_that_was_taken_out_or_of_another_checkpoint_is_found(report):

@@ -1,0 +1,63 @@
+"""Means of outcomes that have a least and a largest value, with intervals that hold for few trials of any shape.
+
+Formula: Gaffke (2005), both sides: the weights of the outcomes are drawn as gaps between uniform numbers, with one gap
+more that goes to the least value for the lower end and to the largest for the upper. For outcomes of 0 and 1 these are
+Clopper and Pearson's ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from evaweb.statistics.base import LEVEL, Interval, StatisticsError, check_level
+
+DRAWS = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Mean:
+    """A mean with its interval."""
+
+    value: float
+    interval: Interval
+
+
+def bounded_mean(
+    strata: Mapping[str, Sequence[float]],
+    *,
+    seed: int,
+    bounds: tuple[float, float] = (0.0, 1.0),
+    level: float = LEVEL,
+    draws: int = DRAWS,
+) -> Mean:
+    """The mean over strata, each equally heavy, of each one's mean outcome, which lies within `bounds`.
+
+    StatisticsError where there is no stratum, one without an outcome, or an outcome outside.
+    """
+    check_level(level)
+    import numpy as np
+
+    low, high = bounds
+    empty = [name for name, outcomes in strata.items() if not len(outcomes)]
+    if not strata or empty:
+        raise StatisticsError(f"{empty[0]!r} has no trial" if empty else "no trial")
+    given = [np.asarray(outcomes, dtype=float) for _, outcomes in sorted(strata.items())]
+    wrong = [float(one) for outcomes in given for one in outcomes if not low <= one <= high]
+    if wrong:
+        raise StatisticsError(f"an outcome of {wrong[0]}; allowed: {low:g} to {high:g}")
+    chance = np.random.default_rng(seed)
+    lower, upper = np.zeros(draws), np.zeros(draws)
+    for outcomes in given:
+        levels, counts = np.unique((outcomes - low) / (high - low), return_counts=True)
+        weights, more = chance.gamma(counts, size=(draws, len(levels))), chance.exponential(size=draws)
+        total, drawn = weights.sum(axis=1) + more, weights @ levels
+        lower += drawn / total / len(given)
+        upper += (drawn + more) / total / len(given)
+    value = float(np.mean([outcomes.mean() for outcomes in given]))
+    ends = (
+        float(np.quantile(side, share))
+        for side, share in ((lower, (1 - level) / 2), (upper, (1 + level) / 2))
+    )
+    least, most = (min(high, max(low, low + (high - low) * end)) for end in ends)
+    return Mean(value, Interval(least, most, level))
