@@ -16,9 +16,13 @@ class BenchPage:
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("console", lambda said: said.type == "error" and self.errors.append(said.text))
-        self.page.goto(f"{demo.url}/login/")
+        self.log_in(username)
+
+    def log_in(self, username):
+        """Fill in the form, at first and where the session has ended."""
+        self.page.goto(f"{self.demo.url}/login/")
         self.page.fill("input[name=username]", username)
-        self.page.fill("input[name=password]", demo.passwords[username])
+        self.page.fill("input[name=password]", self.demo.passwords[username])
         self.page.click("button[type=submit]")
         self.page.wait_for_url(lambda url: "/login" not in url)
 
