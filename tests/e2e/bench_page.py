@@ -46,10 +46,14 @@ class BenchPage:
         self.page.locator("[data-lease-when=mine]").wait_for()
 
     def take_again(self):
-        """Have the station, whether or not its lease has ended meanwhile."""
-        mine, free = (self.page.locator(f"[data-lease-when={lease}]") for lease in ("mine", "free"))
-        eventually(lambda: mine.is_visible() or free.is_visible(), 30, "the page knows who has the station")
-        if not mine.is_visible():
+        """Have the station, whether its lease has ended meanwhile or is that of a page which was closed."""
+        whose = [self.page.locator(f"[data-lease-when={lease}]") for lease in ("mine", "elsewhere", "free")]
+        mine, elsewhere, _ = whose
+        eventually(lambda: any(one.is_visible() for one in whose), 30, "the page knows who has the station")
+        if elsewhere.is_visible():
+            self.page.click("[data-lease=move]")
+            mine.wait_for()
+        elif not mine.is_visible():
             self.take()
 
     def answered(self, command):
