@@ -16,9 +16,13 @@ class BenchPage:
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("console", lambda said: said.type == "error" and self.errors.append(said.text))
-        self.page.goto(f"{demo.url}/login/")
+        self.log_in(username)
+
+    def log_in(self, username):
+        """Fill in the form, at first and where the session has ended."""
+        self.page.goto(f"{self.demo.url}/login/")
         self.page.fill("input[name=username]", username)
-        self.page.fill("input[name=password]", demo.passwords[username])
+        self.page.fill("input[name=password]", self.demo.passwords[username])
         self.page.click("button[type=submit]")
         self.page.wait_for_url(lambda url: "/login" not in url)
 
@@ -42,10 +46,14 @@ class BenchPage:
         self.page.locator("[data-lease-when=mine]").wait_for()
 
     def take_again(self):
-        """Have the station, whether or not its lease has ended meanwhile."""
-        mine, free = (self.page.locator(f"[data-lease-when={lease}]") for lease in ("mine", "free"))
-        eventually(lambda: mine.is_visible() or free.is_visible(), 30, "the page knows who has the station")
-        if not mine.is_visible():
+        """Have the station, whether its lease has ended meanwhile or is that of a page which was closed."""
+        whose = [self.page.locator(f"[data-lease-when={lease}]") for lease in ("mine", "elsewhere", "free")]
+        mine, elsewhere, _ = whose
+        eventually(lambda: any(one.is_visible() for one in whose), 30, "the page knows who has the station")
+        if elsewhere.is_visible():
+            self.page.click("[data-lease=move]")
+            mine.wait_for()
+        elif not mine.is_visible():
             self.take()
 
     def answered(self, command):

@@ -75,7 +75,8 @@ class Page(LivePage):
             state = self.state()
             if state["state"] == "holding":
                 self.command("resume", trial)
-            recorded = state["recording"]["rows"] > 0  # else its episode would be empty, and none
+            recording = state["recording"]  # until it is told of this run its rows are those of the last one
+            recorded = recording["uuid"] == state["run"]["uuid"] and recording["rows"] > 0  # else no episode
             return state["state"] == "running" and self.status(trial) == "running" and recorded
 
         eventually(moves, _SOON_S, f"trial {trial} runs; the station is {self.state()['reason']}")

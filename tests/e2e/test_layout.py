@@ -68,12 +68,23 @@ def faults(page):
     return {size: said for size, said in found.items() if said}
 
 
+@pytest.fixture(scope="module")
+def admin(patient):
+    return visitor(patient, "admin")
+
+
+@pytest.fixture(scope="module")
+def page(browser, patient):
+    page = BenchPage(browser, patient, "ann", WIDE)
+    yield page
+    page.close()
+
+
 @pytest.mark.parametrize("tab", TABS)
-def test_a_page_of_a_station_is_whole_at_every_size_also_while_its_e_stop_is_latched(browser, patient, tab):
-    admin = visitor(patient, "admin")
+def test_a_page_of_a_station_is_whole_at_every_size_also_while_its_e_stop_is_latched(page, admin, tab):
     tidy(admin)
-    page = BenchPage(browser, patient, "ann", WIDE).open(f"/stations/{STATION}/{tab}/")
-    page.at_rest()
+    page.page.set_viewport_size(WIDE)
+    page.open(f"/stations/{STATION}/{tab}/").at_rest()
     page.cameras_live()
     page.page.locator("#curves-marks .legend").first.wait_for()
     assert faults(page) == {}
@@ -81,7 +92,6 @@ def test_a_page_of_a_station_is_whole_at_every_size_also_while_its_e_stop_is_lat
     page.reaches("FAULTED")
     page.page.locator("#situation").wait_for()
     assert faults(page) == {}
-    page.close()
     tidy(admin)
 
 

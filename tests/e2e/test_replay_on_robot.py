@@ -31,7 +31,7 @@ def recorded(patient):
     return {"recording": f"/replay/{folder.name}/", "dataset": "/replay/datasets/swings/-/0/"}, actions
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def operator(browser, patient):
     page = ByHand(browser, patient, "operator", WIDE)
     yield page
