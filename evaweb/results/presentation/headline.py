@@ -62,7 +62,8 @@ def _counts(found: Design, conclusion: Conclusion, pairs: list[tuple[float, floa
     n = len(pairs)
     one, other = sum(a for a, _ in pairs), sum(b for _, b in pairs)
     if found.outcome != SUCCESS:
-        return f"mean scores {one / n:.2f} and {other / n:.2f} after {n} pairs"
+        chance = "" if conclusion.p is None else f", p = {probability(conclusion.p)},"
+        return f"mean scores {one / n:.2f} and {other / n:.2f}{chance} after {n} pairs"
     words = f"{one:.0f}/{n} against {other:.0f}/{n}"
     if (
         conclusion.p is not None
