@@ -220,7 +220,7 @@ def _operator(
                 _made(trial, operator)
                 trial = None
             except Conflict as refused:
-                if "nothing is left" in str(refused) or "are made" in str(refused):
+                if any(word in str(refused) for word in ("nothing is left", "are made", "is closed")):
                     return
                 if "cannot be scored" in str(refused):
                     raise
