@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import takewhile
 from typing import Any
 
 from evaweb.errors import EvaError
 from evaweb.plans.canonical import digest
-from evaweb.plans.models import Plan, Slot
+from evaweb.plans.models import Plan
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.designs import SUCCESS, Conclusion, Design, conclude, design, of_table
+from evaweb.statistics.designs import SUCCESS, Conclusion, Design, Values, conclude, design, of_table
 from evaweb.trials.models import TrialStatus
 
 ENDED = {
@@ -59,29 +60,49 @@ def frozen(document: Mapping[str, Any]) -> Design | None:
     )
 
 
-def pairs_of(plan: Plan, voided: bool = False) -> list[tuple[float, float]]:
-    """What counts of the compared checkpoints, block by block as scheduled, up to the first block that is not made.
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Outcomes of the compared checkpoints, block by block as scheduled, up to the first block that is not made.
 
-    `voided`: as if no trial had been voided that had a score: of each slot its first scored attempt counts.
+    `counted` is what counts; `unvoided` as if no trial had been voided that had a score: of each slot its first one.
     """
+
+    counted: list[Values]
+    unvoided: list[Values]
+
+
+def tried(plan: Plan) -> Pairs:
+    """The pairs of a frozen plan as they are now; none without a comparison. One query."""
     document = plan.document or {}
     found = frozen(document)
     if found is None:
-        return []
+        return Pairs([], [])
     names = document["comparison"]
     value = "trial__verdict__success" if found.outcome == SUCCESS else "trial__verdict__score"
-    blocks: dict[int, dict[str, float]] = defaultdict(dict)
-    status = [TrialStatus.SCORED, TrialStatus.VOIDED] if voided else [TrialStatus.SCORED]
-    counted = plan.handouts.filter(
-        trial__status__in=status, trial__verdict__isnull=False, slot__checkpoint__name__in=names
+    counted: dict[int, dict[str, float]] = defaultdict(dict)
+    unvoided: dict[int, dict[str, float]] = defaultdict(dict)
+    rows = plan.handouts.filter(
+        trial__status__in=(TrialStatus.SCORED, TrialStatus.VOIDED),
+        trial__verdict__isnull=False,
+        slot__checkpoint__name__in=names,
     )
-    for block, name, outcome in counted.order_by("number").values_list(
-        "slot__block", "slot__checkpoint__name", value
+    for block, name, status, outcome in rows.order_by("number").values_list(
+        "slot__block", "slot__checkpoint__name", "trial__status", value
     ):
-        blocks[block].setdefault(name, float(outcome))
-    scheduled = Slot.objects.filter(plan=plan).order_by("block").values_list("block", flat=True).distinct()
-    made = takewhile(lambda block: len(blocks.get(block, ())) == len(names), scheduled)
-    return [(blocks[block][names[0]], blocks[block][names[1]]) for block in made]
+        unvoided[block].setdefault(name, float(outcome))
+        if status == TrialStatus.SCORED:
+            counted[block][name] = float(outcome)
+
+    def made(blocks: Mapping[int, Mapping[str, float]]) -> list[Values]:
+        whole = takewhile(lambda block: len(blocks.get(block, ())) == len(names), range(found.pairs))
+        return [(blocks[block][names[0]], blocks[block][names[1]]) for block in whole]
+
+    return Pairs(made(counted), made(unvoided))
+
+
+def pairs_of(plan: Plan) -> list[Values]:
+    """The pairs that count."""
+    return tried(plan).counted
 
 
 def conclusion_of(plan: Plan) -> Conclusion | None:

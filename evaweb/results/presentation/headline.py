@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from evaweb.plans.design import conclusion_of, frozen, pairs_of
+from evaweb.plans.design import frozen, tried
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.presentation.wording import points, probability
 from evaweb.statistics.designs import SUCCESS, Conclusion, Design, conclude
@@ -27,20 +27,21 @@ class Headline:
 
 def headline(plan: Plan) -> Headline | None:
     """That of a frozen plan; None where it has no comparison."""
-    found, conclusion = frozen(plan.document or {}) if plan.document else None, conclusion_of(plan)
-    if found is None or conclusion is None:
+    found = frozen(plan.document) if plan.document else None
+    if found is None:
         return None
-    now = pairs_of(plan)
+    pairs = tried(plan)
+    now, whole = pairs.counted, pairs.unvoided
     at_reveal = [(one, other) for one, other in plan.at_reveal["pairs"]] if plan.at_reveal else now
-    sentence = _sentence(plan, found, conclusion, at_reveal)
-    whole = pairs_of(plan, voided=True)
-    later = _sentence(plan, found, conclude(found, now), now) if now != at_reveal else ""
-    unvoided = _sentence(plan, found, conclude(found, whole), whole) if whole != now else ""
+    sentence = _sentence(plan, found, at_reveal)
+    later = _sentence(plan, found, now) if now != at_reveal else ""
+    unvoided = _sentence(plan, found, whole) if whole != now else ""
     design = str(plan.get_stopping_display()).partition(":")[0]
     return Headline(sentence, f"{design}, alpha {found.alpha:g}", later, unvoided)
 
 
-def _sentence(plan: Plan, found: Design, conclusion: Conclusion, pairs: list[tuple[float, float]]) -> str:
+def _sentence(plan: Plan, found: Design, pairs: list[tuple[float, float]]) -> str:
+    conclusion = conclude(found, pairs)
     first, second = (plan.document or {})["comparison"]
     if not conclusion.ended:
         made = f"{conclusion.pairs} of {found.pairs} pairs"
