@@ -93,7 +93,7 @@ def test_a_pick_and_place_trial_runs_over_ros_1_and_is_recorded(start: Start, tm
         )
         sets = [
             f'transport.master="{ros.uri}"', f'policy.url="{server.ready["url"]}"', f'data_dir="{tmp_path}"',
-            "run.duration_s=18",
+            "run.duration_s=24",
             "safety.joint_age_s=5.0", "safety.picture_age_s=5.0",
             "control.heartbeat_timeout_s=10.0",  # however busy the machine is
         ]  # fmt: skip

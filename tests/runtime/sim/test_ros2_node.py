@@ -65,7 +65,7 @@ def test_a_pick_and_place_trial_runs_over_ros_2(start: Start, tmp_path: Path) ->
         )
         sets = [
             f"transport.domain={domain}", f'policy.url="{server.ready["url"]}"', f'data_dir="{tmp_path}"',
-            "run.duration_s=18", "recording.enabled=false",
+            "run.duration_s=24", "recording.enabled=false",
             "safety.joint_age_s=5.0", "safety.picture_age_s=5.0",
             "control.heartbeat_timeout_s=10.0",  # however busy the machine is
         ]  # fmt: skip
