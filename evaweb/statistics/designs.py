@@ -40,7 +40,7 @@ class Design:
 
 @dataclass(frozen=True, slots=True)
 class Conclusion:
-    """What a design says of the pairs there are.
+    """What a design says of the pairs there are, of those that are `foreseen`.
 
     `at` is the number of pairs after which it ended, None while it goes on, and `winner` the checkpoint ("first" or
     "second") that a boundary was crossed for. `p` is that of the one test of a fixed number, None with any other rule.
@@ -49,12 +49,13 @@ class Conclusion:
     pairs: int
     at: int | None
     winner: str | None
-    p: float | None = None
+    p: float | None
+    foreseen: int
 
     @property
     def ended(self) -> str:
-        """Empty while it goes on, "boundary" where one was crossed, "full" where all pairs are made without."""
-        return "" if self.at is None else "boundary" if self.winner else "full"
+        """Empty while it goes on, "full" where all pairs are made, whatever is found then, "boundary" before that."""
+        return "" if self.at is None else "full" if self.at == self.foreseen else "boundary"
 
 
 def design(
@@ -113,15 +114,16 @@ def conclude(found: Design, values: Sequence[Values]) -> Conclusion:
     given = values[: found.pairs]
     full = len(given) if len(given) == found.pairs else None
     if found.boundary is not None:
-        return _crossed(found.boundary, given, full)
+        at, winner = _crossed(found.boundary, given)
+        return Conclusion(len(given), at or full, winner, None, found.pairs)
     if found.rule == ANYTIME:
         of = score_evidence if found.outcome == SCORE else _of_successes
         evidence = of(given, found.alpha)
-        return Conclusion(len(given), evidence.stop or full, evidence.winner)
+        return Conclusion(len(given), evidence.stop or full, evidence.winner, None, found.pairs)
     if full is None:
-        return Conclusion(len(given), None, None)
+        return Conclusion(len(given), None, None, None, found.pairs)
     p, lead = _scored(given) if found.outcome == SCORE else _succeeded(given)
-    return Conclusion(full, full, _ahead(lead, 0) if p <= found.alpha else None, p)
+    return Conclusion(full, full, _ahead(lead, 0) if p <= found.alpha else None, p, found.pairs)
 
 
 def _succeeded(values: Sequence[Values]) -> tuple[float, float]:
@@ -139,7 +141,8 @@ def _of_successes(values: Sequence[Values], alpha: float):  # type: ignore[no-un
     return success_evidence([(bool(one), bool(other)) for one, other in values], alpha)
 
 
-def _crossed(found: Boundary, values: Sequence[Values], full: int | None) -> Conclusion:
+def _crossed(found: Boundary, values: Sequence[Values]) -> tuple[int | None, str | None]:
+    """The pair after which a boundary was crossed, and for which checkpoint."""
     for number, look in enumerate(found.looks):
         if look.first > len(values):
             break
@@ -147,8 +150,8 @@ def _crossed(found: Boundary, values: Sequence[Values], full: int | None) -> Con
         # With a margin a boundary asks about its second arm: the plan's first checkpoint.
         winner = found.winner(number, *((first, second) if found.margin is None else (second, first)))
         if winner:
-            return Conclusion(len(values), look.first, winner if found.margin is None else "first")
-    return Conclusion(len(values), full, None)
+            return look.first, winner if found.margin is None else "first"
+    return None, None
 
 
 def _successes(values: Sequence[Values]) -> tuple[int, int]:

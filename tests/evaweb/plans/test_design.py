@@ -13,6 +13,7 @@ from evaweb.results.presentation.headline import headline
 from evaweb.stations.models import Station
 from evaweb.statistics.designs import conclude
 from evaweb.trials import services as trials
+from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders
 
 BETTER = "pi0-new"  # succeeds always; the other one never
@@ -110,6 +111,16 @@ def test_all_pairs_made_close_it_too(bench, draft, owner):
     assert headline(plan).sentence.startswith(
         f"No significant difference between {BETTER} and pi0-block: 2/2"
     )
+
+
+def test_a_fixed_plan_of_three_makes_all_its_trials_and_says_not_what_they_show(bench, draft, owner):
+    draft.checkpoints.add(Checkpoint.objects.create(name="pi0-third", policy={}))
+    plan = frozen_plan(draft, owner, repetitions=4)
+    carry_out(bench, plan, 23)
+    assert plan.state == PlanState.FROZEN
+    carry_out(bench, plan, 1)
+    assert plan.closed_because == "all pairs of its comparison are made, after 8 pairs"
+    assert headline(plan).sentence.startswith(f"{BETTER} succeeded more often")
 
 
 def test_closed_before_its_design_ended_it_concludes_nothing(bench, draft, owner):

@@ -21,15 +21,19 @@ def made(rule, pairs=20, **options):
 @pytest.mark.parametrize("rule", RULES)
 def test_before_its_pairs_are_made_nothing_is_said(rule):
     found = made(rule)
-    assert conclude(found, []) == Conclusion(0, None, None)
+    assert conclude(found, []) == Conclusion(0, None, None, None, 20)
     assert conclude(found, [BETTER, WORSE]).ended == ""
 
 
 def test_a_fixed_number_is_tested_once_at_its_end_however_clear_it_is_before():
     found = made("none")
-    assert conclude(found, [BETTER] * 19) == Conclusion(19, None, None)
+    assert conclude(found, [BETTER] * 19) == Conclusion(19, None, None, None, 20)
     ended = conclude(found, [BETTER] * 20)
-    assert (ended.at, ended.winner, ended.ended) == (20, "first", "boundary")
+    assert (ended.at, ended.winner, ended.ended) == (
+        20,
+        "first",
+        "full",
+    )  # which tells nothing of what was found
     assert ended.p < 1e-6
     equal = conclude(found, [SAME] * 20)
     assert (equal.at, equal.winner, equal.ended, equal.p) == (20, None, "full", 1.0)
