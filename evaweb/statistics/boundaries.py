@@ -117,7 +117,6 @@ class Boundary:
         The first is taken at 40,000 rates; the second holds between them too: along the angle of which the rate is the
         squared sine, the angle of a probability turns by at most the square root of the trials (Cauchy and Schwarz).
         """
-
         null = _Null(self.margin, _FINE)
         total = self._over_margin(null) if self.margin is not None else self._over_equal(null)
         highest = float(total.max())

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.progress import funnel, score_posterior
+from evaweb.statistics.progress import funnel
 from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha, weighted_kappa
 
 RATED = st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=1, max_size=40)
@@ -62,13 +62,3 @@ def test_a_funnel_counts_of_all_and_of_those_that_came_so_far():
     assert funnel([]) == []
     with pytest.raises(StatisticsError, match="the same number in each"):
         funnel([[True], [True, False]])
-
-
-def test_the_published_posterior_of_a_score():
-    found = score_posterior([2, 1, 3, 4, 10], [0, 0.25, 0.5, 0.75, 1])
-    assert found.mean == pytest.approx(0.69)
-    assert found.deviation == pytest.approx(0.068332, abs=1e-6)
-    assert found.interval.low < 0.69 < found.interval.high
-    assert found.interval.high - found.interval.low == pytest.approx(4 * 0.068332, rel=0.05)
-    with pytest.raises(StatisticsError, match="2 counts of 3 levels"):
-        score_posterior([1, 2], [0, 0.5, 1])
