@@ -43,14 +43,7 @@ lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.t
 	$(PY) manage.py lab $(ARGS)
 
 test: setup-dev ## every test; ARGS="-m 'not slow'" for the quick ones
-ifeq ($(strip $(ARGS)),)
-	@failed=0; \
-	$(PY) -m pytest -n auto --dist loadfile -m "not alone" || failed=$$?; \
-	$(PY) -m pytest -n 2 --dist loadfile -m alone || failed=$$?; \
-	exit $$failed
-else
-	$(PY) -m pytest $(ARGS)
-endif
+	$(PY) -m pytest $(or $(ARGS),-n auto --dist loadfile)
 
 lint: setup-dev ## ruff, mypy, and the contracts of .importlinter
 	$(PY) -m ruff check .

@@ -1,4 +1,4 @@
-"""What holds for every test: which stand no load beside them, who shares a lab, and that none is left real-time."""
+"""What holds for every test: how many labs run at once, which files share one, and that none is left real-time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import hypothesis
@@ -16,12 +15,19 @@ from xdist.scheduler import LoadScopeScheduling
 
 from runtime.core.environment import for_programs
 
-_ALONE = [Path(__file__).parent / folder for folder in ("e2e", "crash")]  # whole labs, and what ends them
+_LABS = (  # whole labs and stations in real time: so many of their files at once, beside all others
+    "tests/e2e/",
+    "tests/crash/",
+    "tests/benchmarks/test_estop.py",
+    "tests/runtime/sim/test_ros1_node.py",
+    "tests/runtime/sim/test_ros2_node.py",
+)
+_AT_ONCE = max(2, os.cpu_count() or 1)
 _OF_ONE_LAB = {  # fixtures of tests/e2e, and the files that use them: side by side each would start a lab of its own
     "patient": "story curves datasets debug_modes layout policy preflight replay_on_robot review",
     "shared": "faults stop_process lifetime",
 }
-_LABS = {f"tests/e2e/test_{name}.py": lab for lab, names in _OF_ONE_LAB.items() for name in names.split()}
+_SHARED = {f"tests/e2e/test_{name}.py": lab for lab, names in _OF_ONE_LAB.items() for name in names.split()}
 os.environ |= for_programs(os.environ)
 _BEGAN = os.sched_getscheduler(0)
 hypothesis.settings.register_profile("eva", deadline=None)  # no test asserts timing: others share the machine
@@ -30,20 +36,36 @@ _SOCKETS = tempfile.mkdtemp(prefix="eva-")  # of every station that a test start
 
 
 class _Scheduling(LoadScopeScheduling):  # type: ignore[misc]
-    """Whole files side by side; those of one lab after each other."""
+    """Whole files side by side, those of one lab after each other; a few workers go through the labs."""
 
     def _split_scope(self, nodeid: str) -> str:
         path = nodeid.partition("::")[0]
-        return _LABS.get(path, path)
+        return _SHARED.get(path, path)
 
     def _assign_work_unit(self, node: Any) -> None:
-        """The next file; where a process has died, what it had done is waiting too, and would keep `node` waiting."""
-        while self.workqueue and all(next(iter(self.workqueue.values())).values()):
-            self.workqueue.popitem(last=False)
-        if self.workqueue:
-            super()._assign_work_unit(node)
-        else:
+        """The next lab while fewer than `_AT_ONCE` others have one, the longest ones first; else the next other file.
+
+        Where a process has died, what it had done is waiting too, and would keep `node` waiting.
+        """
+        for done in [scope for scope, tests in self.workqueue.items() if all(tests.values())]:
+            del self.workqueue[done]
+        labs = sorted(filter(_is_lab, self.workqueue), key=lambda scope: scope not in _OF_ONE_LAB)
+        others = [scope for scope in self.workqueue if not _is_lab(scope)]
+        busy = sum(
+            any(_is_lab(scope) and not all(tests.values()) for scope, tests in units.items())
+            for other, units in self.assigned_work.items()
+            if other is not node
+        )
+        chosen = labs or others if busy < _AT_ONCE else others
+        if not chosen:
             node.shutdown()
+            return
+        self.workqueue.move_to_end(chosen[0], last=False)
+        super()._assign_work_unit(node)
+
+
+def _is_lab(scope: str) -> bool:
+    return scope in _OF_ONE_LAB or scope.startswith(_LABS)
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist
@@ -73,24 +95,6 @@ def pytest_unconfigure() -> None:
 def pytest_report_header() -> str:
     """The class in which the tests were started, for whoever wonders about times."""
     return f"started in the scheduling class {_BEGAN}"
-
-
-def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Whether a file has none of the tests that `make test` asks for: ten thousand need not be made to be left out."""
-    if config.option.markexpr == "not alone":
-        return collection_path in _ALONE or None
-    if config.option.markexpr != "alone" or not collection_path.match("test_*.py"):
-        return None
-    placed = any(folder in collection_path.parents for folder in _ALONE)
-    return not (placed or b"mark.alone" in collection_path.read_bytes()) or None
-
-
-@pytest.hookimpl(tryfirst=True)  # before -m chooses
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what `make test` does not run beside anything else."""
-    for item in items:
-        if any(folder in item.path.parents for folder in _ALONE):
-            item.add_marker("alone")
 
 
 @pytest.hookimpl(trylast=True)

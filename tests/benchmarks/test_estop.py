@@ -86,7 +86,6 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[estop.Bench]:
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 @pytest.mark.parametrize("attack", estop.ATTACKS)
 def test_presses_beside_a_small_attack_arrive_and_are_done(lab: estop.Bench, attack: str) -> None:
     row = estop.once(lab, attack, seconds=0.0, share=SHARE)

@@ -74,7 +74,6 @@ def test_a_master_that_is_not_there_is_an_error_in_words() -> None:
 
 @needs_ros1
 @pytest.mark.slow
-@pytest.mark.alone
 def test_a_pick_and_place_trial_runs_over_ros_1_and_is_recorded(start: Start, tmp_path: Path) -> None:
     with master(tmp_path / "ros", whole=True) as ros:
         node = start(

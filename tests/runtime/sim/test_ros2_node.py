@@ -53,7 +53,6 @@ def test_a_robot_that_is_none_is_an_error_in_words(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 def test_a_pick_and_place_trial_runs_over_ros_2(start: Start, tmp_path: Path) -> None:
     with free_domain() as domain:
         node = start(
