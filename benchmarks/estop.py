@@ -102,14 +102,18 @@ def bench(folder: Path, database: Path | None = None, url: str = "") -> Iterator
         yield Bench(running, ready, database, running.visitor, station)
 
 
-def once(found: Bench, attack: str, seconds: float, share: float = 1.0) -> dict[str, Any]:
-    """A run that goes on, the attack, presses for `seconds`; `share` of the attack in its full strength."""
+def once(
+    found: Bench, attack: str, seconds: float, share: float = 1.0, moving: bool = True
+) -> dict[str, Any]:
+    """A run that goes on if `moving`, the attack, presses for `seconds`; `share` of the attack in its full strength."""
     facts = found.lab.announced
     program = Program(facts["stops"], {"Authorization": f"Bearer {facts['token']}"})
     with closing(OpenPage(found.operator, facts["stops"])) as page:
         ways = dict(zip(WAYS, (page.press, page.over_the_socket, program.press), strict=True))
-        _warmed(found, *ways.values())
-        found.station.run()
+        found.station.appeared()
+        if moving:
+            _warmed(found, *ways.values())
+            found.station.run()
         watching = Watching(found.station, facts["pids"]["web"])
         with _under(found, attack, share) as did:
             time.sleep(seconds / 4.0)  # for which nobody presses, and the run is to go on
@@ -131,7 +135,6 @@ def once(found: Bench, attack: str, seconds: float, share: float = 1.0) -> dict[
 
 def _warmed(found: Bench, *ways: Callable[[str], Press]) -> None:
     """Do everything once: the first costs are neither lateness nor growth."""
-    found.station.appeared()
     for press in ways:
         press("to begin with")
     loads(found.operator, _GIVEN_UP_S)
