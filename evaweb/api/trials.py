@@ -14,8 +14,8 @@ from pydantic import create_model
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.tables import Format, table_answer
 from evaweb.blinding import Sight, sight_for
-from evaweb.trials import selectors, services
-from evaweb.trials.models import Score, Trial, TrialStatus
+from evaweb.trials import selectors, services, voids
+from evaweb.trials.models import Score, Trial, TrialStatus, VoidRequest
 from evaweb.trials.record import api_columns, shown
 from evaweb.trials.selectors import TrialFilters
 
@@ -92,10 +92,34 @@ class ScoreOut(Schema):
         }
 
 
+class VoidRequestOut(Schema):
+    """A void of a scored trial of a blind plan, which a second operator agrees to or refuses; `answer` "" till then."""
+
+    uuid: UUID
+    reason: str
+    by: str
+    at: datetime
+    answer: str
+    answer_reason: str
+    answered_by: str | None
+    answered_at: datetime | None
+
+    @staticmethod
+    def of(row: VoidRequest) -> dict[str, Any]:
+        """With the names of both."""
+        plain = ("uuid", "reason", "at", "answer", "answer_reason", "answered_at")
+        return {
+            **{name: getattr(row, name) for name in plain},
+            "by": row.by.get_username(),
+            "answered_by": row.answered_by and row.answered_by.get_username(),
+        }
+
+
 _Detail: Any = create_model(
     "_Detail",
     __base__=TrialOut,
     scores=(list[ScoreOut], ...),
+    void_requests=(list[VoidRequestOut], ...),
     **{name: (hint, ...) for name, hint in _DETAIL.items()},
 )
 
@@ -107,7 +131,8 @@ class TrialDetail(_Detail):
     def of(trial: Trial, sight: Sight) -> dict[str, Any]:
         """With all that is known of it."""
         scores = [ScoreOut.of(score) for score in trial.scores.all()]
-        return {**shown(trial, sight, (*_LIST, *_DETAIL)), "scores": scores}
+        asked = [VoidRequestOut.of(row) for row in trial.void_requests.all()]
+        return {**shown(trial, sight, (*_LIST, *_DETAIL)), "scores": scores, "void_requests": asked}
 
 
 class ScoreIn(Schema):
@@ -134,6 +159,12 @@ class Reason(Schema):
     """Reason, for later readers."""
 
     reason: str = ""
+
+
+class VoidAnswer(Reason):
+    """Whether the trial is to be voided; a refusal with its reason."""
+
+    agree: bool
 
 
 COLUMNS: dict[str, Any] = {**_LIST, "milestones_reached": str, "milestones_missed": str}
@@ -167,8 +198,25 @@ def score(request: HttpRequest, id: int, given: ScoreIn) -> Any:
 
 @router.post("/{int:id}/void", response={200: TrialDetail, **FAILURES}, summary="Void it", url_name="void")
 def void(request: HttpRequest, id: int, given: Reason) -> Any:
-    """Take it out of the count, with a reason; operators. Its repetition is another attempt."""
-    services.trial_void(user=request.auth, trial=selectors.trial_get(id=id), reason=given.reason)
+    """Take it out of the count, with a reason; operators. Its repetition is another attempt.
+
+    A scored trial of a blind plan is void_asked then, until a second blind operator has answered; without an answer
+    within 14 days, or at the reveal, it counts.
+    """
+    voids.trial_void(user=request.auth, trial=selectors.trial_get(id=id), reason=given.reason)
+    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
+
+
+@router.post(
+    "/{int:id}/void/answer",
+    response={200: TrialDetail, **FAILURES},
+    summary="Answer a void",
+    url_name="void_answer",
+)
+def void_answer(request: HttpRequest, id: int, given: VoidAnswer) -> Any:
+    """Agree to a void that another operator asked for, or refuse it with a reason; blind operators."""
+    trial = selectors.trial_get(id=id)
+    voids.void_answer(user=request.auth, trial=trial, agree=given.agree, reason=given.reason)
     return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from django.contrib.auth.models import User
 from django.db import transaction
-from django.db.models import Max, OuterRef, Subquery
+from django.db.models import Case, Max, OuterRef, Subquery, When
 
 from evaweb.errors import Conflict, NotAllowed
 from evaweb.plans import commitment as blinding
@@ -24,6 +24,7 @@ from evaweb.stations.models import Station
 from evaweb.trials import lifecycle
 from evaweb.trials.models import Position, Trial, TrialStatus
 from evaweb.trials.services import trial_create
+from evaweb.trials.voids import voids_lapse
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,7 @@ def hand_out(*, user: User, station: Station, plan: Plan) -> Handout:
     require(user, Role.OPERATOR)
     held = Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
     _check(held, user, station)
+    voids_lapse(Trial.objects.filter(handout__plan=held), user=user)
     _check_goes_on(held)
     slot, before = _next(held, station)
     _check_unchanged(held, slot)
@@ -133,8 +135,10 @@ def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:
 
 
 def _with_newest(slots):  # type: ignore[no-untyped-def]
-    """Each with the status of its newest attempt as `newest`, None before the first."""
-    newest = Handout.objects.filter(slot=OuterRef("pk")).order_by("-number").values("trial__status")[:1]
+    """Each with the status of the attempt that counts, else of its newest one, as `newest`; None before the first."""
+    counts = Case(When(trial__status=TrialStatus.SCORED, then=0), default=1)
+    attempts = Handout.objects.filter(slot=OuterRef("pk")).order_by(counts, "-number")
+    newest = attempts.values("trial__status")[:1]
     return slots.annotate(newest=Subquery(newest))
 
 

@@ -12,10 +12,11 @@ from django.contrib.auth.models import User
 from django.db import transaction
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError
+from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.journal import text
 from evaweb.plans import pictures
 from evaweb.plans.allocation import hand_out
+from evaweb.plans.blinding_rules import has_looked
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
@@ -23,6 +24,7 @@ from evaweb.stations.robot_geometry import facts_of
 from evaweb.trials.models import Position, Trial, TrialStatus
 from evaweb.trials.services import declare_check
 from evaweb.trials.verdicts import LONGEST_NOTE
+from evaweb.trials.voids import declare_by_two
 
 HOLDS = timedelta(hours=12)  # somebody's look at the cameras
 
@@ -159,10 +161,17 @@ def _before(what: str, trial: Trial, user: Any) -> None:
         return
     if what == "run" and not Achieved.objects.filter(trial=trial).exists():
         achieve(user=user, trial=trial)
-    if what == "voided" and handout.plan.state == PlanState.REVEALED:
+    if what.startswith("void") and handout.plan.state == PlanState.REVEALED:
         raise EvaError(
             f"{handout.plan} was revealed: what is voided now would be chosen with the result in view"
         )
+    if what == "void answered" and has_looked(handout.plan, user):
+        raise NotAllowed(f"you have seen results of {handout.plan}: an operator who is blind has to answer")
+
+
+def _blind(trial: Trial) -> bool:
+    return Plan.objects.filter(handouts__trial=trial, blind=True).exists()
 
 
 declare_check(_before)
+declare_by_two(_blind)

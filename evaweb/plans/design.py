@@ -17,6 +17,7 @@ from evaweb.plans.canonical import digest
 from evaweb.plans.models import Plan
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.designs import SUCCESS, Conclusion, Design, Values, conclude, design, of_table
+from evaweb.trials.lifecycle import JUDGED
 from evaweb.trials.models import TrialStatus
 
 ENDED = {
@@ -64,11 +65,21 @@ def frozen(document: Mapping[str, Any]) -> Design | None:
 class Pairs:
     """Outcomes of the compared checkpoints, block by block as scheduled, up to the first block that is not made.
 
-    `counted` is what counts; `unvoided` as if no trial had been voided that had a score: of each slot its first one.
+    `counted` is what counts; `unvoided` as if no trial had been voided that had a score, nor were to be: of each slot
+    its first one. `repeated` says of each pair that counts for which of the two an attempt was thrown away unscored.
     """
 
     counted: list[Values]
     unvoided: list[Values]
+    repeated: list[tuple[bool, bool]]
+
+    def against(self, winner: str) -> list[Values]:
+        """What counts, had each attempt that was thrown away unscored ended as badly for `winner` as it could."""
+        worst = (0.0, 1.0) if winner == "first" else (1.0, 0.0)
+        return [
+            (worst[0] if again[0] else one, worst[1] if again[1] else other)
+            for (one, other), again in zip(self.counted, self.repeated, strict=True)
+        ]
 
 
 def tried(plan: Plan) -> Pairs:
@@ -76,28 +87,33 @@ def tried(plan: Plan) -> Pairs:
     document = plan.document or {}
     found = frozen(document)
     if found is None:
-        return Pairs([], [])
+        return Pairs([], [], [])
     names = document["comparison"]
     value = "trial__verdict__success" if found.outcome == SUCCESS else "trial__verdict__score"
     counted: dict[int, dict[str, float]] = defaultdict(dict)
     unvoided: dict[int, dict[str, float]] = defaultdict(dict)
+    thrown: set[tuple[int, str]] = set()
     rows = plan.handouts.filter(
-        trial__status__in=(TrialStatus.SCORED, TrialStatus.VOIDED),
-        trial__verdict__isnull=False,
-        slot__checkpoint__name__in=names,
+        trial__status__in=(*JUDGED, TrialStatus.INTERRUPTED), slot__checkpoint__name__in=names
     )
     for block, name, status, outcome in rows.order_by("number").values_list(
         "slot__block", "slot__checkpoint__name", "trial__status", value
     ):
+        if outcome is None:
+            thrown.add((block, name))
+            continue
         unvoided[block].setdefault(name, float(outcome))
         if status == TrialStatus.SCORED:
             counted[block][name] = float(outcome)
 
-    def made(blocks: Mapping[int, Mapping[str, float]]) -> list[Values]:
-        whole = takewhile(lambda block: len(blocks.get(block, ())) == len(names), range(found.pairs))
-        return [(blocks[block][names[0]], blocks[block][names[1]]) for block in whole]
+    def made(blocks: Mapping[int, Mapping[str, float]]) -> list[int]:
+        return list(takewhile(lambda block: len(blocks.get(block, ())) == len(names), range(found.pairs)))
 
-    return Pairs(made(counted), made(unvoided))
+    def pairs(blocks: Mapping[int, Mapping[str, float]]) -> list[Values]:
+        return [(blocks[block][names[0]], blocks[block][names[1]]) for block in made(blocks)]
+
+    repeated = [((block, names[0]) in thrown, (block, names[1]) in thrown) for block in made(counted)]
+    return Pairs(pairs(counted), pairs(unvoided), repeated)
 
 
 def pairs_of(plan: Plan) -> list[Values]:

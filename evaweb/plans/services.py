@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from django.contrib.auth.models import User
 from django.db import transaction
+from django.db.models import QuerySet
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
@@ -19,6 +20,7 @@ from evaweb.roles import Role, require, role_of
 from evaweb.trials.lifecycle import OPEN
 from evaweb.trials.models import Evaluation, Trial, TrialStatus
 from evaweb.trials.services import declare_settled
+from evaweb.trials.voids import voids_lapse
 
 _COPIED = (
     "name",
@@ -129,6 +131,7 @@ def plan_reveal(*, user: User, plan: Plan) -> Plan:
             f"{held}: document, schedule and key are not those of the commitment {held.commitment}: "
             "somebody has changed the database; nothing was revealed"
         )
+    voids_lapse(_trials(held), user=user, now=True)
     held.at_reveal = at_the_reveal(held)
     held.state, held.revealed_at, held.revealed_by = PlanState.REVEALED, timezone.now(), user
     held.save()
@@ -158,6 +161,10 @@ def _looked_at(trial: Trial, user: User) -> None:
 
 
 declare_settled(_looked_at)
+
+
+def _trials(plan: Plan) -> QuerySet[Trial]:
+    return Trial.objects.filter(handout__plan=plan)
 
 
 def _unfinished(plan: Plan) -> list[Trial]:

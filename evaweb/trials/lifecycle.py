@@ -18,7 +18,9 @@ class Move(StrEnum):
     END = "ended"
     INTERRUPT = "interrupted"
     SCORE = "scored"
+    ASK = "voided by a second operator"
     VOID = "voided"
+    KEEP = "kept"
     ABANDON = "abandoned"
 
 
@@ -43,12 +45,15 @@ MOVES: dict[tuple[TrialStatus, Move], TrialStatus] = {
     (_S.INTERRUPTED, Move.VOID): _S.VOIDED,
     (_S.SCORED, Move.SCORE): _S.SCORED,  # a correction
     (_S.SCORED, Move.VOID): _S.VOIDED,
+    (_S.SCORED, Move.ASK): _S.VOID_ASKED,  # of a blind plan: a second operator has to agree
+    (_S.VOID_ASKED, Move.VOID): _S.VOIDED,
+    (_S.VOID_ASKED, Move.KEEP): _S.SCORED,
 }
 
 OPEN = (_S.PREPARED, _S.RUNNING, _S.PAUSED)
 UNDER_WAY = (_S.RUNNING, _S.PAUSED)
-JUDGED = (_S.SCORED, _S.VOIDED)
-REPEATED = (_S.INTERRUPTED, _S.VOIDED, _S.ABANDONED)
+JUDGED = (_S.SCORED, _S.VOID_ASKED, _S.VOIDED)
+REPEATED = (_S.INTERRUPTED, _S.VOID_ASKED, _S.VOIDED, _S.ABANDONED)
 """What does not count: the next trial of the same kind is another attempt of the same number."""
 
 _ADVICE = {
@@ -58,6 +63,7 @@ _ADVICE = {
     _S.ENDED: "score it, or void it with a reason",
     _S.INTERRUPTED: "score it, or repeat it as a new attempt",
     _S.SCORED: "correct its score, or void it with a reason",
+    _S.VOID_ASKED: "a second operator agrees or refuses on its page",
     _S.VOIDED: "repeat it as a new attempt",
     _S.ABANDONED: "prepare another one",
 }

@@ -197,6 +197,7 @@ class TrialStatus(models.TextChoices):
     ENDED = "ended", "to be scored"
     INTERRUPTED = "interrupted", "interrupted"
     SCORED = "scored", "scored"
+    VOID_ASKED = "void_asked", "void asked for"
     VOIDED = "voided", "voided"
     ABANDONED = "abandoned", "never run"
 
@@ -213,12 +214,13 @@ _TONES = {
     TrialStatus.ENDED: "warn",
     TrialStatus.INTERRUPTED: "danger",
     TrialStatus.SCORED: "neutral",
+    TrialStatus.VOID_ASKED: "warn",
     TrialStatus.VOIDED: "neutral",
     TrialStatus.ABANDONED: "neutral",
 }
 
 
-_JUDGED = "OLD.status IN ('scored', 'voided')"
+_JUDGED = "OLD.status IN ('scored', 'void_asked', 'voided')"
 
 
 class Trial(models.Model):
@@ -301,7 +303,9 @@ class Trial(models.Model):
             *("prepared_at", "started_at", "ended_at"),
         ),
         only=_JUDGED,
-        moves={"status": {"scored": ("voided",), "voided": ()}},
+        moves={
+            "status": {"scored": ("void_asked", "voided"), "void_asked": ("voided", "scored"), "voided": ()}
+        },
         never=(
             # What was not known yet when it was judged is told once.
             f"{_JUDGED} AND OLD.episode_id IS NOT NULL "
@@ -349,6 +353,48 @@ class Trial(models.Model):
 
     def __str__(self) -> str:
         return f"trial {self.pk}: {self.checkpoint} at {self.scene} {self.position.number}"
+
+
+class VoidRequest(models.Model):
+    """An operator asks for a scored trial of a blind plan to be voided, which a second one agrees to or refuses."""
+
+    class Answer(models.TextChoices):
+        AGREED = "agreed", "agreed to"
+        REFUSED = "refused", "refused"
+        LAPSED = "lapsed", "not answered in time"
+
+    uuid = models.UUIDField(unique=True, default=uuid.uuid4, editable=False)
+    trial = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="void_requests")
+    reason = models.TextField(help_text="Why it should not count.")
+    by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
+    at = models.DateTimeField(default=timezone.now)
+    answer = models.CharField(max_length=8, blank=True, choices=Answer)
+    answer_reason = models.TextField(blank=True)
+    answered_by = models.ForeignKey(
+        settings.AUTH_USER_MODEL, null=True, blank=True, on_delete=models.PROTECT, related_name="+"
+    )
+    answered_at = models.DateTimeField(null=True, blank=True)
+
+    append_only = AppendOnly(
+        "what was asked for is answered once, never changed or removed",
+        but=("answer", "answer_reason", "answered_by", "answered_at"),
+        never=(
+            "OLD.answer <> '' AND (NEW.answer <> OLD.answer OR NEW.answer_reason <> OLD.answer_reason OR "
+            "COALESCE(NEW.answered_by_id, 0) <> COALESCE(OLD.answered_by_id, 0) OR "
+            "NEW.answered_at <> OLD.answered_at)",
+        ),
+    )
+
+    class Meta:
+        ordering = ("id",)
+        constraints = [
+            models.UniqueConstraint(
+                fields=("trial",), condition=models.Q(answer=""), name="void_asked_once_at_a_time"
+            )
+        ]
+
+    def __str__(self) -> str:
+        return f"void of trial {self.trial_id}: {self.get_answer_display() or 'not answered'}"
 
 
 class Score(models.Model):

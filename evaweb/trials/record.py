@@ -223,7 +223,32 @@ class VoidLine(Line):
         return super().written(row, trial=TrialRecord.written(row), **given)
 
 
-JUDGEMENTS: Journal[ScoreLine | VoidLine] = Journal("scores", ScoreLine, VoidLine)
+class VoidRequestLine(Line):
+    """A void that an operator asked for."""
+
+    kind: Literal["void_request"] = "void_request"
+    uuid: UUID
+    trial: TrialRecord
+    by: Annotated[Person, From("by__username")]
+    reason: str
+    at: Moment
+
+
+class VoidAnswerLine(Line):
+    """What became of it; `at` the time when it was answered, or lapsed at somebody's act."""
+
+    ELSEWHERE = frozenset({"kind", "uuid"})
+    kind: Literal["void_answer"] = "void_answer"
+    uuid: UUID  # of the request
+    trial: TrialRecord
+    answer: Annotated[str, Field(pattern="^(agreed|refused|lapsed)$")]
+    reason: Annotated[str, From("answer_reason")] = ""
+    by: Annotated[Person, From("answered_by__username")]
+    at: Annotated[Moment, From("answered_at")]
+
+
+Judgement = ScoreLine | VoidLine | VoidRequestLine | VoidAnswerLine
+JUDGEMENTS: Journal[Judgement] = Journal("scores", ScoreLine, VoidLine, VoidRequestLine, VoidAnswerLine)
 
 
 def file_of(trial: Trial) -> UUID:

@@ -34,8 +34,18 @@ from evaweb.trials.models import (
     Score,
     Trial,
     TrialStatus,
+    VoidRequest,
 )
-from evaweb.trials.record import OutcomeLine, ScoreLine, TrialRecord, VoidLine, asked_trial
+from evaweb.trials.record import (
+    Judgement,
+    OutcomeLine,
+    ScoreLine,
+    TrialRecord,
+    VoidAnswerLine,
+    VoidLine,
+    VoidRequestLine,
+    asked_trial,
+)
 from runtime.recording.reader import read_events
 
 log = logging.getLogger(__name__)
@@ -59,6 +69,7 @@ def restore(kept: Kept) -> int:
         trial, made = _trial(facts, kept, episode)
         scores = _scores(trial, [line for line in lines if isinstance(line, ScoreLine)])
         _judged(trial, lines)
+        scores += _asked(trial, lines)
         if made or scores:
             _publish(trial, made=made)
     if never := _never_ran(trial):
@@ -74,12 +85,12 @@ def _never_ran(trial: Trial) -> str:
     return why and f"trial {trial.pk} is scored and never ran, {why}: void it with a reason"
 
 
-def _judgements(kept: Kept, asked: Mapping[str, Any]) -> list[ScoreLine | VoidLine]:
+def _judgements(kept: Kept, asked: Mapping[str, Any]) -> list[Judgement]:
     """What its lines say; of a score that was given once more, as the database did not take it, the last.
 
     Those of another trial than its recording, in a copy of another file, are left out.
     """
-    lines = [line for line in kept.lines if isinstance(line, ScoreLine | VoidLine)]
+    lines = [line for line in kept.lines if isinstance(line, Judgement)]
     own = asked.get("uuid", "")
     foreign = [str(line.trial.uuid) for line in lines if kept.recorded and str(line.trial.uuid) != own]
     if foreign:
@@ -89,10 +100,10 @@ def _judgements(kept: Kept, asked: Mapping[str, Any]) -> list[ScoreLine | VoidLi
         )
     lines = [line for line in lines if str(line.trial.uuid) not in foreign]
     last = {line.uuid: line for line in lines if isinstance(line, ScoreLine)}
-    return [line for line in lines if isinstance(line, VoidLine) or line is last[line.uuid]]
+    return [line for line in lines if not isinstance(line, ScoreLine) or line is last[line.uuid]]
 
 
-def _facts(lines: Sequence[ScoreLine | VoidLine], asked: Mapping[str, Any]) -> TrialRecord | None:
+def _facts(lines: Sequence[Judgement], asked: Mapping[str, Any]) -> TrialRecord | None:
     """The newest line knows most of its trial; without one it is as its run was asked for."""
     named = {line.trial.uuid for line in lines}
     if len(named) > 1:
@@ -235,16 +246,32 @@ def _milestones(scene: Scene, outcomes: Sequence[OutcomeLine]) -> dict[tuple[int
     return {(milestone.order, milestone.text): milestone for milestone in scene.milestones.all()}
 
 
-def _judged(trial: Trial, lines: Sequence[ScoreLine | VoidLine]) -> None:
+def _judged(trial: Trial, lines: Sequence[Judgement]) -> None:
     """Move the trial to where its lines have brought it; nothing leaves voided."""
     void = next((line for line in lines if isinstance(line, VoidLine)), None)
+    asked = [line for line in lines if isinstance(line, VoidRequestLine | VoidAnswerLine)]
     if void is not None and trial.status != TrialStatus.VOIDED:
         for name, value in {"status": TrialStatus.VOIDED, **void.values()}.items():
             setattr(trial, name, value)
         trial.save()
-    elif lines and trial.status not in lifecycle.JUDGED:
-        trial.status = TrialStatus.SCORED
-        trial.save()
+    elif void is None and lines:
+        waits = bool(asked) and isinstance(asked[-1], VoidRequestLine)
+        status = TrialStatus.VOID_ASKED if waits else TrialStatus.SCORED
+        if trial.status not in lifecycle.JUDGED or (asked and trial.status != status):
+            trial.status = status
+            trial.save()
+
+
+def _asked(trial: Trial, lines: Sequence[Judgement]) -> int:
+    """The voids that were asked for, and their answers; how many rows were not there, or not answered."""
+    answers = {line.uuid: line.values() for line in lines if isinstance(line, VoidAnswerLine)}
+    asked = absent(VoidRequest, [line for line in lines if isinstance(line, VoidRequestLine)], trial=trial)
+    for line in asked:
+        VoidRequest.objects.create(trial=trial, **line.values(), **answers.get(line.uuid, {}))
+    behind = VoidRequest.objects.filter(uuid__in=answers, answer="")
+    for row in behind:
+        VoidRequest.objects.filter(pk=row.pk).update(**answers[row.uuid])
+    return len(asked) + len(behind)
 
 
 def _publish(trial: Trial, *, made: bool) -> None:

@@ -21,7 +21,16 @@ from evaweb.memo import Kept, steady
 from evaweb.stations.models import Command, Station
 from evaweb.statistics.proportions import Summary, summary
 from evaweb.trials import lifecycle
-from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene, Score, Trial, TrialStatus
+from evaweb.trials.models import (
+    Checkpoint,
+    Evaluation,
+    Position,
+    Scene,
+    Score,
+    Trial,
+    TrialStatus,
+    VoidRequest,
+)
 
 UNFINISHED = (*lifecycle.OPEN, TrialStatus.ENDED)
 _Named = TypeVar("_Named", bound=Model)
@@ -104,8 +113,13 @@ def trial_get(*, id: int) -> Trial:
     """The trial with all that is known of it."""
     scores = Score.objects.select_related("rater").prefetch_related("outcomes").order_by("-pk")
     rows = Trial.objects.select_related(*_NAMED, "episode", "voided_by")
+    asked = VoidRequest.objects.select_related("by", "answered_by")
     found = (
-        rows.prefetch_related(Prefetch("scores", scores)).filter(pk=id).first() if 0 < id < 2**63 else None
+        rows.prefetch_related(Prefetch("scores", scores), Prefetch("void_requests", asked))
+        .filter(pk=id)
+        .first()
+        if 0 < id < 2**63
+        else None
     )
     if found is None:
         raise NotFound(f"trial {id} does not exist")

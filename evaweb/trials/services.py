@@ -1,4 +1,4 @@
-"""Actions on trials: prepare, score, void, abandon; what their runs do to them is in `following`."""
+"""Actions on trials: prepare, score, abandon; `voids` takes them out of the count."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from uuid import UUID
 from django.contrib.auth.models import User
 from django.db import IntegrityError, transaction
 from django.db.models import Max
-from django.utils import timezone
 
 from evaweb.episodes.selectors import unrecorded_because
 from evaweb.episodes.services import publish_asked
@@ -32,7 +31,7 @@ from evaweb.trials.models import (
     Trial,
     TrialStatus,
 )
-from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, VoidLine, file_of
+from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, file_of
 from evaweb.trials.selectors import attempts_of, trial_open
 from evaweb.trials.station_events import run_changed
 from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, Verdict, verdict
@@ -47,7 +46,6 @@ __all__ = [
     "trial_create",
     "trial_prepare",
     "trial_score",
-    "trial_void",
 ]
 
 HIGHEST_SEED = 2**31 - 1
@@ -250,7 +248,7 @@ def trial_score(
         "reason": text("reason", reason, LONGEST_NOTE),
     }
     with transaction.atomic():
-        held = _held(trial)
+        held = locked(trial)
         rows = list(held.scene.milestones.order_by("order"))
         judged = partial(verdict, rows, milestones, success, times=times, ordered=held.scene.ordered)
         said = {"rater": user, "source": source, **words}
@@ -267,29 +265,10 @@ def trial_score(
             raise EvaError(f"failure = {words['failure']!r} but the trial is a success: leave failure empty")
         score = Score(uuid=identity_of(uuid), trial=held, success=found.success, score=found.score, **said)
         _keep(held, score, found)
-        _publish(held)
-        _tell(held, user)
+        publish(held)
+        settled(held, user)
     trial.refresh_from_db()
     return score
-
-
-def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
-    """Take a trial out of the count: void is not fail. It stays in the record with its reason."""
-    require(user, Role.OPERATOR)
-    why = _reason_given(reason, "a trial is voided")
-    checked("voided", trial, user)
-    with transaction.atomic():
-        held = _held(trial)
-        if (held.status, held.reason, held.voided_by) == (TrialStatus.VOIDED, why, user):
-            return held  # asked for once more, because the answer was lost
-        lifecycle.apply(held, Move.VOID)
-        held.reason, held.voided_by, held.voided_at = why, user, timezone.now()
-        JUDGEMENTS.append(file_of(held), VoidLine.written(held))
-        held.save()
-        _publish(held)
-        _tell(held, user)
-    trial.refresh_from_db()
-    return trial
 
 
 def trial_abandon(*, user: User, trial: Trial, reason: str = "") -> Trial:
@@ -297,30 +276,31 @@ def trial_abandon(*, user: User, trial: Trial, reason: str = "") -> Trial:
     require(user, Role.OPERATOR)
     why = text("reason", reason, LONGEST_NOTE) or "abandoned"
     with transaction.atomic():
-        held = _held(trial)
+        held = locked(trial)
         why = f"{why} ({user.get_username()})"
         if (held.status, held.reason) == (TrialStatus.ABANDONED, why):
             return held  # asked for once more, because the answer was lost
         lifecycle.apply(held, Move.ABANDON)
         held.reason = why
         held.save()
-        _tell(held, user)
+        settled(held, user)
     trial.refresh_from_db()
     return trial
 
 
-def _publish(trial: Trial) -> None:
+def publish(trial: Trial) -> None:
     """Have its episode written into the dataset with what counts now."""
     if trial.episode is not None:
         publish_asked(episode=trial.episode)
 
 
-def _tell(trial: Trial, user: Any) -> None:
+def settled(trial: Trial, user: Any) -> None:
+    """Tell whoever declared to hear of it."""
     for told in _settled:
         told(trial, user)
 
 
-def _held(trial: Trial) -> Trial:
+def locked(trial: Trial) -> Trial:
     """The trial's row as it is now, kept from others until the transaction ends."""
     return Trial.objects.select_for_update().get(pk=trial.pk)
 
@@ -380,7 +360,7 @@ def _keep(trial: Trial, score: Score, found: Verdict) -> None:
     trial.save()
 
 
-def _reason_given(reason: str, when: str) -> str:
+def reason_given(reason: str, when: str) -> str:
     why = text("reason", reason, LONGEST_NOTE)
     if not why:
         raise EvaError(f"reason is empty: {when} only with a reason that others can read")

@@ -11,4 +11,5 @@ urlpatterns = [
     path("result/trials/<int:id>/", views.trial, name="result-trial"),
     path("result/trials/<int:id>/score", views.score, name="result-score"),
     path("result/trials/<int:id>/void", views.void, name="result-void"),
+    path("result/trials/<int:id>/void/answer", views.void_answer, name="result-void-answer"),
 ]

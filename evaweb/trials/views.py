@@ -17,7 +17,7 @@ from evaweb.episodes.selectors import stage_of
 from evaweb.errors import EvaError
 from evaweb.roles import Role, role_of
 from evaweb.stations.selectors import station_list
-from evaweb.trials import lifecycle, selectors, services
+from evaweb.trials import lifecycle, selectors, services, voids
 from evaweb.trials.figures import scene_figures
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import Trial, TrialStatus
@@ -82,13 +82,28 @@ def void(request: HttpRequest, id: int) -> HttpResponse:
     """Take it out of the count."""
     reason = request.POST.get("void_reason", "")
     try:
-        services.trial_void(
+        voids.trial_void(
             user=request.user,  # type: ignore[arg-type]
             trial=selectors.trial_get(id=id),
             reason=reason,
         )
     except EvaError as fault:
         return _trial_page(request, id, fault=fault, typed={"void_reason": reason})
+    return redirect("result-trial", id=id)
+
+
+@require_POST
+def void_answer(request: HttpRequest, id: int) -> HttpResponse:
+    """Agree to its void, or refuse it."""
+    try:
+        voids.void_answer(
+            user=request.user,  # type: ignore[arg-type]
+            trial=selectors.trial_get(id=id),
+            agree=request.POST.get("agree") == "yes",
+            reason=request.POST.get("answer_reason", ""),
+        )
+    except EvaError as fault:
+        return _trial_page(request, id, fault=fault)
     return redirect("result-trial", id=id)
 
 
@@ -108,7 +123,12 @@ def _trial_page(
         "milestones": [(milestone, _ticked(found, milestone.pk, typed)) for milestone in milestones],
         "implied": any(milestone.required for milestone in milestones),
         "may_score": operator and lifecycle.allows(found, Move.SCORE),
-        "may_void": operator and lifecycle.allows(found, Move.VOID),
+        "may_void": operator
+        and lifecycle.allows(found, Move.VOID)
+        and found.status != TrialStatus.VOID_ASKED,
+        "by_two": voids.by_two(found),
+        "void_requests": list(found.void_requests.all()),
+        "may_answer": operator and voids.may_answer(found, request.user),
         "attempts": selectors.attempts_of(trial=found),
         # When a set-up was asked for and the run could begin tells how long a policy warms up.
         "commands": () if hidden else selectors.commands_of(trial=found),

@@ -135,7 +135,9 @@ def analyse(
     tests = [_test(arms[one], arms[other]) for one, other in couples]
     corrected = holm([test.p for test in tests])
     comparisons = tuple(
-        _comparison(one, other, arms[one], arms[other], test, p, alpha, timing)
+        _comparison(
+            one, other, arms[one], arms[other], test, p, _share(alpha, couples, primary, (one, other)), timing
+        )
         for (one, other), test, p in zip(couples, tests, corrected, strict=True)
     )
     apart = {frozenset((c.first, c.second)) for c in comparisons if c.corrected <= alpha}
@@ -182,6 +184,13 @@ class _Timing:
 
 def _directed(couple: tuple[str, str], primary: tuple[str, str] | None) -> tuple[str, str]:
     return primary if primary is not None and set(couple) == set(primary) else couple
+
+
+def _share(
+    alpha: float, couples: Sequence[tuple[str, str]], primary: tuple[str, str] | None, couple: tuple[str, str]
+) -> float:
+    """Alpha of the evidence: all of it for the comparison that was planned, an equal share for each of the others."""
+    return alpha if couple == primary else alpha / len(couples)
 
 
 def _counts(trials: Sequence[Outcome]) -> tuple[int, int]:

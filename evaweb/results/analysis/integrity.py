@@ -14,8 +14,9 @@ from evaweb.trials.models import Score, Trial, TrialStatus
 class Changes:
     """Of one checkpoint: attempts, and those that do not count.
 
-    Voided trials are told apart by what their score said before (`voided_unscored`: there was none). Scores that were
-    corrected: `to_success`, `to_failure`, and `late` those after the reveal.
+    Voided trials are told apart by what their score said before (`voided_unscored`: there was none); of `asked`
+    the void waits for a second operator. Scores that were corrected: `to_success`, `to_failure`, and `late` those
+    after the reveal.
     """
 
     checkpoint: str
@@ -24,6 +25,7 @@ class Changes:
     voided_successes: int = 0
     voided_failures: int = 0
     voided_unscored: int = 0
+    asked: int = 0
     interrupted: int = 0
     abandoned: int = 0
     to_success: int = 0
@@ -51,6 +53,7 @@ def changes_of(plan: Plan) -> list[Changes]:
         row.voided_successes += status == TrialStatus.VOIDED and success is True
         row.voided_failures += status == TrialStatus.VOIDED and success is False
         row.voided_unscored += status == TrialStatus.VOIDED and success is None
+        row.asked += status == TrialStatus.VOID_ASKED
         row.interrupted += status == TrialStatus.INTERRUPTED
         row.abandoned += status == TrialStatus.ABANDONED
         row.operators.add(operator)

@@ -68,11 +68,17 @@ class Pair:
 
 
 def paired(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[Pair]:
-    """Both checkpoints' trials, block by block, in the order in which the blocks were completed.
+    """Both checkpoints' trials, block by block: those of a plan as scheduled, others as they were completed.
 
     A block in which one of them is missing waits. Of several trials in one block, only the last ones count.
     """
     others = {outcome.block: outcome for outcome in sorted(second, key=lambda o: o.order)}
     ours = {outcome.block: outcome for outcome in sorted(first, key=lambda o: o.order)}
     pairs = [Pair(outcome, others[block]) for block, outcome in ours.items() if block in others]
-    return sorted(pairs, key=lambda pair: max(pair.first.order, pair.second.order))
+    return sorted(pairs, key=_place)
+
+
+def _place(pair: Pair) -> int:
+    """Its place: the number of its block, which a plan's schedule gives; nobody's choice, whoever finishes first."""
+    block = pair.first.block
+    return int(block) if block.isdecimal() else max(pair.first.order, pair.second.order)

@@ -30,7 +30,8 @@ from evaweb.results.ratings.unblinding import has_results, require_seen, sealing
 from evaweb.results.reports.reporting import write_report
 from evaweb.results.selectors import Question
 from evaweb.roles import Role, role_of
-from evaweb.trials.models import TrialStatus
+from evaweb.trials.models import Trial, TrialStatus
+from evaweb.trials.voids import voids_waiting
 
 PER_PAGE = 50
 PLANS_PER_PAGE = 25
@@ -212,6 +213,7 @@ def _common(request: HttpRequest, found: Plan) -> dict[str, Any]:
         "events": found.events.select_related("by"),
         "key": bytes(found.key or b"").hex() if found.state == PlanState.REVEALED else "",
         "may_manage": managed,
+        "voids": voids_waiting(Trial.objects.filter(handout__plan=found)),
         "here": "plans",
         "home": reverse("result-plan", args=[found.name, found.version]),
     }

@@ -43,7 +43,7 @@ def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[
     return {
         "sentence": planned.sentence if planned else comparison_sentence(analysis, found),
         "headline": planned,
-        "facts": [*_of_the_rates(plan, analysis, found), *_of_the_evidence(analysis, found), *_beyond(found)],
+        "facts": [*_of_the_rates(plan, analysis, found), *_of_the_evidence(found), *_beyond(found)],
         "notes": found.notes,
         "reversed": bool(found.stratified and found.stratified.reversed),
         "missed": missed_words(analysis, found),
@@ -74,8 +74,10 @@ def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator
         )
 
 
-def _of_the_evidence(analysis: Analysis, found: Comparison) -> Iterator[Fact]:
-    yield Fact("May one stop?", f"e-process, alpha {analysis.alpha:g}", evidence_words(found.evidence))
+def _of_the_evidence(found: Comparison) -> Iterator[Fact]:
+    yield Fact(
+        "May one stop?", f"e-process, alpha {found.evidence.alpha:.2g}", evidence_words(found.evidence)
+    )
     yield Fact(
         "With partial credit, at any time?",
         "betting e-process on scores",

@@ -16,13 +16,15 @@ class Headline:
     """One sentence, how it was decided, and what else it could be.
 
     `corrected`: with the scores that were corrected after the reveal. `unvoided`: had no scored trial been voided.
-    Each is empty where it is made of the same pairs.
+    `worst`: of a difference, had each attempt that was thrown away unscored been against it. Each is empty where it is
+    made of the same pairs.
     """
 
     sentence: str
     method: str
     corrected: str = ""
     unvoided: str = ""
+    worst: str = ""
 
 
 def headline(plan: Plan) -> Headline | None:
@@ -36,8 +38,11 @@ def headline(plan: Plan) -> Headline | None:
     sentence = _sentence(plan, found, at_reveal)
     later = _sentence(plan, found, now) if now != at_reveal else ""
     unvoided = _sentence(plan, found, whole) if whole != now else ""
+    winner = conclude(found, at_reveal).winner
+    least = pairs.against(winner) if winner else now
+    worst = _sentence(plan, found, least) if least != now else ""
     design = str(plan.get_stopping_display()).partition(":")[0]
-    return Headline(sentence, f"{design}, alpha {found.alpha:g}", later, unvoided)
+    return Headline(sentence, f"{design}, alpha {found.alpha:g}", later, unvoided, worst)
 
 
 def _sentence(plan: Plan, found: Design, pairs: list[tuple[float, float]]) -> str:

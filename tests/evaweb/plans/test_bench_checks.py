@@ -6,6 +6,7 @@ from evaweb.plans import pictures
 from evaweb.plans.models import Achieved, CameraCheck, Plan, Reference
 from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
 from evaweb.trials import services as trials
+from evaweb.trials import voids
 from tests.evaweb.plans.lab import jpeg
 from tests.evaweb.trials import builders
 
@@ -96,4 +97,4 @@ def test_after_the_reveal_nothing_is_voided(bench, plan, owner, shown):
     plan_close(user=owner, plan=plan, reason="enough")
     plan_reveal(user=owner, plan=plan)
     with pytest.raises(EvaError, match="chosen with the result in view"):
-        trials.trial_void(user=bench.operator, trial=trial, reason="it looks bad")
+        voids.trial_void(user=bench.operator, trial=trial, reason="it looks bad")

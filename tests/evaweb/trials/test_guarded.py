@@ -5,7 +5,7 @@ from django.db import IntegrityError, connection, transaction
 from django.utils import timezone
 
 from evaweb.episodes.models import Episode
-from evaweb.trials import lifecycle, services
+from evaweb.trials import lifecycle, services, voids
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
 from tests.evaweb.trials import builders
 
@@ -70,7 +70,7 @@ def test_a_verdict_is_a_score_of_the_trial_and_gives_way_to_a_later_one_alone(sc
 def test_a_judged_trial_goes_no_other_way(scored, status):
     bench, trial = scored
     if status == "voided":
-        services.trial_void(user=bench.operator, trial=trial, reason="the camera had moved")
+        voids.trial_void(user=bench.operator, trial=trial, reason="the camera had moved")
     row, way = Trial.objects.filter(pk=trial.pk), Trial.append_only.moves["status"][status]
     for other in TrialStatus:
         if other not in (status, *way):
@@ -84,7 +84,7 @@ def test_a_judged_trial_goes_no_other_way(scored, status):
 
 def test_why_a_trial_was_voided_stays(scored):
     bench, trial = scored
-    services.trial_void(user=bench.operator, trial=trial, reason="the camera had moved")
+    voids.trial_void(user=bench.operator, trial=trial, reason="the camera had moved")
     refused(lambda: Trial.objects.filter(pk=trial.pk).update(reason="it was too slow"))
     refused(lambda: Trial.objects.filter(pk=trial.pk).update(voided_by=builders.user("eve")))
 
@@ -115,7 +115,7 @@ def test_corrections_and_voids_go_on(scored):
     bench, trial = scored
     correct(bench, trial)
     assert Score.objects.filter(trial=trial).count() == 2
-    services.trial_void(user=bench.operator, trial=trial, reason="the camera had moved")
+    voids.trial_void(user=bench.operator, trial=trial, reason="the camera had moved")
     assert trial.status == "voided"
 
 

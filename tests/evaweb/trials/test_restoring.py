@@ -21,7 +21,7 @@ from evaweb.episodes.services import episode_closed
 from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Command, Station
-from evaweb.trials import restoring, services
+from evaweb.trials import restoring, services, voids
 from evaweb.trials.models import (
     Checkpoint,
     Evaluation,
@@ -31,6 +31,7 @@ from evaweb.trials.models import (
     Scene,
     Score,
     Trial,
+    VoidRequest,
 )
 from evaweb.trials.record import JUDGEMENTS
 from evaweb.trials.selectors import statistics, trial_get, trial_list
@@ -43,7 +44,7 @@ from tests.runtime.lockstep_station import stubbed
 
 pytestmark = pytest.mark.django_db
 
-RECORDS = (MilestoneOutcome, Score, Trial, Evaluation, Episode, Command, Job)
+RECORDS = (MilestoneOutcome, Score, VoidRequest, Trial, Evaluation, Episode, Command, Job)
 CHOICES = (Milestone, Position, Scene, Checkpoint, Station, User)
 
 
@@ -173,7 +174,7 @@ def judged(lab):
     lab.score(corrected, True, True, True, reason="seen on the video")
     voided = lab.run()
     lab.score(voided, True, False, False)
-    services.trial_void(user=lab.bench.operator, trial=voided, reason="a hand was in the picture")
+    voids.trial_void(user=lab.bench.operator, trial=voided, reason="a hand was in the picture")
     lab.bench.unrecorded(success=False)
     lab.run(smoke=True)
     assert [trial.status for trial in trial_list().order_by("pk")] == [
@@ -249,7 +250,7 @@ def test_a_score_that_an_earlier_version_took_for_a_run_that_never_began_is_name
         )
         assert problem.endswith(": void it with a reason")
     trial = Trial.objects.get()
-    services.trial_void(user=lab.bench.operator, trial=trial, reason="it never ran")
+    voids.trial_void(user=lab.bench.operator, trial=trial, reason="it never ran")
     assert reconcile().problems == ()
 
 
@@ -529,3 +530,40 @@ def test_a_score_that_only_the_disk_has_counts_and_is_published(lab):
 
 def test_this_app_restores_what_the_episodes_hand_out():
     assert restoring.restore in reconciling._restorers
+
+
+@pytest.mark.parametrize("answer", ["", "agreed", "refused"])
+def test_voids_that_were_asked_for_and_their_answers_come_back(lab, monkeypatch, answer):
+    monkeypatch.setattr(voids, "_rules", [lambda trial: True])
+    trial, second = lab.run(), builders.user("sam")
+    lab.score(trial, True, False, False)
+    voids.trial_void(user=lab.bench.operator, trial=trial, reason="the plate had slipped")
+    lab.score(lab.run(), True, True, True)
+    if answer:
+        voids.void_answer(user=second, trial=trial, agree=answer == "agreed", reason="seen on the video")
+    before = told()
+    assert [(one["status"], one["attempt"]) for one in before] == {
+        "": [("scored", 2), ("void_asked", 1)],
+        "agreed": [("scored", 2), ("voided", 1)],
+        "refused": [("voided", 2), ("scored", 1)],
+    }[answer]
+    asked = before[1]["void_requests"]
+    assert [(one["by"], one["answer"]) for one in asked] == [(lab.bench.operator.username, answer)]
+    lose(*RECORDS)
+    assert reconcile().problems == ()
+    assert told() == before
+    assert reconcile().restored == 0
+
+
+def test_an_answer_that_a_backup_does_not_have_comes_back(lab, monkeypatch):
+    monkeypatch.setattr(voids, "_rules", [lambda trial: True])
+    trial = lab.run()
+    lab.score(trial, True, False, False)
+    voids.trial_void(user=lab.bench.operator, trial=trial, reason="the plate had slipped")
+    voids.void_answer(user=builders.user("sam"), trial=trial, agree=False, reason="it had not")
+    before = told()
+    with unguarded("trials"):
+        trial.void_requests.update(answer="", answer_reason="", answered_by=None, answered_at=None)
+        Trial.objects.filter(pk=trial.pk).update(status="void_asked")
+    assert reconcile().restored == 1
+    assert told() == before

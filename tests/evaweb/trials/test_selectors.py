@@ -4,7 +4,7 @@ import pytest
 from django.utils import timezone
 
 from evaweb.errors import EvaError, NotFound
-from evaweb.trials import selectors, services
+from evaweb.trials import selectors, services, voids
 from evaweb.trials.models import Checkpoint, Trial
 from evaweb.trials.selectors import TrialFilters
 from tests.evaweb.trials import builders
@@ -19,7 +19,7 @@ def test_statistics_count_scored_trials_per_scene_and_checkpoint_and_name_the_ot
     for success in (True, True, False):
         bench.scored(success)
     bench.scored(True, checkpoint=other)
-    services.trial_void(user=bench.operator, trial=bench.scored(), reason="a hand")
+    voids.trial_void(user=bench.operator, trial=bench.scored(), reason="a hand")
     interrupted = bench.prepare(position=2)
     Trial.objects.filter(pk=interrupted.pk).update(status="interrupted")
     bench.ended()
@@ -119,7 +119,7 @@ def test_the_open_trial_of_a_station_is_the_one_that_is_not_finished(bench):
     assert selectors.trial_open(bench.station) is None
     trial = bench.ended()
     assert selectors.trial_open(bench.station) == trial
-    services.trial_void(user=bench.operator, trial=trial, reason="x")
+    voids.trial_void(user=bench.operator, trial=trial, reason="x")
     assert selectors.trial_open(bench.station) is None
 
 

@@ -11,7 +11,7 @@ from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import unrecorded_because
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
-from evaweb.trials import services
+from evaweb.trials import services, voids
 from evaweb.trials.lifecycle import MOVES, Move
 from evaweb.trials.models import Checkpoint, Evaluation, Milestone, Position, Score, Trial, TrialStatus
 from evaweb.trials.record import JUDGEMENTS
@@ -82,7 +82,7 @@ def test_what_does_not_count_is_repeated_as_a_new_attempt_of_the_same_number(ben
 def test_a_voided_trial_in_the_middle_is_repeated_before_the_next_number(bench):
     first = bench.scored()
     bench.scored()
-    services.trial_void(user=bench.operator, trial=first, reason="the plate was missing")
+    voids.trial_void(user=bench.operator, trial=first, reason="the plate was missing")
     again = bench.prepare()
     assert (again.number, again.attempt) == (1, 2)
 
@@ -154,7 +154,7 @@ def test_a_viewer_can_neither_prepare_nor_score_nor_void_nor_abandon(bench):
     trial = bench.ended()
     for act in (
         lambda: score(bench, trial, user=viewer),
-        lambda: services.trial_void(user=viewer, trial=trial, reason="because"),
+        lambda: voids.trial_void(user=viewer, trial=trial, reason="because"),
         lambda: services.trial_abandon(user=viewer, trial=trial),
     ):
         with pytest.raises(NotAllowed):
@@ -311,12 +311,12 @@ def test_what_somebody_else_says_word_by_word_is_no_repetition(bench):
 
 
 def test_who_voids_or_gives_up_once_more_gets_the_first_answer(bench):
-    voided = services.trial_void(user=bench.operator, trial=bench.scored(), reason="the camera fell")
+    voided = voids.trial_void(user=bench.operator, trial=bench.scored(), reason="the camera fell")
     at = voided.voided_at
-    again = services.trial_void(user=bench.operator, trial=voided, reason="the camera fell")
+    again = voids.trial_void(user=bench.operator, trial=voided, reason="the camera fell")
     assert (again.status, again.voided_at, len(lines(voided.episode_id or voided.uuid))) == ("voided", at, 2)
     with pytest.raises(Conflict, match="cannot be voided"):
-        services.trial_void(user=bench.operator, trial=voided, reason="another reason")
+        voids.trial_void(user=bench.operator, trial=voided, reason="another reason")
     given_up = services.trial_abandon(user=bench.operator, trial=bench.prepare(), reason="wrong block")
     assert services.trial_abandon(user=bench.operator, trial=given_up, reason="wrong block") == given_up
     with pytest.raises(Conflict, match="cannot be abandoned"):
@@ -391,7 +391,7 @@ def test_what_left_no_recorded_row_is_never_scored_and_can_be_voided(bench, stat
         score(bench, trial)
     assert not JUDGEMENTS.path(trial.episode_id or trial.uuid).exists()
     assert [row.summary.success.n for row in statistics()] == [0]
-    assert services.trial_void(user=bench.operator, trial=trial, reason="it never ran").status == "voided"
+    assert voids.trial_void(user=bench.operator, trial=trial, reason="it never ran").status == "voided"
 
 
 def test_what_is_still_being_closed_is_scored_as_soon_as_a_row_of_it_is_on_the_disk(bench, tmp_path):
@@ -476,7 +476,7 @@ def test_the_note_of_one_trial_is_not_that_of_the_next(bench):
 
 def test_void_is_not_fail_and_says_who_and_why(bench):
     trial = bench.scored(success=False)
-    services.trial_void(user=bench.operator, trial=trial, reason="  a hand was in the picture ")
+    voids.trial_void(user=bench.operator, trial=trial, reason="  a hand was in the picture ")
     assert (trial.status, trial.reason) == ("voided", "a hand was in the picture")
     assert trial.voided_by == bench.operator
     assert trial.scores.count() == 1
@@ -487,7 +487,7 @@ def test_void_is_not_fail_and_says_who_and_why(bench):
 def test_nothing_is_voided_without_a_reason(bench, reason):
     trial = bench.ended()
     with pytest.raises(EvaError, match="reason is empty"):
-        services.trial_void(user=bench.operator, trial=trial, reason=reason)
+        voids.trial_void(user=bench.operator, trial=trial, reason=reason)
 
 
 def test_only_a_trial_that_never_ran_is_abandoned(bench):

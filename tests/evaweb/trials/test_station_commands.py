@@ -6,7 +6,7 @@ import pytest
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.stations.models import Command
 from evaweb.stations.runtime_client import NoAnswer
-from evaweb.trials import services
+from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint, Trial
 from evaweb.trials.station_commands import trial_command
 from tests.evaweb.trials import builders
@@ -163,7 +163,7 @@ def test_the_run_of_another_trial_is_not_that_of_this_one(bench, wire):
     give(bench, trial, "setup")
     uuid = give(bench, trial, "run").pk
     Trial.objects.filter(pk=trial.pk).update(status="ended")
-    services.trial_void(user=bench.operator, trial=trial, reason="a person in the way")
+    voids.trial_void(user=bench.operator, trial=trial, reason="a person in the way")
     other = bench.prepare()
     with pytest.raises(Conflict, match=f"not for trial {other.pk}"):
         give(bench, other, "run", uuid=uuid)

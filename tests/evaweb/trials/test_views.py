@@ -4,7 +4,7 @@ import pytest
 from django.test import Client
 
 from evaweb.episodes.models import Episode
-from evaweb.trials import services
+from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint, Score, Trial
 from tests.evaweb.trials import builders
 
@@ -41,7 +41,7 @@ def test_nobody_sees_results_without_logging_in(bench):
 def test_every_rate_stands_beside_its_n_and_its_interval(bench, browser):
     for success in (True, True, True, False):
         bench.scored(success)
-    services.trial_void(user=bench.operator, trial=bench.scored(), reason="a hand")
+    voids.trial_void(user=bench.operator, trial=bench.scored(), reason="a hand")
     text = page(browser, "/result/")
     row = re.search(r'<tr data-checkpoint="pi0-block">.*?</tr>', text, re.S).group()
     cells = re.findall(r'<td class="number[^"]*">(?:<a[^>]*>)?([^<]*)', row)

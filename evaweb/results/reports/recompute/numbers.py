@@ -93,7 +93,11 @@ def numbers(trials: Trials, plan: Mapping[str, Any]) -> dict[str, Any]:
         tuple(wanted) if wanted and set(wanted) == set(couple) else couple
         for couple in combinations(names, 2)
     ]
-    compared = [_comparison(a, b, arms[a], arms[b], alpha, timing) for a, b in couples]
+    planned = tuple(wanted or ())
+    compared = [
+        _comparison(a, b, arms[a], arms[b], alpha if (a, b) == planned else alpha / len(couples), timing)
+        for a, b in couples
+    ]
     for comparison, p in zip(compared, methods.holm([c["barnard"]["p"] for c in compared]), strict=True):
         comparison["barnard"]["holm"] = p
     corrected = {frozenset((c["first"], c["second"])): c["barnard"]["holm"] for c in compared}
@@ -280,7 +284,7 @@ def _scores(differences: Sequence[float]) -> dict[str, Any]:
 def _pairs(first: Trials, second: Trials) -> list[tuple[Trial, Trial]]:
     ours, theirs = {t.block: t for t in first}, {t.block: t for t in second}
     pairs = [(ours[block], theirs[block]) for block in ours if block in theirs]
-    return sorted(pairs, key=lambda pair: max(pair[0].order, pair[1].order))
+    return sorted(pairs, key=lambda pair: int(pair[0].block))
 
 
 def _clustered(first: Trials, second: Trials) -> dict[str, Any] | None:

@@ -113,6 +113,10 @@ def test_three_checkpoints_are_corrected_for_three_comparisons():
     assert smallest.corrected == pytest.approx(3 * smallest.test.p)
     assert found.letters["a"] == found.letters["b"] == "a"
     assert found.letters["c"] == "b"
+    assert {c.evidence.alpha for c in found.comparisons} == {0.05 / 3}
+    planned = analyse(trials({"a": 0.9, "b": 0.85, "c": 0.2}), primary=("a", "c"))
+    shares = {(c.first, c.second): c.evidence.alpha for c in planned.comparisons}
+    assert shares == {("a", "b"): 0.05 / 3, ("a", "c"): 0.05, ("b", "c"): 0.05 / 3}
 
 
 def test_the_same_outcomes_say_the_same():
@@ -156,6 +160,15 @@ def test_pairs_are_in_the_order_in_which_they_were_completed():
     first = [one("a", "x", 0), one("a", "y", 1)]
     second = [one("b", "y", 2), one("b", "x", 3)]
     assert [pair.first.block for pair in paired(first, second)] == ["y", "x"]
+
+
+def test_pairs_of_a_plan_are_in_the_order_of_its_blocks_whichever_station_was_faster():
+    def one(checkpoint, block, order):
+        return Outcome(order, order, str(block), checkpoint, "cups", 1, True, 1.0)
+
+    first = [one("a", 9, 1), one("a", 10, 0)]
+    second = [one("b", 10, 2), one("b", 9, 3)]
+    assert [pair.first.block for pair in paired(first, second)] == ["9", "10"]
 
 
 def test_what_cannot_be_computed_says_why():

@@ -8,7 +8,7 @@ from evaweb.results.analysis.filters import Chosen
 from evaweb.results.analysis.integrity import changes_of
 from evaweb.results.pages.pages import summary_page
 from evaweb.results.presentation.headline import headline
-from evaweb.trials import services
+from evaweb.trials import services, voids
 from tests.evaweb.trials import builders
 
 NEW, OLD = "pi0-new", "pi0-block"
@@ -30,11 +30,12 @@ def tried(bench, plan):
 
 
 def test_failures_of_one_checkpoint_that_were_voided_are_told_and_what_they_change(bench, plan, tried):
-    voided = 0
+    voided, second = 0, builders.user("sam")
     for left in range(16, 0, -1):
         trial = tried(success=False)
         if trial.checkpoint.name == NEW and left > 1:  # the last one ends the plan
-            services.trial_void(user=bench.operator, trial=trial, reason="the plate had slipped")
+            voids.trial_void(user=bench.operator, trial=trial, reason="the plate had slipped")
+            voids.void_answer(user=second, trial=trial, agree=True)
             tried(success=True)
             voided += 1
     found = {row.checkpoint: row for row in changes_of(plan)}
@@ -45,6 +46,22 @@ def test_failures_of_one_checkpoint_that_were_voided_are_told_and_what_they_chan
     said = headline(plan)
     assert said.sentence.startswith(f"{NEW} succeeded more often than {OLD}: {voided}/8 against 0/8")
     assert said.unvoided.startswith(f"No significant difference between {NEW} and {OLD}: 0/8 against 0/8")
+
+
+def test_attempts_thrown_away_unscored_are_told_by_the_worst_that_they_could_have_been(bench, plan, tried):
+    for left in range(16, 0, -1):
+        thrown = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+        new = thrown.checkpoint.name == NEW
+        if new and left > 4:
+            builders.over(thrown, 9.0)
+            voids.trial_void(user=bench.operator, trial=thrown, reason="the plate had slipped")
+        else:
+            services.trial_abandon(user=bench.operator, trial=thrown)  # it never ran: it cannot have failed
+        tried(success=new)
+    said = headline(plan)
+    assert said.sentence.startswith(f"{NEW} succeeded more often than {OLD}: 8/8 against 0/8")
+    assert said.worst.startswith(f"No significant difference between {NEW} and {OLD}: 2/8 against 0/8")
+    assert said.unvoided == ""
 
 
 def test_where_nothing_was_voided_there_is_one_sentence(plan, tried):

@@ -5,7 +5,7 @@ from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
 from evaweb.results.analysis.analysis import analyse
 from evaweb.results.analysis.load_outcomes import outcomes_of, outcomes_of_plan
-from evaweb.trials import services
+from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.trials import builders
 
@@ -59,7 +59,7 @@ def test_a_correction_counts_and_a_void_does_not(bench, plan):
     services.trial_score(
         user=bench.operator, trial=first, milestones=bench.ticks(True, False, False), reason="it fell later"
     )
-    services.trial_void(user=bench.operator, trial=second, reason="the camera had moved")
+    voids.trial_void(user=bench.operator, trial=second, reason="the camera had moved")
     found = {outcome.trial: outcome for outcome in outcomes_of_plan(plan)}
     assert not found[first.pk].success
     assert found[first.pk].milestones == (True, False, False)

@@ -15,7 +15,7 @@ from evaweb.plans.services import plan_close
 from evaweb.results.analysis import caching
 from evaweb.results.ratings import judging
 from evaweb.results.selectors import PlanRow
-from evaweb.trials import services
+from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders
 
@@ -170,7 +170,7 @@ def test_a_correction_and_a_void_are_seen_at_once(plan, owner, bench, carry_out,
     )
     after = caching.analysis_of(plan)
     assert sum(a.success.successes for a in after.arms) != sum(a.success.successes for a in before.arms)
-    services.trial_void(user=bench.operator, trial=plan.handouts.last().trial, reason="a camera had moved")
+    voids.trial_void(user=bench.operator, trial=plan.handouts.last().trial, reason="a camera had moved")
     assert caching.analysis_of(plan).n == 15
     Checkpoint.objects.filter(name="pi0-new").update(name="renamed")
     plan.refresh_from_db()

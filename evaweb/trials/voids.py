@@ -1,0 +1,181 @@
+"""Trials taken out of the count; of a blind plan, where a trial has a score, by two operators.
+
+Whoever knows how a trial was scored can choose by it. So the first operator asks, the trial is repeated meanwhile, and
+a second one who is as blind agrees or refuses. What is not answered in time is not voided: the trial counts again, and
+its repetition does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import timedelta
+from typing import Any
+
+from django.contrib.auth.models import User
+from django.db import transaction
+from django.db.models import QuerySet
+from django.utils import timezone
+
+from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.roles import Role, require
+from evaweb.trials import lifecycle
+from evaweb.trials.lifecycle import Move
+from evaweb.trials.models import Trial, TrialStatus, VoidRequest
+from evaweb.trials.record import (
+    JUDGEMENTS,
+    VoidAnswerLine,
+    VoidLine,
+    VoidRequestLine,
+    file_of,
+)
+from evaweb.trials.services import checked, locked, publish, reason_given, settled
+
+ANSWERED_WITHIN = timedelta(days=14)
+KEPT = "the trial that it repeats counts: its void was not agreed to"
+_rules: list[Callable[[Trial], bool]] = []
+
+
+def declare_by_two(rule: Callable[[Trial], bool]) -> None:
+    """`rule` says of a trial that has a score whether two operators have to agree that it is voided."""
+    _rules.append(rule)
+
+
+def by_two(trial: Trial) -> bool:
+    """Whether two operators have to agree that the trial is voided."""
+    return trial.verdict_id is not None and any(rule(trial) for rule in _rules)
+
+
+def may_answer(trial: Trial, user: User) -> bool:
+    """Whether a void of the trial was asked for, which this user may answer."""
+    asked = trial.void_requests.filter(answer="").first()
+    return asked is not None and _why_not(asked, user) is None
+
+
+def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
+    """Take a trial out of the count, or ask for it where a second operator has to agree.
+
+    Void is not fail: the trial stays in the record with its reason, and is repeated.
+    """
+    require(user, Role.OPERATOR)
+    why = reason_given(reason, "a trial is voided")
+    checked("voided", trial, user)
+    with transaction.atomic():
+        held = locked(trial)
+        if _said_already(held, user, why):
+            return held
+        if held.status == TrialStatus.VOID_ASKED:
+            raise Conflict(
+                f"the void of trial {held.pk} was asked for already: {lifecycle.advice(held.status)}"
+            )
+        if by_two(held):
+            _ask(held, user, why)
+        else:
+            _void(held, user, why)
+        settled(held, user)
+    trial.refresh_from_db()
+    return trial
+
+
+def void_answer(*, user: User, trial: Trial, agree: bool, reason: str = "") -> Trial:
+    """Agree to a void that another operator asked for, or refuse it with a reason."""
+    require(user, Role.OPERATOR)
+    why = reason if agree and not reason.strip() else reason_given(reason, "a void is refused")
+    with transaction.atomic():
+        held = locked(trial)
+        asked = held.void_requests.filter(answer="").select_for_update().first()
+        if asked is None:
+            raise Conflict(f"trial {held.pk} is {TrialStatus(held.status).label}: nobody asks for its void")
+        fault = _why_not(asked, user)
+        if fault is not None:
+            raise fault
+        if agree:
+            _answered(asked, VoidRequest.Answer.AGREED, user, why)
+            _void(held, asked.by, asked.reason)
+        else:
+            _keep(held, asked, VoidRequest.Answer.REFUSED, user, why)
+        settled(held, user)
+    trial.refresh_from_db()
+    return trial
+
+
+def voids_waiting(trials: QuerySet[Trial]) -> QuerySet[VoidRequest]:
+    """What nobody has answered yet, the oldest first."""
+    return VoidRequest.objects.filter(trial__in=trials, answer="").select_related("trial__handout", "by")
+
+
+def voids_lapse(trials: QuerySet[Trial], *, user: User, now: bool = False) -> None:
+    """Have those of `trials` count again whose void nobody has answered in time; with `now` all of them.
+
+    One whose repetition is under way waits for its end. Within a transaction.
+    """
+    asked = voids_waiting(trials)
+    if not now:
+        asked = asked.filter(at__lt=timezone.now() - ANSWERED_WITHIN)
+    for each in asked:
+        held = locked(each.trial)
+        if not _repetitions(held).filter(status__in=lifecycle.OPEN).exists():
+            _keep(held, each, VoidRequest.Answer.LAPSED, user, "")
+
+
+def _why_not(asked: VoidRequest, user: User) -> EvaError | None:
+    """Why this user cannot answer it; None where they can."""
+    if asked.by_id == user.pk:
+        return NotAllowed(f"you asked for the void of trial {asked.trial_id}: another operator has to answer")
+    if asked.at + ANSWERED_WITHIN < timezone.now():
+        return Conflict(
+            f"the void of trial {asked.trial_id} was asked for more than {ANSWERED_WITHIN.days} days ago: it counts"
+        )
+    try:
+        checked("void answered", asked.trial, user)
+    except EvaError as fault:
+        return fault
+    return None
+
+
+def _ask(held: Trial, user: User, why: str) -> None:
+    lifecycle.apply(held, Move.ASK)
+    asked = VoidRequest(trial=held, reason=why, by=user)
+    JUDGEMENTS.append(file_of(held), VoidRequestLine.written(asked))
+    asked.save()
+    held.save()
+
+
+def _answered(asked: VoidRequest, answer: str, user: User, why: str) -> None:
+    asked.answer, asked.answer_reason, asked.answered_by = answer, why, user
+    asked.answered_at = timezone.now()
+    JUDGEMENTS.append(file_of(asked.trial), VoidAnswerLine.written(asked, uuid=str(asked.uuid)))
+    asked.save()
+
+
+def _void(held: Trial, by: User, why: str) -> None:
+    lifecycle.apply(held, Move.VOID)
+    held.reason, held.voided_by, held.voided_at = why, by, timezone.now()
+    JUDGEMENTS.append(file_of(held), VoidLine.written(held))
+    held.save()
+    publish(held)
+
+
+def _keep(held: Trial, asked: VoidRequest, answer: str, user: User, why: str) -> None:
+    """The trial counts again; what was made in its place does not."""
+    for other in _repetitions(held):
+        if other.status in lifecycle.OPEN:
+            raise Conflict(
+                f"trial {held.pk} is being repeated, by trial {other.pk}: {lifecycle.advice(other.status)}, then refuse"
+            )
+        if lifecycle.allows(other, Move.VOID):
+            _void(locked(other), user, KEPT)
+    lifecycle.apply(held, Move.KEEP)
+    _answered(asked, answer, user, why)
+    held.save()
+
+
+def _repetitions(trial: Trial) -> QuerySet[Trial]:
+    same = ("evaluation", "evaluation_version", "checkpoint", "scene", "position", "number")
+    return Trial.objects.filter(**{name: getattr(trial, name) for name in same}, attempt__gt=trial.attempt)
+
+
+def _said_already(held: Trial, user: Any, why: str) -> bool:
+    """Asked for once more, because the answer was lost."""
+    if held.status == TrialStatus.VOID_ASKED:
+        return held.void_requests.filter(answer="", by=user, reason=why).exists()
+    return (held.status, held.reason, held.voided_by_id) == (TrialStatus.VOIDED, why, user.pk)

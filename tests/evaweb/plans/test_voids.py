@@ -1,0 +1,158 @@
+"""A scored trial of a blind plan is voided by two blind operators, or not at all."""
+
+from datetime import timedelta
+
+import pytest
+from django.db import IntegrityError, transaction
+from django.utils import timezone
+
+from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.plans.allocation import hand_out, progress
+from evaweb.plans.blinding_rules import look
+from evaweb.plans.design import tried
+from evaweb.plans.selectors import remaining
+from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.trials import services, voids
+from evaweb.trials.models import Trial, VoidRequest
+from tests.evaweb.trials import builders
+from tests.evaweb.unguarded import unguarded
+
+WHY = "the plate had slipped"
+
+
+@pytest.fixture
+def plan(draft, owner):
+    return plan_freeze(user=owner, plan=draft)
+
+
+@pytest.fixture
+def made(bench, plan):
+    """Makes the next trial and scores it."""
+
+    def make(success=False):
+        trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+        builders.over(trial, 9.0)
+        services.trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, success, success))
+        trial.refresh_from_db()
+        return trial
+
+    return make
+
+
+@pytest.fixture
+def second(db):
+    return builders.user("sam")
+
+
+@pytest.fixture
+def asked(bench, made):
+    """A failure whose void the operator has asked for."""
+    return voids.trial_void(user=bench.operator, trial=made(), reason=WHY)
+
+
+def test_it_is_asked_for_repeated_and_voided_where_a_second_operator_agrees(bench, plan, made, asked, second):
+    assert asked.status == "void_asked"
+    again = made(success=True)
+    assert (again.number, again.attempt) == (asked.number, asked.attempt + 1)
+    assert voids.void_answer(user=second, trial=asked, agree=True).status == "voided"
+    asked.refresh_from_db()
+    assert (asked.reason, asked.voided_by) == (WHY, bench.operator)
+    (row,) = asked.void_requests.all()
+    assert (row.answer, row.answered_by, row.reason) == ("agreed", second, WHY)
+    assert (remaining(plan), progress(plan).counted) == (11, 1)
+
+
+def test_a_refusal_has_it_count_and_not_its_repetition(plan, made, asked, second):
+    again = made(success=True)
+    with pytest.raises(EvaError, match="reason is empty"):
+        voids.void_answer(user=second, trial=asked, agree=False)
+    kept = voids.void_answer(user=second, trial=asked, agree=False, reason="it had not")
+    assert (kept.status, kept.reason, kept.voided_by) == ("scored", "", None)
+    again.refresh_from_db()
+    assert (again.status, again.reason) == ("voided", voids.KEPT)
+    assert (remaining(plan), progress(plan).counted) == (11, 1)
+    following = made()  # the slot has its trial: the next one is handed out
+    assert following.handout.slot_id != asked.handout.slot_id
+
+
+def test_neither_whoever_asked_nor_whoever_looked_answers(bench, plan, owner, asked):
+    with pytest.raises(NotAllowed, match="another operator has to answer"):
+        voids.void_answer(user=bench.operator, trial=asked, agree=True)
+    look(plan, owner)
+    with pytest.raises(NotAllowed, match="an operator who is blind"):
+        voids.void_answer(user=owner, trial=asked, agree=True)
+    with pytest.raises(NotAllowed):
+        voids.void_answer(user=builders.user("vic", "viewer"), trial=asked, agree=True)
+    assert [voids.may_answer(asked, user) for user in (bench.operator, owner)] == [False, False]
+    asked.refresh_from_db()
+    assert asked.status == "void_asked"
+
+
+def test_it_waits_for_the_end_of_a_repetition(bench, plan, asked, second):
+    again = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    with pytest.raises(Conflict, match=f"trial {asked.pk} is being repeated, by trial {again.pk}"):
+        voids.void_answer(user=second, trial=asked, agree=False, reason="it had not")
+    with transaction.atomic():
+        voids.voids_lapse(Trial.objects.all(), user=second, now=True)
+    asked.refresh_from_db()
+    assert asked.status == "void_asked"
+    services.trial_abandon(user=bench.operator, trial=again)
+    assert voids.void_answer(user=second, trial=asked, agree=False, reason="it had not").status == "scored"
+
+
+def test_without_an_answer_it_counts_after_a_fortnight(made, asked, second):
+    made(success=True)
+    past = timezone.now() - voids.ANSWERED_WITHIN - timedelta(seconds=1)
+    with unguarded("trials"):
+        asked.void_requests.update(at=past)
+    assert not voids.may_answer(asked, second)
+    with pytest.raises(Conflict, match="more than 14 days ago"):
+        voids.void_answer(user=second, trial=asked, agree=True)
+    made()
+    asked.refresh_from_db()
+    assert (asked.status, asked.void_requests.get().answer) == ("scored", "lapsed")
+
+
+def test_without_an_answer_it_counts_at_the_reveal(bench, plan, owner, made, asked):
+    again = made(success=True)
+    made()
+    before = tried(plan)
+    assert (before.counted[0] == before.unvoided[0]) is False
+    plan_close(user=owner, plan=plan, reason="enough")
+    plan_reveal(user=owner, plan=plan)
+    asked.refresh_from_db()
+    again.refresh_from_db()
+    assert (asked.status, again.status) == ("scored", "voided")
+    plan.refresh_from_db()
+    assert [tuple(pair) for pair in plan.at_reveal["pairs"]] == before.unvoided == tried(plan).counted
+    with pytest.raises(EvaError, match="with the result in view"):
+        voids.trial_void(user=bench.operator, trial=asked, reason=WHY)
+
+
+def test_it_is_asked_for_once_at_a_time(bench, asked, second):
+    assert voids.trial_void(user=bench.operator, trial=asked, reason=WHY).status == "void_asked"
+    assert VoidRequest.objects.count() == 1
+    with pytest.raises(Conflict, match="was asked for already"):
+        voids.trial_void(user=second, trial=asked, reason="another reason")
+    with pytest.raises(Conflict, match="a second operator agrees or refuses"):
+        services.trial_score(
+            user=bench.operator, trial=asked, milestones=bench.ticks(True, True, True), reason="seen"
+        )
+    voids.void_answer(user=second, trial=asked, agree=False, reason="it had not")
+    voids.trial_void(user=bench.operator, trial=asked, reason="look again")
+    assert [row.answer for row in asked.void_requests.all()] == ["refused", ""]
+
+
+def test_what_has_no_score_or_is_of_no_blind_plan_is_voided_at_once(bench, plan):
+    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    builders.over(trial, 9.0)
+    assert voids.trial_void(user=bench.operator, trial=trial, reason=WHY).status == "voided"
+    assert voids.trial_void(user=bench.operator, trial=bench.scored(), reason=WHY).status == "voided"
+
+
+def test_an_answer_stays(asked, second):
+    voids.void_answer(user=second, trial=asked, agree=True)
+    row = VoidRequest.objects.filter(trial=asked)
+    for change in ({"answer": "refused"}, {"reason": "x"}, {"answered_by": None}, {"answer_reason": "x"}):
+        with pytest.raises(IntegrityError), transaction.atomic():
+            row.update(**change)
