@@ -15,6 +15,7 @@ from evaweb.plans import bench_checks as bench
 from evaweb.plans import services
 from evaweb.plans.allocation import give_back, progress
 from evaweb.plans.blinding_rules import look, sealed_for
+from evaweb.plans.design import told_reason
 from evaweb.plans.models import Achieved, CameraCheck, Plan, PlanState, Reference
 from evaweb.plans.selectors import plan_get, plan_list
 from evaweb.stations.selectors import station_get
@@ -24,7 +25,8 @@ router = Router(tags=["plans"])
 
 
 class PlanOut(Schema):
-    """One version of a plan. While it is blind for the caller, `document`, `digest` and `key` are empty.
+    """One version of a plan. While it is blind for the caller, `document`, `digest` and `key` are empty, and of
+    `closed_because` only that its design has ended is told.
 
     `counted` trials of `total` have their score; `attempts` were handed out.
     """
@@ -56,9 +58,10 @@ class PlanOut(Schema):
         sealed = sealed_for(plan, user)
         done = progress(plan)
         plain = ("name", "version", "title", "state", "blind", "commitment")
-        times = ("frozen_at", "closed_at", "closed_because", "revealed_at")
+        times = ("frozen_at", "closed_at", "revealed_at")
         return {
             **{name: getattr(plan, name) for name in (*plain, *times)},
+            "closed_because": told_reason(plan, sealed),
             "sealed": sealed,
             "owner": plan.owner.get_username(),
             "stations": [station.name for station in plan.stations.all()],

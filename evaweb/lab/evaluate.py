@@ -44,10 +44,13 @@ def carry_out(operator: Visitor, station: str, plan: str, count: int, tell: Tell
         take(page)
         operator.post(f"stations/{station}/cameras", {"first": True})
         for number in range(1, count + 1):
-            if operator.get(f"plans/{plan}")["state"] != "frozen":
+            try:
+                one = _made(operator, page, station, plan)
+            except VisitFailed:
+                if operator.get(f"plans/{plan}")["state"] == "frozen":
+                    raise
                 tell(f"the plan's design has ended after {number - 1} trials")
                 break
-            one = _made(operator, page, station, plan)
             made.append(one)
             verdict = "success" if one.success else "no success"
             tell(f"{number:>3} of {count}  {one.code}  position {one.position}  {verdict}, {one.score:.0%}")

@@ -14,11 +14,12 @@ from django.db.models import Case, Max, OuterRef, Subquery, When
 
 from evaweb.errors import Conflict, NotAllowed
 from evaweb.plans import commitment as blinding
-from evaweb.plans.blinding_rules import has_looked
+from evaweb.plans.blinding_rules import has_looked_at_a_version
 from evaweb.plans.canonical import digest
-from evaweb.plans.design import conclusion_of, ended_because
-from evaweb.plans.documents import checkpoint_of, scene_of
+from evaweb.plans.design import conclusion_of, ended_because, told_reason
+from evaweb.plans.documents import checkpoint_of, scene_of, units_of
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
+from evaweb.plans.services import plan_end
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials import lifecycle
@@ -43,7 +44,6 @@ def progress(plan: Plan) -> Progress:
     return Progress(plan.slots.count(), counted, plan.handouts.count())
 
 
-@transaction.atomic
 def hand_out(*, user: User, station: Station, plan: Plan) -> Handout:
     """Prepare the next trial of `plan` on `station`.
 
@@ -51,6 +51,13 @@ def hand_out(*, user: User, station: Station, plan: Plan) -> Handout:
     NotAllowed for a user who has looked behind the blind.
     """
     require(user, Role.OPERATOR)
+    _check(plan, user, station)
+    plan_end(user=user, plan=plan, asked=True)
+    return _handed_out(user, station, plan)
+
+
+@transaction.atomic
+def _handed_out(user: User, station: Station, plan: Plan) -> Handout:
     held = Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
     _check(held, user, station)
     voids_lapse(Trial.objects.filter(handout__plan=held), user=user)
@@ -98,8 +105,13 @@ def give_back(*, user: User, plan: Plan, station: Station, reason: str) -> int:
 
 def _check(plan: Plan, user: User, station: Station) -> None:
     if plan.state != PlanState.FROZEN:
-        raise Conflict(f"{plan} is {plan.get_state_display()}: no trial of it is handed out")
-    if plan.sealed and has_looked(plan, user):
+        why = told_reason(plan, sealed=True)
+        raise Conflict(
+            f"{plan} has ended: {why}"
+            if why
+            else f"{plan} is {plan.get_state_display()}: no trial of it is handed out"
+        )
+    if plan.sealed and has_looked_at_a_version(plan, user):
         raise NotAllowed(
             f"you have seen results of {plan}, which is blind: ask another operator to run its trials"
         )
@@ -154,7 +166,13 @@ def _why_again(before: Trial) -> str:
 
 def _check_unchanged(plan: Plan, slot: Slot) -> None:
     """The scene and the checkpoint are those that were frozen: an edit meanwhile needs an amended plan."""
-    document = plan.document or {}
+    document, unit = plan.document or {}, units_of(plan)[slot.index]
+    called = (slot.scene.name, slot.checkpoint.name)
+    if called != (
+        unit.condition.scene,
+        unit.checkpoint,
+    ):  # not which: the operator must not learn what comes next
+        raise Conflict(f"a scene or a checkpoint was renamed since {plan} was frozen: call it so again")
     frozen = {scene["name"]: scene for scene in document["scenes"]}[slot.scene.name]
     numbers = [position["number"] for position in frozen["positions"]]
     positions = list(Position.objects.filter(scene=slot.scene, number__in=numbers).order_by("number"))

@@ -16,7 +16,7 @@ from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.journal import text
 from evaweb.plans import pictures
 from evaweb.plans.allocation import hand_out
-from evaweb.plans.blinding_rules import has_looked
+from evaweb.plans.blinding_rules import has_looked_at_a_version
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
@@ -165,8 +165,11 @@ def _before(what: str, trial: Trial, user: Any) -> None:
         raise EvaError(
             f"{handout.plan} was revealed: what is voided now would be chosen with the result in view"
         )
-    if what == "void answered" and has_looked(handout.plan, user):
-        raise NotAllowed(f"you have seen results of {handout.plan}: an operator who is blind has to answer")
+    judged = what in ("scored", "voided", "void answered")
+    if judged and handout.plan.sealed and has_looked_at_a_version(handout.plan, user):
+        raise NotAllowed(
+            f"you have seen results of {handout.plan}: an operator who is blind scores, corrects and voids its trials"
+        )
 
 
 def _blind(trial: Trial) -> bool:

@@ -50,6 +50,11 @@ def has_looked(plan: Plan, user: Any) -> bool:
     return Look.objects.filter(plan=plan, user=user).exists()
 
 
+def has_looked_at_a_version(plan: Plan, user: Any) -> bool:
+    """True if this user has seen what is, or was, sealed of the plan or of a version before or after it."""
+    return Look.objects.filter(plan__name=plan.name, user=user).exists()
+
+
 def may_look(plan: Plan, user: Any) -> bool:
     """True if `look` would be granted, or was."""
     return not plan.sealed or _why_not(plan, user) == ""

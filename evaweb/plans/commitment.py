@@ -41,14 +41,7 @@ def commitment(plan: str, units: Sequence[Unit], key: bytes) -> str:
 
 def schedule_digest(units: Sequence[Unit]) -> str:
     """SHA-256 of the canonical form of the schedule."""
-    return digest(
-        {
-            "units": [
-                [u.index, u.block, u.checkpoint, u.condition.scene, u.condition.position, u.repetition]
-                for u in units
-            ]
-        }
-    )
+    return digest({"units": [unit.row for unit in units]})
 
 
 def verified(plan: str, units: Sequence[Unit], key: bytes, committed: str) -> bool:

@@ -12,13 +12,16 @@ from dataclasses import dataclass
 from itertools import takewhile
 from typing import Any
 
+from django.db.models import OuterRef, Subquery
+from django.utils import timezone
+
 from evaweb.errors import EvaError
 from evaweb.plans.canonical import digest
 from evaweb.plans.models import Plan
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.designs import SUCCESS, Conclusion, Design, Values, conclude, design, of_table
 from evaweb.trials.lifecycle import JUDGED
-from evaweb.trials.models import TrialStatus
+from evaweb.trials.models import Score, TrialStatus
 
 ENDED = {
     "boundary": "a boundary of its design was crossed",
@@ -65,12 +68,13 @@ def frozen(document: Mapping[str, Any]) -> Design | None:
 class Pairs:
     """Outcomes of the compared checkpoints, block by block as scheduled, up to the first block that is not made.
 
-    `counted` is what counts; `unvoided` as if no trial had been voided that had a score, nor were to be: of each slot
-    its first one. `repeated` says of each pair that counts for which of the two an attempt was thrown away unscored.
+    `counted` is what counts; `at_first` as if no trial had been voided that had a score, nor were to be, and none
+    corrected: of each slot the first score. `repeated` says of each pair that counts for which of the two an attempt
+    was thrown away unscored.
     """
 
     counted: list[Values]
-    unvoided: list[Values]
+    at_first: list[Values]
     repeated: list[tuple[bool, bool]]
 
     def against(self, winner: str) -> list[Values]:
@@ -89,20 +93,21 @@ def tried(plan: Plan) -> Pairs:
     if found is None:
         return Pairs([], [], [])
     names = document["comparison"]
-    value = "trial__verdict__success" if found.outcome == SUCCESS else "trial__verdict__score"
+    value = "success" if found.outcome == SUCCESS else "score"
+    first = Score.objects.filter(trial=OuterRef("trial")).order_by("pk").values(value)[:1]
     counted: dict[int, dict[str, float]] = defaultdict(dict)
-    unvoided: dict[int, dict[str, float]] = defaultdict(dict)
+    at_first: dict[int, dict[str, float]] = defaultdict(dict)
     thrown: set[tuple[int, str]] = set()
     rows = plan.handouts.filter(
         trial__status__in=(*JUDGED, TrialStatus.INTERRUPTED), slot__checkpoint__name__in=names
     )
-    for block, name, status, outcome in rows.order_by("number").values_list(
-        "slot__block", "slot__checkpoint__name", "trial__status", value
+    for block, name, status, outcome, before in rows.order_by("number").values_list(
+        "slot__block", "slot__checkpoint__name", "trial__status", f"trial__verdict__{value}", Subquery(first)
     ):
         if outcome is None:
             thrown.add((block, name))
             continue
-        unvoided[block].setdefault(name, float(outcome))
+        at_first[block].setdefault(name, float(before))
         if status == TrialStatus.SCORED:
             counted[block][name] = float(outcome)
 
@@ -113,7 +118,7 @@ def tried(plan: Plan) -> Pairs:
         return [(blocks[block][names[0]], blocks[block][names[1]]) for block in made(blocks)]
 
     repeated = [((block, names[0]) in thrown, (block, names[1]) in thrown) for block in made(counted)]
-    return Pairs(pairs(counted), pairs(unvoided), repeated)
+    return Pairs(pairs(counted), pairs(at_first), repeated)
 
 
 def pairs_of(plan: Plan) -> list[Values]:
@@ -134,12 +139,22 @@ def ended_because(found: Conclusion) -> str:
     return f"{ENDED[found.ended]}, after {found.at} pairs"
 
 
+def told_reason(plan: Plan, sealed: bool) -> str:
+    """Why it was closed; of a plan that is `sealed` for the reader only what the server itself says."""
+    own = any(plan.closed_because.startswith(f"{words}, after ") for words in ENDED.values())
+    return plan.closed_because if own or not sealed else ""
+
+
 def at_the_reveal(plan: Plan) -> dict[str, Any] | None:
     """The pairs that count, kept with their digest: what is corrected later makes no other headline."""
     if frozen(plan.document or {}) is None:
         return None
     pairs = [list(pair) for pair in pairs_of(plan)]
-    return {"pairs": pairs, "digest": digest({"plan": plan.digest, "pairs": pairs})}
+    return {
+        "pairs": pairs,
+        "digest": digest({"plan": plan.digest, "pairs": pairs}),
+        "at": timezone.now().isoformat(),
+    }
 
 
 def looks_of(given: Any) -> list[int]:

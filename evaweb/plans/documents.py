@@ -7,7 +7,7 @@ from typing import Any
 
 from evaweb.plans.design import drafted
 from evaweb.plans.models import Plan
-from evaweb.plans.schedule import Condition
+from evaweb.plans.schedule import Condition, Unit, schedule
 from evaweb.statistics.designs import table
 from evaweb.trials.models import Checkpoint, Position, Scene
 
@@ -96,3 +96,14 @@ def conditions_of(document: dict[str, Any]) -> list[Condition]:
         for scene in document["scenes"]
         for position in scene["positions"]
     ]
+
+
+def units_of(plan: Plan) -> list[Unit]:
+    """The schedule of a frozen plan, drawn by its key."""
+    document = plan.document or {}
+    return schedule(
+        checkpoints=[row["name"] for row in document["checkpoints"]],
+        conditions=conditions_of(document),
+        repetitions=document["repetitions"],
+        key=bytes(plan.key or b""),
+    )

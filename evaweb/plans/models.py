@@ -162,7 +162,12 @@ class Plan(models.Model):
         ),
         only="OLD.state <> 'draft'",
         moves={"state": {"frozen": ("closed",), "closed": ("revealed",), "revealed": ()}},
-        never=("OLD.at_reveal IS NOT NULL AND (NEW.at_reveal IS NULL OR OLD.at_reveal <> NEW.at_reveal)",),
+        never=(
+            "OLD.state = 'revealed' AND (NEW.owner_id <> OLD.owner_id OR NEW.closed_because <> OLD.closed_because "
+            "OR NEW.closed_at <> OLD.closed_at OR NEW.revealed_at IS NULL OR NEW.revealed_at <> OLD.revealed_at "
+            "OR COALESCE(NEW.revealed_by_id, 0) <> COALESCE(OLD.revealed_by_id, 0))",
+            "OLD.at_reveal IS NOT NULL AND (NEW.at_reveal IS NULL OR OLD.at_reveal <> NEW.at_reveal)",
+        ),
     )
 
     class Meta:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from evaweb.errors import EvaError
 from evaweb.plans.seeded_draws import Chance
@@ -34,6 +35,12 @@ class Unit:
     checkpoint: str
     condition: Condition
     repetition: int
+
+    @property
+    def row(self) -> list[Any]:
+        """As it is committed to: index, block, checkpoint, scene, position, repetition."""
+        where = self.condition
+        return [self.index, self.block, self.checkpoint, where.scene, where.position, self.repetition]
 
 
 def schedule(

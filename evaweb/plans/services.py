@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from django.contrib.auth.models import User
 from django.db import transaction
 from django.db.models import QuerySet
@@ -9,11 +11,12 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import commitment as blinding
+from evaweb.plans import reveals
 from evaweb.plans.canonical import difference, digest
 from evaweb.plans.design import at_the_reveal, conclusion_of, drafted, ended_because
-from evaweb.plans.documents import conditions_of, document_of
+from evaweb.plans.documents import document_of, units_of
 from evaweb.plans.models import Plan, PlanEvent, PlanState, PrimaryOutcome, Slot, StoppingRule
-from evaweb.plans.schedule import Unit, schedule
+from evaweb.plans.schedule import Unit
 from evaweb.plans.seeded_draws import new_key
 from evaweb.plans.selectors import handout_of, remaining
 from evaweb.roles import Role, require, role_of
@@ -39,13 +42,20 @@ _COPIED = (
 )
 
 
-@transaction.atomic
 def plan_freeze(*, user: User, plan: Plan) -> Plan:
     """Make a draft a document that never changes, with its schedule and commitment; trials can be handed out then.
 
     Where the database was lost and trials of such a plan came back from the disk, they are its own, and it is closed at
     once: their schedule and codes are gone. Administrators alone.
     """
+    _require_owner(plan, user)
+    if plan.state == PlanState.DRAFT:
+        _check(plan)  # before anything is locked: a boundary takes seconds, and is then known
+    return _frozen(user, plan)
+
+
+@transaction.atomic
+def _frozen(user: User, plan: Plan) -> Plan:
     held = _held(plan)
     _require_owner(held, user)
     if held.state != PlanState.DRAFT:
@@ -53,7 +63,7 @@ def plan_freeze(*, user: User, plan: Plan) -> Plan:
     _check(held)
     document = document_of(held)
     held.document, held.digest, held.key = document, digest(document), new_key()
-    units = _units(held)
+    units = units_of(held)
     held.commitment = blinding.commitment(held.digest, units, bytes(held.key))
     held.evaluation, new = Evaluation.objects.get_or_create(
         name=held.name,
@@ -125,32 +135,47 @@ def plan_reveal(*, user: User, plan: Plan) -> Plan:
     _require_owner(held, user)
     if held.state != PlanState.CLOSED:
         raise Conflict(f"{held} is {held.get_state_display()}: it is closed first, then revealed")
-    units = _units(held)
+    units = units_of(held)
     if not blinding.verified(digest(held.document or {}), units, bytes(held.key or b""), held.commitment):
         raise EvaError(
             f"{held}: document, schedule and key are not those of the commitment {held.commitment}: "
             "somebody has changed the database; nothing was revealed"
         )
+    if _slots(held) != [unit.row for unit in units]:
+        raise EvaError(
+            f"{held}: scenes, positions and checkpoints of its schedule are not called what they were when it was "
+            "frozen: call them so again; nothing was revealed"
+        )
     voids_lapse(_trials(held), user=user, now=True)
-    held.at_reveal = at_the_reveal(held)
+    before = reveals.kept(held)
+    held.at_reveal = before.at_reveal if before else at_the_reveal(held)
     held.state, held.revealed_at, held.revealed_by = PlanState.REVEALED, timezone.now(), user
+    again = (
+        f"; what counts is that of the reveal of {before.at:%Y-%m-%d %H:%M} UTC by {before.by}"
+        if before
+        else ""
+    )
+    if before is None:
+        reveals.keep(held)
     held.save()
-    _note(held, user, "revealed", f"key {bytes(held.key or b'').hex()}; commitment verified")
+    _note(held, user, "revealed", f"key {bytes(held.key or b'').hex()}; commitment verified{again}")
     plan.refresh_from_db()
     return plan
 
 
 @transaction.atomic
-def plan_end(*, user: User, plan: Plan) -> None:
+def plan_end(*, user: User, plan: Plan, asked: bool = False) -> None:
     """Close a running plan whose design has ended, as soon as none of its trials is unfinished.
 
+    With trials left, a boundary that was crossed ends it where the next one is `asked` for: a score that was mistyped
+    can be corrected until then, and corrected to and fro it does not tell at once which trial is of which checkpoint.
     The reason says that a boundary was crossed or that all pairs are made: never for which checkpoint.
     """
     held = _held(plan)
     found = conclusion_of(held) if held.state == PlanState.FROZEN else None
     if found is None or not found.ended or _unfinished(held):
         return
-    if found.ended == "boundary" or not remaining(held):
+    if not remaining(held) or (asked and found.ended == "boundary"):
         _close(held, user, ended_because(found))
 
 
@@ -214,14 +239,10 @@ def _check(plan: Plan) -> None:
     drafted(plan)
 
 
-def _units(plan: Plan) -> list[Unit]:
-    document = plan.document or {}
-    return schedule(
-        checkpoints=[row["name"] for row in document["checkpoints"]],
-        conditions=conditions_of(document),
-        repetitions=document["repetitions"],
-        key=bytes(plan.key or b""),
-    )
+def _slots(plan: Plan) -> list[list[Any]]:
+    """The schedule as the database has it, as `Unit.row` says it."""
+    named = ("index", "block", "checkpoint__name", "scene__name", "position__number", "repetition")
+    return [list(row) for row in plan.slots.order_by("index").values_list(*named)]
 
 
 def _lay_out(plan: Plan, units: list[Unit]) -> None:

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 from evaweb.statistics.base import StatisticsError, check_alpha, check_share
@@ -27,6 +27,8 @@ SHAPES = {"late": 6.0, "early": 1.5}  # power of the share of trials made: how l
 MOST = 250  # trials of an arm
 _RATES = 400  # common rates at which an error is taken, evenly spread over the angles of which they are squared sines
 _FINE = 40_000  # the same for a bound of the error between them
+_END = 1e-7  # of the angles, nearer to whose ends no rate is taken
+_HALVED = 20  # times that the space between two rates is halved
 _SAFETY = 0.996  # of alpha, for what lies between two of the rates
 _CELLS = 512  # tables that are weighed at once, the most extreme first
 _TIE = 1e-9  # relative: what differs by less is compared in whole numbers
@@ -116,18 +118,46 @@ class Boundary:
 
         The first is taken at 40,000 rates; the second holds between them too: along the angle of which the rate is the
         squared sine, the angle of a probability turns by at most the square root of the trials (Cauchy and Schwarz).
+        Where that does not keep it below alpha, rates between are taken too.
         """
-        null = _Null(self.margin, _FINE)
-        total = self._over_margin(null) if self.margin is not None else self._over_equal(null)
-        highest = float(total.max())
-        trials = self.looks[-1].first + self.looks[-1].second
-        turned = math.asin(math.sqrt(min(1.0, highest))) + math.sqrt(trials) * null.gap / 2
-        return highest, math.sin(min(turned, math.pi / 2)) ** 2
-
-    def _over_equal(self, null: _Null) -> NDArray[np.float64]:
-        """Probability of a stop at each pair of equal rates: only the successes of both arms together count."""
         import numpy as np
 
+        wrong, turn = self._wrong(), math.sqrt(self.looks[-1].first + self.looks[-1].second)
+
+        def turned(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+            null = _Null(self.margin, angles)
+            found = np.sum([null.total(*tables) for tables in wrong], axis=0)
+            return np.asarray(np.arcsin(np.sqrt(np.clip(found, 0.0, 1.0))))
+
+        angles = np.linspace(_END, math.pi / 2 - _END, _FINE)
+        at, allowed = turned(angles), math.asin(math.sqrt(self.alpha))
+        highest, bound = float(at.max()), max(at[0], at[-1]) + turn * _END
+        cells = np.stack([angles[:-1], angles[1:], at[:-1], at[1:]])
+        for halved in range(_HALVED + 1):
+            most = (cells[2] + cells[3] + turn * (cells[1] - cells[0])) / 2
+            doubtful = (most > allowed) & (cells[2:].max(axis=0) <= allowed) & (halved < _HALVED)
+            bound = max(bound, float(most[~doubtful].max(initial=0.0)))
+            left, right, low, high = cells[:, doubtful]
+            if not len(left):
+                break
+            middle = (left + right) / 2
+            at = turned(middle)
+            highest = max(highest, float(at.max()))
+            cells = np.hstack([[left, middle, low, at], [middle, right, at, high]])
+        return math.sin(highest) ** 2, math.sin(min(bound, math.pi / 2)) ** 2
+
+    def _wrong(self) -> list[tuple[tuple[NDArray[Any], ...], NDArray[np.float64], tuple[int, int]]]:
+        """The tables at which it stops, by their successes, with their probabilities at rates of a half, and trials.
+
+        While both rates are equal, only the successes of both arms together count.
+        """
+        import numpy as np
+
+        if self.margin is not None:
+            return [
+                (np.nonzero(mass), mass[np.nonzero(mass)], (look.first, look.second))
+                for look, mass in self._walk((0.5, 0.5))
+            ]
         gone, trials = np.zeros(1), 0
         for look, mass in self._walk((0.5, 0.5)):
             for _ in range(look.first + look.second - trials):
@@ -136,16 +166,7 @@ class Boundary:
             gone += np.bincount(
                 np.indices(mass.shape).sum(axis=0).ravel(), mass.ravel(), minlength=trials + 1
             )
-        return null.total((np.arange(trials + 1), np.zeros(trials + 1)), gone, (trials, 0))
-
-    def _over_margin(self, null: _Null) -> NDArray[np.float64]:
-        import numpy as np
-
-        total = np.zeros(_FINE)
-        for look, mass in self._walk((0.5, 0.5)):
-            cells = np.nonzero(mass)
-            total += null.total(cells, mass[cells], (look.first, look.second))
-        return total
+        return [((np.arange(trials + 1), np.zeros(trials + 1)), gone, (trials, 0))]
 
     def _walk(self, rates: tuple[float, float]) -> Iterator[tuple[Look, NDArray[np.float64]]]:
         """Each look with the probability of stopping there at each table: float64 [first + 1, second + 1]."""
@@ -172,17 +193,24 @@ def boundary(
 ) -> Boundary:
     """The boundary of a design that looks after so many trials of each arm, the last look being its end.
 
-    StatisticsError where looks do not grow, an arm has more than 250 trials, or alpha, shape or margin cannot be.
+    The newest ones are known. StatisticsError where looks do not grow, an arm has more than 250 trials, or alpha,
+    shape or margin cannot be.
     """
+    return _boundary(tuple(_checked(looks)), alpha, shape, margin)
+
+
+@lru_cache(maxsize=32)
+def _boundary(
+    counts: tuple[tuple[int, int], ...], alpha: float, shape: str, margin: float | None
+) -> Boundary:
     import numpy as np
 
-    counts = _checked(looks)
     check_alpha(alpha)
     if shape not in SHAPES:
         raise StatisticsError(f"shape = {shape!r}; allowed: {', '.join(SHAPES)}")
     if margin is not None and not 0 < margin < 1:
         raise StatisticsError(f"margin = {margin}; allowed: above 0 and below 1")
-    null = _Null(margin, _RATES)
+    null = _Null(margin, np.linspace(0, math.pi / 2, _RATES + 2)[1:-1])
     spent, total = np.zeros(_RATES), sum(counts[-1])
     alive, before, found = np.ones((1, 1)), (0, 0), []
     for first, second in counts:
@@ -224,12 +252,11 @@ def extremeness(first: int, n: int, second: int, m: int, margin: float | None) -
 class _Null:
     """Pairs of rates at which an error is one: equal ones, or those that differ by just the margin."""
 
-    def __init__(self, margin: float | None, rates: int) -> None:
+    def __init__(self, margin: float | None, angles: NDArray[np.float64]) -> None:
         import numpy as np
 
         self.margin = margin
-        self.gap = math.pi / 2 / (rates + 1)
-        high = np.sin(np.linspace(0, math.pi / 2, rates + 2)[1:-1]) ** 2
+        high = np.sin(angles) ** 2
         first = high if margin is None else margin + (1 - margin) * high
         second = high if margin is None else (1 - margin) * high
         with np.errstate(divide="ignore"):

@@ -18,6 +18,7 @@ from evaweb.statistics.sequential import score_evidence, success_evidence
 FIXED, ANYTIME = "none", "evidence"  # as plans have named them since there are plans
 RULES = (FIXED, ANYTIME, *SHAPES)
 SUCCESS, SCORE = "success", "score"
+_TIE = 1e-9  # relative: a p that is alpha but for its last bits
 Values = tuple[float, float]  # of the first and the second checkpoint in one block
 
 
@@ -123,7 +124,7 @@ def conclude(found: Design, values: Sequence[Values]) -> Conclusion:
     if full is None:
         return Conclusion(len(given), None, None, None, found.pairs)
     p, lead = _scored(given) if found.outcome == SCORE else _succeeded(given)
-    return Conclusion(full, full, _ahead(lead, 0) if p <= found.alpha else None, p, found.pairs)
+    return Conclusion(full, full, _ahead(lead, 0) if p <= found.alpha * (1 + _TIE) else None, p, found.pairs)
 
 
 def _succeeded(values: Sequence[Values]) -> tuple[float, float]:

@@ -33,6 +33,12 @@ class Difference:
     value: float
     interval: Interval
 
+    @property
+    def reversed(self) -> Difference:
+        """The second arm's less the first's."""
+        ends = self.interval
+        return Difference(-self.value, Interval(-ends.high, -ends.low, ends.level))
+
 
 @dataclass(frozen=True, slots=True)
 class ExactTest:

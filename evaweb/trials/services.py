@@ -56,7 +56,10 @@ _TRIES = 5  # to get a number that nobody else takes at the same moment
 
 
 def declare_check(check: Check) -> None:
-    """`check` is asked before a trial is "run" or "voided", with the trial and the user; it raises EvaError."""
+    """`check` is asked before a trial is "run", "scored", "voided" or the like, with the trial and the user.
+
+    It raises EvaError.
+    """
     _checks.append(check)
 
 
@@ -247,6 +250,7 @@ def trial_score(
         "failure": text("failure", failure, LONGEST_FAILURE),
         "reason": text("reason", reason, LONGEST_NOTE),
     }
+    checked("scored", trial, user)
     with transaction.atomic():
         held = locked(trial)
         rows = list(held.scene.milestones.order_by("order"))

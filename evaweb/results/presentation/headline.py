@@ -15,7 +15,8 @@ from evaweb.statistics.difference import newcombe
 class Headline:
     """One sentence, how it was decided, and what else it could be.
 
-    `corrected`: with the scores that were corrected after the reveal. `unvoided`: had no scored trial been voided.
+    `corrected`: with the scores that were corrected after the reveal. `at_first`: as trials were first scored, had none
+    been voided.
     `worst`: of a difference, had each attempt that was thrown away unscored been against it. Each is empty where it is
     made of the same pairs.
     """
@@ -23,8 +24,9 @@ class Headline:
     sentence: str
     method: str
     corrected: str = ""
-    unvoided: str = ""
+    at_first: str = ""
     worst: str = ""
+    versions: tuple[str, ...] = ()
 
 
 def headline(plan: Plan) -> Headline | None:
@@ -33,16 +35,16 @@ def headline(plan: Plan) -> Headline | None:
     if found is None:
         return None
     pairs = tried(plan)
-    now, whole = pairs.counted, pairs.unvoided
+    now, whole = pairs.counted, pairs.at_first
     at_reveal = [(one, other) for one, other in plan.at_reveal["pairs"]] if plan.at_reveal else now
     sentence = _sentence(plan, found, at_reveal)
     later = _sentence(plan, found, now) if now != at_reveal else ""
-    unvoided = _sentence(plan, found, whole) if whole != now else ""
+    at_first = _sentence(plan, found, whole) if whole != at_reveal else ""
     winner = conclude(found, at_reveal).winner
     least = pairs.against(winner) if winner else now
     worst = _sentence(plan, found, least) if least != now else ""
     design = str(plan.get_stopping_display()).partition(":")[0]
-    return Headline(sentence, f"{design}, alpha {found.alpha:g}", later, unvoided, worst)
+    return Headline(sentence, f"{design}, alpha {found.alpha:g}", later, at_first, worst, _versions(plan))
 
 
 def _sentence(plan: Plan, found: Design, pairs: list[tuple[float, float]]) -> str:
@@ -53,7 +55,10 @@ def _sentence(plan: Plan, found: Design, pairs: list[tuple[float, float]]) -> st
         if plan.state == PlanState.FROZEN:
             return f"{first} and {second} are not compared yet: {made} are made, and the design goes on"
         return f"{first} and {second} were not compared: closed after {made}, before the design ended"
-    counts = _counts(found, conclusion, pairs[: conclusion.at])
+    counted = pairs[: conclusion.at]
+    if conclusion.winner == "second":  # the better one is named first
+        counted = [(other, one) for one, other in counted]
+    counts = _counts(found, conclusion, counted)
     if found.margin is not None:
         claim = f"{first} is {'' if conclusion.winner else 'not shown to be '}not worse than {second}"
         return f"{claim} by {100 * found.margin:g} points or more: {counts}"
@@ -62,6 +67,23 @@ def _sentence(plan: Plan, found: Design, pairs: list[tuple[float, float]]) -> st
     better, worse = (first, second) if conclusion.winner == "first" else (second, first)
     what = "succeeded more often" if found.outcome == SUCCESS else "reached higher scores"
     return f"{better} {what} than {worse}: {counts}"
+
+
+def _versions(plan: Plan) -> tuple[str, ...]:
+    """What each version before this one came to, the newest first: each had all of its alpha."""
+    told, version = [], plan.amends
+    while version is not None:
+        found = frozen(version.document) if version.document else None
+        if found is not None:
+            pairs = version.at_reveal["pairs"] if version.at_reveal else tried(version).counted
+            sentence = _sentence(version, found, [(one, other) for one, other in pairs])
+            told.append(f"Version {version.version}: {sentence}. Amended because: {_amended(version)}")
+        version = version.amends
+    return tuple(told)
+
+
+def _amended(version: Plan) -> str:
+    return version.amendment.amended_because
 
 
 def _counts(found: Design, conclusion: Conclusion, pairs: list[tuple[float, float]]) -> str:

@@ -34,15 +34,17 @@ def probability(p: float) -> str:
 
 def verdict(found: Comparison, one: Proportion, other: Proportion, alpha: float) -> str:
     """The comparison in one sentence, with its evidence; says only what the corrected exact test says."""
-    counts = (
-        f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {points(found.difference)}"
-    )
-    if found.corrected <= alpha:
-        better, worse = (
-            (found.first, found.second) if found.difference.value > 0 else (found.second, found.first)
+    difference = found.difference
+    if found.corrected > alpha:
+        counts = (
+            f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {points(difference)}"
         )
-        return f"{better} succeeded more often than {worse}: {counts}"
-    return f"{found.first} and {found.second} are not told apart: {counts}"
+        return f"{found.first} and {found.second} are not told apart: {counts}"
+    better, worse = found.first, found.second
+    if difference.value < 0:
+        better, worse, one, other, difference = worse, better, other, one, difference.reversed
+    counts = f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {points(difference)}"
+    return f"{better} succeeded more often than {worse}: {counts}"
 
 
 def missed(n: int, rate: float | None, alpha: float) -> str:

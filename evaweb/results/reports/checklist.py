@@ -28,6 +28,7 @@ def checklist(plan: Plan, analysis: Analysis) -> list[Item]:
     return [
         _beforehand(plan, trials),
         _criteria(plan),
+        _versions(plan),
         _order(plan),
         _blind(plan),
         _complete(plan, trials),
@@ -125,9 +126,17 @@ def _corrections(plan: Plan) -> Item:
     late = scores.filter(scored_at__gte=plan.revealed_at).count() if plan.revealed_at else 0
     return Item(
         "Scores kept as they were given",
-        _yes(late == 0),
+        "no" if late else "partly" if corrected else "yes",
         f"{corrected} corrections, each a row of its own with author and reason, {late} scores after the reveal",
     )
+
+
+def _versions(plan: Plan) -> Item:
+    before, version = 0, plan.amends
+    while version is not None:
+        before, version = before + bool(version.document), version.amends
+    words = f"version {plan.version}; {before} frozen before it, each with all of its alpha"
+    return Item("One version of the plan", _yes(before == 0), words)
 
 
 def _second_rater(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]

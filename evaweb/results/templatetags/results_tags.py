@@ -11,6 +11,7 @@ from django.urls import reverse
 from django.utils.html import format_html, format_html_join
 from django.utils.safestring import SafeString
 
+from evaweb.plans.design import told_reason
 from evaweb.plans.models import Plan, PlanState, StoppingRule
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.analysis.outcomes import Outcome
@@ -79,6 +80,12 @@ def of_trial(rows: Mapping[int, list[Any]], trial: int) -> list[Any]:
 def words(text: str) -> list[str]:
     """The words of a text."""
     return text.split()
+
+
+@register.simple_tag
+def closed_because(plan: Plan, sealed: bool) -> str:
+    """Why it was closed, as far as the reader may know."""
+    return told_reason(plan, sealed)
 
 
 @register.simple_tag

@@ -3,8 +3,9 @@
 import pytest
 from django.db import IntegrityError, transaction
 
-from evaweb.errors import Conflict, EvaError
+from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import hand_out
+from evaweb.plans.blinding_rules import look
 from evaweb.plans.canonical import digest
 from evaweb.plans.design import conclusion_of, frozen, pairs_of
 from evaweb.plans.models import Plan, PlanState
@@ -13,8 +14,10 @@ from evaweb.results.presentation.headline import headline
 from evaweb.stations.models import Station
 from evaweb.statistics.designs import conclude
 from evaweb.trials import services as trials
+from evaweb.trials import voids
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders
+from tests.evaweb.unguarded import unguarded
 
 BETTER = "pi0-new"  # succeeds always; the other one never
 
@@ -41,6 +44,18 @@ def carry_out(bench, plan, count):
     plan.refresh_from_db()
 
 
+def until_it_ends(bench, plan, **said):
+    """Trials, until a boundary is crossed and the next one refused; how many were made."""
+    made = 0
+    while conclusion_of(plan).ended != "boundary":
+        scored(bench, handed(bench, plan), **said)
+        made += 1
+    with pytest.raises(Conflict, match="has ended: a boundary of its design was crossed"):
+        handed(bench, plan)
+    plan.refresh_from_db()
+    return made
+
+
 @pytest.fixture
 def other(db):
     return Station.objects.create(name="bench-2", robot="agilex_piper", simulated=True, boot="b")
@@ -61,16 +76,23 @@ def test_the_boundary_is_part_of_what_is_frozen(early):
 
 
 def test_it_ends_by_itself_as_soon_as_a_boundary_is_crossed_and_says_not_for_which(bench, early):
-    made = 0
-    while early.state == PlanState.FROZEN:
-        carry_out(bench, early, 1)
-        made += 1
+    made = until_it_ends(bench, early)
     assert made < 40
     assert early.state == PlanState.CLOSED
     assert early.closed_because == f"a boundary of its design was crossed, after {made // 2} pairs"
     assert BETTER not in early.events.get(what="closed").text
-    with pytest.raises(Conflict, match="no trial of it is handed out"):
+    with pytest.raises(Conflict, match="has ended: a boundary of its design was crossed"):
         handed(bench, early)
+
+
+def test_a_score_that_was_mistyped_can_be_corrected_before_the_next_trial_is_asked_for(bench, early):
+    needed = next(n for n in range(1, 21) if conclude(frozen(early.document), [(1.0, 0.0)] * n).ended)
+    carry_out(bench, early, 2 * needed)
+    assert (early.state, conclusion_of(early).ended) == (PlanState.FROZEN, "boundary")
+    last = early.handouts.order_by("number").last().trial
+    scored(bench, last, success=last.checkpoint.name != BETTER, reason="the wrong key")
+    carry_out(bench, early, 1)
+    assert (early.state, conclusion_of(early).ended) == (PlanState.FROZEN, "")
 
 
 def test_a_trial_that_is_under_way_elsewhere_is_finished_first_and_changes_nothing(bench, early, other):
@@ -83,6 +105,8 @@ def test_a_trial_that_is_under_way_elsewhere_is_finished_first_and_changes_nothi
     assert early.state == PlanState.FROZEN
     assert pairs_of(early) == []  # the first block is not made: what was finished before it does not enter
     scored(bench, waiting)
+    with pytest.raises(Conflict, match="has ended"):
+        handed(bench, early)
     early.refresh_from_db()
     assert early.state == PlanState.CLOSED
     assert conclusion_of(early).at < 11
@@ -100,6 +124,8 @@ def test_while_its_last_trial_runs_no_other_is_handed_out(bench, early, other):
     ):
         handed(bench, early)
     trials.trial_abandon(user=bench.operator, trial=late)
+    with pytest.raises(Conflict, match="has ended"):
+        handed(bench, early)
     early.refresh_from_db()
     assert early.state == PlanState.CLOSED
 
@@ -143,8 +169,7 @@ def test_a_fixed_number_says_nothing_before_its_end_however_clear_it_is(bench, d
 
 
 def test_what_is_corrected_after_the_reveal_makes_no_other_headline(bench, early, owner):
-    while early.state == PlanState.FROZEN:
-        carry_out(bench, early, 1)
+    until_it_ends(bench, early)
     plan_reveal(user=owner, plan=early)
     before = headline(early)
     assert before.corrected == ""
@@ -158,11 +183,101 @@ def test_what_is_corrected_after_the_reveal_makes_no_other_headline(bench, early
         Plan.objects.filter(pk=early.pk).update(at_reveal=None)
 
 
+def test_a_user_who_has_looked_changes_no_score_before_the_reveal(bench, early, owner):
+    carry_out(bench, early, 4)
+    trial = early.handouts.first().trial
+    look(early, owner)
+    for what in (
+        lambda: trials.trial_score(
+            user=owner, trial=trial, milestones=bench.ticks(True, False, False), reason="looked again"
+        ),
+        lambda: voids.trial_void(user=owner, trial=trial, reason="it looks bad"),
+    ):
+        with pytest.raises(NotAllowed, match="you have seen results"):
+            what()
+    plan_close(user=owner, plan=early, reason="enough")
+    again = plan_amend(user=owner, plan=early, reason="more trials")
+    plan_freeze(user=owner, plan=again)
+    with pytest.raises(NotAllowed, match="you have seen results"):
+        hand_out(user=owner, station=bench.station, plan=again)
+
+
+def test_a_correction_before_the_reveal_is_told_beside_the_headline(bench, draft, owner):
+    plan = frozen_plan(draft, owner, repetitions=4)
+    carry_out(bench, plan, 16)
+    first = next(h.trial for h in plan.handouts.all() if h.trial.checkpoint.name == BETTER)
+    scored(bench, first, success=False, reason="it fell later")
+    plan_reveal(user=owner, plan=plan)
+    said = headline(plan)
+    assert "7/8 against 0/8" in said.sentence
+    assert "8/8 against 0/8" in said.at_first
+
+
+def test_the_better_one_is_named_first_with_its_numbers(bench, draft, owner):
+    draft.first, draft.second = draft.second, draft.first
+    plan = frozen_plan(draft, owner, repetitions=4)
+    carry_out(bench, plan, 16)
+    said = headline(plan).sentence
+    assert said.startswith(
+        f"{BETTER} succeeded more often than pi0-block: 8/8 against 0/8, difference 100 points ["
+    )
+
+
+def test_versions_before_it_are_told(bench, draft, owner):
+    plan = frozen_plan(draft, owner, repetitions=4)
+    carry_out(bench, plan, 6)
+    again = plan_amend(user=owner, plan=plan, reason="another lamp")
+    again = plan_freeze(user=owner, plan=again)
+    carry_out(bench, again, 16)
+    (told,) = headline(again).versions
+    assert told.startswith(f"Version 1: {BETTER} and pi0-block were not compared: closed after 3 of 8 pairs")
+    assert told.endswith("Amended because: another lamp")
+    assert headline(plan).versions == ()
+
+
+def test_a_second_reveal_of_a_database_that_was_put_back_keeps_the_first(bench, draft, owner):
+    plan = frozen_plan(draft, owner, repetitions=4)
+    carry_out(bench, plan, 16)
+    plan_reveal(user=owner, plan=plan)
+    first = plan.at_reveal
+    with unguarded("plans"):
+        Plan.objects.filter(pk=plan.pk).update(
+            state=PlanState.CLOSED, at_reveal=None, revealed_at=None, revealed_by=None
+        )
+    for handout in plan.handouts.all():
+        scored(bench, handout.trial, success=True, reason="looked again")
+    plan.refresh_from_db()
+    plan_reveal(user=owner, plan=plan)
+    assert plan.at_reveal == first
+    assert "what counts is that of the reveal of" in plan.events.filter(what="revealed").last().text
+    assert "8/8 against 8/8" in headline(plan).corrected
+
+
+def test_checkpoints_that_swapped_their_names_run_nothing_and_reveal_nothing(bench, draft, owner):
+    plan = frozen_plan(draft, owner, repetitions=4)
+    one, other = draft.first, draft.second
+    Checkpoint.objects.filter(pk=other.pk).update(policy=one.policy)  # as if both had been the same all along
+    for row, name in ((one, "aside"), (other, BETTER), (one, "pi0-block")):
+        Checkpoint.objects.filter(pk=row.pk).update(name=name)
+    with pytest.raises(Conflict, match="was renamed since"):
+        handed(bench, plan)
+    plan_close(user=owner, plan=plan, reason="enough")
+    with pytest.raises(EvaError, match="not called what they were"):
+        plan_reveal(user=owner, plan=plan)
+
+
+def test_what_is_kept_of_a_revealed_plan_stays(bench, draft, owner):
+    plan = frozen_plan(draft, owner, repetitions=1)
+    carry_out(bench, plan, 4)
+    plan_reveal(user=owner, plan=plan)
+    for change in ({"closed_because": "enough"}, {"revealed_at": None}, {"owner": bench.operator}):
+        with pytest.raises(IntegrityError), transaction.atomic():
+            Plan.objects.filter(pk=plan.pk).update(**change)
+
+
 def test_not_worse_by_the_margin(bench, draft, owner):
     plan = frozen_plan(draft, owner, stopping="late", margin=0.5, repetitions=8)
-    while plan.state == PlanState.FROZEN:
-        scored(bench, handed(bench, plan), success=True)
-        plan.refresh_from_db()
+    until_it_ends(bench, plan, success=True)
     said = f"{BETTER} is not worse than pi0-block by 50 points or more: "
     assert headline(plan).sentence.startswith(said)
 

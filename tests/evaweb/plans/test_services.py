@@ -130,7 +130,9 @@ def test_trials_come_in_the_order_of_the_plan_each_under_a_code_of_its_own(bench
     plan.refresh_from_db()
     assert plan.state == PlanState.CLOSED
     assert plan.closed_because == "all pairs of its comparison are made, after 6 pairs"
-    with pytest.raises(Conflict, match="Blocks v1 is closed: no trial of it is handed out"):
+    with pytest.raises(
+        Conflict, match="Blocks v1 has ended: all pairs of its comparison are made, after 6 pairs"
+    ):
         hand_out(user=bench.operator, station=bench.station, plan=plan)
     assert (progress(plan).counted, progress(plan).attempts) == (12, 12)
 

@@ -79,7 +79,7 @@ def test_neither_whoever_asked_nor_whoever_looked_answers(bench, plan, owner, as
     with pytest.raises(NotAllowed, match="another operator has to answer"):
         voids.void_answer(user=bench.operator, trial=asked, agree=True)
     look(plan, owner)
-    with pytest.raises(NotAllowed, match="an operator who is blind"):
+    with pytest.raises(NotAllowed, match="an operator who is blind scores"):
         voids.void_answer(user=owner, trial=asked, agree=True)
     with pytest.raises(NotAllowed):
         voids.void_answer(user=builders.user("vic", "viewer"), trial=asked, agree=True)
@@ -117,14 +117,14 @@ def test_without_an_answer_it_counts_at_the_reveal(bench, plan, owner, made, ask
     again = made(success=True)
     made()
     before = tried(plan)
-    assert (before.counted[0] == before.unvoided[0]) is False
+    assert (before.counted[0] == before.at_first[0]) is False
     plan_close(user=owner, plan=plan, reason="enough")
     plan_reveal(user=owner, plan=plan)
     asked.refresh_from_db()
     again.refresh_from_db()
     assert (asked.status, again.status) == ("scored", "voided")
     plan.refresh_from_db()
-    assert [tuple(pair) for pair in plan.at_reveal["pairs"]] == before.unvoided == tried(plan).counted
+    assert [tuple(pair) for pair in plan.at_reveal["pairs"]] == before.at_first == tried(plan).counted
     with pytest.raises(EvaError, match="with the result in view"):
         voids.trial_void(user=bench.operator, trial=asked, reason=WHY)
 

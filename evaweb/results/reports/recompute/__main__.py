@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from .designs import error, primary
+from .designs import error, kept_faults, primary
 from .judged import agreement, preferences, score_alpha
 from .numbers import Drawn, Trial, numbers
 from .sealed import faults
@@ -33,7 +33,7 @@ def main() -> int:
     rows, scores, ratings, preferred = (
         _rows(data / f"{name}.csv") for name in ("trials", "scores", "ratings", "preferences")
     )
-    wrong = [*faults(seal, plan, rows), *_boundary(plan)]
+    wrong = [*faults(seal, plan, rows), *kept_faults(rows, scores, plan, seal["at_reveal"]), *_boundary(plan)]
     trials = [_trial(row) for row in rows]
     found = {
         **numbers(trials, plan),

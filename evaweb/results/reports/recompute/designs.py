@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
 from itertools import takewhile
 from typing import Any, Protocol
 
 from . import methods
 
 Pair = tuple[float, float]
+_TIE = 1e-9  # relative: a p that is alpha in other last bits
 
 
 class Row(Protocol):
@@ -43,6 +47,62 @@ def pairs_of(trials: Sequence[Row], plan: Mapping[str, Any]) -> list[Pair]:
     return [(blocks[block][names[0]], blocks[block][names[1]]) for block in made]
 
 
+def kept_faults(
+    rows: Sequence[Mapping[str, str]],
+    scores: Sequence[Mapping[str, str]],
+    plan: Mapping[str, Any],
+    at_reveal: Mapping[str, Any] | None,
+) -> list[str]:
+    """Contradictions of the trials, their scores, and the pairs that the reveal kept."""
+    given: dict[str, list[Mapping[str, str]]] = defaultdict(list)
+    for score in scores:
+        given[score["trial"]].append(score)
+    known = {row["trial"] for row in rows}
+    found = [
+        f"scores.csv has a score of trial {trial}, trials.csv no such trial"
+        for trial in given
+        if trial not in known
+    ]
+    for row in rows:
+        newest = given[row["trial"]][-1] if given[row["trial"]] else {}
+        said, kept = (
+            [_plain(of.get(name, "")) for name in ("success", "score", "milestones")] for of in (row, newest)
+        )
+        if said != kept and (newest or row["status"] == "scored"):
+            found.append(f"trial {row['trial']} is said to be {said}, its newest score is {kept}")
+    if at_reveal is not None and not found:
+        pairs = [list(pair) for pair in pairs_of([_stood(row, given, at_reveal["at"]) for row in rows], plan)]
+        if pairs != [[float(one), float(other)] for one, other in at_reveal["pairs"]]:
+            found.append("the pairs of the reveal are not those of the scores that stood then")
+    return found
+
+
+@dataclass(frozen=True)
+class _Stood:
+    block: str
+    checkpoint: str
+    status: str
+    success: bool
+    score: float
+
+
+def _stood(row: Mapping[str, str], given: Mapping[str, Sequence[Mapping[str, str]]], at: str) -> _Stood:
+    """A trial by the last of its scores at that time."""
+    then = datetime.fromisoformat(at)
+    before = [score for score in given[row["trial"]] if datetime.fromisoformat(score["scored_at"]) <= then]
+    counts = row["status"] == "scored" and bool(before)
+    success, score = (before[-1]["success"] == "true", float(before[-1]["score"])) if counts else (False, 0.0)
+    return _Stood(row["block"], row["checkpoint"], "scored" if counts else "", success, score)
+
+
+def _plain(cell: str) -> Any:
+    """A cell as JSON reads it: numbers and lists are the same however they are written."""
+    try:
+        return json.loads(cell)
+    except ValueError:
+        return cell
+
+
 def conclusion(pairs: Sequence[Pair], plan: Mapping[str, Any]) -> dict[str, Any]:
     """After how many pairs the design ended, for which checkpoint, and the p of a fixed number's one test."""
     said, names = plan["stopping"], plan["comparison"]
@@ -65,7 +125,7 @@ def conclusion(pairs: Sequence[Pair], plan: Mapping[str, Any]) -> dict[str, Any]
             p = methods.sign_flips([one - other for one, other in given])
         else:
             p = methods.barnard(int(first), at, int(second), at)[1]
-        winner = names[0 if first > second else 1] if p <= said["alpha"] else ""
+        winner = names[0 if first > second else 1] if p <= said["alpha"] * (1 + _TIE) else ""
     return {"pairs": len(given), "at": at, "winner": winner or None, "p": p}
 
 
@@ -86,12 +146,34 @@ def error(plan: Mapping[str, Any]) -> float:
         for (a, b), ways in tables.items():
             gone[a + b] += ways
     share = [ways / math.comb(trials, x) for x, ways in enumerate(gone)]
-    rates = 80 * trials
-    gap = math.pi / 2 / (rates + 1)
-    highest = max(_mixed(share, math.sin(gap * i) ** 2) for i in range(1, rates + 1))
-    # Along the angle of which the rate is the squared sine, that of a probability turns by at most sqrt(trials).
-    turned = math.asin(math.sqrt(min(1.0, highest))) + math.sqrt(trials) * gap / 2
-    return math.sin(min(turned, math.pi / 2)) ** 2
+    return _bound(share, said["alpha"])
+
+
+def _bound(share: Sequence[float], alpha: float) -> float:
+    """A bound of the mean of `share` over binomial numbers of successes, whatever the rate.
+
+    Along the angle of which the rate is the squared sine, that of a probability turns by at most sqrt(trials). Between
+    two rates that this does not keep below alpha another one is taken, until they are as near as can be told.
+    """
+    turn, allowed, end = math.sqrt(len(share) - 1), math.asin(math.sqrt(alpha)), 1e-7
+
+    def turned(angle: float) -> float:
+        return math.asin(math.sqrt(min(1.0, max(0.0, _mixed(share, math.sin(angle) ** 2)))))
+
+    angles = [end + (math.pi / 2 - 2 * end) * i / 1000 for i in range(1001)]
+    at = [turned(angle) for angle in angles]
+    cells = list(zip(angles, angles[1:], at, at[1:], strict=False))
+    bound = max(at[0], at[-1]) + turn * end
+    while cells:
+        left, right, low, high = cells.pop()
+        most = (low + high + turn * (right - left)) / 2
+        if most <= allowed or max(low, high) > allowed or right - left < 1e-9:
+            bound = max(bound, most)
+        else:
+            middle = (left + right) / 2
+            at_middle = turned(middle)
+            cells += [(left, middle, low, at_middle), (middle, right, at_middle, high)]
+    return math.sin(min(bound, math.pi / 2)) ** 2
 
 
 def _foreseen(plan: Mapping[str, Any]) -> int:

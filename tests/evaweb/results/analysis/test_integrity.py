@@ -45,7 +45,7 @@ def test_failures_of_one_checkpoint_that_were_voided_are_told_and_what_they_chan
     assert voided in (7, 8)
     said = headline(plan)
     assert said.sentence.startswith(f"{NEW} succeeded more often than {OLD}: {voided}/8 against 0/8")
-    assert said.unvoided.startswith(f"No significant difference between {NEW} and {OLD}: 0/8 against 0/8")
+    assert said.at_first.startswith(f"No significant difference between {NEW} and {OLD}: 0/8 against 0/8")
 
 
 def test_attempts_thrown_away_unscored_are_told_by_the_worst_that_they_could_have_been(bench, plan, tried):
@@ -61,12 +61,12 @@ def test_attempts_thrown_away_unscored_are_told_by_the_worst_that_they_could_hav
     said = headline(plan)
     assert said.sentence.startswith(f"{NEW} succeeded more often than {OLD}: 8/8 against 0/8")
     assert said.worst.startswith(f"No significant difference between {NEW} and {OLD}: 2/8 against 0/8")
-    assert said.unvoided == ""
+    assert said.at_first == ""
 
 
 def test_where_nothing_was_voided_there_is_one_sentence(plan, tried):
     tried(success=True)
-    assert headline(plan).unvoided == ""
+    assert headline(plan).at_first == ""
 
 
 def test_corrections_are_told_by_their_direction_and_late_ones_apart(bench, plan, owner, tried):

@@ -8,6 +8,7 @@ import pytest
 from django.core.management import CommandError, call_command
 
 from evaweb.plans import pictures
+from evaweb.plans.canonical import digest
 from evaweb.plans.models import Achieved, Reference
 from evaweb.results.analysis.caching import analysis_of
 from evaweb.results.ratings import judging
@@ -118,6 +119,31 @@ def test_a_trial_that_was_taken_out_or_of_another_checkpoint_is_found(report):
     ]
     path.write_text("".join(swapped), "utf-8")
     assert "is not what the schedule foresaw" in recompute(report).stdout
+
+
+def test_pairs_of_the_reveal_that_were_forged_with_their_digest_are_found(report):
+    data = report / "data"
+    seal, plan = (json.loads((data / name).read_text("utf-8")) for name in ("seal.json", "plan.json"))
+    seal["at_reveal"]["pairs"] = [[other, one] for one, other in seal["at_reveal"]["pairs"]]
+    seal["at_reveal"]["digest"] = digest({"plan": digest(plan), "pairs": seal["at_reveal"]["pairs"]})
+    (data / "seal.json").write_text(json.dumps(seal), "utf-8")
+    assert "the pairs of the reveal are not those of the scores that stood then" in recompute(report).stdout
+
+
+@pytest.mark.parametrize(("column", "value"), [("success", None), ("score", "0.125"), ("trial", "99999")])
+def test_a_score_that_is_not_that_of_its_trial_is_found(report, column, value):
+    path = report / "data" / "scores.csv"
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    flipped = "false" if rows[-1]["success"] == "true" else "true"
+    rows[-1][column] = flipped if value is None else value
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    found = recompute(report)
+    assert found.returncode == 1
+    assert "newest score" in found.stdout or "no such trial" in found.stdout
 
 
 def test_the_page_needs_no_network_and_shows_the_checklist(report):

@@ -1,0 +1,47 @@
+"""The reveal of a plan on the disk: a database that is put back does not make it undone.
+
+DATA/reveals/UUID.jsonl, named by the first half of the plan's digest. The first line counts, whatever came later.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from pydantic import Field
+
+from evaweb.journal import From, Journal, Line, Moment, Person
+from evaweb.plans.models import Plan
+
+log = logging.getLogger(__name__)
+
+
+class RevealLine(Line):
+    """A reveal: what of the plan's comparison counts from then on."""
+
+    kind: Literal["reveal"] = "reveal"
+    name: str
+    version: Annotated[int, Field(ge=1, lt=2**31)]
+    digest: str
+    at_reveal: dict[str, Any] | None
+    by: Annotated[Person, From("revealed_by__username")]
+    at: Annotated[Moment, From("revealed_at")]
+
+
+REVEALS: Journal[RevealLine] = Journal("reveals", RevealLine)
+
+
+def kept(plan: Plan) -> RevealLine | None:
+    """The first reveal of a frozen plan, of whatever database; None before it."""
+    lines = REVEALS.read(_file(plan), log.warning)
+    return next((line for line in lines if line.digest == plan.digest), None)
+
+
+def keep(plan: Plan) -> None:
+    """Write down a reveal that is about to be saved. Raises NotKept."""
+    REVEALS.append(_file(plan), RevealLine.written(plan))
+
+
+def _file(plan: Plan) -> UUID:
+    return UUID(hex=plan.digest[:32])
