@@ -16,6 +16,7 @@ from evaweb.api import (
     collecting,
     datasets,
     episodes,
+    failures,
     jobs,
     plans,
     preflights,
@@ -72,6 +73,7 @@ api.add_router("/episodes", episodes.router)
 api.add_router("/datasets", datasets.router)
 api.add_router("", reviews.router)
 api.add_router("/scenes", scenes.router)
+api.add_router("/failures", failures.router)
 api.add_router("/checkpoints", checkpoints.router)
 api.add_router("/preflights", preflights.router)
 api.add_router("", collecting.router)

@@ -25,6 +25,7 @@ from evaweb.results.reports.document import analysis_document, arm_document, com
 from evaweb.results.reports.tables import COLUMNS, outcome_page, outcome_pages
 from evaweb.results.selectors import plan_get
 from evaweb.tabular_export import in_pages
+from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import Score
 
 router = Router(tags=["results"])
@@ -54,6 +55,7 @@ class RatingOut(Schema):
     success: bool
     score: float
     failure: str
+    failure_phase: str
     note: str
     blind: bool
     at: datetime
@@ -61,7 +63,7 @@ class RatingOut(Schema):
     @staticmethod
     def of(rating: Rating) -> dict[str, Any]:
         """Flat."""
-        plain = ("uuid", "success", "score", "failure", "note", "blind", "at")
+        plain = ("uuid", "success", "score", *FIELDS, "note", "blind", "at")
         return {
             **{name: getattr(rating, name) for name in plain},
             "trial": rating.trial_id,
@@ -106,6 +108,7 @@ class ScoreRow(Schema):
     success: bool
     score: float
     failure: str
+    failure_phase: str
     note: str
     reason: str
     scored_at: datetime
@@ -113,7 +116,7 @@ class ScoreRow(Schema):
     @staticmethod
     def of(score: Score) -> dict[str, Any]:
         """Flat."""
-        plain = ("uuid", "source", "success", "score", "failure", "note", "reason", "scored_at")
+        plain = ("uuid", "source", "success", "score", *FIELDS, "note", "reason", "scored_at")
         return {
             **{name: getattr(score, name) for name in plain},
             "trial": score.trial_id,

@@ -47,6 +47,7 @@ class SceneOut(Schema):
     layout: str
     time_limit_s: float | None
     ordered: bool
+    failure_required: bool
     active: bool
     positions: list[PositionOut]
     milestones: list[MilestoneOut]

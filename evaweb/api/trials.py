@@ -15,6 +15,7 @@ from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.tables import Format, table_answer
 from evaweb.blinding import Sight, sight_for
 from evaweb.trials import selectors, services, voids
+from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import Score, Trial, TrialStatus, VoidRequest
 from evaweb.trials.record import api_columns, shown
 from evaweb.trials.selectors import TrialFilters
@@ -77,6 +78,7 @@ class ScoreOut(Schema):
     score: float
     note: str
     failure: str
+    failure_phase: str
     reason: str
     scored_at: datetime
     milestones: list[OutcomeOut]
@@ -84,7 +86,7 @@ class ScoreOut(Schema):
     @staticmethod
     def of(score: Score) -> dict[str, Any]:
         """With its milestones."""
-        plain = ("uuid", "source", "success", "score", "note", "failure", "reason", "scored_at")
+        plain = ("uuid", "source", "success", "score", "note", *FIELDS, "reason", "scored_at")
         return {
             **{name: getattr(score, name) for name in plain},
             "rater": score.rater.get_username(),
@@ -149,7 +151,12 @@ class ScoreIn(Schema):
     ]
     success: bool | None = None
     note: str = ""
-    failure: str = ""
+    failure: Annotated[
+        str, Field(description="Why it failed, best one of the lab's causes: see /failures")
+    ] = ""
+    failure_phase: Annotated[
+        str, Field(description="In which phase, one of the lab's; then the cause is one of the lab's too")
+    ] = ""
     source: str = Score.Source.HUMAN.value
     reason: str = ""
     uuid: Annotated[UUID | None, Field(description="Of your own; another one for each score")] = None

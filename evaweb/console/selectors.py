@@ -15,11 +15,11 @@ from evaweb.plans.selectors import handout_of, plans_open
 from evaweb.stations.models import Lease, Station
 from evaweb.stations.robot_geometry import facts_of
 from evaweb.stations.selectors import last_set_up, leases_open, station_list
-from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Score, Trial, TrialStatus
+from evaweb.trials.failures import Level, offered
+from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED, checkpoint_list, scene_list, trial_list, trial_open
 
 SESSION_KEY = "station"
-FAILURES_OFFERED = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Panel:
     """Contents of the four steps of an evaluation, as one user may see them.
 
     `trial` is the unfinished one, with the `milestones` of its scene; `implied` says whether they decide on
-    success, `set_up` whether the station was last set up for it. Without one, `scene`, `position` and
+    success, `failures` what can be said of a failure, `set_up` whether the station was last set up for it. Without one, `scene`, `position` and
     `checkpoint` are the choice to begin with, after `last`, the newest finished one.
 
     `plans` are those that are open here, `plan` the one that is worked on, `handout` how the trial was handed out,
@@ -55,7 +55,7 @@ class Panel:
     checkpoint: Checkpoint | None
     milestones: tuple[Milestone, ...]
     set_up: bool
-    failures: tuple[str, ...]
+    failures: tuple[Level, ...]
     hidden: bool  # which checkpoint the trial is of
     plans: tuple[Plan, ...] = ()
     plan: Plan | None = None
@@ -155,7 +155,7 @@ def panel(*, station: Station, user: Any, sight: Sight, scene: str = "", plan: s
         checkpoint=last.checkpoint if last and not sight.hides(last) else None,
         milestones=tuple(trial.scene.milestones.order_by("order")) if trial else (),
         set_up=trial is not None and _is_set_up(trial),
-        failures=_failures() if trial else (),
+        failures=offered() if trial else (),
         hidden=trial is not None and sight.hides(trial),
         plans=plans,
         plan=worked,
@@ -198,8 +198,3 @@ def _is_set_up(trial: Trial) -> bool:
     last = last_set_up(station=trial.station)
     return last is not None and last == trial.setup
 
-
-def _failures() -> tuple[str, ...]:
-    """The words that were last used for what went wrong, the newest first."""
-    newest = Score.objects.exclude(failure="").order_by("-pk").values_list("failure", flat=True)[:200]
-    return tuple(dict.fromkeys(newest))[:FAILURES_OFFERED]

@@ -1,6 +1,6 @@
 """Scenes, checkpoints and plans as TOML: what one lab wrote down, another reads.
 
-    [[scene]]       name, title, instruction, criterion, layout, time_limit_s, ordered
+    [[scene]]       name, title, instruction, criterion, layout, time_limit_s, ordered, failure_required
     [[scene.position]]   number, label, description, bench
     [[scene.milestone]]  order, text, points, required, time_limit_s, truth
     [[checkpoint]]  name, description, policy, digest, parent (a name), tags
@@ -83,6 +83,7 @@ def _written(
 
 def _scene_table(scene: Scene) -> dict[str, Any]:
     table = scene_of(scene, list(scene.positions.order_by("number")))
+    table["failure_required"] = scene.failure_required  # what is asked of raters: no part of a frozen plan
     table["position"], table["milestone"] = table.pop("positions"), table.pop("milestones")
     return table
 

@@ -45,6 +45,7 @@ class SceneTable(Table):
     layout: str = ""
     time_limit_s: float | None = None
     ordered: bool = False
+    failure_required: bool = False
     position: list[PositionTable] = Field(min_length=1)
     milestone: list[MilestoneTable] = []
 

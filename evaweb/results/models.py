@@ -24,6 +24,7 @@ class Rating(models.Model):
     score = models.FloatField(help_text="Share of the points of all milestones, 0 to 1.")
     milestones = models.JSONField(default=list, help_text="[text, reached] of each, in their order.")
     failure = models.CharField(max_length=60, blank=True)
+    failure_phase = models.CharField(max_length=60, blank=True)
     note = models.TextField(blank=True)
     blind = models.BooleanField(help_text="Whether the rater could not know which checkpoint it was.")
     at = models.DateTimeField(default=timezone.now)

@@ -13,6 +13,8 @@ from django.db.models import Case, Count, Exists, IntegerField, Max, Min, OuterR
 from evaweb.errors import EvaError, NotFound
 from evaweb.plans.models import Plan, PlanState, Slot
 from evaweb.stations.models import Station
+from evaweb.trials.failure_words import NOT_SAID
+from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import MilestoneOutcome, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED
 
@@ -68,7 +70,7 @@ class StationNow:
 class Question:
     """Which trials of a plan are meant; "" where it does not matter.
 
-    `success` is yes or no, `missed` and `reached` are the words of a milestone. Without a `status` those that count.
+    `success` is yes or no, `failure` and `failure_phase` may be "not said", `missed` and `reached` are the words of a milestone. Without a `status` those that count.
     """
 
     checkpoint: str = ""
@@ -79,6 +81,7 @@ class Question:
     status: str = TrialStatus.SCORED.value
     success: str = ""
     failure: str = ""
+    failure_phase: str = ""
     missed: str = ""
     reached: str = ""
 
@@ -146,11 +149,13 @@ def trials_of_plan(plan: Plan, question: Question) -> QuerySet[Trial]:
         "scene": "scene__name",
         "station": "station__name",
         "operator": "operator__username",
-        "failure": "verdict__failure",
     }
     for name, field in fields.items():
         if value := getattr(question, name):
             rows = rows.filter(**{field: value})
+    for name in FIELDS:
+        if value := getattr(question, name):
+            rows = rows.filter(**{f"verdict__{name}": "" if value == NOT_SAID else value})
     if question.position:
         rows = rows.filter(position__number=_whole("position", question.position))
     if question.status:

@@ -17,6 +17,7 @@ from django.utils.html import format_html
 from evaweb.trials.models import (
     Checkpoint,
     Evaluation,
+    FailureTerm,
     Milestone,
     MilestoneOutcome,
     Position,
@@ -125,7 +126,7 @@ class SceneAdmin(ActiveActions, admin.ModelAdmin):
     formfield_overrides = _SHORT
     fieldsets = (
         (None, {"fields": (("title", "name"), "instruction", "active")}),
-        ("At the bench", {"fields": ("layout", "criterion", "time_limit_s", "ordered")}),
+        ("At the bench", {"fields": ("layout", "criterion", "time_limit_s", "ordered", "failure_required")}),
     )
 
     def get_queryset(self, request: HttpRequest) -> QuerySet[Scene]:
@@ -175,6 +176,37 @@ class SceneAdmin(ActiveActions, admin.ModelAdmin):
     def trials_n(self, scene: Scene) -> int:
         """Number of trials."""
         return scene.n_trials  # type: ignore[attr-defined, no-any-return]
+
+
+@admin.register(FailureTerm)
+class FailureTermAdmin(ActiveActions, admin.ModelAdmin):
+    """The taxonomy of failures; scores keep its words, whatever becomes of them here."""
+
+    list_display = ("words", "level", "shortcut", "order", "active")
+    list_editable = ("order",)
+    list_filter = ("level", "active")
+
+    def get_readonly_fields(self, request: HttpRequest, obj: FailureTerm | None = None) -> tuple[str, ...]:
+        """What a word is of."""
+        return ("level",) if obj else ()
+
+    def save_model(self, request: HttpRequest, obj: FailureTerm, form: Any, change: bool) -> None:
+        """Say so where scores were given with other words."""
+        before = form.initial.get("words") if "words" in form.changed_data else ""
+        super().save_model(request, obj, form, change)
+        field = "failure_phase" if obj.level == FailureTerm.Level.PHASE else "failure"
+        scores = Score.objects.filter(**{field: before}).count() if change and before else 0
+        if scores:
+            messages.warning(
+                request,
+                f"{scores} score{'s' if scores > 1 else ''} said {before!r} and keep it: they are counted apart "
+                f"from those that will say {obj.words!r}.",
+            )
+
+    @admin.display(description="key", ordering="key")
+    def shortcut(self, term: FailureTerm) -> str:
+        """As it is pressed."""
+        return f"Shift + {term.key.upper()}" if term.key else ""
 
 
 class CheckpointForm(forms.ModelForm):
@@ -291,7 +323,7 @@ class ScoreInline(ReadOnly, admin.TabularInline):
     model = Score
     fk_name = "trial"
     extra = 0
-    fields = ("scored_at", "rater", "source", "success", "score", "failure", "note", "reason")
+    fields = ("scored_at", "rater", "source", "success", "score", "failure_phase", "failure", "note", "reason")
     readonly_fields = fields
 
 
@@ -311,7 +343,7 @@ class TrialAdmin(ReadOnly, admin.ModelAdmin):
         "page",
     )
     list_filter = ("status", "scene", "checkpoint", "station")
-    search_fields = ("uuid", "scores__note", "scores__failure", "operator__username")
+    search_fields = ("uuid", "scores__note", "scores__failure", "scores__failure_phase", "operator__username")
     list_select_related = ("scene", "position", "checkpoint", "station")
     date_hierarchy = "prepared_at"
     inlines = (ScoreInline,)
@@ -340,9 +372,9 @@ class OutcomeInline(ReadOnly, admin.TabularInline):
 class ScoreAdmin(ReadOnly, admin.ModelAdmin):
     """Every score there ever was."""
 
-    list_display = ("scored_at", "trial", "rater", "source", "success", "score", "failure", "reason")
+    list_display = ("scored_at", "trial", "rater", "source", "success", "score", "why", "reason")
     list_filter = ("success", "source", "trial__scene", "trial__checkpoint")
-    search_fields = ("note", "failure", "reason", "rater__username")
+    search_fields = ("note", "failure", "failure_phase", "reason", "rater__username")
     list_select_related = ("trial__scene", "trial__checkpoint", "trial__position", "rater")
     date_hierarchy = "scored_at"
     inlines = (OutcomeInline,)

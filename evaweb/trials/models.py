@@ -6,13 +6,20 @@ import uuid
 
 from django.conf import settings
 from django.core.exceptions import ValidationError
-from django.core.validators import MaxValueValidator, MinValueValidator, RegexValidator
+from django.core.validators import (
+    MaxValueValidator,
+    MinValueValidator,
+    ProhibitNullCharactersValidator,
+    RegexValidator,
+)
 from django.db import models
+from django.db.models.functions import Lower
 from django.utils import timezone
 
 from evaweb.append_only import AppendOnly
 from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
+from evaweb.trials.failure_words import why_words
 from evaweb.trials.tables import check_bench, check_policy, check_tags
 
 
@@ -35,6 +42,11 @@ class Scene(models.Model):
     )
     ordered = models.BooleanField(
         "milestones in order", default=False, help_text="One counts only after all those before it."
+    )
+    failure_required = models.BooleanField(
+        "failures explained",
+        default=False,
+        help_text="A failed trial is not scored without the phase in which it failed, and the cause.",
     )
     active = models.BooleanField(default=True, help_text="Off: not offered to operators.")
     created_at = models.DateTimeField(auto_now_add=True)
@@ -97,6 +109,67 @@ class Milestone(models.Model):
 
     def __str__(self) -> str:
         return self.text
+
+
+FAILURE_KEYS = "abcdefghijmnoqtvwyz"
+"""Letters that choose a failure, with Shift: not those with which the Eval page commands, alone or with Shift.
+
+A scored trial's keys are gone with its form: pressed once too often, each must be harmless.
+"""
+
+
+class FailureTerm(models.Model):
+    """A word of the lab's taxonomy of failures: a phase of the task, or a cause.
+
+    Scores keep the words, not the term: what becomes of a term changes nothing that was said.
+    """
+
+    class Level(models.TextChoices):
+        PHASE = "phase", "phase"
+        CAUSE = "cause", "cause"
+
+    level = models.CharField(max_length=5, choices=Level)
+    words = models.CharField(
+        max_length=60, validators=[ProhibitNullCharactersValidator()], help_text="As scores have it."
+    )
+    key = models.CharField(
+        max_length=1,
+        blank=True,
+        validators=[
+            RegexValidator(
+                rf"\A[{FAILURE_KEYS}]\Z",
+                f"%(value)s was given; allowed: one of {' '.join(FAILURE_KEYS)}, or none",
+            )
+        ],
+        help_text="Chooses it at scoring, pressed with Shift: one of "
+        f"{' '.join(FAILURE_KEYS)} that no other has.",
+    )
+    order = models.PositiveSmallIntegerField(default=0, help_text="Among those of its level.")
+    active = models.BooleanField(default=True, help_text="Off: retired, not offered; scores keep it.")
+
+    class Meta:
+        ordering = ("-level", "order", "pk")  # phases come first
+        verbose_name = "failure phase or cause"
+        verbose_name_plural = "failure phases and causes"
+        constraints = [
+            models.UniqueConstraint(
+                Lower("words"),
+                "level",
+                name="failure_term_once",
+                violation_error_message="There is one of these words already; one that is retired can be "
+                "switched on.",
+            ),
+            models.UniqueConstraint(
+                fields=("key",),
+                condition=~models.Q(key=""),
+                name="failure_key_once",
+                violation_error_message="Another phase or cause has this key; a retired one keeps its own "
+                "until it is emptied.",
+            ),
+        ]
+
+    def __str__(self) -> str:
+        return self.words
 
 
 class Checkpoint(models.Model):
@@ -413,6 +486,7 @@ class Score(models.Model):
     )
     note = models.TextField(blank=True)
     failure = models.CharField(max_length=60, blank=True, help_text="What went wrong, in a word or two.")
+    failure_phase = models.CharField(max_length=60, blank=True, help_text="The phase in which it did.")
     reason = models.TextField(blank=True, help_text="Of a correction: why the one before does not stand.")
     source = models.CharField(max_length=16, choices=Source, default=Source.HUMAN)
     scored_at = models.DateTimeField(default=timezone.now)
@@ -430,6 +504,11 @@ class Score(models.Model):
 
     def __str__(self) -> str:
         return f"{'success' if self.success else 'failure'}, {self.score:.0%}"
+
+    @property
+    def why(self) -> str:
+        """Phase and cause of a failure, as far as they were said."""
+        return why_words(self.failure_phase, self.failure)
 
 
 class MilestoneOutcome(models.Model):

@@ -85,6 +85,7 @@ class TrialRecord(Line):
     duration_s: Annotated[_Seconds | None, Column(open=True, written="after")] = None
     note: Annotated[str | None, Column("verdict__note", open=True, written="never")] = None
     failure: Annotated[str | None, Column("verdict__failure", open=True, written="never")] = None
+    failure_phase: Annotated[str | None, Column("verdict__failure_phase", open=True, written="never")] = None
     rater: Annotated[str | None, Column("verdict__rater__username", open=True, written="never")] = None
     source: Annotated[str | None, Column("verdict__source", open=True, written="never")] = None
     scored_at: Annotated[datetime | None, Column("verdict__scored_at", open=True, written="never")] = None
@@ -196,6 +197,7 @@ class ScoreLine(Line):
     score: Annotated[float, Field(ge=0, le=1)]
     note: str = ""
     failure: Annotated[str, Field(max_length=60)] = ""
+    failure_phase: Annotated[str, Field(max_length=60)] = ""
     reason: str = ""
     source: Score.Source = Score.Source.HUMAN
     milestones: Annotated[tuple[OutcomeLine, ...], From("outcomes__all")] = ()

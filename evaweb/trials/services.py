@@ -19,7 +19,7 @@ from evaweb.journal import text
 from evaweb.roles import Role, require
 from evaweb.stations.commands import identity_of
 from evaweb.stations.models import Station
-from evaweb.trials import lifecycle
+from evaweb.trials import failures, lifecycle
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import (
     Checkpoint,
@@ -34,7 +34,7 @@ from evaweb.trials.models import (
 from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, file_of
 from evaweb.trials.selectors import attempts_of, trial_open
 from evaweb.trials.station_events import run_changed
-from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, Verdict, verdict
+from evaweb.trials.verdicts import LONGEST_NOTE, Verdict, verdict
 
 __all__ = [
     "checked",
@@ -230,6 +230,7 @@ def trial_score(
     success: bool | None = None,
     note: str = "",
     failure: str = "",
+    failure_phase: str = "",
     source: str = Score.Source.HUMAN,
     reason: str = "",
     uuid: UUID | str | None = None,
@@ -237,7 +238,8 @@ def trial_score(
     """Add a score; of a trial that has one it is a correction, needs a reason, and counts from then on.
 
     `milestones`: id -> reached, for every milestone of the scene; `times`: id -> when [s after the start of the run],
-    as far as known. Disk first, then the row, then publication.
+    as far as known. What `failure` and `failure_phase` may be says `failures.check_failure`. Disk first, then the row,
+    then publication.
 
     The same `uuid` again, or without one word by word what this rater said and counts already, is the first score,
     whose answer was lost: nothing is added. Conflict for a uuid that is another score's.
@@ -247,7 +249,7 @@ def trial_score(
         raise EvaError(f"source = {source!r}; allowed: {', '.join(Score.Source.values)}")
     words = {
         "note": text("note", note, LONGEST_NOTE),
-        "failure": text("failure", failure, LONGEST_FAILURE),
+        **failures.stripped(failure_phase=failure_phase, failure=failure),
         "reason": text("reason", reason, LONGEST_NOTE),
     }
     checked("scored", trial, user)
@@ -265,8 +267,13 @@ def trial_score(
             )
         _check_scorable(held, words["reason"])
         found = judged()
-        if found.success and words["failure"]:
-            raise EvaError(f"failure = {words['failure']!r} but the trial is a success: leave failure empty")
+        failures.check_failure(
+            held.scene,
+            words,
+            success=found.success,
+            by_person=source == Score.Source.HUMAN,
+            said=failures.said_of(held.verdict),
+        )
         score = Score(uuid=identity_of(uuid), trial=held, success=found.success, score=found.score, **said)
         _keep(held, score, found)
         publish(held)

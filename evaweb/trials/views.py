@@ -17,7 +17,7 @@ from evaweb.episodes.selectors import stage_of
 from evaweb.errors import EvaError
 from evaweb.roles import Role, role_of
 from evaweb.stations.selectors import station_list
-from evaweb.trials import lifecycle, selectors, services, voids
+from evaweb.trials import failures, lifecycle, selectors, services, voids
 from evaweb.trials.figures import scene_figures
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import Trial, TrialStatus
@@ -61,7 +61,7 @@ def score(request: HttpRequest, id: int) -> HttpResponse:
     found = selectors.trial_get(id=id)
     ticked = set(request.POST.getlist("milestone"))
     milestones = {key: str(key) in ticked for key in found.scene.milestones.values_list("pk", flat=True)}
-    given = {name: request.POST.get(name, "") for name in ("note", "failure", "reason")}
+    given = {name: request.POST.get(name, "") for name in ("note", "reason", *failures.FIELDS)}
     try:
         services.trial_score(
             user=request.user,  # type: ignore[arg-type]
@@ -114,6 +114,7 @@ def _trial_page(
     hidden = sight_for(request).hides(found)
     operator = role_of(request.user) is not Role.VIEWER
     milestones = list(found.scene.milestones.order_by("order"))
+    typed = typed or _as_scored(found)
     context = {
         "trial": found,
         "episode": found.episode,
@@ -136,7 +137,8 @@ def _trial_page(
         "laid_out": laid_out(found),
         "further": labelled(found, sight_for(request)),
         "fault": fault,
-        "typed": typed or _as_scored(found),
+        "typed": typed,
+        "failures": failures.offered(typed),
         "uuid": uuid4(),  # of the score that may be sent from this page, and then be sent again
     }
     return render(request, "trials/trial.html", context, status=fault.status if fault else 200)
@@ -164,7 +166,7 @@ def _as_scored(trial: Trial) -> dict[str, Any]:
     if verdict is None:
         return {}
     success = "yes" if verdict.success else "no"
-    return {"note": verdict.note, "failure": verdict.failure, "success": success}
+    return {"note": verdict.note, "success": success, **failures.said_of(verdict)}
 
 
 def _filters(given: Mapping[str, str], sight: Sight) -> tuple[TrialFilters, EvaError | None]:

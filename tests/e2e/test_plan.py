@@ -60,14 +60,16 @@ def started(operator):
     return shown(operator)
 
 
-def scored(operator, ticks):
-    """The run is stopped, and what is ticked is saved."""
+def scored(operator, ticks, failure=()):
+    """The run is stopped, and what is ticked is saved, with what is pressed of its failure."""
     operator.page.locator("[data-command=stop][data-trial]:visible").click()
     operator.page.locator("#score").wait_for()
     for key in ticks:
         box = operator.page.locator("#score input[name=milestone]").nth(key - 1)
         if not box.is_checked():
             box.check()
+    for key in failure:
+        operator.page.keyboard.press(key)
     operator.page.locator("button[form=score]").click()
     operator.page.locator("[data-next]").wait_for()
 
@@ -94,8 +96,9 @@ def test_trials_of_a_blind_plan_are_made_through_the_tab(operator, demo):
     eventually(
         lambda: "at " in page.locator("#live [data-at]").first.inner_text(), 10, "the tick has its time"
     )
-    scored(operator, ticks=(1, 2))
+    scored(operator, ticks=(1, 2), failure=("Shift+G", "Shift+D"))
     outcomes = operator.api("trials?limit=1")["items"][0]
+    assert (outcomes["failure_phase"], outcomes["failure"]) == ("grasp", "dropped")
     assert (outcomes["code"], outcomes["checkpoint"], outcomes["success"]) == (first, first, False)
     reached = operator.api(f"trials/{outcomes['id']}")["scores"][0]["milestones"]
     assert [one["reached"] for one in reached] == [True, True, False, False]

@@ -25,6 +25,7 @@ from evaweb.statistics.proportions import Posterior, Proportion, clopper_pearson
 from evaweb.statistics.rates import Rate, rate
 from evaweb.statistics.sequential import Evidence, score_evidence, success_evidence
 from evaweb.statistics.success_times import Curve, RestrictedMean, incidence, restricted_mean
+from evaweb.trials.failure_words import NOT_SAID, why_words
 
 SEED = 20_260  # of all that is drawn: the same data give the same interval
 T = TypeVar("T")
@@ -40,6 +41,25 @@ class Funnel:
 
 
 @dataclass(frozen=True, slots=True)
+class FailureMode:
+    """A phase and cause, "" where they were not said, of `count` out of `n` trials, with the exact interval of that.
+
+    Each interval is of one mode, named beforehand: of the most frequent one of many it says too much.
+    """
+
+    phase: str
+    cause: str
+    count: int
+    n: int
+    interval: Interval
+
+    @property
+    def words(self) -> str:
+        """As it is shown."""
+        return why_words(self.phase, self.cause) or NOT_SAID
+
+
+@dataclass(frozen=True, slots=True)
 class Arm:
     """One checkpoint: how often it succeeds, how far it comes, how long it takes.
 
@@ -47,7 +67,7 @@ class Arm:
     `speed` successes per hour of running, `interventions` how often a run was broken off. `curve` and `mean_time` are
     of time to success [s], up to one horizon for all arms, by which a trial that failed has not succeeded.
     `smoothness` is SPARC of what was measured, `commanded` of what was sent, over those trials of which there is a
-    recording.
+    recording. `failures` are all that failed, the most frequent mode first.
     """
 
     checkpoint: str
@@ -63,7 +83,7 @@ class Arm:
     mean_time: RestrictedMean | None
     speed: Rate | None
     interventions: Rate | None
-    failures: tuple[tuple[str, int], ...]
+    failures: tuple[FailureMode, ...]
     smoothness: Average | None
     commanded: Average | None
 
@@ -222,10 +242,20 @@ def _arm(name: str, trials: list[Outcome], interruptions: list[Interruption], ti
         restricted_mean(times, timing.until, seed=SEED) if times else None,
         rate(sum(succeeded), sum(durations)) if timed and sum(durations) > 0 else None,
         _interventions(durations, interruptions),
-        tuple(Counter(o.failure for o in trials if not o.success and o.failure).most_common()),
+        _failures(trials),
         average([o.smoothness for o in trials if o.smoothness is not None]),
         average([o.commanded for o in trials if o.commanded is not None]),
     )
+
+
+def _failures(trials: Sequence[Outcome]) -> tuple[FailureMode, ...]:
+    n = len(trials)
+    counts = Counter((o.failure_phase, o.failure) for o in trials if not o.success)
+    modes = (
+        FailureMode(phase, cause, count, n, clopper_pearson(count, n))
+        for (phase, cause), count in counts.items()
+    )
+    return tuple(sorted(modes, key=lambda mode: (-mode.count, mode.phase, mode.cause)))
 
 
 def _interventions(durations: list[float], interruptions: list[Interruption]) -> Rate | None:

@@ -25,6 +25,7 @@ _FIELDS = _RUN | {
     "success": "verdict__success",
     "score": "verdict__score",
     "failure": "verdict__failure",
+    "failure_phase": "verdict__failure_phase",
     "smoothness": "episode__smoothness",
     "commanded": "episode__smoothness_commanded",
 }

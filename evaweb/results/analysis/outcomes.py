@@ -6,6 +6,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from evaweb.trials.failure_words import why_words
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -31,6 +33,12 @@ class Outcome:
     labels: tuple[str, ...] = field(default=())  # of the milestones
     smoothness: float | None = None  # SPARC of the measured motion; None where there is no recording of it
     commanded: float | None = None  # the same of what was sent
+    failure_phase: str = ""
+
+    @property
+    def why(self) -> str:
+        """Phase and cause of a failure, as far as they were said."""
+        return why_words(self.failure_phase, self.failure)
 
     @property
     def condition(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from evaweb.errors import EvaError
@@ -18,20 +19,22 @@ from evaweb.results.presentation.drawings import conditions, courses, rates
 from evaweb.results.presentation.drawings.svg import Drawing
 from evaweb.results.presentation.facts import comparison_facts, comparison_sentence, missed_words, primary_of
 from evaweb.results.presentation.headline import headline
-from evaweb.results.presentation.listings import MOST_PAIRS, arm_rows, pair_rows, scene_rows
+from evaweb.results.presentation.listings import MOST_PAIRS, arm_rows, failure_tables, pair_rows, scene_rows
 from evaweb.results.presentation.wording import evidence_words
+from evaweb.trials.failures import in_order
 
 
 def summary_page(plan: Plan, only: Chosen) -> dict[str, Any]:
     """Everything that the plan's page shows of its results."""
-    at = caching.fingerprint(plan)
-    return caching.page_of(plan, ("summary", only), at, lambda: _summary(plan, only, at))
+    at, order = caching.fingerprint(plan), in_order()
+    name = ("summary", only, *order.values())  # the lab's order of words is in no fingerprint of trials
+    return caching.page_of(plan, name, at, lambda: _summary(plan, only, at, order))
 
 
-def _summary(plan: Plan, only: Chosen, at: Hashable) -> dict[str, Any]:
+def _summary(plan: Plan, only: Chosen, at: Hashable, order: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
     outcomes = caching.runs_of(plan, at).outcomes
     analysis = caching.analysis_of(plan, only, at)
-    order = {arm.checkpoint: i for i, arm in enumerate(analysis.arms)}
+    place = {arm.checkpoint: i for i, arm in enumerate(analysis.arms)}
     primary = primary_of(plan, analysis)
     scenes = sorted({name for arm in analysis.arms for name in arm.scenes})
     return {
@@ -40,12 +43,12 @@ def _summary(plan: Plan, only: Chosen, at: Hashable) -> dict[str, Any]:
         "choices": choices(outcomes),
         "primary": primary and comparison_facts(plan, analysis, primary),
         "table": arm_rows(plan, analysis, only),
-        "intervals": _intervals(plan, "Success rates", analysis, order, only),
+        "intervals": _intervals(plan, "Success rates", analysis, place, only),
         "violins": rates.violins(analysis.arms, analysis.letters) if analysis.arms else None,
         "funnels": [drawn for scene in scenes if (drawn := _funnel(plan, analysis, scene, only))],
         "success_times": courses.success_times(analysis.arms),
         "grid": conditions.grid(analysis.arms, _grid_links(plan, analysis, only)),
-        "pareto": conditions.pareto(analysis.arms, _failure_links(plan, analysis, only)),
+        "failures": failure_tables(analysis, order, partial(trials_address, plan, only, success="no")),
         "scenes": [(scene, scene_rows(plan, analysis, scene, only)) for scene in scenes],
         "others": [
             (found, comparison_sentence(analysis, found), compare_address(plan, found, only))
@@ -169,7 +172,3 @@ def _grid_links(plan: Plan, analysis: Analysis, only: Chosen) -> dict[tuple[str,
             )
     return links
 
-
-def _failure_links(plan: Plan, analysis: Analysis, only: Chosen) -> dict[str, str]:
-    tags = {tag for arm in analysis.arms for tag, _ in arm.failures}
-    return {tag: trials_address(plan, only, failure=tag, success="no") for tag in tags}

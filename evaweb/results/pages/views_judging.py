@@ -18,6 +18,7 @@ from evaweb.results.ratings import judging
 from evaweb.results.ratings.video_available import seen
 from evaweb.results.selectors import plan_get
 from evaweb.roles import Role, role_of
+from evaweb.trials import failures
 
 _ANSWERS = {"yes": True, "no": False}
 
@@ -47,6 +48,7 @@ def rate(request: HttpRequest) -> HttpResponse:
         "view": view,
         "milestones": [(milestone, str(milestone.pk) in ticked) for milestone in milestones],
         "implied": any(milestone.required for milestone in milestones),
+        "failures": failures.offered(typed),
         "unable": _unable(user, [view]),
         "fault": fault,
         "typed": typed,
@@ -98,8 +100,7 @@ def _rated(request: HttpRequest) -> None:
         code=code,
         milestones={key: str(key) in ticked for key in keys},
         success=_ANSWERS.get(request.POST.get("success", "")),
-        failure=request.POST.get("failure", ""),
-        note=request.POST.get("note", ""),
+        **{name: request.POST.get(name, "") for name in (*failures.FIELDS, "note")},
     )
 
 

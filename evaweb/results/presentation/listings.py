@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,9 +14,12 @@ from evaweb.results.analysis.analysis import Analysis, Arm
 from evaweb.results.analysis.filters import Chosen, choices
 from evaweb.results.analysis.outcomes import Outcome, paired
 from evaweb.results.presentation.addresses import beside_address, trials_address
+from evaweb.results.presentation.drawings import conditions
 from evaweb.results.presentation.wording import ends
 from evaweb.statistics.bounded import Mean
 from evaweb.statistics.proportions import Proportion
+from evaweb.trials.failure_words import NOT_SAID
+from evaweb.trials.failures import FIELDS
 from evaweb.trials.figures import average_words
 from evaweb.trials.models import Trial
 
@@ -67,6 +70,54 @@ def scene_rows(plan: Plan, analysis: Analysis, scene: str, only: Chosen) -> list
     ]
 
 
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """How many trials, and where they are."""
+
+    count: int
+    address: str
+
+
+def failure_tables(
+    analysis: Analysis, order: Mapping[str, Sequence[str]], address: Callable[..., str]
+) -> list[dict[str, Any]]:
+    """Of each checkpoint that failed the phases and causes of it: a Pareto chart, and a table with its sums.
+
+    `order`: the lab's words by field; others follow, what was not said comes last. `address` of trials by their
+    checkpoint, failure_phase and failure, of which any may be left out.
+    """
+    return [_failure_table(i, arm, order, address) for i, arm in enumerate(analysis.arms) if arm.failures]
+
+
+def _failure_table(
+    i: int, arm: Arm, order: Mapping[str, Sequence[str]], address: Callable[..., str]
+) -> dict[str, Any]:
+    phases = _ordered({mode.phase for mode in arm.failures}, order["failure_phase"])
+    causes = _ordered({mode.cause for mode in arm.failures}, order["failure"])
+
+    def cell(phase: str | None, cause: str | None) -> Cell:
+        """Of one phase and cause; None for all."""
+        chosen = [m for m in arm.failures if phase in (None, m.phase) and cause in (None, m.cause)]
+        named = {"failure_phase": phase, "failure": cause}
+        where = {field: words or NOT_SAID for field, words in named.items() if words is not None}
+        return Cell(sum(m.count for m in chosen), address(checkpoint=arm.checkpoint, **where))
+
+    rows = [(phase or NOT_SAID, [cell(phase, cause) for cause in (*causes, None)]) for phase in phases]
+    links = {(mode.phase, mode.cause): cell(mode.phase, mode.cause).address for mode in arm.failures}
+    return {
+        "checkpoint": arm.checkpoint,
+        "n": arm.success.n,
+        "pareto": conditions.pareto(i, arm, links),
+        "head": [cause or NOT_SAID for cause in causes],
+        "rows": [*rows, ("all", [cell(None, cause) for cause in (*causes, None)])],
+    }
+
+
+def _ordered(found: set[str], order: Sequence[str]) -> list[str]:
+    place = {words: i for i, words in enumerate(order)}
+    return sorted(found, key=lambda words: (not words, place.get(words, len(place)), words))
+
+
 def pair_rows(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[dict[str, Any]]:
     """Both trials of each block, with where they are played side by side."""
     pairs = paired(first, second)
@@ -102,10 +153,11 @@ def trial_row(trial: Trial) -> dict[str, Any]:
 def trial_choices(plan: Plan) -> dict[str, list[str]]:
     """Values that the list of trials can be narrowed to."""
     runs = caching.runs_of(plan).outcomes
+    failed = [run for run in runs if not run.success]
     return {
         **choices(runs),
         "checkpoint": sorted({run.checkpoint for run in runs}),
-        "failure": sorted({run.failure for run in runs if run.failure}),
+        **{field: sorted({getattr(run, field) or NOT_SAID for run in failed}) for field in FIELDS},
     }
 
 

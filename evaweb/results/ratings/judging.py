@@ -23,9 +23,10 @@ from evaweb.results.models import Preference, Rating
 from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
 from evaweb.results.ratings.video_available import coming, require_seen_on_video, seen
 from evaweb.roles import Role, require
+from evaweb.trials import failures
 from evaweb.trials.models import Score, Trial, TrialStatus
 from evaweb.trials.record import file_of
-from evaweb.trials.verdicts import LONGEST_FAILURE, LONGEST_NOTE, verdict
+from evaweb.trials.verdicts import LONGEST_NOTE, verdict
 
 _STATES = (PlanState.FROZEN, PlanState.CLOSED, PlanState.REVEALED)
 
@@ -102,6 +103,7 @@ def rate(
     milestones: Mapping[object, object],
     success: bool | None = None,
     failure: str = "",
+    failure_phase: str = "",
     note: str = "",
 ) -> Rating:
     """Keep what a rater, not the operator of the trial of that code, saw on its video: on the disk, then as a row."""
@@ -118,7 +120,7 @@ def rate(
         "success": found.success,
         "score": found.score,
         "milestones": [[row[0].text, row[1]] for row in found.reached],
-        "failure": text("failure", failure, LONGEST_FAILURE),
+        **failures.stripped(failure_phase=failure_phase, failure=failure),
         "note": text("note", note, LONGEST_NOTE),
     }
     before = Rating.objects.filter(trial=trial, rater=user).first()
@@ -126,6 +128,7 @@ def rate(
         return _once_more(before, said, twice)
     if has_looked(plan, user):
         raise NotAllowed(f"you have seen results of {plan}: a second rater must not know them")
+    failures.check_failure(trial.scene, said, success=found.success)
     require_seen_on_video(handout)
     rating = Rating(trial=trial, rater=user, blind=plan.sealed, **said)
     RATINGS.append(file_of(trial), RatingLine.written(rating))

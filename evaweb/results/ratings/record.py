@@ -28,6 +28,7 @@ class RatingLine(Line):
     score: Annotated[float, Field(ge=0, le=1)]
     milestones: tuple[tuple[str, StrictBool], ...] = ()
     failure: Annotated[str, Field(max_length=60)] = ""
+    failure_phase: Annotated[str, Field(max_length=60)] = ""
     note: str = ""
     blind: StrictBool
 

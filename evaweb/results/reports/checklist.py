@@ -156,7 +156,7 @@ def _second_rater(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
 
 def _narrative(analysis: Analysis) -> Item:
     failed = sum(arm.success.n - arm.success.successes for arm in analysis.arms)
-    named = sum(n for arm in analysis.arms for _, n in arm.failures)
+    named = sum(m.count for arm in analysis.arms for m in arm.failures if m.phase or m.cause)
     kept = "yes" if named == failed else "partly" if named else "no"
     return Item("Why trials failed", kept, f"{named} of {failed} failures have a reason")
 

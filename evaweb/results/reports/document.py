@@ -6,6 +6,7 @@ is [time, share that has succeeded, low, high].
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 from evaweb.results.analysis.analysis import Analysis, Arm, Comparison
@@ -57,7 +58,17 @@ def arm_document(arm: Arm) -> dict[str, Any]:
         "time_to_success": _time(arm),
         "successes_per_hour": _rate(arm.speed),
         "interruptions_per_hour": _rate(arm.interventions),
-        "failures": dict(arm.failures),
+        "failures": _by_cause(arm),
+        "failure_modes": [
+            {
+                "failure_phase": mode.phase,
+                "failure": mode.cause,
+                "count": mode.count,
+                "n": mode.n,
+                "clopper_pearson": _ends(mode.interval),
+            }
+            for mode in arm.failures
+        ],
         "smoothness": _average(arm.smoothness),
         "smoothness_commanded": _average(arm.commanded),
     }
@@ -121,6 +132,15 @@ def _average(found: Average | None) -> dict[str, Any] | None:
 
 def _clustered(found: Difference | None) -> dict[str, Any] | None:
     return None if found is None else {"value": found.value, "gaffke": _ends(found.interval)}
+
+
+def _by_cause(arm: Arm) -> dict[str, int]:
+    """Each cause that was said, in any phase."""
+    found: Counter[str] = Counter()
+    for mode in arm.failures:
+        if mode.cause:
+            found[mode.cause] += mode.count
+    return dict(found)
 
 
 def _rate(found: Rate | None) -> dict[str, Any] | None:

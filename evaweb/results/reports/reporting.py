@@ -29,6 +29,7 @@ from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.document import analysis_document
 from evaweb.results.reports.tables import COLUMNS, milestones_of, outcome_pages
 from evaweb.tabular_export import csv_lines, in_pages
+from evaweb.trials.failures import in_order
 from evaweb.trials.models import Score
 
 _STYLES = (
@@ -36,7 +37,7 @@ _STYLES = (
     *("result/result.css", "result/figures.css", "result/plans.css"),
 )
 _PROGRAM = Path(__file__).parent / "recompute"
-_RATINGS = ("trial", "rater", "success", "score", "milestones", "failure", "note", "blind", "at")
+_RATINGS = ("trial", "rater", "success", "score", "milestones", "failure", "failure_phase", "note", "blind", "at")
 _PREFERENCES = (
     "first",
     "second",
@@ -49,7 +50,8 @@ _PREFERENCES = (
     "at",
 )
 _SCORES = (
-    *("trial", "rater", "source", "success", "score", "milestones", "failure", "note", "reason", "scored_at"),
+    *("trial", "rater", "source", "success", "score", "milestones", "failure", "failure_phase", "note"),
+    *("reason", "scored_at"),
 )
 
 
@@ -150,7 +152,7 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         ],
         "success_times": courses.success_times(arms),
         "grid": conditions.grid(arms, {}),
-        "pareto": conditions.pareto(arms, {}),
+        "failures": listings.failure_tables(analysis, in_order(), lambda **named: ""),
         "evidence": primary and courses.evidence(primary.evidence, primary.first, primary.second),
         "agreement": agreement_of(plan),
         "preferences": preferences_of(plan),

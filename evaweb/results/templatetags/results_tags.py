@@ -54,7 +54,7 @@ def probability(p: float) -> str:
 @register.filter
 def outcome_words(run: Outcome) -> str:
     """Success or failure, and the score where that says more."""
-    said = "success" if run.success else f"failure{f': {run.failure}' if run.failure else ''}"
+    said = "success" if run.success else ": ".join(filter(None, ("failure", run.why)))
     return f"{said}, {100 * run.score:.0f} % of points" if 0 < run.score < 1 else said
 
 

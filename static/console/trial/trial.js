@@ -123,8 +123,8 @@ export class TrialPanel {
   async #score(form) {
     const milestones = {};
     for (const box of form.querySelectorAll('[name="milestone"]')) milestones[box.value] = box.checked;
-    const { note, failure, success } = form.elements;
-    const score = { milestones, times: times(form), note: note.value, failure: failure.disabled ? "" : failure.value };
+    const { note, success } = form.elements;
+    const score = { milestones, times: times(form), note: note.value, ...whyOf(form) };
     if (success) score.success = success.value === "yes";
     await post(`${config.trial}/${form.dataset.score}/score`, { ...score, uuid: this.#uuid(form.dataset.score, score) });
     saved(form);
@@ -148,11 +148,24 @@ function saved(form) {
   form.dispatchEvent(new Event("eva:saved", { bubbles: true }));
 }
 
+/** Phase and cause of a failure, as far as they are said; of a success nothing. */
+function whyOf(form) {
+  const said = (name) => form.querySelector(`#why:not([hidden]) [name="${name}"]:checked`)?.value ?? "";
+  return { failure_phase: said("failure_phase"), failure: said("failure") };
+}
+
+/** What of a failure is asked for and not said yet; "" for nothing. */
+function unexplained(form) {
+  const levels = [...form.querySelectorAll('#why[data-explained="yes"]:not([hidden]) fieldset')];
+  const open = levels.filter((level) => !level.querySelector(":checked")).map((level) => level.querySelector("legend").textContent.toLowerCase());
+  return open.length ? `say of the failure its ${open.join(" and its ")}` : "";
+}
+
 function saveButton() {
   return document.querySelector('[type="submit"][form="score"]');
 }
 
-/** Say what the ticks come to, and why they cannot be saved yet; a success has nothing that went wrong. */
+/** Say what the ticks come to, and why they cannot be saved yet; a success is not asked what went wrong. */
 function scoreRule() {
   const form = document.getElementById("score");
   if (!form) return;
@@ -162,6 +175,7 @@ function scoreRule() {
   const verdict = form.querySelector(".verdict");
   verdict.textContent = success === null ? "Success? Say yes or no." : success ? "Success" : "No success";
   verdict.dataset.verdict = String(success);
-  form.elements.failure.disabled = success === true;
-  saveButton().dataset.blocked = success === null ? "say whether it was a success" : "";
+  const why = form.querySelector("#why");
+  if (why) why.hidden = success !== false;
+  saveButton().dataset.blocked = success === null ? "say whether it was a success" : unexplained(form);
 }

@@ -166,6 +166,25 @@ def test_a_note_with_unicode_and_newlines_survives_to_csv(rest, bench):
     assert (row["milestones_reached"], row["milestones_missed"]) == ("held; lifted", "on the plate")
 
 
+def test_a_failure_is_scored_in_the_labs_words_which_are_listed(rest, bench):
+    builders.failure_terms()
+    words = [(row["level"], row["words"], row["key"]) for row in rest.get("failures")[1]]
+    assert words == [
+        *(("phase", "approach", "a"), ("phase", "grasp", "g")),
+        *(("cause", "missed", "m"), ("cause", "dropped", "d")),
+    ]
+    assert len(rest.get("failures", inactive="true")[1]) == 6
+    trial = bench.ended()
+    said = {"milestones": bench.ticks(True, False, False), "failure_phase": "grip", "failure": "dropped"}
+    status, answer = rest.post(f"trials/{trial.pk}/score", **said)
+    assert (status, answer["error"]) == (400, "failure_phase = 'grip'; allowed: approach, grasp")
+    status, answer = rest.post(f"trials/{trial.pk}/score", **{**said, "failure_phase": "grasp"})
+    assert status == 200
+    assert (answer["failure_phase"], answer["scores"][0]["failure_phase"]) == ("grasp", "grasp")
+    (row,) = csv.DictReader(io.StringIO(rest.csv("trials"), newline=""))
+    assert (row["failure_phase"], row["failure"]) == ("grasp", "dropped")
+
+
 def test_csv_has_the_columns_of_json_and_all_rows(rest, bench):
     for _ in range(3):
         bench.scored()

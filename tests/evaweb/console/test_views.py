@@ -22,8 +22,10 @@ from evaweb.roles import Role
 from evaweb.stations.commands import COLLECTING, KINDS
 from evaweb.stations.models import Command, Lease, LeaseRequest, Station
 from evaweb.trials.models import (
+    FAILURE_KEYS,
     Checkpoint,
     Evaluation,
+    FailureTerm,
     Milestone,
     Position,
     Scene,
@@ -31,6 +33,7 @@ from evaweb.trials.models import (
     Trial,
     TrialStatus,
 )
+from tests.evaweb.trials import builders
 
 pytestmark = pytest.mark.django_db
 NASTY = '<script>alert("x")</script>'
@@ -532,15 +535,41 @@ def test_without_a_required_milestone_success_is_asked_for(
     assert 'name="success"' in text_of(browser, "/stations/bench-1/eval/panel")
 
 
-def test_the_failures_of_before_are_offered_newest_first(
-    ada: User, station: Station, scene: Scene, checkpoint: Checkpoint
+def test_phases_and_causes_are_offered_with_their_keys_where_a_trial_is_scored(
+    browser: Client, ada: User, station: Station, scene: Scene, checkpoint: Checkpoint
 ) -> None:
-    for word in ("dropped", "missed", "dropped"):
-        trial = make_trial(station, ada, "scored")
-        Score.objects.create(trial=trial, rater=ada, success=False, score=0.0, failure=word)
-    make_trial(station, ada, "ended")
+    builders.failure_terms()
+    trial = make_trial(station, ada, "ended")
+    text = text_of(browser, "/stations/bench-1/eval/panel")
+    chosen = re.findall(r'name="(failure\w*)" value="(\w*)"(?: checked)?(?: data-key="([^"]+)")?', text)
+    assert chosen == [
+        *(("failure_phase", "approach", "shift+a"), ("failure_phase", "grasp", "shift+g")),
+        ("failure_phase", "", ""),
+        *(("failure", "missed", "shift+m"), ("failure", "dropped", "shift+d"), ("failure", "", "")),
+    ]
+    type(scene).objects.update(failure_required=True)
+    text = text_of(browser, "/stations/bench-1/eval/panel")
+    assert 'data-explained="yes"' in text
+    assert "not said" not in text
+    type(trial).objects.filter(pk=trial.pk).update(status="prepared")
+    assert "failure" not in text_of(browser, "/stations/bench-1/eval/panel")
 
-    assert selectors.panel(station=station, user=ada, sight=EVERYTHING).failures == ("dropped", "missed")
+
+def test_no_key_of_a_failure_is_another_one_of_the_eval_page_or_commands_without_shift(
+    browser: Client, ada: User, station: Station, scene: Scene, checkpoint: Checkpoint
+) -> None:
+    FailureTerm.objects.all().delete()
+    make_trial(station, ada, "prepared")
+    pages = text_of(browser, "/stations/bench-1/eval/")
+    assert 'data-key="shift+u"' in pages
+    Trial.objects.update(status="ended")
+    pages += text_of(browser, "/stations/bench-1/eval/")
+    keys = set(re.findall(r'data-key="([^"]+)"', pages))
+    assert keys.isdisjoint({f"shift+{key}" for key in FAILURE_KEYS})
+    acting = re.findall(r"<[^>]*data-(?:command|lease|prepare|next|confirm-cameras)[^>]*>", pages)
+    used = {key for tag in acting for key in re.findall(r'data-key="([^"]+)"', tag)}
+    assert {"r", "s", "u"} <= used
+    assert used.isdisjoint(FAILURE_KEYS)
 
 
 @pytest.mark.parametrize(("status", "number"), [("scored", 2), ("voided", 1), ("interrupted", 1)])

@@ -33,6 +33,7 @@ def test_what_was_exported_is_the_same_when_it_is_read_again(draft, admin):
 
 
 def test_another_lab_reads_it(draft, admin):
+    Scene.objects.update(failure_required=True)
     text = exported(plans=[draft])
     before = document_of(draft)
     draft.delete()
@@ -46,6 +47,7 @@ def test_another_lab_reads_it(draft, admin):
     ]
     found = Plan.objects.get()
     assert found.owner == admin
+    assert Scene.objects.get().failure_required
     assert document_of(found) == {**before, "owner": "adam"}
     assert plan_freeze(user=admin, plan=found).slots.count() == 12
 

@@ -13,7 +13,7 @@ from django.contrib.auth.models import Group, User
 from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
 from evaweb.trials import services
-from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Trial
+from evaweb.trials.models import Checkpoint, FailureTerm, Milestone, Position, Scene, Trial
 from runtime.ipc.messages import Ack, Command
 from tests.standing import standing
 
@@ -40,6 +40,18 @@ def scene(name: str = "block-on-plate", required: bool = True) -> Scene:
             scene=made, order=order, text=text, points=points, required=required and order == 3
         )
     return made
+
+
+def failure_terms() -> None:
+    """Two phases and two causes, with keys, and one of each that is retired; no others."""
+    FailureTerm.objects.all().delete()
+    for order, (level, words, key) in enumerate(
+        (
+            *(("phase", "approach", "a"), ("phase", "grasp", "g"), ("phase", "retired", "")),
+            *(("cause", "missed", "m"), ("cause", "dropped", "d"), ("cause", "retired", "")),
+        )
+    ):
+        FailureTerm.objects.create(level=level, words=words, key=key, order=order, active=words != "retired")
 
 
 def over(trial: Trial, seconds: float | None = 12.5, **facts: Any) -> Trial:

@@ -25,6 +25,7 @@ from evaweb.trials import restoring, services, voids
 from evaweb.trials.models import (
     Checkpoint,
     Evaluation,
+    FailureTerm,
     Milestone,
     MilestoneOutcome,
     Position,
@@ -168,9 +169,10 @@ def everything():
 @pytest.fixture
 def judged(lab):
     """Trials of every kind that is over: scored, corrected, voided, repeated without a recording, interrupted."""
+    builders.failure_terms()
     lab.score(lab.run(), True, True, True, note="zuerst ⟂, dann gut")
     corrected = lab.run(position=2)
-    lab.score(corrected, True, False, False, failure="slipped")
+    lab.score(corrected, True, False, False, failure="dropped", failure_phase="grasp")
     lab.score(corrected, True, True, True, reason="seen on the video")
     voided = lab.run()
     lab.score(voided, True, False, False)
@@ -190,7 +192,8 @@ def judged(lab):
 def test_trials_scores_and_statistics_of_a_lost_database_come_back(judged):
     before, counts = told(), counted()
     assert counts[0][2].success.n == 3
-    lose(*RECORDS)
+    assert "grasp" in {one["failure_phase"] for trial in before for one in trial["scores"]}
+    lose(*RECORDS, FailureTerm)
     report = reconcile()
     assert (report.problems, report.restored) == ((), 5 + 5)
     # The interrupted one was never judged: the times and the reason of its run are those of its recording.

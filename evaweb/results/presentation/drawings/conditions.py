@@ -1,7 +1,8 @@
-"""Plots of failures: a grid of initial conditions and checkpoints, a Pareto chart of reasons."""
+"""Plots of failures: a grid of initial conditions and checkpoints, Pareto charts of phases and causes."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from evaweb.results.analysis.analysis import Arm
@@ -12,13 +13,15 @@ from evaweb.results.presentation.drawings.svg import (
     drawing,
     element,
     label,
-    legend,
+    line,
     link,
+    number,
     series,
+    ticks,
     words,
     wrapped,
 )
-from evaweb.results.presentation.wording import rate_words
+from evaweb.results.presentation.wording import ends, rate_words
 
 _LABELS = 180
 _LETTERS = 22  # of a condition or a failure in a line
@@ -64,38 +67,44 @@ def grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Drawing |
     )
 
 
-def pareto(arms: Sequence[Arm], links: Mapping[str, str]) -> Drawing | None:
-    """Failures by what was written down for them, the most frequent first, a bar per checkpoint in each.
+def pareto(i: int, arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
+    """Failures of one checkpoint, the i-th series, by phase and cause, the most frequent first.
 
-    Beside each stands how many failures have been named so far, of all.
+    Bars are shares of all its trials, with their intervals as lines. `links` by phase and cause lead to those trials.
     """
-    totals: dict[str, int] = {}
-    for arm in arms:
-        for tag, n in arm.failures:
-            totals[tag] = totals.get(tag, 0) + n
-    if not totals:
-        return None
-    tags = sorted(totals, key=lambda tag: (-totals[tag], tag))
-    most, total = max(totals.values()), sum(totals.values())
+    total, so_far = sum(mode.count for mode in arm.failures), 0
     width, row = 600.0, 34
-    scale = Scale(0, most, _LABELS, width - 170)
-    whose, head = legend([(i, arm.checkpoint) for i, arm in enumerate(arms)], width)
-    parts, so_far = [whose], 0
-    for at, tag in enumerate(tags):
-        y, x = head + row * at, scale(0)
-        bars = label(_LABELS - 12, y + 18, tag, _LETTERS, "end")
-        for i, arm in enumerate(arms):
-            n = dict(arm.failures).get(tag, 0)
-            if n:
-                wide = scale(n) - scale(0)
-                bars += element("rect", x=x, y=y + 3, width=wide, height=20.0, class_=f"beam {series(i)}")
-                x += wide
-        so_far += totals[tag]
-        by = ", ".join(f"{arm.checkpoint} {dict(arm.failures).get(tag, 0)}" for arm in arms)
-        bars += words(width - 158, y + 18, f"{totals[tag]} ({so_far} of {total} so far)", class_="value")
-        parts.append(link(links.get(tag, ""), f"{tag}: {totals[tag]} of {total} failures ({by})", bars))
-    said = "; ".join(f"{tag} {totals[tag]} of {total}" for tag in tags)
-    return drawing(width, head + row * len(tags) + 6, "Why trials failed", said, *parts, kind="pareto")
+    height = row * len(arm.failures) + 30
+    # Of whole percents, so that the longest interval has room.
+    most = min(1.0, math.ceil(10 * max((mode.interval.high for mode in arm.failures), default=1.0)) / 10)
+    scale = Scale(0, most, _LABELS, width - 165)
+    parts, said = [_percents(scale, height - 26)], []
+    for at, mode in enumerate(arm.failures):
+        y, so_far = float(row * at), so_far + mode.count
+        share = f"{mode.count}/{mode.n}, {100 * mode.count / mode.n:.0f} % [{ends(mode.interval)}]"
+        bar = label(_LABELS - 12, y + 18, mode.words, _LETTERS, "end")
+        bar += element(
+            "rect", x=scale(0), y=y + 4, width=scale(mode.count / mode.n) - scale(0), height=18.0,
+            class_=f"beam {series(i)}",
+        )  # fmt: skip
+        bar += line([(scale(mode.interval.low), y + 13), (scale(mode.interval.high), y + 13)], "error")
+        bar += words(width - 155, y + 18, share, class_="value small")
+        title = f"{mode.words}: {share}; {so_far} of {total} failures so far"
+        parts.append(link(links.get((mode.phase, mode.cause), ""), title, bar))
+        said.append(title)
+    return drawing(
+        width, height, f"Why trials of {arm.checkpoint} failed", "; ".join(said), *parts, kind="pareto"
+    )
+
+
+def _percents(scale: Scale, y: float) -> str:
+    """An axis of shares that need not reach 100 %."""
+    shares = ticks(0, 100 * scale.high, 4)
+    return "".join(
+        line([(scale(share / 100), 0.0), (scale(share / 100), y)], "grid")
+        + words(scale(share / 100), y + 16, number(share) + (" %" if share == shares[-1] else ""), "middle", "tick")
+        for share in shares
+    )
 
 
 def _natural(condition: str) -> tuple[str, int]:

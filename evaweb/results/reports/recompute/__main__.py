@@ -124,6 +124,7 @@ def _trial(row: dict[str, str]) -> Trial:
         milestones=tuple((text, reached) for text, reached in json.loads(row["milestones"] or "[]")),
         smoothness=_float(row["smoothness"]),
         commanded=_float(row["smoothness_commanded"]),
+        failure_phase=row["failure_phase"],
     )
 
 

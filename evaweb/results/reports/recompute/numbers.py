@@ -33,6 +33,7 @@ class Trial:
     milestones: tuple[tuple[str, bool], ...]
     smoothness: float | None = None
     commanded: float | None = None
+    failure_phase: str = ""
 
     @property
     def condition(self) -> str:
@@ -157,9 +158,26 @@ def _arm(trials: Trials, broken: Trials, timing: Timing) -> dict[str, Any]:
         "successes_per_hour": _per_hour(sum(ok for _, ok in timed), exposure),
         "interruptions_per_hour": _per_hour(len(broken), whole),
         "failures": dict(Counter(t.failure for t in trials if not t.success and t.failure)),
+        "failure_modes": _modes(trials),
         "smoothness": student([t.smoothness for t in trials if t.smoothness is not None]),
         "smoothness_commanded": student([t.commanded for t in trials if t.commanded is not None]),
     }
+
+
+def _modes(trials: Trials) -> list[dict[str, Any]]:
+    """Failed trials by phase and cause, the most frequent first; shares are of all trials."""
+    n = len(trials)
+    counts = Counter((t.failure_phase, t.failure) for t in trials if not t.success)
+    return [
+        {
+            "failure_phase": phase,
+            "failure": cause,
+            "count": count,
+            "n": n,
+            "clopper_pearson": methods.clopper_pearson(count, n),
+        }
+        for (phase, cause), count in sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    ]
 
 
 def _mean(scenes: Mapping[str, Sequence[float]]) -> dict[str, Any]:

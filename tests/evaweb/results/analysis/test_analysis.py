@@ -6,6 +6,7 @@ import pytest
 
 from evaweb.results.analysis.analysis import analyse
 from evaweb.results.analysis.outcomes import Outcome, paired
+from evaweb.statistics.proportions import clopper_pearson
 
 LABELS = ("held", "lifted", "on the plate")
 
@@ -30,7 +31,8 @@ def trials(rates, blocks=40, scenes=("cups",), seed=3):
                     score=1.0 if success else 0.5 * lifted,
                     duration=float(random.uniform(5, 30)),
                     milestones=(True, lifted, success),
-                    failure="" if success else ("dropped" if lifted else "missed"),
+                    failure="" if success else ("dropped" if lifted else ""),
+                    failure_phase="" if success or block % 2 else "grasp",
                     labels=LABELS,
                 )
             )
@@ -47,7 +49,11 @@ def test_the_better_one_comes_first_with_everything_that_is_said_of_it():
     assert [step.of_all.n for step in new.funnels[0].steps] == [40, 40, 40]
     assert new.funnels[0].labels == LABELS
     assert new.curve.successes == new.success.successes == new.speed.events
-    assert dict(found.arm("old").failures).keys() == {"dropped", "missed"}
+    old = found.arm("old")
+    assert sum(mode.count for mode in old.failures) == old.success.n - old.success.successes
+    assert {mode.words for mode in old.failures} == {"grasp: dropped", "dropped", "grasp", "not said"}
+    assert [mode.count for mode in old.failures] == sorted((m.count for m in old.failures), reverse=True)
+    assert all(mode.interval == clopper_pearson(mode.count, 40) for mode in old.failures)
     assert found.letters == {"new": "a", "old": "b"}
     assert found.notes == ()
 

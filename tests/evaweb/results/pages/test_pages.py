@@ -1,7 +1,9 @@
 import io
+import re
 import zipfile
 from dataclasses import replace
 from datetime import timedelta
+from html import unescape
 
 import pytest
 from django.db import connection
@@ -16,7 +18,7 @@ from evaweb.results.analysis import caching
 from evaweb.results.ratings import judging
 from evaweb.results.selectors import PlanRow
 from evaweb.trials import services, voids
-from evaweb.trials.models import Checkpoint
+from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.trials import builders
 
 PLAN = "/result/plans/blocks/1/"
@@ -133,6 +135,35 @@ def test_every_number_leads_to_its_trials(revealed, as_, viewer):
     wrong = client.get(f"{PLAN}trials/?success=maybe")
     assert wrong.status_code == 400
     assert "allowed: yes, no" in wrong.content.decode()
+
+
+def test_every_count_of_failures_leads_to_its_trials_and_all_failures_are_counted(
+    revealed, as_, viewer, bench
+):
+    builders.failure_terms()
+    failed = list(Trial.objects.filter(verdict__success=False).order_by("pk"))
+    said = [{"failure_phase": "grasp", "failure": "dropped"}, {"failure_phase": "approach"}, {}]
+    for trial, given in zip(failed, said, strict=False):
+        ticks = bench.ticks(True, False, False)
+        services.trial_score(
+            user=bench.operator, trial=trial, milestones=ticks, reason="on the video", **given
+        )
+    client = as_(viewer)
+    text = client.get(PLAN).content.decode()
+    part = text[text.index('id="why-head"') : text.index('id="changes-head"')]
+    assert "Not planned: a lead for another evaluation" in part
+    assert "Clopper-Pearson" in part
+    counts = re.findall(r'<a href="([^"]+)">(\d+)</a>', part)
+    for address, n in counts:
+        listed = client.get(unescape(address)).content.decode()
+        assert f'Trials <span class="muted small">{n}</span>' in listed, address
+    assert {"failure=not+said", "failure_phase=grasp", "failure=%3Ddropped"} <= {
+        named for address, _ in counts for named in unescape(address).partition("?")[2].split("&")
+    }
+    tables = re.findall(r'<tr><th scope="row">all</th>(.*?)</tr>', part)
+    totals = [re.findall(r">(\d+)</a>", row)[-1] for row in tables]
+    assert sum(map(int, totals)) == len(failed)
+    assert part.count('<svg class="drawing pareto"') == len(tables) == 2
 
 
 def test_filters_are_in_the_address_and_wrong_ones_are_named(revealed, as_, viewer):

@@ -38,7 +38,7 @@ def figures(analysis):
         "success_times": courses.success_times(analysis.arms),
         "evidence": courses.evidence(found.evidence, found.first, found.second, 40),
         "grid": conditions.grid(analysis.arms, {}),
-        "pareto": conditions.pareto(analysis.arms, {NASTY: "/trials/?failure=1&x=2"}),
+        "pareto": conditions.pareto(0, analysis.arms[0], {("", NASTY): "/trials/?failure=1&x=2"}),
     }
 
 

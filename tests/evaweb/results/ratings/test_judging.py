@@ -262,3 +262,5 @@ def test_a_name_or_a_note_that_cannot_be_kept_is_refused(plan, carry_out, rater,
         judging.rate(**said, note="x" * 8001)
     with pytest.raises(EvaError, match="U\\+0000"):
         judging.rate(**said, failure="a\x00b")
+    with pytest.raises(EvaError, match="'missed' but the trial is a success"):
+        judging.rate(**said, failure="missed")

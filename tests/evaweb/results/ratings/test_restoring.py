@@ -25,11 +25,12 @@ def rater(db):
 def judged(plan, carry_out, rater, bench):
     """Two trials rated again, one pair compared."""
     carry_out(plan, 16)
+    builders.failure_terms()
     for reached in (True, False):
         handout = judging.to_rate(rater).found
         ticks = bench.ticks(True, reached, reached)
-        failure = "" if reached else "wölbt sich"
-        judging.rate(user=rater, plan=plan, code=handout.code, milestones=ticks, failure=failure, note="n")
+        said = {} if reached else {"failure": "dropped", "failure_phase": "grasp"}
+        judging.rate(user=rater, plan=plan, code=handout.code, milestones=ticks, note="wölbt sich", **said)
     pair = judging.to_prefer(rater).found
     codes = {"first": pair.first.code, "second": pair.second.code}
     judging.prefer(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)

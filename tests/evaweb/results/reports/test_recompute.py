@@ -39,6 +39,7 @@ def outcomes(checkpoints, n, scenes, seed):
                     labels=("one", "two", "three"),
                     smoothness=-chance.uniform(2, 9) if chance.random() < 0.8 else None,
                     commanded=-3.0 if name == 0 else -chance.uniform(2, 9),
+                    failure_phase="" if ok else chance.choice(["", "grasp", "place"]),
                 )
             )
     return found
@@ -60,6 +61,7 @@ def as_rows(runs):
             tuple(zip(r.labels, r.milestones, strict=True)),
             r.smoothness,
             r.commanded,
+            r.failure_phase,
         )
         for r in runs
     ]

@@ -1,0 +1,10 @@
+"""Failures in words; no Django, so that analyses outside of it say the same."""
+
+from __future__ import annotations
+
+NOT_SAID = "not said"
+
+
+def why_words(phase: str, cause: str) -> str:
+    """ "grasp: dropped"; what was not said is left out."""
+    return ": ".join(filter(None, (phase, cause)))

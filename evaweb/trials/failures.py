@@ -1,0 +1,104 @@
+"""The lab's taxonomy of failures: what a form offers, and what a score may say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from evaweb.errors import EvaError
+from evaweb.journal import text
+from evaweb.trials.models import FailureTerm, Scene, Score
+from evaweb.trials.verdicts import LONGEST_FAILURE
+
+FIELDS = {"failure_phase": FailureTerm.Level.PHASE, "failure": FailureTerm.Level.CAUSE}
+"""What scores, forms and REST call each level."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Words of one level, with their key, and whether they are those that were said before."""
+
+    words: str
+    key: str
+    chosen: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """One level as a form offers it, under the name of its field."""
+
+    field: str
+    label: str
+    choices: tuple[Choice, ...]
+
+    @property
+    def said(self) -> bool:
+        """True if one is chosen."""
+        return any(choice.chosen for choice in self.choices)
+
+
+def offered(said: Mapping[str, str] | None = None) -> tuple[Level, ...]:
+    """Phases, then causes, those that are retired left out; what was `said` before stays, whatever became of it.
+
+    A level without words is left out.
+    """
+    terms, found = list(FailureTerm.objects.filter(active=True)), []
+    for field, level in FIELDS.items():
+        before = (said or {}).get(field, "")
+        known = [Choice(row.words, row.key, row.words == before) for row in terms if row.level == level]
+        if before and not any(choice.chosen for choice in known):
+            known.append(Choice(before, "", True))
+        if known:
+            found.append(Level(field, level.label.capitalize(), tuple(known)))
+    return tuple(found)
+
+
+def said_of(score: Score | None) -> dict[str, str]:
+    """What a score says of it, by field."""
+    return {field: getattr(score, field) for field in FIELDS} if score else {}
+
+
+def in_order() -> Mapping[str, tuple[str, ...]]:
+    """Of each level by its field the words, retired ones too, in the lab's order."""
+    rows = FailureTerm.objects.values_list("level", "words")
+    return {field: tuple(words for of, words in rows if of == level) for field, level in FIELDS.items()}
+
+
+def stripped(*, failure_phase: str, failure: str) -> dict[str, str]:
+    """Both as they are kept; EvaError where they cannot be."""
+    return {
+        "failure": text("failure", failure, LONGEST_FAILURE),
+        "failure_phase": text("failure_phase", failure_phase, LONGEST_FAILURE),
+    }
+
+
+def check_failure(
+    scene: Scene,
+    words: Mapping[str, str],
+    *,
+    success: bool,
+    by_person: bool = True,
+    said: Mapping[str, str] | None = None,
+) -> None:
+    """EvaError where a score must not say `words`, by field; `said` is what stood before, which may stay.
+
+    A phase is one of the lab's. So is a cause that stands with a phase, or where the scene wants both of whoever
+    scores; a cause alone may be in other words, as programs have them.
+    """
+    for field in FIELDS if success else ():
+        if words[field]:
+            raise EvaError(f"{field} = {words[field]!r} but the trial is a success: leave {field} empty")
+    wanted = scene.failure_required and by_person and not success
+    if not (wanted or any(words[field] for field in FIELDS)):
+        return
+    offers = {level.field: [choice.words for choice in level.choices] for level in offered(said)}
+    for field in FIELDS:
+        value, allowed = words[field], offers.get(field, [])
+        if wanted and allowed and not value:
+            raise EvaError(
+                f"{field} is missing: scene {scene.name} wants it of every failed trial; allowed: "
+                f"{', '.join(allowed)}"
+            )
+        listed = wanted or field == "failure_phase" or words["failure_phase"]
+        if listed and value and value not in allowed:
+            raise EvaError(f"{field} = {value!r}; allowed: {', '.join(allowed) or 'none, the lab has none'}")
