@@ -95,6 +95,16 @@ def install(connection: Any, guards: Iterable[Guard]) -> None:
                 cursor.execute(statement)
 
 
+def laid_aside(apps: Any, editor: Any) -> None:
+    """For a migration: SQLite rebuilds no table that a trigger of another one names. They come back once it is done."""
+    if editor.connection.vendor != "sqlite":
+        return
+    with editor.connection.cursor() as cursor:
+        cursor.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'")
+        for (name,) in cursor.fetchall():
+            cursor.execute(f'DROP TRIGGER "{name}"')
+
+
 def protect(app: AppConfig) -> None:
     """Have what the models of `app` declare installed whenever its tables were migrated."""
 

@@ -36,7 +36,8 @@ class Panel:
     """Contents of the four steps of an evaluation, as one user may see them.
 
     `trial` is the unfinished one, with the `milestones` of its scene; `implied` says whether they decide on
-    success, `failures` what can be said of a failure, `set_up` whether the station was last set up for it. Without one, `scene`, `position` and
+    success, `failures` what can be said of a failure,
+    `set_up` whether the station was last set up for it. Without one, `scene`, `position` and
     `checkpoint` are the choice to begin with, after `last`, the newest finished one.
 
     `plans` are those that are open here, `plan` the one that is worked on, `handout` how the trial was handed out,
@@ -197,4 +198,3 @@ def _is_set_up(trial: Trial) -> bool:
     """True if the last set-up of the station that may have been carried out was for this trial."""
     last = last_set_up(station=trial.station)
     return last is not None and last == trial.setup
-

@@ -70,7 +70,8 @@ class StationNow:
 class Question:
     """Which trials of a plan are meant; "" where it does not matter.
 
-    `success` is yes or no, `failure` and `failure_phase` may be "not said", `missed` and `reached` are the words of a milestone. Without a `status` those that count.
+    `success` is yes or no, `failure` and `failure_phase` may be "not said",
+    `missed` and `reached` are the words of a milestone. Without a `status` those that count.
     """
 
     checkpoint: str = ""

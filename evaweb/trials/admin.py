@@ -323,7 +323,7 @@ class ScoreInline(ReadOnly, admin.TabularInline):
     model = Score
     fk_name = "trial"
     extra = 0
-    fields = ("scored_at", "rater", "source", "success", "score", "failure_phase", "failure", "note", "reason")
+    fields = ("scored_at", "rater", "source", "success", "score", "why", "note", "reason")
     readonly_fields = fields
 
 

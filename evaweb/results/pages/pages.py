@@ -171,4 +171,3 @@ def _grid_links(plan: Plan, analysis: Analysis, only: Chosen) -> dict[tuple[str,
                 plan, only, checkpoint=arm.checkpoint, scene=scene, position=position
             )
     return links
-

@@ -37,7 +37,9 @@ _STYLES = (
     *("result/result.css", "result/figures.css", "result/plans.css"),
 )
 _PROGRAM = Path(__file__).parent / "recompute"
-_RATINGS = ("trial", "rater", "success", "score", "milestones", "failure", "failure_phase", "note", "blind", "at")
+_RATINGS = (
+    *("trial", "rater", "success", "score", "milestones", "failure", "failure_phase", "note", "blind", "at"),
+)
 _PREFERENCES = (
     "first",
     "second",

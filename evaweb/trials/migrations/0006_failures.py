@@ -2,6 +2,8 @@ import django.core.validators
 import django.db.models.functions.text
 from django.db import migrations, models
 
+from evaweb.append_only import laid_aside
+
 # level, words, key: what a lab begins with, in this order.
 TERMS = (
     ("phase", "approach", "a"),
@@ -32,6 +34,7 @@ class Migration(migrations.Migration):
     ]
 
     operations = [
+        migrations.RunPython(laid_aside, migrations.RunPython.noop),
         migrations.AddField(
             model_name="scene",
             name="failure_required",
@@ -88,9 +91,7 @@ class Migration(migrations.Migration):
                 ("order", models.PositiveSmallIntegerField(default=0, help_text="Among those of its level.")),
                 (
                     "active",
-                    models.BooleanField(
-                        default=True, help_text="Off: retired, not offered; scores keep it."
-                    ),
+                    models.BooleanField(default=True, help_text="Off: retired, not offered; scores keep it."),
                 ),
             ],
             options={
@@ -118,5 +119,5 @@ class Migration(migrations.Migration):
                 "emptied.",
             ),
         ),
-        migrations.RunPython(make_terms, migrations.RunPython.noop),
+        migrations.RunPython(make_terms, laid_aside),
     ]

@@ -1,13 +1,15 @@
 """The database refuses what our services never do."""
 
 import pytest
+from django.core.management import call_command
 from django.db import IntegrityError, connection, transaction
 from django.utils import timezone
 
 from evaweb.episodes.models import Episode
 from evaweb.trials import lifecycle, services, voids
-from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
+from evaweb.trials.models import FailureTerm, MilestoneOutcome, Score, Trial, TrialStatus
 from tests.evaweb.trials import builders
+from tests.evaweb.unguarded import unguarded
 
 
 @pytest.fixture
@@ -40,6 +42,25 @@ def test_a_score_is_neither_changed_nor_removed(scored):
     refused(lambda: Score.objects.filter(trial=trial)._raw_delete("default"))
     refused(lambda: sql("UPDATE trials_score SET id = id + 900"))
     assert Score.objects.get(trial=trial).success
+
+
+@pytest.fixture
+def emptied(transactional_db):
+    """Afterwards all rows are gone: what the database refuses to remove is in the way of the next test."""
+    yield
+    with unguarded("trials"):
+        call_command("flush", verbosity=0, interactive=False, inhibit_post_migrate=True)
+
+
+def test_a_database_with_guarded_scores_is_brought_up_to_date_and_guarded_again(emptied):
+    score = builders.bench().scored(success=False).verdict
+    call_command("migrate", "trials", "0005_setup_took", verbosity=0)
+    call_command("migrate", verbosity=0)
+    found = Score.objects.get()
+    assert (found, found.success, found.failure_phase) == (score, False, "")
+    assert FailureTerm.objects.filter(active=True).count() == 13
+    refused(lambda: Score.objects.update(failure_phase="grasp"))
+    refused(lambda: Trial.objects.update(operator=builders.user("eve")))
 
 
 def test_a_score_is_not_replaced_either(scored):

@@ -102,7 +102,13 @@ def _percents(scale: Scale, y: float) -> str:
     shares = ticks(0, 100 * scale.high, 4)
     return "".join(
         line([(scale(share / 100), 0.0), (scale(share / 100), y)], "grid")
-        + words(scale(share / 100), y + 16, number(share) + (" %" if share == shares[-1] else ""), "middle", "tick")
+        + words(
+            scale(share / 100),
+            y + 16,
+            number(share) + (" %" if share == shares[-1] else ""),
+            "middle",
+            "tick",
+        )
         for share in shares
     )
 

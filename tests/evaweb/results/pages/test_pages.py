@@ -292,7 +292,7 @@ def test_rating_again_shows_the_code_and_nothing_that_was_said(plan, carry_out, 
     handout, _ = judging.to_rate(rater)[:2]
     text = client.get("/result/rate/").content.decode()
     assert handout.code in text
-    for secret in ("pi0-new", "pi0-block", "dropped", f"/result/trials/{handout.trial_id}"):
+    for secret in ("pi0-new", "pi0-block", "=dropped", f"/result/trials/{handout.trial_id}"):
         assert secret not in text
     given = {"plan": "blocks", "version": "1", "code": handout.code, "success": ""}
     assert client.post("/result/rate/", given).status_code == 302

@@ -108,7 +108,6 @@ def test_checkpoints_whose_names_begin_alike_are_told_apart_in_every_figure(anal
         "success_times": courses.success_times(arms),
         "evidence": courses.evidence(one, *LONG),
         "grid": conditions.grid(arms, {}),
-        "pareto": conditions.pareto(arms, {}),
     }
     for figure, markup in drawn.items():
         texts = [e.text or "" for e in ElementTree.fromstring(markup).iter() if e.tag.endswith("text")]
