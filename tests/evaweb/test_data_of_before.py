@@ -102,6 +102,15 @@ def _value(row, field):
     return list(type(other).objects.filter(pk=other.pk).values_list(*names).get())
 
 
+def _as_far(then, now):
+    """What is said now, without what nobody asked for then."""
+    if isinstance(then, dict):
+        return {name: _as_far(value, now[name]) for name, value in then.items()}
+    if isinstance(then, list) and len(then) == len(now):
+        return [_as_far(*both) for both in zip(then, now, strict=True)]
+    return now
+
+
 @pytest.fixture
 def report(monkeypatch, settings, tmp_path, db):
     return restored(monkeypatch, settings, tmp_path)
@@ -135,8 +144,7 @@ def test_the_api_says_what_it_said_then(report):
     Checkpoint.objects.update(active=True)
     plan_reveal(user=adam, plan=plan_freeze(user=adam, plan=plan))
     found = answers()
-    known = EXPECTED["trials"][0]
-    assert [{name: row[name] for name in known} for row in found["trials"]] == EXPECTED["trials"]
+    assert _as_far(EXPECTED["trials"], found["trials"]) == EXPECTED["trials"]
     header = EXPECTED["csv"][0]
     chosen = [found["csv"][0].index(name) for name in header]
     assert chosen == sorted(chosen)

@@ -57,12 +57,17 @@ def _in_order(lines):
 
 
 _TRIALS = ("trial", "first", "second")
+_LATER = ("failure_phase",)  # not in the lines of then
 
 
 def _then(line):
     """What was known of its trials then; without the reason, another one when it was written, and how a station is."""
     known = before("scores", "score")[0]["trial"].keys() - {"reason", "simulated"}
-    return {name: _only(known, value) if name in _TRIALS else value for name, value in line.items()}
+    return {
+        name: _only(known, value) if name in _TRIALS else value
+        for name, value in line.items()
+        if name not in _LATER
+    }
 
 
 def _only(known, said):

@@ -158,13 +158,31 @@ def test_a_score_is_given_and_corrected_on_the_page(bench, browser):
     text = answer.content.decode()
     assert "give a reason" in text
     assert "it lies on it" in text
-    assert text.count(" checked>") == 3
+    assert len(re.findall(r'name="milestone" value="\d+" checked>', text)) == 3
     answer = browser.post(f"{where}/score", send(bench, trial, True, True, True, reason="seen on the video"))
     assert answer.status_code == 302
     assert list(Score.objects.values_list("success", flat=True)) == [False, True]
     text = page(browser, f"{where}/")
     assert "Correction: seen on the video" in text
     assert text.count("<li") >= 2
+
+
+def test_a_correction_begins_with_what_was_said_of_the_failure_before(bench, browser):
+    builders.failure_terms()
+    trial = bench.ended()
+    where = f"/result/trials/{trial.pk}"
+    said = {"failure_phase": "grasp", "failure": "slipped on the way"}
+    ticks = bench.ticks(True, False, False)
+    services.trial_score(user=bench.operator, trial=trial, milestones=ticks, failure=said["failure"])
+    text = page(browser, f"{where}/")
+    assert "<dd>slipped on the way</dd>" in text
+    assert 'name="failure" value="slipped on the way" checked' in text
+    assert 'name="failure" value="retired"' not in text
+    answer = browser.post(
+        f"{where}/score", send(bench, trial, True, False, False, reason="on the video", **said)
+    )
+    assert answer.status_code == 302
+    assert "<dd>grasp: slipped on the way</dd>" in page(browser, f"{where}/")
 
 
 def test_a_form_that_is_sent_twice_is_one_score(bench, browser):
