@@ -255,7 +255,9 @@ def _failures(trials: Sequence[Outcome]) -> tuple[FailureMode, ...]:
         FailureMode(phase, cause, count, n, clopper_pearson(count, n))
         for (phase, cause), count in counts.items()
     )
-    return tuple(sorted(modes, key=lambda mode: (-mode.count, mode.phase, mode.cause)))
+    return tuple(
+        sorted(modes, key=lambda mode: (-mode.count, not mode.phase, mode.phase, not mode.cause, mode.cause))
+    )
 
 
 def _interventions(durations: list[float], interruptions: list[Interruption]) -> Rate | None:

@@ -81,7 +81,7 @@ class Cell:
 def failure_tables(
     analysis: Analysis, order: Mapping[str, Sequence[str]], address: Callable[..., str]
 ) -> list[dict[str, Any]]:
-    """Of each checkpoint that failed the phases and causes of it: a Pareto chart, and a table with its sums.
+    """Of each checkpoint that failed a Pareto chart, and a table of causes by phase with its sums.
 
     `order`: the lab's words by field; others follow, what was not said comes last. `address` of trials by their
     checkpoint, failure_phase and failure, of which any may be left out.
@@ -102,14 +102,14 @@ def _failure_table(
         where = {field: words or NOT_SAID for field, words in named.items() if words is not None}
         return Cell(sum(m.count for m in chosen), address(checkpoint=arm.checkpoint, **where))
 
-    rows = [(phase or NOT_SAID, [cell(phase, cause) for cause in (*causes, None)]) for phase in phases]
+    rows = [(cause or NOT_SAID, [cell(phase, cause) for phase in (*phases, None)]) for cause in causes]
     links = {(mode.phase, mode.cause): cell(mode.phase, mode.cause).address for mode in arm.failures}
     return {
         "checkpoint": arm.checkpoint,
         "n": arm.success.n,
         "pareto": conditions.pareto(i, arm, links),
-        "head": [cause or NOT_SAID for cause in causes],
-        "rows": [*rows, ("all", [cell(None, cause) for cause in (*causes, None)])],
+        "head": [phase or NOT_SAID for phase in phases],
+        "rows": [*rows, ("all", [cell(phase, None) for phase in (*phases, None)])],
     }
 
 

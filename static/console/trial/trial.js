@@ -21,7 +21,7 @@ export class TrialPanel {
     new PlanControls(store, commands, (name, work) => this.#do(name, work));
     document.addEventListener("click", (event) => this.#clicked(event));
     document.addEventListener("submit", (event) => this.#submitted(event));
-    document.addEventListener("input", (event) => event.target.closest("#score") && scoreRule());
+    document.addEventListener("input", (event) => event.target.closest("#score") && this.draw());
     store.on(["snapshot", "second"], () => this.draw());
     store.on("changed", (what) => what.some((name) => OF_TRIALS.includes(name)) && this.refresh());
     document.body.addEventListener("htmx:afterSettle", () => this.draw());
@@ -46,6 +46,7 @@ export class TrialPanel {
     for (const run of this.#panel.querySelectorAll("[data-needs-setup]")) {
       run.dataset.blocked = status !== "prepared" ? "choose and set up first" : setUp === "yes" ? "" : "set up first";
     }
+    scoreRule();
     this.#commands.gate();
     if (!snapshot) return;
     this.#clock(snapshot, Number(limit));
@@ -53,7 +54,6 @@ export class TrialPanel {
       const reached = snapshot.truth?.milestones?.[word.dataset.truth];
       word.textContent = reached === undefined ? "" : ` · bench: ${reached ? "reached" : "not reached"}`;
     }
-    scoreRule();
   }
 
   #clock({ run }, limit) {

@@ -168,15 +168,16 @@ def _modes(trials: Trials) -> list[dict[str, Any]]:
     """Failed trials by phase and cause, the most frequent first; shares are of all trials."""
     n = len(trials)
     counts = Counter((t.failure_phase, t.failure) for t in trials if not t.success)
+    ranked = sorted((-count, not phase, phase, not cause, cause) for (phase, cause), count in counts.items())
     return [
         {
             "failure_phase": phase,
             "failure": cause,
-            "count": count,
+            "count": -count,
             "n": n,
-            "clopper_pearson": methods.clopper_pearson(count, n),
+            "clopper_pearson": methods.clopper_pearson(-count, n),
         }
-        for (phase, cause), count in sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+        for count, _, phase, _, cause in ranked
     ]
 
 
