@@ -68,6 +68,10 @@ def scored(operator, ticks, failure=()):
         box = operator.page.locator("#score input[name=milestone]").nth(key - 1)
         if not box.is_checked():
             box.check()
+    if failure:  # of a success it is not asked
+        for state in ("hidden", "visible"):
+            operator.page.keyboard.press("4")
+            operator.page.locator("#why").wait_for(state=state)
     for key in failure:
         operator.page.keyboard.press(key)
     operator.page.locator("button[form=score]").click()
