@@ -50,6 +50,14 @@ def test_a_program_without_us_computes_every_number_again(report):
     assert numbers["n"] == 16
     assert numbers["agreement"]["ratings"] == 8
     assert numbers["preferences"]["n"] == 8
+    modes = [mode for arm in numbers["arms"].values() for mode in arm["failure_modes"]]
+    assert {(mode["failure_phase"], mode["failure"]) for mode in modes} == {("", "=dropped")}
+    assert sum(mode["count"] for mode in modes) == 16 - sum(a["successes"] for a in numbers["arms"].values())
+    why = (
+        (report / "index.html").read_text("utf-8").partition("Why they failed")[2].partition("</section>")[0]
+    )
+    assert why.count('<svg class="drawing pareto"') == 2
+    assert "href" not in why
     assert "schedule and codes: 0 do not come out" in found.stdout
 
 
