@@ -40,7 +40,7 @@ def words(levels):
 
 def test_what_a_lab_begins_with_is_a_valid_taxonomy(db):
     FailureTerm.objects.all().delete()
-    rows = import_module("evaweb.trials.migrations.0006_failures").TERMS
+    rows = import_module("evaweb.trials.migrations.0007_failures").TERMS
     for order, (level, text, key) in enumerate(rows):
         term = FailureTerm(level=level, words=text, key=key, order=order)
         term.full_clean()

@@ -54,7 +54,7 @@ def emptied(transactional_db):
 
 def test_a_database_with_guarded_scores_is_brought_up_to_date_and_guarded_again(emptied):
     score = builders.bench().scored(success=False).verdict
-    call_command("migrate", "trials", "0005_setup_took", verbosity=0)
+    call_command("migrate", "trials", "0006_void_requests", verbosity=0)
     call_command("migrate", verbosity=0)
     found = Score.objects.get()
     assert (found, found.success, found.failure_phase) == (score, False, "")

@@ -30,7 +30,7 @@ def make_terms(apps, editor):
 
 class Migration(migrations.Migration):
     dependencies = [
-        ("trials", "0005_setup_took"),
+        ("trials", "0006_void_requests"),
     ]
 
     operations = [
