@@ -8,7 +8,7 @@ from django.core.exceptions import ValidationError
 from django.test import Client
 
 from evaweb.errors import EvaError
-from evaweb.trials import services
+from evaweb.trials import services, voids
 from evaweb.trials.failures import in_order, offered
 from evaweb.trials.models import FailureTerm, Score
 from evaweb.trials.record import JUDGEMENTS
@@ -88,7 +88,7 @@ def test_a_scene_may_want_both_of_whoever_scores_and_of_no_bench(bench, terms):
     for given, field in (({"failure": "dropped"}, "failure_phase"), ({"failure_phase": "grasp"}, "failure")):
         with pytest.raises(EvaError, match=f"{field} is missing: scene block-on-plate wants it"):
             score(bench, trial := bench.ended(), **given)
-        services.trial_void(user=bench.operator, trial=trial, reason="of this test")
+        voids.trial_void(user=bench.operator, trial=trial, reason="of this test")
     assert score(bench, bench.ended(), source="truth").why == ""
     assert score(bench, bench.ended(), success=True).success is True
     FailureTerm.objects.all().delete()
