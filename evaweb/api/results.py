@@ -1,7 +1,8 @@
-"""Results of plans: every statistic, every attempt, comparisons, second ratings, preferences."""
+"""Results of plans: every statistic, every attempt, comparisons, second ratings, judgements, preferences."""
 
 from __future__ import annotations
 
+import json
 from datetime import datetime
 from typing import Annotated, Any
 from uuid import UUID
@@ -15,11 +16,11 @@ from evaweb.api.tables import Format, table_answer
 from evaweb.errors import NotFound
 from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.agreement import agreement_of, preferences_of
+from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import Chosen, chosen
 from evaweb.results.analysis.planner import Question, question_of, table_of
-from evaweb.results.models import Preference, Rating
+from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.ratings.unblinding import require_seen
 from evaweb.results.reports.document import analysis_document, arm_document, comparison_document
 from evaweb.results.reports.tables import COLUMNS, outcome_page, outcome_pages
@@ -68,6 +69,37 @@ class RatingOut(Schema):
             **{name: getattr(rating, name) for name in plain},
             "trial": rating.trial_id,
             "rater": rating.rater.get_username(),
+        }
+
+
+class JudgementOut(Schema):
+    """What an automatic judge said of a trial.
+
+    `milestones` is JSON: [[text, reached, probability that it was], ...], null twice for no verdict; `reason` says why
+    there is none at all. `pictures` is JSON: [[camera, time in s, SHA-256], ...] of those it was shown; `prompt` is the
+    SHA-256 of the words.
+    """
+
+    uuid: UUID
+    trial: int
+    judge: str
+    version: str
+    model: str
+    milestones: str
+    reason: str
+    prompt: str
+    pictures: str
+    at: datetime
+
+    @staticmethod
+    def of(row: Judgement) -> dict[str, Any]:
+        """Flat."""
+        plain = ("uuid", "judge", "version", "model", "reason", "prompt", "at")
+        listed = ("milestones", "pictures")
+        return {
+            **{name: getattr(row, name) for name in plain},
+            **{name: json.dumps(getattr(row, name), ensure_ascii=False) for name in listed},
+            "trial": row.trial_id,
         }
 
 
@@ -144,7 +176,7 @@ class Planned(Schema):
     url_name="plan-results",
 )
 def results(request: HttpRequest, name: str, version: int, only: Query[Only]) -> Any:
-    """Of each checkpoint, of each pair, and of raters and preferences; intervals are [low, high] at 95 %."""
+    """Of each checkpoint, of each pair, of raters, automatic judges and preferences; intervals are at 95 %."""
     plan, which = _seen(request, name, version, only)
     analysis = caching.analysis_of(plan, which)
     return {
@@ -155,6 +187,7 @@ def results(request: HttpRequest, name: str, version: int, only: Query[Only]) ->
         **analysis_document(analysis),
         "notes": list(analysis.notes),
         "agreement": agreement_of(plan),
+        "judges": judges_of(plan),
         "preferences": preferences_of(plan),
     }
 
@@ -245,6 +278,21 @@ def ratings(
     plan, _ = _seen(request, name, version, Only())
     rows = Rating.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
     return _rows(request, plan, "ratings", rows, RatingOut, paging, format)
+
+
+@router.get(
+    _PLAN + "/judgements",
+    response={200: Page[JudgementOut], **FAILURES},
+    summary="What automatic judges said",
+    url_name="plan-judgements",
+)
+def judgements(
+    request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
+) -> Any:
+    """Each trial once by each version of a judge; they never change its score and are no ratings."""
+    plan, _ = _seen(request, name, version, Only())
+    rows = Judgement.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
+    return _rows(request, plan, "judgements", rows, JudgementOut, paging, format)
 
 
 @router.get(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import simplejpeg
+from numpy.typing import NDArray
 from PIL import Image
 
 from evaweb.episodes.folders import THUMBNAIL
@@ -77,9 +78,14 @@ def _fill(episode: Episode, draft: Path, tell: Callable[[str], None]) -> None:
 def thumbnail(video: Path, frame: int) -> bytes:
     """Frame `frame` of the video as a JPEG of WIDTH pixels; RecordingError where it cannot be decoded."""
     with Pictures(video) as pictures:
-        picture = Image.fromarray(pictures[min(frame, len(pictures) - 1)])
-    height = max(1, round(picture.height * WIDTH / picture.width))
-    small = picture.resize((WIDTH, height), Image.Resampling.LANCZOS)
+        return jpeg_of(pictures[min(frame, len(pictures) - 1)], WIDTH)
+
+
+def jpeg_of(pixels: NDArray[np.uint8], width: int) -> bytes:
+    """A picture, RGB [H, W, 3], as a JPEG of that width in pixels, with nothing but pixels in it."""
+    picture = Image.fromarray(pixels)
+    height = max(1, round(picture.height * width / picture.width))
+    small = picture.resize((width, height), Image.Resampling.LANCZOS)
     jpeg: bytes = simplejpeg.encode_jpeg(np.ascontiguousarray(small), quality=QUALITY)
     return jpeg
 

@@ -1,16 +1,22 @@
-"""What second raters say of trials, and which of two trials people prefer; neither changes a trial's own score."""
+"""What second raters and automatic judges say of trials, and which of two people prefer; none changes a trial's score."""
 
 from __future__ import annotations
 
 import uuid
 
 from django.conf import settings
+from django.core.exceptions import ValidationError
+from django.core.validators import MaxValueValidator, MinValueValidator
 from django.db import models
 from django.db.models import F, Q
 from django.utils import timezone
 
 from evaweb.append_only import AppendOnly
+from evaweb.errors import EvaError
 from evaweb.plans.models import Plan
+from evaweb.results.judges import KINDS
+from evaweb.results.judges.base import PATIENCE_S, Setup
+from evaweb.results.judges.finding import built
 from evaweb.trials.models import Trial
 
 
@@ -74,3 +80,88 @@ class Preference(models.Model):
 
     def __str__(self) -> str:
         return f"{self.rater}, {self.first_id} and {self.second_id}: {self.get_outcome_display()}"
+
+
+class AutomaticJudge(models.Model):
+    """A judge that an administrator has set up; one with a server is asked at the address that was allowed, no other."""
+
+    name = models.SlugField(max_length=60, unique=True)
+    kind = models.CharField(max_length=20, choices=[(kind, kind) for kind in KINDS])
+    address = models.CharField(
+        max_length=300,
+        blank=True,
+        help_text="Of a chat server, without /chat/completions, e.g. https://judge.example.org/v1. It is sent pictures, "
+        "instructions and milestones once it is allowed, in the list of judges.",
+    )
+    model = models.CharField(max_length=120, blank=True, help_text="As the server calls it.")
+    key_variable = models.CharField(
+        max_length=80,
+        blank=True,
+        help_text="The environment variable of the worker that has the key, EVA_JUDGE_...; the key itself is never "
+        "stored here.",
+    )
+    plain = models.BooleanField(
+        "http to another machine", default=False, help_text="Everybody on the way can see the pictures and the key."
+    )
+    patience_s = models.FloatField(
+        "patience [s]",
+        default=PATIENCE_S,
+        validators=[MinValueValidator(1), MaxValueValidator(600)],
+        help_text="For one trial in all. Without an answer by then it has no verdict.",
+    )
+    allowed_address = models.CharField(max_length=300, blank=True, editable=False)
+    allowed_by = models.ForeignKey(
+        settings.AUTH_USER_MODEL, null=True, editable=False, on_delete=models.PROTECT, related_name="+"
+    )
+    allowed_at = models.DateTimeField(null=True, editable=False)
+
+    class Meta:
+        ordering = ("name",)
+        verbose_name = "judge"
+
+    def __str__(self) -> str:
+        return self.name
+
+    @property
+    def setup(self) -> Setup:
+        """What its module is built of."""
+        return Setup(self.address, self.model, self.key_variable, self.plain, self.patience_s)
+
+    def clean(self) -> None:
+        """A set-up of which its module can build a judge."""
+        try:
+            built(self.name, self.kind, self.setup)
+        except EvaError as fault:
+            raise ValidationError(str(fault)) from None
+
+
+class Judgement(models.Model):
+    """What an automatic judge said of a trial; for its agreement with people, no more: it is no score and no rating.
+
+    `judge` and `version` are words: the row outlives the judge's set-up.
+    """
+
+    uuid = models.UUIDField(unique=True, default=uuid.uuid4, editable=False)
+    trial = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="judgements")
+    judge = models.CharField(max_length=60)
+    version = models.CharField(max_length=200)
+    model = models.CharField(max_length=200, blank=True, help_text="What the server said has answered.")
+    milestones = models.JSONField(
+        default=list,
+        help_text="[text, reached, probability that it was] of each, in their order; null, null for no verdict.",
+    )
+    reason = models.TextField(blank=True, help_text="Why there is no verdict at all.")
+    prompt = models.CharField(max_length=64, blank=True, help_text="SHA-256 of the words that it was asked with.")
+    pictures = models.JSONField(default=list, help_text="[camera, time in s, SHA-256] of each that it was shown.")
+    at = models.DateTimeField(default=timezone.now)
+
+    append_only = AppendOnly("what a judge said is never changed or removed")
+
+    class Meta:
+        ordering = ("trial", "pk")
+        constraints = [
+            models.UniqueConstraint(fields=("trial", "judge", "version"), name="judgement_once")
+        ]
+
+    def __str__(self) -> str:
+        return f"{self.judge} ({self.version}) of trial {self.trial_id}: {self.reason or 'judged'}"

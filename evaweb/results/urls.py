@@ -22,6 +22,6 @@ urlpatterns = [
     path(_PLAN + "trials/", views.trials, name="result-plan-trials"),
     *(
         path(f"{_PLAN}{what}", views.act, {"what": what}, name=f"result-{what}")
-        for what in ("freeze", "amend", "close", "reveal", "look")
+        for what in ("freeze", "amend", "close", "reveal", "look", "judge")
     ),
 ]

@@ -16,6 +16,7 @@ WEB_ALONE = frozenset(
         *("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN", "HF_TOKEN_PATH"),
     )
 )
+_JUDGES = "EVA_JUDGE_"  # begins the names of keys of automatic judges, which the worker alone asks
 # For ssh: its agent, its tickets, its language, and where it finds itself.
 _OF_SSH = frozenset(
     (
@@ -28,7 +29,11 @@ _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS") 
 
 def without_secrets(given: Mapping[str, str]) -> dict[str, str]:
     """An environment without what is the web's alone."""
-    return {name: value for name, value in given.items() if name not in WEB_ALONE}
+    return {name: value for name, value in given.items() if not _web_alone(name)}
+
+
+def _web_alone(name: str) -> bool:
+    return name in WEB_ALONE or name.startswith(_JUDGES)
 
 
 def for_programs(given: Mapping[str, str]) -> dict[str, str]:
@@ -60,7 +65,7 @@ def shed() -> None:
 
 def secret(key: str, name: str) -> str:
     """The value of the variable `name`, which `key` of a deployment names; ConfigurationError where there is none."""
-    if name in WEB_ALONE:
+    if _web_alone(name):
         raise ConfigurationError(
             f"{key} names {name}, which is the web's and never a station's; allowed: a variable of its own, "
             "such as EVA_POLICY_KEY"

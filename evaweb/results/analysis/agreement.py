@@ -1,12 +1,15 @@
-"""Agreement of raters and preferred checkpoint, as JSON; what cannot be said is null with its reason."""
+"""Agreement of raters and of automatic judges, and preferred checkpoint, as JSON; what cannot be said is null."""
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
+from dataclasses import asdict
 from typing import Any
 
 from evaweb.plans.models import Plan
-from evaweb.results.models import Preference, Rating
+from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.statistics.base import StatisticsError
+from evaweb.statistics.calibration import calibration
 from evaweb.statistics.preference import Comparison, NotIdentifiedError, preferences
 from evaweb.statistics.proportions import proportion
 from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha
@@ -51,7 +54,7 @@ def agreement(pairs: list[tuple[bool, bool]]) -> dict[str, Any]:
     }
 
 
-def _stood(rating: Rating) -> Score:
+def _stood(rating: Rating | Judgement) -> Score:
     """The newest score of its trial when it was made; the first one where a clock that was set back says none was."""
     scores = list(rating.trial.scores.all())
     return next((score for score in reversed(scores) if score.scored_at <= rating.at), scores[0])
@@ -72,6 +75,53 @@ def _alpha(units: list[list[float]]) -> float | None:
         return krippendorff_alpha(units, "interval")
     except StatisticsError:
         return None
+
+
+def judges_of(plan: Plan) -> list[dict[str, Any]] | None:
+    """Of each version of each automatic judge and the score that stood then, milestone by milestone; None without any.
+
+    No rating of a person is in it, and nothing of it in theirs.
+    """
+    counted = Judgement.objects.filter(
+        trial__evaluation=plan.evaluation_id, trial__status=TrialStatus.SCORED
+    ).prefetch_related("trial__scores__outcomes")
+    rows = defaultdict(list)
+    for row in counted.order_by("trial_id", "pk"):
+        rows[row.judge, row.version].append(row)
+    return [_judged(*key, of_one) for key, of_one in sorted(rows.items())] or None
+
+
+def _judged(judge: str, version: str, rows: list[Judgement]) -> dict[str, Any]:
+    said: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
+    for row in rows:
+        words = {text: (reached, probability) for text, reached, probability in row.milestones}
+        for outcome in _stood(row).outcomes.all():
+            if outcome.text in words:
+                said.setdefault(outcome.text, []).append((outcome.reached, *words[outcome.text]))
+    return {
+        "judge": judge,
+        "version": version,
+        "trials": len(rows),
+        "no_verdict": dict(sorted(Counter(row.reason for row in rows if row.reason).items())),
+        "milestones": {text: _on_milestone(found) for text, found in said.items()},
+        "calibration": _calibration([one for found in said.values() for one in found]),
+    }
+
+
+def _on_milestone(said: list[tuple[bool, bool | None, float | None]]) -> dict[str, Any]:
+    pairs = [(scored, reached) for scored, reached, _ in said if reached is not None]
+    found = _calibration(said)
+    return {
+        "no_verdict": len(said) - len(pairs),
+        "agreement": agreement(pairs) if pairs else None,
+        "brier": found and found["brier"],
+    }
+
+
+def _calibration(said: list[tuple[bool, bool | None, float | None]]) -> dict[str, Any] | None:
+    """Of probabilities that milestones were reached, beside whether people said so."""
+    given = [(probability, scored) for scored, _, probability in said if probability is not None]
+    return asdict(calibration(given)) if given else None
 
 
 def comparisons_of(plan: Plan) -> list[Comparison]:

@@ -22,10 +22,11 @@ from evaweb.plans.blinding_rules import look, may_look
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results import selectors
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.agreement import agreement_of, preferences_of
+from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
 from evaweb.results.analysis.filters import chosen
 from evaweb.results.pages import pages
 from evaweb.results.presentation import listings
+from evaweb.results.ratings.automatic import judge_ask, judges_ready
 from evaweb.results.ratings.unblinding import has_results, require_seen, sealing, why_sealed
 from evaweb.results.reports.reporting import write_report
 from evaweb.results.selectors import Question
@@ -140,22 +141,23 @@ def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_POST
 def act(request: HttpRequest, name: str, version: int, what: str) -> HttpResponse:
-    """Freeze, amend, close or reveal it, or look behind the blind: by its owner, with a reason where one is due."""
+    """Freeze, amend, close or reveal it, look behind the blind, or have it judged: by its owner, with what is due."""
     found = _found(name, version)
     user: Any = request.user
     reason = request.POST.get("reason", "")
-    acts: Mapping[str, Callable[[], Plan | None]] = {
+    acts: Mapping[str, Callable[[], object]] = {
         "freeze": lambda: services.plan_freeze(user=user, plan=found),
         "amend": lambda: services.plan_amend(user=user, plan=found, reason=reason),
         "close": lambda: services.plan_close(user=user, plan=found, reason=reason),
         "reveal": lambda: services.plan_reveal(user=user, plan=found),
         "look": lambda: look(found, user),
+        "judge": lambda: judge_ask(user=user, plan=found, name=request.POST.get("judge", "")),
     }
     try:
         made = acts[what]()
     except EvaError as fault:
         return _plan_page(request, found, fault, typed=reason)
-    shown = made or found
+    shown = made if isinstance(made, Plan) else found
     return redirect("result-plan", name=shown.name, version=shown.version)
 
 
@@ -173,7 +175,11 @@ def _plan_page(
         only = chosen(request.GET, caching.runs_of(found).outcomes)
     except EvaError as problem:
         only, fault = chosen({}, ()), fault or problem
-    judged = {"agreement": agreement_of(found), "preferences": preferences_of(found)}
+    judged = {
+        "agreement": agreement_of(found),
+        "judges": judges_of(found),
+        "preferences": preferences_of(found),
+    }
     context = {
         **pages.summary_page(found, only),
         **judged,
@@ -214,6 +220,7 @@ def _common(request: HttpRequest, found: Plan) -> dict[str, Any]:
         "key": bytes(found.key or b"").hex() if found.state == PlanState.REVEALED else "",
         "may_manage": managed,
         "voids": voids_waiting(Trial.objects.filter(handout__plan=found)),
+        "judges_ready": judges_ready() if managed and has_results(found) else [],
         "here": "plans",
         "home": reverse("result-plan", args=[found.name, found.version]),
     }

@@ -1,7 +1,7 @@
-"""Second ratings and preferences as lines of an episode's own journal of verdicts.
+"""Second ratings, preferences and what automatic judges said, as lines of an episode's own journal of verdicts.
 
-They lie beside its scores, DATA/scores/UUID.jsonl: a rating with the trial that it is of, a preference with the one
-that was run second, when the other one was there already. Nothing serves these files.
+They lie beside its scores, DATA/scores/UUID.jsonl: a rating or judgement with the trial that it is of, a preference
+with the one that was run second, when the other one was there already. Nothing serves these files.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from uuid import UUID
 from pydantic import Field, StrictBool
 
 from evaweb.journal import From, Journal, Line, Moment, Person
-from evaweb.results.models import Preference, Rating
+from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.trials.record import Name, TrialRecord
 
 
@@ -60,4 +60,31 @@ class PreferenceLine(Line):
         return super().written(row, **pair, **given)
 
 
-RATINGS: Journal[RatingLine | PreferenceLine] = Journal("scores", RatingLine, PreferenceLine)
+_Share = Annotated[float, Field(ge=0, le=1)]
+_Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+class JudgementLine(Line):
+    """What an automatic judge said."""
+
+    kind: Literal["judgement"] = "judgement"
+    uuid: UUID
+    trial: TrialRecord
+    judge: Annotated[str, Field(min_length=1, max_length=60)]
+    version: Annotated[str, Field(min_length=1, max_length=200)]
+    model: Annotated[str, Field(max_length=200)] = ""
+    at: Moment
+    milestones: tuple[tuple[str, StrictBool | None, _Share | None], ...] = ()
+    reason: str = ""
+    prompt: _Digest | Literal[""] = ""
+    pictures: tuple[tuple[str, float, _Digest], ...] = ()
+
+    @classmethod
+    def written(cls, row: Judgement, **given: Any) -> dict[str, Any]:
+        """The line of a judgement that is about to be saved."""
+        return super().written(row, trial=TrialRecord.asked(row.trial), **given)
+
+
+RATINGS: Journal[RatingLine | PreferenceLine | JudgementLine] = Journal(
+    "scores", RatingLine, PreferenceLine, JudgementLine
+)

@@ -1,4 +1,4 @@
-"""Second ratings and preferences that the database has lost, made again from the files of scores; see .record."""
+"""Ratings, preferences and judgements that the database has lost, made again from the files of scores; see .record."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from django.db import DataError, IntegrityError, transaction
 from evaweb.episodes.reconcile import Kept, restores
 from evaweb.errors import EvaError
 from evaweb.plans.models import Plan
-from evaweb.results.models import Preference, Rating
-from evaweb.results.ratings.record import PreferenceLine, RatingLine
+from evaweb.results.models import Judgement, Preference, Rating
+from evaweb.results.ratings.record import JudgementLine, PreferenceLine, RatingLine
 from evaweb.trials.models import Trial
 from evaweb.trials.record import TrialRecord
 
@@ -27,6 +27,8 @@ def restore(kept: Kept) -> int:
                 made += _rating(line)
             elif isinstance(line, PreferenceLine):
                 made += _preference(line)
+            elif isinstance(line, JudgementLine):
+                made += _judgement(line)
         except (EvaError, DataError, IntegrityError) as error:
             kept.say(f"run {kept.uuid}: its {line.kind} {line.uuid}: {error}")
     return made
@@ -54,6 +56,17 @@ def _preference(line: PreferenceLine) -> bool:
     if plan is None:
         log.warning("preference %s is of plan %s v%d, which is lost", line.uuid, line.plan, line.version)
     Preference.objects.create(plan=plan, first=first, second=second, **said)
+    return True
+
+
+@transaction.atomic
+def _judgement(line: JudgementLine) -> bool:
+    if Judgement.objects.filter(uuid=line.uuid).exists():
+        return False
+    trial, said = _trial(line.trial), line.values()
+    if Judgement.objects.filter(trial=trial, judge=line.judge, version=line.version).exists():
+        return False
+    Judgement.objects.create(trial=trial, **said)
     return True
 
 

@@ -17,11 +17,11 @@ from evaweb.errors import EvaError
 from evaweb.plans.design import conclusion_of
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.agreement import agreement_of, preferences_of
+from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.analysis.integrity import changes_of
-from evaweb.results.models import Rating
+from evaweb.results.models import Judgement, Rating
 from evaweb.results.presentation import facts, listings
 from evaweb.results.presentation.drawings import conditions, courses, rates
 from evaweb.results.reports import bench_photos as laid_out
@@ -51,6 +51,7 @@ _PREFERENCES = (
     "blind",
     "at",
 )
+_JUDGEMENTS = ("trial", "judge", "version", "model", "milestones", "reason", "prompt", "pictures", "at")
 _SCORES = (
     *("trial", "rater", "source", "success", "score", "milestones", "failure", "failure_phase", "note"),
     *("reason", "scored_at"),
@@ -76,6 +77,7 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     _csv(data / "scores.csv", _SCORES, _scores(plan))
     _csv(data / "ratings.csv", _RATINGS, _ratings(plan))
     _csv(data / "preferences.csv", _PREFERENCES, _preferences(plan))
+    _csv(data / "judgements.csv", _JUDGEMENTS, _judgements(plan))
     _csv(data / "laid_out.csv", laid_out.COLUMNS, laid_out.laid_out(plan))
     left = laid_out.write_pictures(plan, data / "pictures", most_pictures)
     shutil.copytree(_PROGRAM, out / "recompute", ignore=shutil.ignore_patterns("__pycache__"))
@@ -93,6 +95,7 @@ def numbers_of(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         **analysis_document(analysis),
         "primary": _primary(plan),
         "agreement": agreement_of(plan),
+        "judges": judges_of(plan),
         "preferences": preferred and {name: value for name, value in preferred.items() if name not in words},
     }
 
@@ -157,6 +160,7 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         "failures": listings.failure_tables(analysis, in_order(), lambda **named: ""),
         "evidence": primary and courses.evidence(primary.evidence, primary.first, primary.second),
         "agreement": agreement_of(plan),
+        "judges": judges_of(plan),
         "preferences": preferences_of(plan),
         "checklist": checklist(plan, analysis),
         "runs": runs.outcomes,
@@ -201,6 +205,19 @@ def _ratings(plan: Plan) -> Iterator[list[dict[str, Any]]]:
             "trial": row.trial_id,
             "rater": row.rater.get_username(),
             "milestones": json.dumps(row.milestones, ensure_ascii=False),
+        }
+        for row in rows
+    ]
+
+
+def _judgements(plan: Plan) -> Iterator[list[dict[str, Any]]]:
+    rows = Judgement.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
+    listed = ("milestones", "pictures")
+    yield [
+        {
+            **{name: getattr(row, name) for name in _JUDGEMENTS},
+            "trial": row.trial_id,
+            **{name: json.dumps(getattr(row, name), ensure_ascii=False) for name in listed},
         }
         for row in rows
     ]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from .designs import error, kept_faults, primary
-from .judged import agreement, preferences, score_alpha
+from .judged import agreement, calibration, on_milestone, preferences, score_alpha
 from .numbers import Drawn, Trial, numbers
 from .sealed import faults
 
@@ -30,8 +30,8 @@ def main() -> int:
     plan, seal, shown = (
         json.loads((data / name).read_text("utf-8")) for name in ("plan.json", "seal.json", "numbers.json")
     )
-    rows, scores, ratings, preferred = (
-        _rows(data / f"{name}.csv") for name in ("trials", "scores", "ratings", "preferences")
+    rows, scores, ratings, preferred, judgements = (
+        _rows(data / f"{name}.csv") for name in ("trials", "scores", "ratings", "preferences", "judgements")
     )
     wrong = [*faults(seal, plan, rows), *kept_faults(rows, scores, plan, seal["at_reveal"]), *_boundary(plan)]
     trials = [_trial(row) for row in rows]
@@ -39,6 +39,7 @@ def main() -> int:
         **numbers(trials, plan),
         "primary": primary(trials, plan, seal["at_reveal"]),
         "agreement": _agreement(rows, scores, ratings),
+        "judges": _judges(rows, scores, judgements),
         "preferences": preferences(
             [(row["first_checkpoint"], row["second_checkpoint"], row["outcome"]) for row in preferred]
         ),
@@ -74,9 +75,7 @@ def _rows(path: Path) -> Rows:
 
 def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None:
     """Of trials that count: what second raters said, and the score that stood then."""
-    given: dict[str, Rows] = {row["trial"]: [] for row in rows if row["status"] == "scored"}
-    for score in scores:
-        given.get(score["trial"], []).append(score)
+    given = _given(rows, scores)
     pairs = [(_stood(given[row["trial"]], row["at"]), row) for row in ratings if row["trial"] in given]
     if not pairs:
         return None
@@ -94,6 +93,44 @@ def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None
         "milestones": {text: agreement(found) for text, found in milestones.items()},
         "score_alpha": score_alpha([(float(a["score"]), float(b["score"])) for a, b in pairs]),
     }
+
+
+def _given(rows: Rows, scores: Rows) -> dict[str, Rows]:
+    """The scores of each trial that counts."""
+    given: dict[str, Rows] = {row["trial"]: [] for row in rows if row["status"] == "scored"}
+    for score in scores:
+        given.get(score["trial"], []).append(score)
+    return given
+
+
+def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] | None:
+    """Of trials that count: what each version of each automatic judge said, and the score that stood then."""
+    given = _given(rows, scores)
+    judges: dict[tuple[str, str], Rows] = {}
+    for row in judgements:
+        if row["trial"] in given:
+            judges.setdefault((row["judge"], row["version"]), []).append(row)
+    found = []
+    for (judge, version), said in sorted(judges.items()):
+        words: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
+        for row in said:
+            own = {text: (reached, p) for text, reached, p in json.loads(row["milestones"])}
+            for text, scored in json.loads(_stood(given[row["trial"]], row["at"])["milestones"]):
+                if text in own:
+                    words.setdefault(text, []).append((scored, *own[text]))
+        reasons = [row["reason"] for row in said if row["reason"]]
+        probable = [(p, scored) for of_one in words.values() for scored, _, p in of_one if p is not None]
+        found.append(
+            {
+                "judge": judge,
+                "version": version,
+                "trials": len(said),
+                "no_verdict": {reason: reasons.count(reason) for reason in reasons},
+                "milestones": {text: on_milestone(of_one) for text, of_one in words.items()},
+                "calibration": calibration(probable),
+            }
+        )
+    return found or None
 
 
 def _stood(scores: Rows, at: str) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Statistics of ratings and preferences: agreement beyond chance, Bradley-Terry with ties by Newton."""
+"""Statistics of raters, automatic judges and preferences: agreement, calibration, Bradley-Terry by Newton."""
 
 from __future__ import annotations
 
@@ -31,6 +31,34 @@ def agreement(pairs: Sequence[tuple[bool, bool]]) -> dict[str, Any]:
         "kappa": 1.0 if same == n else (observed - by_chance) / (1 - by_chance),
         "ac1": 1.0 if same == n else (observed - gwet) / (1 - gwet),
         "alpha": 1.0 if same == n else 1 - (1 - observed) / expected,
+    }
+
+
+def calibration(pairs: Sequence[tuple[float, bool]]) -> dict[str, Any] | None:
+    """Of (probability, whether it was so), in tenths."""
+    if not pairs:
+        return None
+    tenths: dict[int, list[tuple[float, bool]]] = {}
+    for pair in pairs:
+        tenths.setdefault(sum(pair[0] >= k / 10 for k in range(1, 10)), []).append(pair)
+    n, bins, gaps = len(pairs), [], 0.0
+    for k, held in sorted(tenths.items()):
+        mean, true = sum(p for p, _ in held) / len(held), sum(so for _, so in held)
+        gaps += len(held) / n * abs(mean - true / len(held))
+        edges = {"low": k / 10, "high": (k + 1) / 10}
+        bins.append({**edges, "n": len(held), "probability": mean, "true": true})
+    brier = math.fsum((1 - p) ** 2 if so else p * p for p, so in pairs) / n
+    return {"n": n, "brier": brier, "error": gaps, "bins": bins}
+
+
+def on_milestone(said: Sequence[tuple[bool, bool | None, float | None]]) -> dict[str, Any]:
+    """Of (by the score, by the judge, probability): both None where the judge gave no verdict."""
+    pairs = [(scored, reached) for scored, reached, _ in said if reached is not None]
+    found = calibration([(p, scored) for scored, _, p in said if p is not None])
+    return {
+        "no_verdict": len(said) - len(pairs),
+        "agreement": agreement(pairs) if pairs else None,
+        "brier": found and found["brier"],
     }
 
 

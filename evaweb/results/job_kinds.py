@@ -1,0 +1,29 @@
+"""The job of automatic judges."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from evaweb.jobs.kinds import Work, job_kind
+from evaweb.plans.models import Plan
+from evaweb.results.ratings import automatic
+
+_TURN_S = 20.0  # then what else waits has its turn
+_NAMED = 50  # codes of trials without pictures
+
+
+@job_kind(automatic.KIND)
+def judge(work: Work) -> Mapping[str, Any]:
+    """Show trials of a plan to a judge, and ask for the rest; args: plan, judge."""
+    plan, name = Plan.objects.get(pk=work.args["plan"]), work.args["judge"]
+    until, shown = time.monotonic() + _TURN_S, 0
+    while automatic.judge_next(plan=plan, name=name):
+        shown += 1
+        work.tell(f"{shown} trials were shown to {name}")
+        if time.monotonic() >= until:
+            automatic.judge_wanted(plan=plan, judge=name)
+            break
+    waiting, unseen = automatic.left(plan=plan, name=name)
+    return {"shown": shown, "left": waiting, "without_pictures": unseen[:_NAMED]}

@@ -1,0 +1,294 @@
+"""A judge behind an HTTP server of the OpenAI-compatible chat format, shown pictures and asked once about a trial.
+
+It is sent to the address that its set-up names and to no other: redirects are not followed and no proxy is used. What
+it answers is bounded in time and size, and either is exactly what was asked for or no verdict.
+"""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import json
+import os
+import re
+import socket
+import ssl
+import threading
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from ipaddress import ip_address
+from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from evaweb.errors import EvaError
+from evaweb.results.judges.base import Case, NoVerdict, Said, Setup, Still, Verdict
+
+SEES: Literal["pictures", "truth"] = "pictures"
+SERVED = True
+LARGEST_ANSWER = 256 * 1024  # bytes
+_CONNECT_S = 10.0
+_KEY = re.compile(r"EVA_JUDGE_[A-Z0-9_]{1,60}")
+_HOW = (
+    "You look at still pictures of one run of a robot, and say of each milestone whether it was reached during the run. "
+    "Each picture has its camera and its time after the start of the run before it. Judge by the pictures alone. Answer "
+    'with one JSON object and nothing else: {"milestones": [{"number": 1, "verdict": "reached", "probability": 0.97}]}, '
+    "with one entry for each milestone. A verdict is reached, not reached, or no verdict where the pictures do not "
+    "show it. The probability is that the milestone was reached, from 0 to 1, and null with no verdict."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where a judge is asked."""
+
+    secure: bool
+    host: str
+    port: int
+    path: str
+
+
+def endpoint_of(setup: Setup) -> Endpoint:
+    """The address of a set-up, to which /chat/completions is added; EvaError says what is allowed."""
+    given = setup.address
+    allowed = "allowed: https://HOST[:PORT]/PATH, such as https://judge.example.org/v1"
+    try:
+        parts = urlsplit(given)
+        port, host = parts.port, parts.hostname or ""
+    except ValueError as error:
+        raise EvaError(f"address = {given!r:.200}: {error}; {allowed}") from None
+    odd = parts.query or parts.fragment or parts.username is not None or parts.password is not None
+    if parts.scheme not in ("http", "https") or odd or not re.fullmatch(r"[!-~]+", given) or not host:
+        raise EvaError(f"address = {given!r:.200}; {allowed}")
+    secure = parts.scheme == "https"
+    if not (secure or setup.plain or _on_this_machine(host)):
+        raise EvaError(
+            f"address = {given!r:.200}: pictures would travel for everybody to read; allowed: https, http on this "
+            "machine, or http elsewhere where that is ticked"
+        )
+    return Endpoint(secure, host, port or (443 if secure else 80), f"{parts.path.rstrip('/')}/chat/completions")
+
+
+def _on_this_machine(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    number: int
+    verdict: Literal["reached", "not reached", "no verdict"]
+    probability: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] | None
+
+
+class _Answer(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    milestones: list[_Line]
+
+
+class _Message(BaseModel):
+    content: str | None = None
+    refusal: str | None = None
+
+
+class _Choice(BaseModel):
+    message: _Message
+    finish_reason: str | None = None
+
+
+class _Completion(BaseModel):
+    choices: Annotated[list[_Choice], Field(min_length=1)]
+    model: str | None = None
+
+
+class Chat:
+    """Asks once, waits so long and no longer, and takes nothing but what was asked for."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        self._endpoint = endpoint_of(setup)
+        if not setup.model.strip():
+            raise EvaError("model is empty: name the one that is asked")
+        if setup.key_variable and not _KEY.fullmatch(setup.key_variable):
+            raise EvaError(
+                f"key_variable = {setup.key_variable!r:.80}; allowed: the name of an environment variable that begins "
+                "with EVA_JUDGE_, or none"
+            )
+
+    @property
+    def version(self) -> str:
+        """With the model that is asked."""
+        return f"chat 1, {self._setup.model}"
+
+    def words(self, case: Case) -> str:
+        """What stands around the pictures."""
+        return json.dumps([_HOW, _question(case)], ensure_ascii=False)
+
+    def judge(self, case: Case) -> Verdict:
+        """What the server says; NoVerdict with the reason otherwise, EvaError where its key is not there."""
+        key = self._key()
+        content = self._posted(json.dumps(_request(case, self._setup.model)).encode(), key)
+        if key:  # there are servers that quote it
+            content = content.replace(key.encode(), b"...")
+        return _read(content, len(case.steps))
+
+    def _key(self) -> str:
+        name = self._setup.key_variable
+        if not name:
+            return ""
+        key = os.environ.get(name, "").strip()
+        if not re.fullmatch(r"[!-~]{1,4096}", key):
+            raise EvaError(f"the variable {name} of the worker's environment is not set, or holds what is no key")
+        return key
+
+    def _posted(self, body: bytes, key: str) -> bytes:
+        at, wait = self._endpoint, self._setup.patience_s
+        headers = {"Content-Type": "application/json", "Accept": "application/json", "Connection": "close"}
+        headers |= {"Authorization": f"Bearer {key}"} if key else {}
+        # Of http.client and not of urllib: that follows redirects, and proxies of the environment.
+        connection = (http.client.HTTPSConnection if at.secure else http.client.HTTPConnection)(at.host, at.port)
+        with closing(connection), _Deadline(wait) as deadline:
+            try:
+                connection.sock = deadline.connected(at)
+                connection.request("POST", at.path, body, headers)
+                answer = connection.getresponse()
+                content = answer.read(LARGEST_ANSWER + 1) if answer.status == 200 else b""
+            except (OSError, http.client.HTTPException, UnicodeError) as error:
+                raise NoVerdict(_unheard(error, deadline)) from None
+            if deadline.over:  # what is cut off may look like an end
+                raise NoVerdict(_unheard(TimeoutError(), deadline))
+        if 300 <= answer.status < 400:
+            raise NoVerdict(f"the server sends on to elsewhere (HTTP {answer.status}), which is not followed")
+        if answer.status != 200:
+            raise NoVerdict(f"the server answered HTTP {answer.status}")
+        if len(content) > LARGEST_ANSWER:
+            raise NoVerdict(f"the answer is longer than {LARGEST_ANSWER} bytes")
+        return content
+
+
+class _Deadline:
+    """Cuts a connection off when its time is over, whatever it is waiting for then."""
+
+    def __init__(self, wait: float) -> None:
+        self.wait, self.over = wait, False
+        self._socket: socket.socket | None = None
+        self._timer = threading.Timer(wait, self._cut)
+        self._timer.daemon = True
+
+    def __enter__(self) -> _Deadline:
+        self._timer.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._timer.cancel()
+        if self._socket is not None:
+            self._socket.close()
+
+    def connected(self, at: Endpoint) -> socket.socket:
+        """A connection to there, with its certificate verified."""
+        made = socket.create_connection((at.host, at.port), min(self.wait, _CONNECT_S))
+        made.settimeout(self.wait)
+        self._socket = made
+        if at.secure:
+            context = ssl.create_default_context()
+            made = context.wrap_socket(made, server_hostname=at.host, do_handshake_on_connect=False)
+            self._socket = made
+            made.do_handshake()
+        if self.over:
+            raise TimeoutError
+        return made
+
+    def _cut(self) -> None:
+        self.over = True
+        if self._socket is not None:
+            with suppress(OSError):
+                socket.socket.shutdown(self._socket, socket.SHUT_RDWR)  # not TLS's own, which would wait
+
+
+def _unheard(error: Exception, deadline: _Deadline) -> str:
+    if deadline.over or isinstance(error, TimeoutError):
+        return f"no answer within {deadline.wait:g} s"
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"the server's certificate does not hold: {error.verify_message}"
+    if isinstance(error, OSError):
+        return f"the server cannot be reached: {error.strerror or type(error).__name__}"
+    if isinstance(error, UnicodeError):
+        return "the server's name is none that a machine can have"
+    return f"the server does not speak HTTP as is usual: {type(error).__name__}"
+
+
+def _question(case: Case) -> str:
+    within = (f" (within {step.limit_s:g} s)" if step.limit_s is not None else "" for step in case.steps)
+    lines = [f"{n}. {step.text}{limit}" for n, (step, limit) in enumerate(zip(case.steps, within, strict=True), 1)]
+    success = [f"Success: {case.criterion}"] if case.criterion else []
+    return "\n".join([f"The robot was told: {case.instruction}", *success, "Milestones:", *lines])
+
+
+def _request(case: Case, model: str) -> dict[str, Any]:
+    shown = [part for still in case.stills for part in _parts(still)]
+    return {
+        "model": model,
+        "temperature": 0,
+        "response_format": {"type": "json_object"},
+        "messages": [
+            {"role": "system", "content": _HOW},
+            {"role": "user", "content": [{"type": "text", "text": _question(case)}, *shown]},
+        ],
+    }
+
+
+def _parts(still: Still) -> list[dict[str, Any]]:
+    url = f"data:image/jpeg;base64,{base64.b64encode(still.jpeg).decode()}"
+    return [
+        {"type": "text", "text": f"{still.camera}, {still.at:.1f} s"},
+        {"type": "image_url", "image_url": {"url": url}},
+    ]
+
+
+def _read(content: bytes, n: int) -> Verdict:
+    """The verdict on `n` milestones in what a server answered; NoVerdict."""
+    try:
+        completion = _Completion.model_validate_json(content)
+    except ValidationError as error:
+        raise NoVerdict(f"the answer is no completion: {_wrong(error)}") from None
+    choice = completion.choices[0]
+    if choice.message.refusal or choice.finish_reason == "content_filter":
+        raise NoVerdict(f"it refused: {choice.message.refusal or 'its filter of contents did'}")
+    if choice.finish_reason not in (None, "stop"):
+        raise NoVerdict(f"it did not come to its end: {choice.finish_reason!a:.40}")
+    try:
+        lines = _Answer.model_validate_json(choice.message.content or "").milestones
+    except ValidationError as error:
+        raise NoVerdict(f"what it said is not what was asked for: {_wrong(error)}") from None
+    numbers = sorted(line.number for line in lines)
+    if numbers != list(range(1, n + 1)):
+        raise NoVerdict(f"it spoke of the milestones {numbers!r:.60}; asked were 1 to {n}")
+    return Verdict(
+        tuple(_said(line) for line in sorted(lines, key=lambda line: line.number)),
+        (completion.model or "").replace("\x00", "")[:200],
+    )
+
+
+def _said(line: _Line) -> Said:
+    reached = {"reached": True, "not reached": False, "no verdict": None}[line.verdict]
+    try:
+        return Said(reached, line.probability)
+    except ValueError as error:
+        raise NoVerdict(f"milestone {line.number}: {error}") from None
+
+
+def _wrong(error: ValidationError) -> str:
+    """The first fault, without what stood there."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    place = ".".join(map(str, first["loc"]))
+    return f"{place}: {first['msg']}" if place else str(first["msg"])
+
+
+def build(setup: Setup) -> Chat:
+    """EvaError where address, model or the name of the key cannot be."""
+    return Chat(setup)

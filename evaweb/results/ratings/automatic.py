@@ -1,0 +1,208 @@
+"""Automatic judges: allowed, asked for, shown one trial after the other, and what they said kept.
+
+What they say is never a score and never a rating. A trial is shown to one version of a judge once, whatever comes of
+it: a judge that is asked until it answers would be chosen by its answers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+from django.contrib.auth.models import User
+from django.db import transaction
+from django.db.models import Exists, OuterRef
+from django.utils import timezone
+
+from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
+from evaweb.jobs.models import Job
+from evaweb.jobs.services import enqueue
+from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState
+from evaweb.results.judges.base import Case, NoVerdict, Said, Step
+from evaweb.results.judges.finding import Found, built
+from evaweb.results.models import AutomaticJudge, Judgement
+from evaweb.results.ratings.record import RATINGS, JudgementLine
+from evaweb.results.ratings.stills import stills_of
+from evaweb.results.ratings.video_available import seen
+from evaweb.roles import Role, require, role_of
+from evaweb.trials.models import Milestone, Trial, TrialStatus
+from evaweb.trials.record import file_of
+from runtime.recording.files import RecordingError
+
+log = logging.getLogger(__name__)
+
+KIND = "judge"  # of the job
+LONGEST_REASON = 300  # characters of what a server may have said
+
+
+# --- administrators ----------------------------------------------------------------------------------------
+
+
+def judge_allow(*, user: User, judge: AutomaticJudge) -> None:
+    """Let it be sent pictures to the address that it has now; who allowed it is kept, and another address is another."""
+    require(user, Role.ADMIN)
+    if not judge.address:
+        raise Conflict(f"judge {judge} has no address: there is nothing to allow")
+    built(judge.name, judge.kind, judge.setup)
+    judge.allowed_address, judge.allowed_by, judge.allowed_at = judge.address, user, timezone.now()
+    judge.save(update_fields=["allowed_address", "allowed_by", "allowed_at"])
+    log.info("judge %s: %a allows %s", judge, user.get_username(), judge.address)
+
+
+def judge_forbid(*, user: User, judge: AutomaticJudge) -> None:
+    """Send nothing to it any more; what it is being asked just now is still answered."""
+    require(user, Role.ADMIN)
+    judge.allowed_address, judge.allowed_by, judge.allowed_at = "", None, None
+    judge.save(update_fields=["allowed_address", "allowed_by", "allowed_at"])
+    log.info("judge %s: %a allows it no longer", judge, user.get_username())
+
+
+# --- asking ------------------------------------------------------------------------------------------------
+
+
+def judges_ready() -> list[AutomaticJudge]:
+    """Those that could be asked now."""
+    found = []
+    for judge in AutomaticJudge.objects.all():
+        try:
+            _ready(judge)
+        except EvaError:
+            continue
+        found.append(judge)
+    return found
+
+
+def judge_ask(*, user: User, plan: Plan, name: str) -> Job:
+    """Have the worker show all scored trials of the plan to a judge; its owner, or an administrator.
+
+    Before the reveal too: what it says is hidden until then.
+    """
+    role = require(user, Role.OPERATOR)
+    if role is not Role.ADMIN and plan.owner_id != user.pk:
+        raise NotAllowed(f"{plan} is {plan.owner.get_username()}'s: its owner or an administrator asks a judge")
+    if plan.state == PlanState.DRAFT:
+        raise Conflict(f"{plan} is a draft: it has no trials to be judged")
+    judge = _judge(name)
+    _ready(judge)
+    with transaction.atomic():
+        PlanEvent.objects.create(plan=plan, by=user, what="judge asked", text=f"the judge {judge} ({judge.kind})")
+        return judge_wanted(plan=plan, judge=judge.name)
+
+
+def judge_wanted(*, plan: Plan, judge: str) -> Job:
+    """The job that shows its trials to a judge, where there is none yet."""
+    return enqueue(kind=KIND, key=f"{KIND}:{plan.pk}:{judge}", args={"plan": plan.pk, "judge": judge})
+
+
+def _judge(name: str) -> AutomaticJudge:
+    found = AutomaticJudge.objects.filter(name=name).first()
+    if found is None:
+        there = ", ".join(AutomaticJudge.objects.values_list("name", flat=True))
+        raise NotFound(f"there is no judge {name!r:.80}; there are: {there or 'none, an administrator adds them'}")
+    return found
+
+
+def _ready(judge: AutomaticJudge) -> Found:
+    """The judge, to be asked; EvaError where it cannot be, or must not: its address was never allowed."""
+    found = built(judge.name, judge.kind, judge.setup)
+    if found.served and judge.allowed_address != judge.address:
+        raise NotAllowed(
+            f"judge {judge}: {judge.address} is not allowed: an administrator allows it under Administration, Judges"
+        )
+    return found
+
+
+# --- being judged ------------------------------------------------------------------------------------------
+
+
+def judge_next(*, plan: Plan, name: str) -> bool:
+    """Show the next trial to the judge and keep what it says; False where there is none that can be shown.
+
+    Nothing is held while it is asked. EvaError where the judge itself fails, and nothing is kept.
+    """
+    found = _ready(_judge(name))  # anew for each trial: it may have been forbidden since
+    handout = next(_showable(plan, found), None)
+    if handout is None:
+        return False
+    judgement = Judgement(trial=handout.trial, judge=found.name, version=found.judge.version)
+    said: list[Said] = []
+    try:
+        case = _case(handout.trial, found)
+        words = found.judge.words(case)
+        judgement.prompt = hashlib.sha256(words.encode()).hexdigest() if words else ""
+        judgement.pictures = [
+            [still.camera, still.at, hashlib.sha256(still.jpeg).hexdigest()] for still in case.stills
+        ]
+        if found.pictures and not case.stills:
+            raise NoVerdict("there is no picture of it")
+        verdict = found.asked(case)
+        judgement.model, said = verdict.model, list(verdict.milestones)
+    except RecordingError:
+        log.warning("judge %s: pictures of trial %s cannot be read", name, handout.trial_id, exc_info=True)
+        judgement.reason = "its pictures cannot be read"
+    except NoVerdict as none:
+        judgement.reason = " ".join(str(none).replace("\x00", "").split())[:LONGEST_REASON] or "it gave none"
+    _keep(judgement, said)
+    return True
+
+
+def left(*, plan: Plan, name: str) -> tuple[int, list[str]]:
+    """How many scored trials the judge has not been shown, and the codes of those without pictures on this machine."""
+    found = _ready(_judge(name))
+    waiting = list(_waiting(plan, found))
+    return len(waiting), [row.code for row in waiting if not _can_be_shown(row, found)]
+
+
+def _waiting(plan: Plan, found: Found) -> Iterator[Handout]:
+    """Those that count, have milestones, and were not shown to it, in the order in which they were handed out."""
+    shown = Judgement.objects.filter(trial=OuterRef("trial"), judge=found.name, version=found.judge.version)
+    rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).exclude(Exists(shown))
+    rows = rows.filter(Exists(Milestone.objects.filter(scene=OuterRef("trial__scene"))))
+    yield from rows.select_related("trial__scene", "trial__episode").order_by("number")
+
+
+def _showable(plan: Plan, found: Found) -> Iterator[Handout]:
+    return (handout for handout in _waiting(plan, found) if _can_be_shown(handout, found))
+
+
+def _can_be_shown(handout: Handout, found: Found) -> bool:
+    return not found.pictures or seen(handout.trial.episode)
+
+
+def _case(trial: Trial, found: Found) -> Case:
+    """What the judge may know of a trial."""
+    milestones = list(trial.scene.milestones.order_by("order"))
+    return Case(
+        trial.instruction,
+        trial.scene.criterion,
+        tuple(Step(row.text, row.time_limit_s) for row in milestones),
+        stills_of(trial.episode) if found.pictures and trial.episode is not None else (),
+        () if found.pictures else tuple(_true(trial.truth or {}, row) for row in milestones),
+    )
+
+
+def _true(truth: dict[str, Any], milestone: Milestone) -> bool | None:
+    """Whether the bench says that it was reached in time, None where it says nothing of it."""
+    known = truth.get("milestones", {}).get(milestone.truth)
+    at, limit = truth.get("reached", {}).get(milestone.truth), milestone.time_limit_s
+    late = at is not None and limit is not None and at > limit
+    return None if known is None else bool(known) and not late
+
+
+@transaction.atomic
+def _keep(judgement: Judgement, said: list[Said]) -> None:
+    """On the disk, then as a row, unless another worker was sooner or the trial counts no longer."""
+    trial = Trial.objects.select_for_update(of=("self",)).select_related("scene").get(pk=judgement.trial_id)
+    named = {name: getattr(judgement, name) for name in ("trial_id", "judge", "version")}
+    if trial.status != TrialStatus.SCORED or Judgement.objects.filter(**named).exists():
+        return
+    texts = list(trial.scene.milestones.order_by("order").values_list("text", flat=True))
+    words = said or [Said()] * len(texts)
+    judgement.milestones = [
+        [text, one.reached, one.probability] for text, one in zip(texts, words, strict=True)
+    ]
+    judgement.at = timezone.now()
+    RATINGS.append(file_of(trial), JudgementLine.written(judgement))
+    judgement.save()

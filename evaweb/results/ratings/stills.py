@@ -1,0 +1,37 @@
+"""Pictures of a trial as an automatic judge is shown them: few, small, by numbers of cameras, nothing but pixels."""
+
+from __future__ import annotations
+
+from evaweb.episodes.folders import preview_video
+from evaweb.episodes.models import Episode
+from evaweb.episodes.preview import jpeg_of
+from evaweb.results.judges.base import Still
+
+CAMERAS = 4  # the first of the recording
+OF_EACH = 8  # evenly over the run, with the first and the last that there are
+WIDTH = 512  # pixels at most
+
+
+def stills_of(episode: Episode) -> tuple[Still, ...]:
+    """Camera after camera in the order of time, of those that have a video; RecordingError where one is damaged."""
+    from runtime.datasets.pictures import Pictures  # web processes know the job too, and never do it
+
+    found = []
+    for number, camera in enumerate(episode.cameras[:CAMERAS], 1):
+        video = preview_video(episode.uuid, camera)
+        if not video.exists():  # lost before its first picture
+            continue
+        with Pictures(video) as pictures:
+            times = pictures.times
+            for index in sample(len(pictures)):
+                pixels = pictures[index]
+                jpeg = jpeg_of(pixels, min(WIDTH, pixels.shape[1]))
+                found.append(Still(f"camera {number}", round(times[index] - times[0], 3), jpeg))
+    return tuple(found)
+
+
+def sample(n: int, most: int = OF_EACH) -> list[int]:
+    """At most so many of 0 to n - 1, evenly, both ends among them."""
+    if n <= most:
+        return list(range(n))
+    return [round(k * (n - 1) / (most - 1)) for k in range(most)]

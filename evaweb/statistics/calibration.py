@@ -1,0 +1,59 @@
+"""Probabilities that were given of something, beside how often it was so.
+
+Brier score: Brier (1950). Reliability table: Murphy and Winkler (1977). Expected calibration error, which is biased
+upwards where bins hold few: Naeini, Cooper and Hauskrecht (2015).
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from evaweb.statistics.base import StatisticsError, check_share
+
+BINS = 10
+_EDGES = [k / BINS for k in range(1, BINS)]
+
+
+@dataclass(frozen=True, slots=True)
+class Bin:
+    """Probabilities from `low` up to, but for the last, `high`: how many, their mean, and of how many it was so."""
+
+    low: float
+    high: float
+    n: int
+    probability: float
+    true: int
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Of `n` probabilities: mean squared error, expected calibration error, and the bins that hold any."""
+
+    n: int
+    brier: float
+    error: float
+    bins: tuple[Bin, ...]
+
+
+def calibration(pairs: Sequence[tuple[float, bool]]) -> Calibration:
+    """Of (probability, whether it was so), in ten bins of equal width; StatisticsError for none."""
+    if not pairs:
+        raise StatisticsError("no probability was given")
+    for probability, _ in pairs:
+        check_share("probability", probability)
+    n, binned = len(pairs), [list[tuple[float, bool]]() for _ in range(BINS)]
+    for pair in pairs:
+        binned[bisect_right(_EDGES, pair[0])].append(pair)
+    bins = tuple(
+        Bin(k / BINS, (k + 1) / BINS, len(held), sum(p for p, _ in held) / len(held), sum(true for _, true in held))
+        for k, held in enumerate(binned)
+        if held
+    )
+    return Calibration(
+        n,
+        sum((probability - true) ** 2 for probability, true in pairs) / n,
+        sum(abs(held.n * held.probability - held.true) for held in bins) / n,
+        bins,
+    )
