@@ -1,4 +1,4 @@
-"""What second raters and automatic judges say of trials, and which of two people prefer; none changes a trial's score."""
+"""What second raters and automatic judges say of trials, and which of two people prefer: never a trial's own score."""
 
 from __future__ import annotations
 
@@ -82,16 +82,21 @@ class Preference(models.Model):
         return f"{self.rater}, {self.first_id} and {self.second_id}: {self.get_outcome_display()}"
 
 
+def kinds() -> list[tuple[str, str]]:
+    """The kinds of judges that can be set up."""
+    return [(kind, kind) for kind in KINDS]
+
+
 class AutomaticJudge(models.Model):
-    """A judge that an administrator has set up; one with a server is asked at the address that was allowed, no other."""
+    """A judge that an administrator has set up; one with a server is asked at the address that was allowed."""
 
     name = models.SlugField(max_length=60, unique=True)
-    kind = models.CharField(max_length=20, choices=[(kind, kind) for kind in KINDS])
+    kind = models.CharField(max_length=20, choices=kinds)
     address = models.CharField(
         max_length=300,
         blank=True,
-        help_text="Of a chat server, without /chat/completions, e.g. https://judge.example.org/v1. It is sent pictures, "
-        "instructions and milestones once it is allowed, in the list of judges.",
+        help_text="Of a chat server, without /chat/completions, e.g. https://judge.example.org/v1. It is sent "
+        "pictures, instructions and milestones once it is allowed, in the list of judges.",
     )
     model = models.CharField(max_length=120, blank=True, help_text="As the server calls it.")
     key_variable = models.CharField(
@@ -101,7 +106,9 @@ class AutomaticJudge(models.Model):
         "stored here.",
     )
     plain = models.BooleanField(
-        "http to another machine", default=False, help_text="Everybody on the way can see the pictures and the key."
+        "http to another machine",
+        default=False,
+        help_text="Everybody on the way can see the pictures and the key.",
     )
     patience_s = models.FloatField(
         "patience [s]",
@@ -151,17 +158,19 @@ class Judgement(models.Model):
         help_text="[text, reached, probability that it was] of each, in their order; null, null for no verdict.",
     )
     reason = models.TextField(blank=True, help_text="Why there is no verdict at all.")
-    prompt = models.CharField(max_length=64, blank=True, help_text="SHA-256 of the words that it was asked with.")
-    pictures = models.JSONField(default=list, help_text="[camera, time in s, SHA-256] of each that it was shown.")
+    prompt = models.CharField(
+        max_length=64, blank=True, help_text="SHA-256 of the words that it was asked with."
+    )
+    pictures = models.JSONField(
+        default=list, help_text="[camera, time in s, SHA-256] of each that it was shown."
+    )
     at = models.DateTimeField(default=timezone.now)
 
     append_only = AppendOnly("what a judge said is never changed or removed")
 
     class Meta:
         ordering = ("trial", "pk")
-        constraints = [
-            models.UniqueConstraint(fields=("trial", "judge", "version"), name="judgement_once")
-        ]
+        constraints = [models.UniqueConstraint(fields=("trial", "judge", "version"), name="judgement_once")]
 
     def __str__(self) -> str:
         return f"{self.judge} ({self.version}) of trial {self.trial_id}: {self.reason or 'judged'}"

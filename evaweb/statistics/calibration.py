@@ -47,7 +47,13 @@ def calibration(pairs: Sequence[tuple[float, bool]]) -> Calibration:
     for pair in pairs:
         binned[bisect_right(_EDGES, pair[0])].append(pair)
     bins = tuple(
-        Bin(k / BINS, (k + 1) / BINS, len(held), sum(p for p, _ in held) / len(held), sum(true for _, true in held))
+        Bin(
+            k / BINS,
+            (k + 1) / BINS,
+            len(held),
+            sum(p for p, _ in held) / len(held),
+            sum(true for _, true in held),
+        )
         for k, held in enumerate(binned)
         if held
     )

@@ -20,6 +20,7 @@ from evaweb.plans.allocation import hand_out
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_close, plan_freeze
 from evaweb.preflights.models import Preflight
+from evaweb.results.models import Judgement
 from evaweb.stations.models import Command
 from evaweb.trials import services as trials
 from evaweb.trials.models import Checkpoint, Trial
@@ -219,6 +220,10 @@ class Lab:
         self.trial.refresh_from_db()
         ticks = dict.fromkeys(self.scene.milestones.values_list("pk", flat=True), True)
         trials.trial_score(user=self.operator, trial=self.trial, milestones=ticks, note="fine")
+        words = [[text, True, FIGURE / 1e12] for text in self.scene.milestones.values_list("text", flat=True)]
+        Judgement.objects.create(
+            trial=self.trial, judge="seer", version="chat 1, x", milestones=words, reason=ERROR
+        )
         if not self.dataset:
             told = publish_episode(Work({"uuid": str(self.episode.uuid)}, lambda text: None))
             self.dataset = told["dataset"].removeprefix("datasets/")

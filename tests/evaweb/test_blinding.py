@@ -36,7 +36,9 @@ def _data(settings, tmp_path, monkeypatch):
 def lab(live, runtime, ann, recorded, settings):  # noqa: F811
     """A frozen plan of olga's, a runtime that says secrets, a scene, and an operator."""
     yield Lab(live, runtime, ann, recorded["finished"], settings.DATA_DIR)
-    with unguarded("plans", "trials"):  # what the database refuses to remove is in the way of the next test
+    with unguarded(
+        "plans", "trials", "results"
+    ):  # what the database refuses to remove is in the way of the next test
         call_command("flush", verbosity=0, interactive=False, inhibit_post_migrate=True)
 
 

@@ -38,7 +38,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Still:
-    """A picture of `camera`, which is a number and no name, `at` [s] after the start of the run; a JPEG of pixels alone."""
+    """A picture of `camera`, a number and no name, `at` [s] after the start of the run; a JPEG of pixels alone."""
 
     camera: str
     at: float

@@ -23,9 +23,7 @@ class BenchTruth:
         """Whether the bench says that each was reached, within its time."""
         if all(known is None for known in case.truth):
             raise NoVerdict("the bench reports none of its milestones")
-        return Verdict(
-            tuple(Said() if known is None else Said(known, float(known)) for known in case.truth)
-        )
+        return Verdict(tuple(Said() if known is None else Said(known, float(known)) for known in case.truth))
 
 
 def build(setup: Setup) -> BenchTruth:

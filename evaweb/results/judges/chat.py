@@ -31,11 +31,12 @@ LARGEST_ANSWER = 256 * 1024  # bytes
 _CONNECT_S = 10.0
 _KEY = re.compile(r"EVA_JUDGE_[A-Z0-9_]{1,60}")
 _HOW = (
-    "You look at still pictures of one run of a robot, and say of each milestone whether it was reached during the run. "
-    "Each picture has its camera and its time after the start of the run before it. Judge by the pictures alone. Answer "
-    'with one JSON object and nothing else: {"milestones": [{"number": 1, "verdict": "reached", "probability": 0.97}]}, '
-    "with one entry for each milestone. A verdict is reached, not reached, or no verdict where the pictures do not "
-    "show it. The probability is that the milestone was reached, from 0 to 1, and null with no verdict."
+    "You look at still pictures of one run of a robot, and say of each milestone whether it was reached during the "
+    "run. Each picture has its camera and its time after the start of the run before it. Judge by the pictures alone. "
+    "Answer with one JSON object and nothing else: "
+    '{"milestones": [{"number": 1, "verdict": "reached", "probability": 0.97}]}, with one entry for each milestone. '
+    "A verdict is reached, not reached, or no verdict where the pictures do not show it. The probability is that the "
+    "milestone was reached, from 0 to 1, and null with no verdict."
 )
 
 
@@ -67,7 +68,9 @@ def endpoint_of(setup: Setup) -> Endpoint:
             f"address = {given!r:.200}: pictures would travel for everybody to read; allowed: https, http on this "
             "machine, or http elsewhere where that is ticked"
         )
-    return Endpoint(secure, host, port or (443 if secure else 80), f"{parts.path.rstrip('/')}/chat/completions")
+    return Endpoint(
+        secure, host, port or (443 if secure else 80), f"{parts.path.rstrip('/')}/chat/completions"
+    )
 
 
 def _on_this_machine(host: str) -> bool:
@@ -143,7 +146,9 @@ class Chat:
             return ""
         key = os.environ.get(name, "").strip()
         if not re.fullmatch(r"[!-~]{1,4096}", key):
-            raise EvaError(f"the variable {name} of the worker's environment is not set, or holds what is no key")
+            raise EvaError(
+                f"the variable {name} of the worker's environment is not set, or holds what is no key"
+            )
         return key
 
     def _posted(self, body: bytes, key: str) -> bytes:
@@ -151,7 +156,9 @@ class Chat:
         headers = {"Content-Type": "application/json", "Accept": "application/json", "Connection": "close"}
         headers |= {"Authorization": f"Bearer {key}"} if key else {}
         # Of http.client and not of urllib: that follows redirects, and proxies of the environment.
-        connection = (http.client.HTTPSConnection if at.secure else http.client.HTTPConnection)(at.host, at.port)
+        connection = (http.client.HTTPSConnection if at.secure else http.client.HTTPConnection)(
+            at.host, at.port
+        )
         with closing(connection), _Deadline(wait) as deadline:
             try:
                 connection.sock = deadline.connected(at)
@@ -224,7 +231,9 @@ def _unheard(error: Exception, deadline: _Deadline) -> str:
 
 def _question(case: Case) -> str:
     within = (f" (within {step.limit_s:g} s)" if step.limit_s is not None else "" for step in case.steps)
-    lines = [f"{n}. {step.text}{limit}" for n, (step, limit) in enumerate(zip(case.steps, within, strict=True), 1)]
+    lines = [
+        f"{n}. {step.text}{limit}" for n, (step, limit) in enumerate(zip(case.steps, within, strict=True), 1)
+    ]
     success = [f"Success: {case.criterion}"] if case.criterion else []
     return "\n".join([f"The robot was told: {case.instruction}", *success, "Milestones:", *lines])
 

@@ -26,7 +26,7 @@ from evaweb.results.models import AutomaticJudge, Judgement
 from evaweb.results.ratings.record import RATINGS, JudgementLine
 from evaweb.results.ratings.stills import stills_of
 from evaweb.results.ratings.video_available import seen
-from evaweb.roles import Role, require, role_of
+from evaweb.roles import Role, require
 from evaweb.trials.models import Milestone, Trial, TrialStatus
 from evaweb.trials.record import file_of
 from runtime.recording.files import RecordingError
@@ -41,7 +41,7 @@ LONGEST_REASON = 300  # characters of what a server may have said
 
 
 def judge_allow(*, user: User, judge: AutomaticJudge) -> None:
-    """Let it be sent pictures to the address that it has now; who allowed it is kept, and another address is another."""
+    """Let it be sent pictures at the address that it has now; who allowed it is kept."""
     require(user, Role.ADMIN)
     if not judge.address:
         raise Conflict(f"judge {judge} has no address: there is nothing to allow")
@@ -81,13 +81,17 @@ def judge_ask(*, user: User, plan: Plan, name: str) -> Job:
     """
     role = require(user, Role.OPERATOR)
     if role is not Role.ADMIN and plan.owner_id != user.pk:
-        raise NotAllowed(f"{plan} is {plan.owner.get_username()}'s: its owner or an administrator asks a judge")
+        raise NotAllowed(
+            f"{plan} is {plan.owner.get_username()}'s: its owner or an administrator asks a judge"
+        )
     if plan.state == PlanState.DRAFT:
         raise Conflict(f"{plan} is a draft: it has no trials to be judged")
     judge = _judge(name)
     _ready(judge)
     with transaction.atomic():
-        PlanEvent.objects.create(plan=plan, by=user, what="judge asked", text=f"the judge {judge} ({judge.kind})")
+        PlanEvent.objects.create(
+            plan=plan, by=user, what="judge asked", text=f"the judge {judge} ({judge.kind})"
+        )
         return judge_wanted(plan=plan, judge=judge.name)
 
 
@@ -100,7 +104,9 @@ def _judge(name: str) -> AutomaticJudge:
     found = AutomaticJudge.objects.filter(name=name).first()
     if found is None:
         there = ", ".join(AutomaticJudge.objects.values_list("name", flat=True))
-        raise NotFound(f"there is no judge {name!r:.80}; there are: {there or 'none, an administrator adds them'}")
+        raise NotFound(
+            f"there is no judge {name!r:.80}; there are: {there or 'none, an administrator adds them'}"
+        )
     return found
 
 

@@ -57,7 +57,7 @@ def test_attempts_in_pages_as_csv_and_as_parquet(asked):
     assert [row["smoothness"] for row in table].count(None) == 4
 
 
-@pytest.mark.parametrize("what", ["scores", "ratings", "preferences"])
+@pytest.mark.parametrize("what", ["scores", "ratings", "judgements", "preferences"])
 def test_other_entities_in_all_formats(asked, what):
     n = 16 if what == "scores" else 0
     assert asked(what).json()["total"] == n

@@ -22,7 +22,7 @@ SHED = (
 
 
 def test_a_program_that_was_started_with_secrets_goes_on_without_as_the_same_process():
-    given = os.environ | dict.fromkeys(WEB_ALONE, "canary") | {"KEPT": "this"}
+    given = os.environ | dict.fromkeys((*WEB_ALONE, "EVA_JUDGE_MINE"), "canary") | {"KEPT": "this"}
     started = subprocess.Popen([sys.executable, "-c", SHED], env=given, stdout=subprocess.PIPE, text=True)
     said, _ = started.communicate(timeout=60)
     assert started.returncode == 0
@@ -94,7 +94,7 @@ def test_ssh_gets_what_it_needs_and_no_key_of_anybody(monkeypatch):
         ssh.end()
 
 
-@pytest.mark.parametrize("name", sorted(WEB_ALONE))
+@pytest.mark.parametrize("name", sorted((*WEB_ALONE, "EVA_JUDGE_MINE")))
 def test_what_is_the_webs_is_no_key_of_a_policy_even_where_the_deployment_says_so(name, monkeypatch):
     monkeypatch.setenv(name, "canary")
     with pytest.raises(ConfigurationError, match=f"names {name}, which is the web's") as caught:

@@ -11,6 +11,7 @@ from evaweb.plans import pictures
 from evaweb.plans.canonical import digest
 from evaweb.plans.models import Achieved, Reference
 from evaweb.results.analysis.caching import analysis_of
+from evaweb.results.models import Judgement
 from evaweb.results.ratings import judging
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.reporting import write_report
@@ -39,8 +40,21 @@ def report(revealed, tmp_path, bench):
         new_is_first = pair.first.slot.checkpoint.name == "pi0-new"
         outcome = "tie" if index % 4 == 2 else "first" if won_by_new == new_is_first else "second"
         judging.prefer(user=rater, plan=revealed, outcome=outcome, why="smoother", **codes)
+    for number, handout in enumerate(revealed.handouts.order_by("number")):
+        judged_by_machine(handout.trial, number)
     call_command("eval_report", "blocks", "--out", str(tmp_path / "report"))
     return tmp_path / "report"
+
+
+def judged_by_machine(trial, number):
+    """What two judges say of it: one a little of everything, one never anything."""
+    words = [
+        [text, number % 3 > 0, 0.9 - 0.01 * number if number % 3 else 0.3] for text in ("held", "lifted")
+    ]
+    words.append(["on the plate", None, None])
+    Judgement.objects.create(trial=trial, judge="=seer", version="chat 1, x", milestones=words)
+    nothing = [[text, None, None] for text, *_ in words]
+    Judgement.objects.create(trial=trial, judge="mute", version="1", milestones=nothing, reason="HTTP 500")
 
 
 def test_a_program_without_us_computes_every_number_again(report):
@@ -58,6 +72,13 @@ def test_a_program_without_us_computes_every_number_again(report):
     )
     assert why.count('<svg class="drawing pareto"') == 2
     assert "href" not in why
+    seer, mute = numbers["judges"]
+    assert (seer["judge"], seer["milestones"]["held"]["agreement"]["n"], seer["calibration"]["n"]) == (
+        "=seer",
+        16,
+        32,
+    )
+    assert (mute["no_verdict"], mute["calibration"]) == ({"HTTP 500": 16}, None)
     assert "schedule and codes: 0 do not come out" in found.stdout
 
 
@@ -86,6 +107,11 @@ WAYS = (
     ("comparisons", 0, "barnard", "p"),
     ("comparisons", 0, "evidence", "log_e_first", 3),
     ("agreement", "success", "ac1"),
+    ("judges", 0, "milestones", "held", "agreement", "kappa"),
+    ("judges", 0, "milestones", "lifted", "brier"),
+    ("judges", 0, "calibration", "error"),
+    ("judges", 0, "calibration", "bins", 1, "probability"),
+    ("judges", 1, "no_verdict", "HTTP 500"),
     ("preferences", "contrasts", 0, "difference"),
     ("letters", "pi0-new"),
 )
@@ -162,6 +188,8 @@ def test_the_page_needs_no_network_and_shows_the_checklist(report):
     assert 'href="/' not in page
     assert "A second, blind rater" in page
     assert "was better" not in page
+    assert "Does =seer agree with people?" in page
+    assert "16 × HTTP 500" in page
 
 
 def test_what_is_blind_is_reported_only_where_that_is_meant(plan, tmp_path, carry_out):
