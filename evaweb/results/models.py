@@ -114,7 +114,7 @@ class AutomaticJudge(models.Model):
         "patience [s]",
         default=PATIENCE_S,
         validators=[MinValueValidator(1), MaxValueValidator(600)],
-        help_text="For one trial in all. Without an answer by then it has no verdict.",
+        help_text="For the answer about one trial; one without it by then has no verdict.",
     )
     allowed_address = models.CharField(max_length=300, blank=True, editable=False)
     allowed_by = models.ForeignKey(

@@ -17,7 +17,7 @@ from evaweb.collect.models import SessionEvent
 from evaweb.collect.record import EventLine
 from evaweb.journal import NotKept
 from evaweb.results.models import Preference, Rating
-from evaweb.results.ratings.record import PreferenceLine, RatingLine
+from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
 from evaweb.reviews.models import Review, Segment
 from evaweb.reviews.record import REVIEWS, ReviewLine, SegmentLine
 from evaweb.trials.models import Score, Trial
@@ -139,6 +139,15 @@ def _nested(levels):
 
 SCORE = before("scores", "score")[0]
 TRIAL = SCORE["trial"]
+JUDGED = {
+    **{name: SCORE[name] for name in ("uuid", "trial", "at")},
+    "kind": "judgement",
+    "judge": "seer",
+    "version": "chat 1, x",
+    "prompt": "a" * 64,
+    "milestones": [["held", True, 0.9], ["lifted", None, None]],
+    "pictures": [["camera 1", 0, "b" * 64]],
+}
 
 
 @pytest.mark.parametrize(
@@ -172,12 +181,23 @@ TRIAL = SCORE["trial"]
         ({**SCORE, "trial": {**TRIAL, "station": "../x"}}, "score.trial.station is '../x'"),
         ({**SCORE, "trial": {**TRIAL, "truth": {"a": [float("nan")]}}}, "score.trial.truth is {'a': [nan]}"),
         ({**SCORE, "trial": {**TRIAL, "truth": {"a\0": 1}}}, "U+0000"),
+        ({**JUDGED, "milestones": [["held", True, 1.5]]}, "judgement.milestones.0.2 is 1.5"),
+        ({**JUDGED, "milestones": [["held", True, float("nan")]]}, "judgement.milestones.0.2 is nan"),
+        ({**JUDGED, "milestones": [["held", 1, 0.5]]}, "judgement.milestones.0.1 is 1"),
+        ({**JUDGED, "pictures": [["camera 1", 0.0, "../x"]]}, "judgement.pictures.0.2 is '../x'"),
+        ({**JUDGED, "prompt": "x"}, "judgement.prompt"),
+        ({**JUDGED, "judge": ""}, "judgement.judge is ''"),
     ],
 )
 def test_a_line_that_cannot_be_kept_is_named_and_stops_no_other(kept, line, words):
     found, said = kept(JUDGEMENTS, line)
     assert (found, len(said)) == ([], 1)
     assert words in said[0]
+
+
+def test_what_a_judge_said_is_read_as_it_was_written(kept):
+    (line,), said = kept(RATINGS, JUDGED)
+    assert (line.milestones, said) == ((("held", True, 0.9), ("lifted", None, None)), [])
 
 
 def test_a_part_does_not_end_before_it_begins(kept):

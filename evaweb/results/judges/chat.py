@@ -279,7 +279,7 @@ def _read(content: bytes, n: int) -> Verdict:
         raise NoVerdict(f"it spoke of the milestones {numbers!r:.60}; asked were 1 to {n}")
     return Verdict(
         tuple(_said(line) for line in sorted(lines, key=lambda line: line.number)),
-        (completion.model or "").replace("\x00", "")[:200],
+        completion.model or "",
     )
 
 

@@ -17,9 +17,15 @@ class Found:
     """A judge that can be asked; `pictures` where it is shown these, else the bench's truth."""
 
     name: str
+    version: str
     judge: Judge
     pictures: bool
     served: bool
+
+    def words(self, case: Case) -> str:
+        """All that it is told in words; EvaError that names the judge."""
+        with _named(self.name):
+            return self.judge.words(case)
 
     def asked(self, case: Case) -> Verdict:
         """Its verdict, one word for each milestone; NoVerdict, else EvaError that names the judge."""
@@ -39,7 +45,8 @@ def built(name: str, kind: str, setup: Setup) -> Found:
         raise EvaError(f"judge {name}: kind = {kind!r:.40}; allowed: {', '.join(kinds)}")
     with _named(name):
         module: ModuleType = kinds[kind]
-        return Found(name, module.build(setup), module.SEES == "pictures", module.SERVED)
+        judge = module.build(setup)
+        return Found(name, judge.version, judge, module.SEES == "pictures", module.SERVED)
 
 
 @contextmanager

@@ -1,14 +1,15 @@
 """Automatic judges: allowed, asked for, shown one trial after the other, and what they said kept.
 
-What they say is never a score and never a rating. A trial is shown to one version of a judge once, whatever comes of
-it: a judge that is asked until it answers would be chosen by its answers.
+What they say is never a score and never a rating. A trial is shown to one version of a judge once, whatever it says:
+a judge that is asked until it answers would be chosen by its answers. Where a worker ends before it has heard, nothing
+is kept, and the trial is shown again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from django.contrib.auth.models import User
@@ -34,7 +35,7 @@ from runtime.recording.files import RecordingError
 log = logging.getLogger(__name__)
 
 KIND = "judge"  # of the job
-LONGEST_REASON = 300  # characters of what a server may have said
+LONGEST_REASON, LONGEST_MODEL = 300, 200  # characters of what a server may have said
 
 
 # --- administrators ----------------------------------------------------------------------------------------
@@ -115,7 +116,7 @@ def _ready(judge: AutomaticJudge) -> Found:
     found = built(judge.name, judge.kind, judge.setup)
     if found.served and judge.allowed_address != judge.address:
         raise NotAllowed(
-            f"judge {judge}: {judge.address} is not allowed: an administrator allows it under Administration, Judges"
+            f"judge {judge}: its address is not allowed: an administrator allows it under Administration, Judges"
         )
     return found
 
@@ -132,11 +133,12 @@ def judge_next(*, plan: Plan, name: str) -> bool:
     handout = next(_showable(plan, found), None)
     if handout is None:
         return False
-    judgement = Judgement(trial=handout.trial, judge=found.name, version=found.judge.version)
-    said: list[Said] = []
+    judgement = Judgement(trial=handout.trial, judge=found.name, version=found.version)
+    milestones = list(handout.trial.scene.milestones.order_by("order"))
+    said = [Said()] * len(milestones)
     try:
-        case = _case(handout.trial, found)
-        words = found.judge.words(case)
+        case = _case(handout.trial, milestones, found)
+        words = found.words(case)
         judgement.prompt = hashlib.sha256(words.encode()).hexdigest() if words else ""
         judgement.pictures = [
             [still.camera, still.at, hashlib.sha256(still.jpeg).hexdigest()] for still in case.stills
@@ -144,14 +146,22 @@ def judge_next(*, plan: Plan, name: str) -> bool:
         if found.pictures and not case.stills:
             raise NoVerdict("there is no picture of it")
         verdict = found.asked(case)
-        judgement.model, said = verdict.model, list(verdict.milestones)
+        judgement.model, said = _short(verdict.model, LONGEST_MODEL), list(verdict.milestones)
     except RecordingError:
         log.warning("judge %s: pictures of trial %s cannot be read", name, handout.trial_id, exc_info=True)
         judgement.reason = "its pictures cannot be read"
     except NoVerdict as none:
-        judgement.reason = " ".join(str(none).replace("\x00", "").split())[:LONGEST_REASON] or "it gave none"
-    _keep(judgement, said)
+        judgement.reason = _short(str(none), LONGEST_REASON) or "it gave none"
+    judgement.milestones = [
+        [row.text, one.reached, one.probability] for row, one in zip(milestones, said, strict=True)
+    ]
+    _keep(judgement)
     return True
+
+
+def _short(said: str, longest: int) -> str:
+    """Words of others, on one line, as both databases can keep them."""
+    return " ".join(said.replace("\x00", "").encode("utf-8", "replace").decode().split())[:longest]
 
 
 def left(*, plan: Plan, name: str) -> tuple[int, list[str]]:
@@ -163,7 +173,7 @@ def left(*, plan: Plan, name: str) -> tuple[int, list[str]]:
 
 def _waiting(plan: Plan, found: Found) -> Iterator[Handout]:
     """Those that count, have milestones, and were not shown to it, in the order in which they were handed out."""
-    shown = Judgement.objects.filter(trial=OuterRef("trial"), judge=found.name, version=found.judge.version)
+    shown = Judgement.objects.filter(trial=OuterRef("trial"), judge=found.name, version=found.version)
     rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).exclude(Exists(shown))
     rows = rows.filter(Exists(Milestone.objects.filter(scene=OuterRef("trial__scene"))))
     yield from rows.select_related("trial__scene", "trial__episode").order_by("number")
@@ -177,9 +187,8 @@ def _can_be_shown(handout: Handout, found: Found) -> bool:
     return not found.pictures or seen(handout.trial.episode)
 
 
-def _case(trial: Trial, found: Found) -> Case:
+def _case(trial: Trial, milestones: Sequence[Milestone], found: Found) -> Case:
     """What the judge may know of a trial."""
-    milestones = list(trial.scene.milestones.order_by("order"))
     return Case(
         trial.instruction,
         trial.scene.criterion,
@@ -198,17 +207,12 @@ def _true(truth: dict[str, Any], milestone: Milestone) -> bool | None:
 
 
 @transaction.atomic
-def _keep(judgement: Judgement, said: list[Said]) -> None:
+def _keep(judgement: Judgement) -> None:
     """On the disk, then as a row, unless another worker was sooner or the trial counts no longer."""
-    trial = Trial.objects.select_for_update(of=("self",)).select_related("scene").get(pk=judgement.trial_id)
+    trial = Trial.objects.select_for_update().get(pk=judgement.trial_id)
     named = {name: getattr(judgement, name) for name in ("trial_id", "judge", "version")}
     if trial.status != TrialStatus.SCORED or Judgement.objects.filter(**named).exists():
         return
-    texts = list(trial.scene.milestones.order_by("order").values_list("text", flat=True))
-    words = said or [Said()] * len(texts)
-    judgement.milestones = [
-        [text, one.reached, one.probability] for text, one in zip(texts, words, strict=True)
-    ]
     judgement.at = timezone.now()
     RATINGS.append(file_of(trial), JudgementLine.written(judgement))
     judgement.save()

@@ -6,6 +6,7 @@ from evaweb.episodes.folders import preview_video
 from evaweb.episodes.models import Episode
 from evaweb.episodes.preview import jpeg_of
 from evaweb.results.judges.base import Still
+from runtime.datasets.pictures import Pictures
 
 CAMERAS = 4  # the first of the recording
 OF_EACH = 8  # evenly over the run, with the first and the last that there are
@@ -14,8 +15,6 @@ WIDTH = 512  # pixels at most
 
 def stills_of(episode: Episode) -> tuple[Still, ...]:
     """Camera after camera in the order of time, of those that have a video; RecordingError where one is damaged."""
-    from runtime.datasets.pictures import Pictures  # web processes know the job too, and never do it
-
     found = []
     for number, camera in enumerate(episode.cameras[:CAMERAS], 1):
         video = preview_video(episode.uuid, camera)

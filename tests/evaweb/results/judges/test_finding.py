@@ -30,7 +30,7 @@ def plug_in(monkeypatch):
 
 def test_the_two_that_come_with_the_product_are_found_by_name():
     bench, chat = built("b", "bench", Setup()), built("c", "chat", Setup("https://judge.example", "seer"))
-    assert [(one.pictures, one.served, one.judge.version) for one in (bench, chat)] == [
+    assert [(one.pictures, one.served, one.version) for one in (bench, chat)] == [
         (False, False, "bench 1"),
         (True, True, "chat 1, seer"),
     ]

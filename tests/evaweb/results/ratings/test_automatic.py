@@ -372,11 +372,11 @@ def test_before_the_reveal_it_works_and_nobody_sees_what_it_says(filmed, owner, 
     for user in (owner, admin, bench.operator):
         client.force_login(user)
         said_of = client.get(page).content.decode()
-        assert not [word for word in ("agree with people", "0.99", "0.987", "Brier") if word in said_of]
+        assert not [word for word in ("agree with the scores", "0.99", "0.987", "Brier") if word in said_of]
         assert client.get(rows).status_code == 403
     plan_reveal(user=owner, plan=filmed)
     shown = client.get(page).content.decode()
-    assert "Does seer agree with people?" in shown
+    assert "Does seer agree with the scores?" in shown
     assert "Brier score" in shown
     assert "chat 1, seer-1" in shown
     assert client.get(rows).json()["total"] == 16

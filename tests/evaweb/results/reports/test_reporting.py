@@ -188,7 +188,7 @@ def test_the_page_needs_no_network_and_shows_the_checklist(report):
     assert 'href="/' not in page
     assert "A second, blind rater" in page
     assert "was better" not in page
-    assert "Does =seer agree with people?" in page
+    assert "Does =seer agree with the scores?" in page
     assert "16 × HTTP 500" in page
 
 
