@@ -23,7 +23,7 @@ from evaweb.results.ratings import automatic, judging
 from evaweb.results.ratings.stills import CAMERAS, OF_EACH, sample, stills_of
 from evaweb.results.reports.reporting import numbers_of
 from evaweb.results.reports.tables import outcome_pages
-from evaweb.trials import services
+from evaweb.trials import services, voids
 from evaweb.trials.models import Milestone, Score, Trial
 from tests.evaweb.results.judges.server import http, message, said, serving
 from tests.evaweb.trials import builders
@@ -283,7 +283,7 @@ def test_a_trial_that_counts_no_longer_when_the_answer_comes_is_not_judged(filme
     first = filmed.handouts.order_by("number").first().trial
 
     def shown(episode):
-        services.trial_void(user=bench.operator, trial=first, reason="the camera had moved")
+        voids.trial_void(user=bench.operator, trial=first, reason="the camera had moved")
         return stills_of(episode)
 
     monkeypatch.setattr(automatic, "stills_of", shown)
