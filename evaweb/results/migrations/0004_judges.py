@@ -13,7 +13,7 @@ import evaweb.results.models
 
 class Migration(migrations.Migration):
     dependencies = [
-        ("results", "0002_judgements_kept"),
+        ("results", "0003_failure_phase"),
         ("trials", "0001_initial"),
         migrations.swappable_dependency(settings.AUTH_USER_MODEL),
     ]
