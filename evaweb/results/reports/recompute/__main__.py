@@ -21,6 +21,7 @@ _SHOWN = 40
 _CLOSE = 1e-6  # relative: both ways to a number end in the last bits of different sums
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 Rows = list[dict[str, str]]
+_BROKEN = (ArithmeticError, LookupError, TypeError, ValueError)  # of what a cell or a number should not be
 _TAIL = 0.015  # of what was drawn anew, how much more or less than 2.5 % may lie beyond an end: six standard errors
 
 
@@ -34,16 +35,20 @@ def main() -> int:
         _rows(data / f"{name}.csv") for name in ("trials", "scores", "ratings", "preferences", "judgements")
     )
     wrong = [*faults(seal, plan, rows), *kept_faults(rows, scores, plan, seal["at_reveal"]), *_boundary(plan)]
-    trials = [_trial(row) for row in rows]
-    found = {
-        **numbers(trials, plan),
-        "primary": primary(trials, plan, seal["at_reveal"]),
-        "agreement": _agreement(rows, scores, ratings),
-        "judges": _judges(rows, scores, judgements),
-        "preferences": preferences(
-            [(row["first_checkpoint"], row["second_checkpoint"], row["outcome"]) for row in preferred]
-        ),
-    }
+    found = {}
+    try:
+        trials = [_trial(row) for row in rows]
+        found = {
+            **numbers(trials, plan),
+            "primary": primary(trials, plan, seal["at_reveal"]),
+            "agreement": _agreement(rows, scores, ratings),
+            "judges": _judges(rows, scores, judgements),
+            "preferences": preferences(
+                [(row["first_checkpoint"], row["second_checkpoint"], row["outcome"]) for row in preferred]
+            ),
+        }
+    except _BROKEN as fault:
+        wrong.append(f"the files in data/ contradict each other, no number follows: {fault!r}")
     seen = 0
     for where, problem in differences(shown, found, ""):
         seen += 1
@@ -215,6 +220,9 @@ if __name__ == "__main__":
     try:
         code = main()
         print(end="", flush=True)  # also where there is no standard output (`>&-`)
+    except _BROKEN as fault:
+        print(f"the files in data/ contradict each other: {fault!r}")
+        code = 1
     except BrokenPipeError:  # `... | head -1`; this program stands alone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 141
