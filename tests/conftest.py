@@ -14,6 +14,7 @@ import pytest
 from xdist.scheduler import LoadScopeScheduling
 
 from runtime.core.environment import for_programs
+from tests.migrated import SHARED
 
 _LABS = (  # whole labs and stations in real time: so many of their files at once, beside all others
     "tests/e2e/",
@@ -23,6 +24,7 @@ _LABS = (  # whole labs and stations in real time: so many of their files at onc
     "tests/runtime/sim/test_ros2_node.py",
 )
 _AT_ONCE = max(2, os.cpu_count() or 1)
+_GIVES_WAY = 5
 _OF_ONE_LAB = {  # fixtures of tests/e2e, and the files that use them: side by side each would start a lab of its own
     "patient": "story curves datasets debug_modes layout policy preflight replay_on_robot review",
     "shared": "faults stop_process lifetime",
@@ -33,6 +35,9 @@ _BEGAN = os.sched_getscheduler(0)
 hypothesis.settings.register_profile("eva", deadline=None)  # no test asserts timing: others share the machine
 hypothesis.settings.load_profile("eva")
 _SOCKETS = tempfile.mkdtemp(prefix="eva-")  # of every station that a test starts
+_OWN = SHARED not in os.environ  # else that of the process that started this one
+if _OWN:
+    os.environ[SHARED] = tempfile.mkdtemp(prefix="eva-shared-")
 
 
 class _Scheduling(LoadScopeScheduling):  # type: ignore[misc]
@@ -88,8 +93,10 @@ def pytest_configure() -> None:
 
 
 def pytest_unconfigure() -> None:
-    """No socket of a test outlives the tests."""
+    """No socket of a test outlives the tests, nor does what they share."""
     shutil.rmtree(_SOCKETS, ignore_errors=True)
+    if _OWN:
+        shutil.rmtree(os.environ[SHARED], ignore_errors=True)
 
 
 def pytest_report_header() -> str:
@@ -101,6 +108,13 @@ def pytest_report_header() -> str:
 def pytest_collection_finish() -> None:
     """What is loaded by now stays: the garbage collector does not look at it again and again."""
     gc.freeze()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """A worker that goes through no labs, or through no more, gives way to those: they wait in real time."""
+    if "PYTEST_XDIST_WORKER" in os.environ and not _is_lab(item.nodeid) and os.nice(0) < _GIVES_WAY:
+        os.nice(_GIVES_WAY - os.nice(0))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,33 +1,46 @@
-"""An empty database with every table, made once by a process of the tests, for labs that begin with a copy of it."""
+"""An empty database with every table, made once, for labs and for tests that begin with a copy of it."""
 
 from __future__ import annotations
 
-import atexit
+import fcntl
 import os
 import shutil
 import sqlite3
 import subprocess
 import sys
-import tempfile
 from contextlib import closing
 from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+SHARED = "EVA_TESTS_SHARED"  # the folder of all processes of these tests; tests/conftest.py makes it
 
 
 def copy(folder: Path) -> None:
     """Put it into the data folder of a lab."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    database = folder / "eva.sqlite3"
+    copy_to(folder / "eva.sqlite3")
+
+
+def copy_to(database: Path) -> None:
+    """Put it there."""
     shutil.copyfile(_made(), database)
     database.chmod(0o600)
 
 
 @cache
 def _made() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="eva-migrated-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    """The file, of all processes of these tests: the first one that wants it makes it, others wait."""
+    folder = Path(os.environ[SHARED])
+    whole = folder / "whole.sqlite3"
+    with (folder / "lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not whole.exists():
+            _make(folder, whole)
+    return whole
+
+
+def _make(folder: Path, whole: Path) -> None:
     ours = {name: value for name, value in os.environ.items() if not name.startswith(("EVA_", "DJANGO_"))}
     subprocess.run(
         [sys.executable, "manage.py", "migrate", "--verbosity", "0"],
@@ -35,7 +48,7 @@ def _made() -> Path:
         env=ours | {"EVA_DATA_DIR": str(folder)},
         check=True,
     )
-    whole = folder / "whole.sqlite3"
-    with closing(sqlite3.connect(folder / "eva.sqlite3")) as made, closing(sqlite3.connect(whole)) as copied:
+    part = folder / "part.sqlite3"
+    with closing(sqlite3.connect(folder / "eva.sqlite3")) as made, closing(sqlite3.connect(part)) as copied:
         made.backup(copied)  # whatever its journal still has
-    return whole
+    part.rename(whole)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from uuid import uuid4
 
 import pytest
@@ -16,6 +17,7 @@ from django.test import TransactionTestCase
 from evaweb.errors import NotFound
 from evaweb.stations import commands
 from evaweb.stations.models import Command, Station
+from tests import migrated
 from tests.evaweb.stand_in import StandIn
 from tests.evaweb.trials import builders
 
@@ -43,6 +45,15 @@ def _written(row: Command) -> None:
         commands.unwritten.keep(row)
     except NotFound as fault:
         commands.log.error("%s is not written down: %s", row, fault)
+
+
+@pytest.fixture(scope="session")
+def django_db_keepdb(django_db_modify_db_settings: None) -> bool:
+    """The tests' database begins as a copy of one that is made once: every worker would make the same for seconds."""
+    database = connections["default"]
+    if database.vendor == "sqlite":
+        migrated.copy_to(Path(database.settings_dict["TEST"]["NAME"]))
+    return database.vendor == "sqlite"
 
 
 _NEVER_CHANGED = {"django_content_type", "auth_permission", "trials_failureterm"}  # of every database alike
