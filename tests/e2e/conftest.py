@@ -19,7 +19,10 @@ PATIENT = {
     "lease.ttl_s": 20,
 }
 SETS = [f"--set={key}={value}" for key, value in PATIENT.items()]
-FIRST, LAST = "test_story", "test_lifetime"  # the one sees a fresh lab, the other ends it
+FIRST, LAST = (
+    "test_story",
+    ("test_plan", "test_lifetime"),
+)  # it sees a fresh lab; they leave it blind, or end it
 LABS = ("patient", "shared")
 running = {}  # by the name of the fixture
 
@@ -29,7 +32,7 @@ def pytest_collection_modifyitems(items):
 
     def place(item):
         used = [number for number, lab in enumerate(LABS) if lab in item.fixturenames]
-        return (used or [len(LABS)])[0], item.path.stem != FIRST, item.path.stem == LAST
+        return (used or [len(LABS)])[0], item.path.stem != FIRST, item.path.stem in LAST
 
     items.sort(key=place)
 

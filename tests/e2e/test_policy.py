@@ -33,6 +33,7 @@ MORE = (
     "/result/prefer/",
     "/result/trials/1/",
 )
+SAME = ("history", "delete")  # of administration: one page for all models
 OF_EACH = 2  # addresses of one view; of administration, whose pages are made by one machine, one and one that pops up
 DRAWN = "() => new Promise((seen) => requestAnimationFrame(() => requestAnimationFrame(seen)))"
 MADE = f"""
@@ -133,7 +134,7 @@ def crawled(windows, seeds):
 
     By turns in several windows: each page stays open while the next one loads, and what it does late is seen.
     """
-    waiting, asked, seen, errors, shown = list(seeds), set(), {}, {}, {}
+    waiting, asked, seen, errors, shown, names = list(seeds), set(), {}, {}, {}, set()
 
     def left(window):
         if complaints := window.complaints():
@@ -143,9 +144,10 @@ def crawled(windows, seeds):
     while waiting:
         path = waiting.pop(0)
         name = resolve(urlsplit(path).path).view_name
-        of_each, kind = (
-            (1, (name, "_popup" in path)) if name.startswith("admin:") else (OF_EACH, (name, False))
-        )
+        of_each, kind = OF_EACH, (name, False)
+        if name.startswith("admin:"):
+            action = name.rpartition("_")[2]
+            of_each, kind = 1, (action if action in SAME else name, "_popup" in path)
         if path in asked or len(seen.get(kind, [])) >= of_each:
             continue
         window = next(turns)
@@ -153,13 +155,14 @@ def crawled(windows, seeds):
         if not window.shows(path):
             continue
         seen.setdefault(kind, []).append(path)
+        names.add(name)
         left(window)
         shown[window] = path
         window.open(path)
         waiting += window.links()
     for window in windows:
         left(window)
-    return errors, {name for name, _ in seen}
+    return errors, names
 
 
 def test_no_page_does_what_its_policy_forbids(browser, filled):
