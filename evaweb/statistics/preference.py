@@ -9,7 +9,7 @@ ranked.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -39,11 +39,15 @@ class NotIdentifiedError(StatisticsError):
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """`first` was run or shown first, `second` second, and this was preferred."""
+    """`first` was run or shown first, `second` second, and this was preferred.
+
+    `weight`: the share that it has of one comparison, where several people compared the same two runs.
+    """
 
     first: str
     second: str
     outcome: Outcome
+    weight: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,15 +154,15 @@ class _Design:
             if given.outcome != "tie"
         )
         self.ties = any(given.outcome == "tie" for given in comparisons)
-        cells: Counter[tuple[str, str, Outcome]] = Counter(
-            (given.first, given.second, given.outcome) for given in comparisons
-        )
+        cells: defaultdict[tuple[str, str, Outcome], float] = defaultdict(float)
+        for given in comparisons:
+            cells[given.first, given.second, given.outcome] += given.weight
         shown = sorted({(first, second) for first, second, _ in cells})
         outcomes: tuple[Outcome, ...] = ("first", "second", "tie") if self.ties else ("first", "second")
         k = len(self.names)
         self.size = k - 1 + self.ties + order_effect
         self.vectors = np.zeros((len(shown), len(outcomes), self.size))
-        self.counts = np.array([[float(cells[*pair, o]) for o in outcomes] for pair in shown])
+        self.counts = np.array([[cells[*pair, o] for o in outcomes] for pair in shown])
         self.offsets = np.array([0.0, 0.0, math.log(2)][: len(outcomes)])
         place = {name: i - 1 for i, name in enumerate(self.names)}  # the first policy has no slot
         for row, (first, second) in zip(self.vectors, shown, strict=True):

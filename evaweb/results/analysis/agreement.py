@@ -125,10 +125,12 @@ def _calibration(said: list[tuple[bool, bool | None, float | None]]) -> dict[str
 
 
 def comparisons_of(plan: Plan) -> list[Comparison]:
-    """Preferences of people, by checkpoint."""
+    """Preferences of people, by checkpoint: all that were said of the same two trials weigh as one."""
     rows = Preference.objects.filter(plan=plan).order_by("pk")
-    named = rows.values_list("first__checkpoint__name", "second__checkpoint__name", "outcome")
-    return [Comparison(first, second, outcome) for first, second, outcome in named]
+    names = ("first__checkpoint__name", "second__checkpoint__name", "outcome")
+    said = list(rows.values_list("first_id", "second_id", *names))
+    people = Counter((first, second) for first, second, *_ in said)
+    return [Comparison(*named, 1 / people[first, second]) for first, second, *named in said]
 
 
 def preferences_of(plan: Plan) -> dict[str, Any] | None:

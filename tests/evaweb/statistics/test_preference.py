@@ -115,3 +115,13 @@ def test_comparisons_that_cannot_be_are_refused():
         preferences([Comparison("A", "B", "both")])
     with pytest.raises(StatisticsError, match="no comparison"):
         preferences([])
+
+
+def test_what_several_people_say_of_the_same_two_weighs_as_one():
+    once = preferences(compared({("A", "B"): (30, 10, 4)}))
+    thrice = preferences(
+        [Comparison(one.first, one.second, one.outcome, 1 / 3) for one in compared({("A", "B"): (30, 10, 4)})]
+        * 3
+    )
+    assert thrice.worth == pytest.approx(once.worth)
+    assert thrice.error == pytest.approx(once.error)

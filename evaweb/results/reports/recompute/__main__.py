@@ -7,6 +7,7 @@ import json
 import math
 import os
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -38,13 +39,17 @@ def main() -> int:
     found = {}
     try:
         trials = [_trial(row) for row in rows]
+        people = Counter(map(_of, preferred))
         found = {
             **numbers(trials, plan),
             "primary": primary(trials, plan, seal["at_reveal"]),
             "agreement": _agreement(rows, scores, ratings),
             "judges": _judges(rows, scores, judgements),
             "preferences": preferences(
-                [(row["first_checkpoint"], row["second_checkpoint"], row["outcome"]) for row in preferred]
+                [
+                    (row["first_checkpoint"], row["second_checkpoint"], row["outcome"], 1 / people[_of(row)])
+                    for row in preferred
+                ]
             ),
         }
     except _BROKEN as fault:
@@ -144,6 +149,10 @@ def _stood(scores: Rows, at: str) -> dict[str, str]:
     return next(
         (score for score in reversed(scores) if datetime.fromisoformat(score["scored_at"]) <= then), scores[0]
     )
+
+
+def _of(preferred: dict[str, str]) -> tuple[str, str]:
+    return preferred["first"], preferred["second"]
 
 
 def _text(cell: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
@@ -71,22 +71,24 @@ def score_alpha(pairs: Sequence[tuple[float, float]]) -> float:
     return 1.0 if observed == 0 else 1 - observed / expected
 
 
-def preferences(rows: Sequence[tuple[str, str, str]]) -> dict[str, Any] | None:
-    """Of (first, second, outcome); the ranking is None where the likelihood has no maximum."""
+def preferences(rows: Sequence[tuple[str, str, str, float]]) -> dict[str, Any] | None:
+    """Of (first, second, outcome, its share of one comparison); no ranking where the likelihood has no maximum."""
     if not rows:
         return None
-    counted = {"n": len(rows), "ties": sum(outcome == "tie" for *_, outcome in rows)}
+    counted = {"n": len(rows), "ties": sum(row[2] == "tie" for row in rows)}
     found = _fitted(rows, True) or _fitted(rows, False)
     if found is None:
         return {**counted, "ranking": None, "contrasts": [], "tie": None, "order": None, "order_z": None}
     return {**counted, **found}
 
 
-def _fitted(rows: Sequence[tuple[str, str, str]], order: bool) -> dict[str, Any] | None:
+def _fitted(rows: Sequence[tuple[str, str, str, float]], order: bool) -> dict[str, Any] | None:
     names = sorted({name for row in rows for name in row[:2]})
-    ties = any(outcome == "tie" for *_, outcome in rows)
+    ties = any(row[2] == "tie" for row in rows)
     k, size = len(names), len(names) - 1 + ties + order
-    cells = Counter(rows)
+    cells: dict[tuple[str, str, str], float] = defaultdict(float)
+    for first, second, outcome, weight in rows:
+        cells[first, second, outcome] += weight
     shown = sorted({row[:2] for row in rows})
     kinds = ("first", "second", "tie") if ties else ("first", "second")
 
@@ -123,7 +125,7 @@ def _fitted(rows: Sequence[tuple[str, str, str]], order: bool) -> dict[str, Any]
     return None
 
 
-_Design = Sequence[Sequence[tuple[list[float], int, float]]]
+_Design = Sequence[Sequence[tuple[list[float], float, float]]]
 
 
 def _slopes(design: _Design, x: Sequence[float]) -> tuple[list[float], list[list[float]]]:

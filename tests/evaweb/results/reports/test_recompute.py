@@ -94,7 +94,9 @@ def test_preferences_come_to_the_same(seed):
     rows = []
     for _ in range(60):
         one, other = chance.sample(names, 2)
-        rows.append((one, other, chance.choice(("first", "first", "second", "tie"))))
+        rows.append(
+            (one, other, chance.choice(("first", "first", "second", "tie")), chance.choice((1.0, 0.5)))
+        )
     mine = judged.preferences(rows)
     lab = preferences([Comparison(*row) for row in rows], order_effect=True)
     assert {line["checkpoint"]: line["worth"] for line in mine["ranking"]} == pytest.approx(
@@ -110,7 +112,11 @@ def test_preferences_come_to_the_same(seed):
 
 @pytest.mark.parametrize(
     "rows",
-    [[("a", "b", "first")] * 5, [("a", "b", "first")] * 5 + [("a", "b", "tie")] * 5, [("a", "b", "tie")] * 3],
+    [
+        [("a", "b", "first", 1.0)] * 5,
+        [("a", "b", "first", 1.0)] * 5 + [("a", "b", "tie", 1.0)] * 5,
+        [("a", "b", "tie", 1.0)] * 3,
+    ],
 )
 def test_what_cannot_be_ranked_is_ranked_by_neither(rows):
     assert judged.preferences(rows)["ranking"] is None

@@ -9,7 +9,8 @@ from django.core.management import CommandError, call_command
 
 from evaweb.plans import pictures
 from evaweb.plans.canonical import digest
-from evaweb.plans.models import Achieved, Reference
+from evaweb.plans.models import Achieved, Plan, Reference
+from evaweb.results.analysis.agreement import comparisons_of
 from evaweb.results.analysis.caching import analysis_of
 from evaweb.results.models import Judgement
 from evaweb.results.ratings import judging
@@ -40,6 +41,7 @@ def report(revealed, tmp_path, bench):
         new_is_first = pair.first.slot.checkpoint.name == "pi0-new"
         outcome = "tie" if index % 4 == 2 else "first" if won_by_new == new_is_first else "second"
         judging.prefer(user=rater, plan=revealed, outcome=outcome, why="smoother", **codes)
+    judging.prefer(user=builders.user("rob"), plan=revealed, outcome="tie", why="alike", **codes)
     for number, handout in enumerate(revealed.handouts.order_by("number")):
         judged_by_machine(handout.trial, number)
     call_command("eval_report", "blocks", "--out", str(tmp_path / "report"))
@@ -63,7 +65,8 @@ def test_a_program_without_us_computes_every_number_again(report):
     numbers = json.loads((report / "data" / "numbers.json").read_text("utf-8"))
     assert numbers["n"] == 16
     assert numbers["agreement"]["ratings"] == 8
-    assert numbers["preferences"]["n"] == 8
+    assert numbers["preferences"]["n"] == 9
+    assert sorted(row.weight for row in comparisons_of(Plan.objects.get())) == [0.5, 0.5, *[1.0] * 7]
     modes = [mode for arm in numbers["arms"].values() for mode in arm["failure_modes"]]
     assert {(mode["failure_phase"], mode["failure"]) for mode in modes} == {("", "=dropped")}
     assert sum(mode["count"] for mode in modes) == 16 - sum(a["successes"] for a in numbers["arms"].values())
