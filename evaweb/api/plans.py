@@ -17,7 +17,8 @@ from evaweb.plans.allocation import give_back, progress
 from evaweb.plans.blinding_rules import look, sealed_for
 from evaweb.plans.design import told_reason
 from evaweb.plans.models import Achieved, CameraCheck, Plan, PlanState, Reference
-from evaweb.plans.selectors import plan_get, plan_list
+from evaweb.plans.regions import words
+from evaweb.plans.selectors import plan_get, plan_list, reference_get
 from evaweb.stations.selectors import station_get
 from evaweb.trials import selectors as trials
 
@@ -110,13 +111,55 @@ class Reason(Schema):
     reason: str = ""
 
 
+class RegionIn(Schema):
+    """A named rectangle: its left upper corner and its size, as shares of the picture's width and height."""
+
+    name: str
+    x: float
+    y: float
+    width: float
+    height: float
+
+
+class RegionsIn(Schema):
+    """All regions of a reference picture."""
+
+    regions: list[RegionIn]
+
+
+class RegionOut(Schema):
+    """Match of one region, from 1 to 0, and where its object lies: pixels to the right and down, null where it is not seen."""
+
+    name: str
+    at: list[float]
+    match: float
+    dx: int | None
+    dy: int | None
+    words: str
+
+    @staticmethod
+    def of(row: dict[str, Any]) -> dict[str, Any]:
+        """With where it lies, in words."""
+        return {**row, "words": words(row)}
+
+
 class SeenOut(Schema):
-    """Picture of one camera, its reference ("": none), and how well they match, from 1 down."""
+    """Picture of one camera, its reference ("": none), how well they match, from 1 down, and each region of it."""
 
     camera: str
     picture: str
     reference: str
     match: float | None
+    regions: list[RegionOut] = []
+
+
+class BenchOut(Schema):
+    """What one camera shows now: its reference ("": none), how well they match, and each region of it."""
+
+    camera: str
+    reference: str
+    match: float | None
+    regions: list[RegionOut]
 
 
 class CamerasOut(Schema):
@@ -148,17 +191,26 @@ class ReferenceIn(Schema):
 
 
 class ReferenceOut(Schema):
-    """One reference picture."""
+    """One reference picture, with the regions in which the bench is compared."""
 
+    id: int
     camera: str
     picture: str
+    regions: list[RegionIn]
     by: str
     at: datetime
 
     @staticmethod
     def of(row: Reference) -> dict[str, Any]:
         """With the user who took it."""
-        return {"camera": row.camera, "picture": row.picture, "by": row.by.get_username(), "at": row.at}
+        return {
+            "id": row.pk,
+            "camera": row.camera,
+            "picture": row.picture,
+            "regions": row.regions,
+            "by": row.by.get_username(),
+            "at": row.at,
+        }
 
 
 class AchievedIn(Schema):
@@ -279,6 +331,39 @@ def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
 
 
 @router.post(
+    "/references/{int:id}/regions",
+    response={201: ReferenceOut, **FAILURES},
+    summary="Draw regions of a reference picture",
+    url_name="reference-regions",
+)
+def regions(request: HttpRequest, id: int, given: RegionsIn) -> Any:
+    """Another reference with the same picture and these regions, in which the bench is compared; operators."""
+    drawn = [region.dict() for region in given.regions]
+    row = bench.regions_draw(user=request.auth, reference=reference_get(id=id), drawn=drawn)
+    return Status(201, ReferenceOut.of(row))
+
+
+@router.get(
+    "/trials/{int:id}/bench",
+    response={200: list[BenchOut], **FAILURES},
+    summary="How the bench lies now",
+    url_name="bench",
+)
+def lies(request: HttpRequest, id: int) -> Any:
+    """Of each camera how well it now matches the references of the trial's position; nothing is kept."""
+    seen = bench.bench_now(trial=trials.trial_get(id=id), patience_s=1.0)
+    return [
+        {
+            "camera": one.camera,
+            "reference": one.reference.picture if one.reference else "",
+            "match": one.match,
+            "regions": [RegionOut.of(row) for row in one.regions],
+        }
+        for one in seen
+    ]
+
+
+@router.post(
     "/trials/{int:id}/achieved",
     response={201: list[SeenOut], **FAILURES},
     summary="Keep how the bench is laid out",
@@ -292,4 +377,10 @@ def achieved(request: HttpRequest, id: int, given: AchievedIn) -> Any:
 
 def _seen(row: Achieved) -> dict[str, Any]:
     reference = row.reference.picture if row.reference else ""
-    return {"camera": row.camera, "picture": row.picture, "reference": reference, "match": row.match}
+    return {
+        "camera": row.camera,
+        "picture": row.picture,
+        "reference": reference,
+        "match": row.match,
+        "regions": [RegionOut.of(each) for each in row.regions],
+    }

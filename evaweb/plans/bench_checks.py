@@ -4,7 +4,8 @@ out as its reference picture shows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
@@ -14,7 +15,7 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.journal import text
-from evaweb.plans import pictures
+from evaweb.plans import pictures, regions
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.blinding_rules import has_looked_at_a_version
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
@@ -84,15 +85,70 @@ def references(*, station: Station, position: Position | None) -> dict[str, Refe
 
 @transaction.atomic
 def references_take(*, user: User, station: Station, position: Position | None) -> list[Reference]:
-    """Make what the cameras show now the references of a position, or of the cameras; others stay in the record."""
+    """Make what the cameras show now the references of a position, or of the cameras; others stay in the record.
+
+    Regions that were drawn stay where they are on the picture.
+    """
     require(user, Role.OPERATOR)
     found = pictures.now(station, cameras_of(station))
+    before = references(station=station, position=position)
     return [
         Reference.objects.create(
-            station=station, position=position, camera=camera, picture=pictures.keep(jpeg), by=user
+            station=station,
+            position=position,
+            camera=camera,
+            picture=pictures.keep(jpeg),
+            regions=before[camera].regions if camera in before else [],
+            by=user,
         )
         for camera, jpeg in found.items()
     ]
+
+
+@transaction.atomic
+def regions_draw(*, user: User, reference: Reference, drawn: Any) -> Reference:
+    """Another reference with the same picture and these regions: [{"name", "x", "y", "width", "height"}, ...].
+
+    Conflict where there is a newer one, or where a running plan with a least match has begun to judge by this camera's
+    reference: its gate does not change under it.
+    """
+    require(user, Role.OPERATOR)
+    found = regions.regions_of(drawn)
+    position = reference.position
+    if position is None:
+        raise EvaError("this reference says what a camera shows at all; allowed: regions of a position's")
+    station = Station.objects.select_for_update().get(pk=reference.station_id)
+    newest = references(station=station, position=position)[reference.camera]
+    if newest.pk != reference.pk:
+        raise Conflict(
+            f"{reference.camera} has a newer reference here, by {newest.by.get_username()}: draw on that one"
+        )
+    regions.check_sizes(found, pictures.kept(reference.picture))
+    plan = _judging_by(reference)
+    if plan is not None:
+        raise Conflict(
+            f"{plan} is running and has judged trials by the reference of {reference.camera} here: its gate stays as "
+            "it is; amend the plan to draw other regions"
+        )
+    return Reference.objects.create(
+        station=station,
+        position=position,
+        camera=reference.camera,
+        picture=reference.picture,
+        regions=[region.model_dump() for region in found],
+        by=user,
+    )
+
+
+def _judging_by(reference: Reference) -> Plan | None:
+    judged = Achieved.objects.filter(
+        reference__station=reference.station_id,
+        reference__position=reference.position_id,
+        camera=reference.camera,
+    )
+    return Plan.objects.filter(
+        state=PlanState.FROZEN, match_gate__isnull=False, handouts__trial__in=judged.values("trial")
+    ).first()
 
 
 # --- trials --------------------------------------------------------------------------------------------------
@@ -108,6 +164,45 @@ def next_trial(*, user: User, station: Station, plan: Plan) -> Handout:
     return hand_out(user=user, station=station, plan=plan)
 
 
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What a camera shows of a bench now; `match` and `regions` as in Achieved, None and [] without a reference."""
+
+    camera: str
+    jpeg: bytes
+    reference: Reference | None
+    match: float | None
+    regions: list[dict[str, Any]]
+
+    @property
+    def worst(self) -> tuple[float, str] | None:
+        """The match that a gate is about, and what it is of, in words; None without a reference."""
+        if self.regions:
+            row = min(self.regions, key=lambda row: float(row["match"]))
+            return row["match"], f"{self.camera}, {row['name']} {row['match']:.2f} ({regions.words(row)})"
+        return None if self.match is None else (self.match, f"{self.camera} {self.match:.2f}")
+
+
+def bench_now(*, trial: Trial, patience_s: float = 3.0) -> list[Seen]:
+    """What each camera shows now, and how well it matches the references of the trial's position, before its run."""
+    if trial.status != TrialStatus.PREPARED:
+        raise Conflict(
+            f"trial {trial.pk} is {trial.get_status_display()}: the bench is looked at before the run"
+        )
+    known = references(station=trial.station, position=trial.position)
+    found = pictures.now(trial.station, cameras_of(trial.station), patience_s)
+    return [_seen(camera, jpeg, known.get(camera)) for camera, jpeg in found.items()]
+
+
+def _seen(camera: str, jpeg: bytes, reference: Reference | None) -> Seen:
+    if reference is None:
+        return Seen(camera, jpeg, None, None, [])
+    before = pictures.kept(reference.picture)
+    drawn = regions.regions_of(reference.regions)
+    rows = regions.matched(drawn, before, jpeg) if drawn else []
+    return Seen(camera, jpeg, reference, pictures.match(before, jpeg), rows)
+
+
 def achieve(*, user: User, trial: Trial, override: str = "") -> list[Achieved]:
     """Keep what the cameras show now, before the run, with how well it matches the position's references.
 
@@ -115,41 +210,32 @@ def achieve(*, user: User, trial: Trial, override: str = "") -> list[Achieved]:
     """
     require(user, Role.OPERATOR)
     why = text("override", override, LONGEST_NOTE)
-    if trial.status != TrialStatus.PREPARED:
-        raise Conflict(
-            f"trial {trial.pk} is {trial.get_status_display()}: the bench is looked at before the run"
-        )
-    known = references(station=trial.station, position=trial.position)
-    found = pictures.now(trial.station, cameras_of(trial.station))
-    matches = {
-        camera: pictures.match(pictures.kept(known[camera].picture), jpeg)
-        for camera, jpeg in found.items()
-        if camera in known
-    }
-    _require_match(trial, matches, why)
+    seen = bench_now(trial=trial)
+    _require_match(trial, seen, why)
     return [
         Achieved.objects.create(
             trial=trial,
-            camera=camera,
-            picture=pictures.keep(jpeg),
-            reference=known.get(camera),
-            match=matches.get(camera),
+            camera=one.camera,
+            picture=pictures.keep(one.jpeg),
+            reference=one.reference,
+            match=one.match,
+            regions=one.regions,
             override=why,
             by=user,
         )
-        for camera, jpeg in found.items()
+        for one in seen
     ]
 
 
-def _require_match(trial: Trial, matches: Mapping[str, float], why: str) -> None:
+def _require_match(trial: Trial, seen: Sequence[Seen], why: str) -> None:
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     least = handout.plan.match_gate if handout else None
     if least is None or why:
         return
-    low = [f"{camera} {matched:.2f}" for camera, matched in sorted(matches.items()) if matched < least]
+    low = sorted(one.worst[1] for one in seen if one.worst is not None and one.worst[0] < least)
     if low:
         raise Conflict(
-            f"the bench is not as its reference shows: {', '.join(low)}, wanted {least:.2f}; lay it out again, or give "
+            f"the bench is not as its reference shows: {'; '.join(low)}, wanted {least:.2f}; lay it out again, or give "
             "a reason"
         )
 

@@ -6,6 +6,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from evaweb.plans.regions import Region
+
 _Name = Annotated[str, Field(min_length=1, max_length=120)]
 
 
@@ -98,6 +100,7 @@ class ReferenceTable(Table):
     station: str = Field(max_length=63)
     camera: str = Field(min_length=1, max_length=63)
     picture: str = Field(pattern=r"^[0-9a-f]{64}$")
+    regions: list[Region] = []
 
 
 class File(Table):

@@ -104,8 +104,9 @@ class Plan(models.Model):
         null=True,
         blank=True,
         validators=[MinValueValidator(0), MaxValueValidator(1)],
-        help_text="Of the bench with the position's reference picture, 0 to 1, before a trial runs; a lower one "
-        "needs a reason. Empty: it is measured, and stops nothing.",
+        help_text="Of the bench with the position's reference picture, 0 to 1, before a trial runs: of its worst region "
+        "where regions are drawn (0.75 is a good value), else of the whole picture. A lower one needs a reason. Empty: it "
+        "is measured, and stops nothing.",
     )
 
     evaluation = models.OneToOneField(
@@ -284,7 +285,8 @@ class PlanEvent(models.Model):
 class Reference(models.Model):
     """What a camera of a station shows of a position as it should lie; without a position what the camera shows at all.
 
-    The newest of a camera and position counts. `picture` names a file: see evaweb.plans.pictures.
+    The newest of a camera and position counts. `picture` names a file: see evaweb.plans.pictures. `regions` are where
+    its objects lie: see evaweb.plans.regions; others are another row with the same picture.
     """
 
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="references")
@@ -293,6 +295,7 @@ class Reference(models.Model):
         Position, null=True, blank=True, on_delete=models.PROTECT, related_name="references"
     )
     picture = models.CharField(max_length=64)
+    regions = models.JSONField(default=list, blank=True)
     by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
     at = models.DateTimeField(auto_now_add=True)
 
@@ -309,7 +312,9 @@ class Reference(models.Model):
 class Achieved(models.Model):
     """What a camera showed when a trial's run was asked for, and how well that matches the reference there was.
 
-    `match` is evaweb.plans.pictures.match; `override` the reason why a lower one than the plan's least was accepted.
+    `match` is evaweb.plans.pictures.match, of the whole picture; `regions` what evaweb.plans.regions.matched found in
+    each of the reference's, which count in its place where there are any. `override`: why a lower one than the plan's
+    least was accepted.
     """
 
     trial = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="achieved")
@@ -319,6 +324,7 @@ class Achieved(models.Model):
         Reference, null=True, blank=True, on_delete=models.PROTECT, related_name="+"
     )
     match = models.FloatField(null=True, blank=True)
+    regions = models.JSONField(default=list, blank=True)
     override = models.TextField(blank=True)
     by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
     at = models.DateTimeField(auto_now_add=True)

@@ -1,6 +1,6 @@
 """Reference pictures of positions in files that labs exchange: which they are in the TOML, they themselves beside it.
 
-    [[reference]]  scene, position, station, camera, picture (the SHA-256 of the JPEG, and its name)
+    [[reference]]  scene, position, station, camera, picture (the SHA-256 of the JPEG, and its name), regions
 
 An archive (zip) has the TOML and pictures/<SHA-256>.jpg. What cameras show at all is of one lab's benches: that stays.
 """
@@ -19,6 +19,7 @@ from django.contrib.auth.models import User
 
 from evaweb.errors import EvaError, NotFound
 from evaweb.plans import pictures
+from evaweb.plans import regions as drawing
 from evaweb.plans.models import Reference
 from evaweb.stations.models import Station
 from evaweb.trials.models import Position, Scene
@@ -46,6 +47,7 @@ def reference_tables(scenes: Iterable[Scene]) -> list[dict[str, Any]]:
             "station": row.station.name,
             "camera": row.camera,
             "picture": row.picture,
+            **({"regions": row.regions} if row.regions else {}),
         }
         for row in newest.values()
         if row.position is not None
@@ -145,7 +147,7 @@ def _taken(row: Mapping[str, Any], found: Mapping[str, bytes], user: User) -> st
         return f"left out, for there is no station {row['station']}"
     key = {"station": station, "position": position, "camera": row["camera"]}
     ours = Reference.objects.filter(**key).first()
-    if ours is not None and ours.picture != row["picture"]:
+    if ours is not None and (ours.picture, ours.regions) != (row["picture"], row["regions"]):
         return "left out, for this lab has its own"
     jpeg = found.get(row["picture"])
     if ours is not None:
@@ -154,5 +156,7 @@ def _taken(row: Mapping[str, Any], found: Mapping[str, bytes], user: User) -> st
         return "the same"
     if jpeg is None and not pictures.is_kept(row["picture"]):
         return "left out, for the file has not their pictures: import the archive"
-    Reference.objects.create(**key, picture=pictures.keep(jpeg) if jpeg else row["picture"], by=user)
+    drawing.check_sizes(drawing.regions_of(row["regions"]), jpeg or pictures.kept(row["picture"]))
+    name = pictures.keep(jpeg) if jpeg else row["picture"]
+    Reference.objects.create(**key, picture=name, regions=row["regions"], by=user)
     return "new"

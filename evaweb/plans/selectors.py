@@ -7,7 +7,7 @@ from typing import Any
 from django.db.models import Q, QuerySet
 
 from evaweb.errors import NotFound
-from evaweb.plans.models import Handout, Plan, PlanState
+from evaweb.plans.models import Handout, Plan, PlanState, Reference
 from evaweb.roles import Role, role_of
 from evaweb.stations.models import Station
 from evaweb.trials.models import Trial, TrialStatus
@@ -49,3 +49,12 @@ def remaining(plan: Plan) -> int:
 def handout_of(*, trial: Trial) -> Handout | None:
     """Handout of a trial, None for one of no plan."""
     return Handout.objects.select_related("plan", "slot").filter(trial=trial).first()
+
+
+def reference_get(*, id: int) -> Reference:
+    """That reference picture of a camera."""
+    rows = Reference.objects.select_related("station", "position__scene", "by")
+    found = rows.filter(pk=id).first() if 0 < id < 2**63 else None
+    if found is None:
+        raise NotFound(f"reference picture {id} does not exist")
+    return found

@@ -3,12 +3,34 @@
 from __future__ import annotations
 
 from django.http import HttpRequest, HttpResponse
+from django.shortcuts import render
 from django.views.decorators.http import require_safe
 
+from evaweb.plans import regions
+from evaweb.plans.bench_checks import references
 from evaweb.plans.pictures import kept
+from evaweb.plans.selectors import reference_get
+from evaweb.roles import Role, role_of
 
 
 @require_safe
 def picture(request: HttpRequest, name: str) -> HttpResponse:
     """One of them."""
     return HttpResponse(kept(name), content_type="image/jpeg")
+
+
+@require_safe
+def reference(request: HttpRequest, id: int) -> HttpResponse:
+    """A reference picture with its regions, which operators draw there; links lead to those of the other cameras."""
+    found = reference_get(id=id)
+    newest = references(station=found.station, position=found.position)
+    context = {
+        "reference": found,
+        "newest": newest[found.camera],
+        "cameras": sorted(newest.items()),
+        "most": regions.MOST,
+        "may_draw": found.position is not None
+        and newest[found.camera].pk == found.pk
+        and role_of(request.user) >= Role.OPERATOR,
+    }
+    return render(request, "plans/reference.html", context)

@@ -10,13 +10,14 @@ from evaweb.errors import NotFound
 from evaweb.plans import pictures
 from evaweb.plans.models import Achieved, Plan
 
-COLUMNS = ("trial", "camera", "picture", "reference", "match", "override", "by", "at")
+COLUMNS = ("trial", "camera", "picture", "reference", "match", "regions", "override", "by", "at")
 _FIELDS = (
     "trial_id",
     "camera",
     "picture",
     "reference__picture",
     "match",
+    "regions",
     "override",
     "by__username",
     "at",

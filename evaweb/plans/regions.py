@@ -1,0 +1,225 @@
+"""Regions of a reference picture, drawn where an object lies, and how well a picture matches the reference in each.
+
+A region's match is a normalised cross-correlation of the three colours at the camera's own resolution, but no more
+than 640 pixels wide: the best one within TOLERANCE of where the region was drawn. Both pictures are brought to details
+of 5 to 33 pixels before, which leaves out noise of the sensor, and light that changes over the bench. Brightness does
+not count, nor contrast between half and twice; beyond that the match falls: a trace of an object is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+import simplejpeg
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+from evaweb.errors import EvaError
+
+MOST = 12  # of one picture
+WIDEST = 640  # pixels of a picture that is compared
+TOLERANCE = 4  # pixels of these: what a camera gives way, far less than an object that was laid elsewhere
+REACH = 40  # pixels of these: how far an object that lies elsewhere is looked for
+_LEAST = 8  # pixels of a region's side
+_SEEN = 0.7  # match at another place from which the object is said to lie there
+_FLAT = 1.5  # grey levels of spread below which a picture shows nothing
+_FINE, _COARSE = 2, 16  # pixels to each side: means over these are what is left of noise, and of light
+
+_Pixels = np.ndarray[tuple[int, ...], np.dtype[Any]]
+_Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class Region(BaseModel):
+    """A named rectangle: its left upper corner and its size, as shares of the picture's width and height."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+    name: str = Field(min_length=1, max_length=40)
+    x: _Share
+    y: _Share
+    width: _Share
+    height: _Share
+
+    @model_validator(mode="after")
+    def _inside(self) -> Region:
+        if self.x + self.width > 1 + 1e-6 or self.y + self.height > 1 + 1e-6:
+            raise ValueError("it reaches beyond the picture; allowed: x + width and y + height up to 1")
+        return self
+
+
+_REGIONS = TypeAdapter(Annotated[list[Region], Field(max_length=MOST)])
+
+
+def regions_of(given: Any) -> list[Region]:
+    """The regions of plain values, each name once; EvaError names what is wrong with which."""
+    try:
+        found = _REGIONS.validate_python(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "regions"
+        raise EvaError(f"regions: {where}: {first['msg']} (given: {first['input']!r:.80})") from None
+    names = [region.name for region in found]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise EvaError(f"regions: {twice!r} is there twice; allowed: each name once")
+    return found
+
+
+def check_sizes(found: list[Region], jpeg: bytes) -> None:
+    """EvaError where a region is too small on this picture, or shows nothing that could be recognised."""
+    picture = _common([_pixels(jpeg)])[0]
+    for region in found:
+        top, left, bottom, right = _box(region, picture)
+        if bottom - top < _LEAST or right - left < _LEAST:
+            raise EvaError(
+                f"region {region.name!r}: {right - left} x {bottom - top} pixels of the picture; allowed: "
+                f"{_LEAST} x {_LEAST} or more"
+            )
+        if _spread(_details(picture, (top, left, bottom, right))) < _FLAT:
+            raise EvaError(
+                f"region {region.name!r} is of one colour in the picture: draw it around an object and its edges"
+            )
+
+
+def matched(found: list[Region], reference: bytes, now: bytes) -> list[dict[str, Any]]:
+    """Of each region {"name", "match", "dx", "dy", "at"}; dx and dy are null where the object is not seen nearby.
+
+    `match` goes from 1, the same, to 0; `dx` to the right and `dy` down say by how many pixels of the live picture the
+    object lies elsewhere; `at` is the region, [x, y, width, height] as shares.
+    """
+    live = _pixels(now)
+    before, after = _common([_pixels(reference), live])
+    scale = (live.shape[1] / after.shape[1], live.shape[0] / after.shape[0])
+    return [
+        {
+            "name": region.name,
+            "at": [region.x, region.y, region.width, region.height],
+            **_found(region, before, after, scale),
+        }
+        for region in found
+    ]
+
+
+def words(row: Mapping[str, Any]) -> str:
+    """Where the object of a row of `matched` lies: in its place, by how much elsewhere, or that it is not recognised."""
+    dx, dy = row["dx"], row["dy"]
+    if dx is None or dy is None:
+        return "not recognised here or nearby"
+    sides = ((dx, "to the right", "to the left"), (dy, "down", "up"))
+    moved = [f"{abs(by)} px {more if by > 0 else less}" for by, more, less in sides if abs(by) > TOLERANCE]
+    return ", ".join(moved) or "in its place"
+
+
+def _found(region: Region, before: _Pixels, after: _Pixels, scale: tuple[float, float]) -> dict[str, Any]:
+    top, left, bottom, right = box = _box(region, before)
+    wanted = _details(before, box)
+    around = (top - REACH, left - REACH, bottom + REACH, right + REACH)
+    first_row, first_column, last_row, last_column = _inside(around, after)
+    places = _correlations(wanted, _details(after, (first_row, first_column, last_row, last_column)))
+    down = np.arange(places.shape[0]) + first_row - top
+    across = np.arange(places.shape[1]) + first_column - left
+    near = places[np.ix_(np.abs(down) <= TOLERANCE, np.abs(across) <= TOLERANCE)]
+    row, column = np.unravel_index(int(places.argmax()), places.shape)
+    seen = places[row, column] >= _SEEN
+    return {
+        "match": round(float(np.clip(near.max(), 0, 1)), 4),
+        "dx": round(float(across[column]) * scale[0]) if seen else None,
+        "dy": round(float(down[row]) * scale[1]) if seen else None,
+    }
+
+
+def _correlations(wanted: _Pixels, around: _Pixels) -> _Pixels:
+    """Match of `wanted` with each place of `around` at which all of it lies inside."""
+    height, width, _ = wanted.shape
+    shape = around.shape[:2]
+    centred = wanted - wanted.mean(axis=(0, 1))
+    mine = max(float((centred**2).sum()), 1e-9)
+    spectrum = np.fft.rfft2(around, axes=(0, 1)) * np.conj(np.fft.rfft2(centred, s=shape, axes=(0, 1)))
+    rows, columns = shape[0] - height + 1, shape[1] - width + 1
+    both = np.fft.irfft2(spectrum.sum(axis=2), s=shape, axes=(0, 1))[:rows, :columns]
+    pixels = height * width
+    sums, squares = _sums(around, height, width), _sums(around**2, height, width)
+    theirs = np.maximum((squares - sums**2 / pixels).sum(axis=2), 1e-9)
+    contrast = np.sqrt(theirs / mine)
+    fade = np.minimum(1.0, 2 * np.minimum(contrast, 1 / contrast))
+    found: _Pixels = both / np.sqrt(mine * theirs) * fade
+    return found
+
+
+def _sums(values: _Pixels, height: int, width: int) -> _Pixels:
+    """Sums of the values in each window of this size."""
+    total = np.pad(values.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0), (0, 0)))
+    inside: _Pixels = (
+        total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
+    )
+    return inside
+
+
+def _spread(values: _Pixels) -> float:
+    return float(np.sqrt(((values - values.mean(axis=(0, 1))) ** 2).sum(axis=2).mean()))
+
+
+def _box(region: Region, picture: _Pixels) -> tuple[int, int, int, int]:
+    """First row and column, and those after the last."""
+    height, width = picture.shape[:2]
+    return (
+        round(region.y * height),
+        round(region.x * width),
+        round((region.y + region.height) * height),
+        round((region.x + region.width) * width),
+    )
+
+
+def _common(pictures: list[_Pixels]) -> list[_Pixels]:
+    """The pictures at the size of the smallest, no wider than WIDEST."""
+    height = min(picture.shape[0] for picture in pictures)
+    width = min(picture.shape[1] for picture in pictures)
+    if width > WIDEST:
+        height, width = round(height * WIDEST / width), WIDEST
+    return [_brought(picture, height, width) for picture in pictures]
+
+
+def _brought(picture: _Pixels, height: int, width: int) -> _Pixels:
+    """Each pixel is the mean of those that it stands for."""
+    if picture.shape[:2] == (height, width):
+        return picture
+    rows = np.linspace(0, picture.shape[0], height + 1).round().astype(int)
+    columns = np.linspace(0, picture.shape[1], width + 1).round().astype(int)
+    exact = picture.astype(np.float64)
+    sums = np.add.reduceat(np.add.reduceat(exact, rows[:-1], axis=0), columns[:-1], axis=1)
+    small: _Pixels = sums / np.outer(np.diff(rows), np.diff(columns))[..., None]
+    return small
+
+
+def _details(picture: _Pixels, box: tuple[int, int, int, int]) -> _Pixels:
+    """What is between fine and coarse in the box of the picture, with what lies around it in view."""
+    top, left, bottom, right = box
+    wide = (top - _COARSE, left - _COARSE, bottom + _COARSE, right + _COARSE)
+    first_row, first_column, last_row, last_column = _inside(wide, picture)
+    missing = (
+        (first_row - wide[0], wide[2] - last_row),
+        (first_column - wide[1], wide[3] - last_column),
+        (0, 0),
+    )
+    seen = np.pad(
+        picture[first_row:last_row, first_column:last_column].astype(np.float64), missing, mode="edge"
+    )
+    inner = seen[_COARSE - _FINE : _FINE - _COARSE, _COARSE - _FINE : _FINE - _COARSE]
+    return _means(inner, 2 * _FINE + 1) - _means(seen, 2 * _COARSE + 1)
+
+
+def _means(values: _Pixels, side: int) -> _Pixels:
+    return _sums(values, side, side) / side**2
+
+
+def _inside(box: tuple[int, int, int, int], picture: _Pixels) -> tuple[int, int, int, int]:
+    """What of the box lies inside the picture."""
+    return max(0, box[0]), max(0, box[1]), min(picture.shape[0], box[2]), min(picture.shape[1], box[3])
+
+
+def _pixels(jpeg: bytes) -> _Pixels:
+    try:
+        return simplejpeg.decode_jpeg(jpeg, colorspace="RGB")
+    except ValueError as error:
+        raise EvaError(f"this is no JPEG: {error}") from None
