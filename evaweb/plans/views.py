@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from django.http import HttpRequest, HttpResponse
 from django.shortcuts import render
+from django.urls import reverse
 from django.views.decorators.http import require_safe
 
 from evaweb.plans import regions
@@ -28,9 +29,14 @@ def reference(request: HttpRequest, id: int) -> HttpResponse:
         "reference": found,
         "newest": newest[found.camera],
         "cameras": sorted(newest.items()),
-        "most": regions.MOST,
+        "editing": {
+            "regions": found.regions,
+            "most": regions.MOST,
+            "save": reverse("api:reference-regions", args=[found.pk]),
+            "next": reverse("reference", args=[0]),
+        },
         "may_draw": found.position is not None
         and newest[found.camera].pk == found.pk
-        and role_of(request.user) >= Role.OPERATOR,
+        and role_of(request.user) is not Role.VIEWER,
     }
     return render(request, "plans/reference.html", context)

@@ -16,6 +16,7 @@ import { Events } from "./live/events.js";
 import { keyboard } from "./commands/keys.js";
 import { LeaseControls } from "./commands/lease.js";
 import { preflights } from "./trial/preflight.js";
+import { regionLook } from "./trial/region_look.js";
 import { resetAid } from "./trial/reset_aid.js";
 import { scenePane } from "./scene/scene_pane.js";
 import { setUp } from "./trial/setup.js";
@@ -79,7 +80,7 @@ async function start() {
   new LeaseControls(store, socket, commands);
   if (config.page === "eval") {
     new TrialPanel(store, commands);
-    resetAid();
+    resetAid(regionLook());
   }
   if (config.page === "debug") byHand(store, socket, commands);
   veil(store);

@@ -7,8 +7,8 @@ const BLINK_MS = 500;
 // What is drawn over the live picture: with which composite operation, and how dense.
 const MODES = { blend: ["source-over", 0.5], minimum: ["darken", 1], difference: ["difference", 1], blink: ["source-over", 1], edges: ["screen", 1] };
 
-/** Keeps the overlays of the panel's reference pictures; `say` is not needed: the match stands in the panel. */
-export function resetAid() {
+/** Keeps the overlays of the panel's reference pictures; the match stands in the panel, but of cameras that are `regional`. */
+export function resetAid(regional) {
   const pictures = new Map(); // address -> {image, edges}
   let mode = "";
   const chosen = () => document.getElementById("aid-mode");
@@ -28,7 +28,7 @@ export function resetAid() {
       if (reference && !pictures.has(reference)) load(pictures, reference, look);
       cover(figure, reference && mode ? pictures.get(reference) : null, mode);
     }
-    tell(aid, pictures);
+    tell(aid, pictures, regional);
   };
   setInterval(look, LOOK_MS);
   look();
@@ -77,11 +77,12 @@ function cover(figure, picture, mode) {
 }
 
 /** The match of each camera that has a reference, in words; what is below the least is marked. */
-function tell(aid, pictures) {
+function tell(aid, pictures, regional) {
   const line = document.getElementById("aid-match");
   if (!line) return;
   const matches = {};
   for (const [camera, address] of Object.entries(aid)) {
+    if (regional.has(camera)) continue;
     const live = document.querySelector(`[data-camera="${CSS.escape(camera)}"] canvas`);
     const picture = pictures.get(address);
     if (live && picture) matches[camera] = correlation(small(live), small(picture.image));
@@ -89,6 +90,7 @@ function tell(aid, pictures) {
   const least = Number(document.getElementById("aid").dataset.least || Number.NaN);
   const low = new Set(below(matches, least).map(([camera]) => camera));
   const words = Object.entries(matches).map(([camera, value]) => `${camera} ${value.toFixed(2)}${low.has(camera) ? " !" : ""}`);
+  line.hidden = !words.length && regional.size > 0;
   line.textContent = words.length ? `Match: ${words.join(", ")}${Number.isFinite(least) ? ` (wanted ${least})` : ""}` : "Match: waiting for pictures";
   line.toggleAttribute("data-low", low.size > 0);
 }
