@@ -17,7 +17,6 @@ from evaweb.plans.allocation import give_back, progress
 from evaweb.plans.blinding_rules import look, sealed_for
 from evaweb.plans.design import told_reason
 from evaweb.plans.models import Achieved, CameraCheck, Plan, PlanState, Reference
-from evaweb.plans.regions import words
 from evaweb.plans.selectors import plan_get, plan_list, reference_get
 from evaweb.stations.selectors import station_get
 from evaweb.trials import selectors as trials
@@ -128,7 +127,7 @@ class RegionsIn(Schema):
 
 
 class RegionOut(Schema):
-    """Match of one region, from 1 to 0, and where its object lies: pixels to the right and down, null where it is not seen."""
+    """Match of one region, from 1 to 0, and where its object lies: pixels to the right and down, null if it is not seen."""
 
     name: str
     at: list[float]
@@ -136,11 +135,6 @@ class RegionOut(Schema):
     dx: int | None
     dy: int | None
     words: str
-
-    @staticmethod
-    def of(row: dict[str, Any]) -> dict[str, Any]:
-        """With where it lies, in words."""
-        return {**row, "words": words(row)}
 
 
 class SeenOut(Schema):
@@ -357,7 +351,7 @@ def lies(request: HttpRequest, id: int) -> Any:
             "camera": one.camera,
             "reference": one.reference.picture if one.reference else "",
             "match": one.match,
-            "regions": [RegionOut.of(row) for row in one.regions],
+            "regions": one.regions,
         }
         for one in seen
     ]
@@ -382,5 +376,5 @@ def _seen(row: Achieved) -> dict[str, Any]:
         "picture": row.picture,
         "reference": reference,
         "match": row.match,
-        "regions": [RegionOut.of(each) for each in row.regions],
+        "regions": row.regions,
     }

@@ -179,7 +179,7 @@ class Seen:
         """The match that a gate is about, and what it is of, in words; None without a reference."""
         if self.regions:
             row = min(self.regions, key=lambda row: float(row["match"]))
-            return row["match"], f"{self.camera}, {row['name']} {row['match']:.2f} ({regions.words(row)})"
+            return row["match"], f"{self.camera}, {row['name']} {row['match']:.2f} ({row['words']})"
         return None if self.match is None else (self.match, f"{self.camera} {self.match:.2f}")
 
 

@@ -8,7 +8,6 @@ not count, nor contrast between half and twice; beyond that the match falls: a t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -83,10 +82,10 @@ def check_sizes(found: list[Region], jpeg: bytes) -> None:
 
 
 def matched(found: list[Region], reference: bytes, now: bytes) -> list[dict[str, Any]]:
-    """Of each region {"name", "match", "dx", "dy", "at"}; dx and dy are null where the object is not seen nearby.
+    """Of each region {"name", "at", "match", "dx", "dy", "words"}; dx and dy are None where the object is not seen nearby.
 
-    `match` goes from 1, the same, to 0; `dx` to the right and `dy` down say by how many pixels of the live picture the
-    object lies elsewhere; `at` is the region, [x, y, width, height] as shares.
+    `at` is the region, [x, y, width, height] as shares; `match` goes from 1, the same, to 0; `dx` to the right and `dy`
+    down say by how many pixels of the live picture the object lies elsewhere, `words` the same in words.
     """
     live = _pixels(now)
     before, after = _common([_pixels(reference), live])
@@ -101,16 +100,6 @@ def matched(found: list[Region], reference: bytes, now: bytes) -> list[dict[str,
     ]
 
 
-def words(row: Mapping[str, Any]) -> str:
-    """Where the object of a row of `matched` lies: in its place, by how much elsewhere, or that it is not recognised."""
-    dx, dy = row["dx"], row["dy"]
-    if dx is None or dy is None:
-        return "not recognised here or nearby"
-    sides = ((dx, "to the right", "to the left"), (dy, "down", "up"))
-    moved = [f"{abs(by)} px {more if by > 0 else less}" for by, more, less in sides if abs(by) > TOLERANCE]
-    return ", ".join(moved) or "in its place"
-
-
 def _found(region: Region, before: _Pixels, after: _Pixels, scale: tuple[float, float]) -> dict[str, Any]:
     top, left, bottom, right = box = _box(region, before)
     wanted = _details(before, box)
@@ -122,11 +111,19 @@ def _found(region: Region, before: _Pixels, after: _Pixels, scale: tuple[float, 
     near = places[np.ix_(np.abs(down) <= TOLERANCE, np.abs(across) <= TOLERANCE)]
     row, column = np.unravel_index(int(places.argmax()), places.shape)
     seen = places[row, column] >= _SEEN
+    dx, dy = round(float(across[column]) * scale[0]), round(float(down[row]) * scale[1])
     return {
         "match": round(float(np.clip(near.max(), 0, 1)), 4),
-        "dx": round(float(across[column]) * scale[0]) if seen else None,
-        "dy": round(float(down[row]) * scale[1]) if seen else None,
+        "dx": dx if seen else None,
+        "dy": dy if seen else None,
+        "words": _words(dx, dy) if seen else "not recognised here or nearby",
     }
+
+
+def _words(dx: int, dy: int) -> str:
+    sides = ((dx, "to the right", "to the left"), (dy, "down", "up"))
+    moved = [f"{abs(by)} px {more if by > 0 else less}" for by, more, less in sides if abs(by) > TOLERANCE]
+    return ", ".join(moved) or "in its place"
 
 
 def _correlations(wanted: _Pixels, around: _Pixels) -> _Pixels:

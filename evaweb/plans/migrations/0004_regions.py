@@ -5,25 +5,33 @@ from django.db import migrations, models
 
 
 class Migration(migrations.Migration):
-
     dependencies = [
-        ('plans', '0003_designs'),
+        ("plans", "0003_designs"),
     ]
 
     operations = [
         migrations.AddField(
-            model_name='achieved',
-            name='regions',
+            model_name="achieved",
+            name="regions",
             field=models.JSONField(blank=True, default=list),
         ),
         migrations.AddField(
-            model_name='reference',
-            name='regions',
+            model_name="reference",
+            name="regions",
             field=models.JSONField(blank=True, default=list),
         ),
         migrations.AlterField(
-            model_name='plan',
-            name='match_gate',
-            field=models.FloatField(blank=True, help_text="Of the bench with the position's reference picture, 0 to 1, before a trial runs: of its worst region where regions are drawn (0.75 is a good value), else of the whole picture. A lower one needs a reason. Empty: it is measured, and stops nothing.", null=True, validators=[django.core.validators.MinValueValidator(0), django.core.validators.MaxValueValidator(1)], verbose_name='least match'),
+            model_name="plan",
+            name="match_gate",
+            field=models.FloatField(
+                blank=True,
+                help_text="Of the bench with the position's reference picture, 0 to 1, before a trial runs: of its worst region where regions are drawn (0.75 is a good value), else of the whole picture. A lower one needs a reason. Empty: it is measured, and stops nothing.",
+                null=True,
+                validators=[
+                    django.core.validators.MinValueValidator(0),
+                    django.core.validators.MaxValueValidator(1),
+                ],
+                verbose_name="least match",
+            ),
         ),
     ]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,12 @@ def laid_out(plan: Plan) -> Iterator[list[dict[str, Any]]]:
     """A row for each camera of each attempt that was asked to run."""
     rows = Achieved.objects.filter(trial__evaluation=plan.evaluation_id).order_by("trial_id", "pk")
     yield [dict(zip(COLUMNS, row, strict=True)) for row in rows.values_list(*_FIELDS)]
+
+
+def as_text(pages: Iterable[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]]:
+    """The same with regions as JSON, "" where there are none."""
+    for rows in pages:
+        yield [{**row, "regions": json.dumps(row["regions"]) if row["regions"] else ""} for row in rows]
 
 
 def write_pictures(plan: Plan, folder: Path, most: int | None) -> int:

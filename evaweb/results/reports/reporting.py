@@ -78,7 +78,7 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     _csv(data / "ratings.csv", _RATINGS, _ratings(plan))
     _csv(data / "preferences.csv", _PREFERENCES, _preferences(plan))
     _csv(data / "judgements.csv", _JUDGEMENTS, _judgements(plan))
-    _csv(data / "laid_out.csv", laid_out.COLUMNS, laid_out.laid_out(plan))
+    _csv(data / "laid_out.csv", laid_out.COLUMNS, laid_out.as_text(laid_out.laid_out(plan)))
     left = laid_out.write_pictures(plan, data / "pictures", most_pictures)
     shutil.copytree(_PROGRAM, out / "recompute", ignore=shutil.ignore_patterns("__pycache__"))
     page = out / "index.html"

@@ -1,6 +1,6 @@
 import pytest
 
-from evaweb.errors import Conflict, EvaError, NotFound
+from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.plans import bench_checks as looking
 from evaweb.plans import pictures
 from evaweb.plans.models import Achieved, CameraCheck, Plan, Reference
@@ -17,7 +17,9 @@ CAMERAS = ("cam_high", "cam_left_wrist", "cam_right_wrist")
 def shown(monkeypatch):
     """What the cameras show, by their names."""
     found = {camera: jpeg(seed) for seed, camera in enumerate(CAMERAS)}
-    monkeypatch.setattr(looking.pictures, "now", lambda station, cameras: {c: found[c] for c in cameras})
+    monkeypatch.setattr(
+        looking.pictures, "now", lambda station, cameras, patience_s=3.0: {c: found[c] for c in cameras}
+    )
     monkeypatch.setattr(looking, "cameras_of", lambda station: list(CAMERAS))
     return found
 
@@ -98,3 +100,109 @@ def test_after_the_reveal_nothing_is_voided(bench, plan, owner, shown):
     plan_reveal(user=owner, plan=plan)
     with pytest.raises(EvaError, match="chosen with the result in view"):
         voids.trial_void(user=bench.operator, trial=trial, reason="it looks bad")
+
+
+# --- regions -------------------------------------------------------------------------------------------------
+
+
+CORNER = {"name": "block", "x": 0.25, "y": 0.34, "width": 0.25, "height": 0.33}
+
+
+@pytest.fixture
+def laid(bench, plan, shown):
+    """A trial that is prepared at a position with references, and the newest of them by camera."""
+    looking.cameras_confirm(user=bench.operator, station=bench.station, first=True)
+    trial = looking.next_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    looking.references_take(user=bench.operator, station=bench.station, position=trial.position)
+    return trial
+
+
+def high(trial):
+    return looking.references(station=trial.station, position=trial.position)["cam_high"]
+
+
+def without_block(picture):
+    """The same picture but for the region, which is of one grey."""
+    pixels = pictures.simplejpeg.decode_jpeg(picture)
+    pixels[78:166, 76:164] = 128
+    return pictures.simplejpeg.encode_jpeg(pixels, quality=85)
+
+
+def test_the_least_match_is_of_the_worst_region_and_each_is_kept(bench, laid, shown):
+    user = bench.operator
+    looking.regions_draw(user=user, reference=high(laid), drawn=[CORNER, CORNER | {"name": "cup", "x": 0.7}])
+    shown["cam_high"] = without_block(shown["cam_high"])
+    assert pictures.match(jpeg(0), shown["cam_high"]) > 0.8  # the whole picture sees nothing of it
+    with pytest.raises(
+        Conflict, match=r"cam_high, block 0\.\d\d \(not recognised here or nearby\), wanted 0\.80"
+    ):
+        looking.achieve(user=user, trial=laid)
+    looking.achieve(user=user, trial=laid, override="the block is lost")
+    row = Achieved.objects.get(trial=laid, camera="cam_high")
+    assert [(one["name"], one["match"] < 0.8) for one in row.regions] == [("block", True), ("cup", False)]
+    assert row.match == pictures.match(jpeg(0), shown["cam_high"])
+    assert row.reference.regions[0] == CORNER
+    assert Achieved.objects.get(trial=laid, camera="cam_left_wrist").regions == []
+
+
+def test_regions_that_match_let_a_run_begin_although_the_rest_of_the_picture_is_another(bench, laid, shown):
+    looking.regions_draw(user=bench.operator, reference=high(laid), drawn=[CORNER])
+    pixels = pictures.simplejpeg.decode_jpeg(jpeg(0))
+    pixels[:, 220:] = 255 - pixels[:, 220:]  # further away than anything that a region looks at
+    shown["cam_high"] = pictures.simplejpeg.encode_jpeg(pixels, quality=85)
+    assert pictures.match(jpeg(0), shown["cam_high"]) < 0.8
+    assert len(looking.achieve(user=bench.operator, trial=laid)) == 3
+
+
+def test_regions_are_another_reference_and_stay_with_the_next_picture(bench, laid, shown):
+    first = high(laid)
+    drawn = looking.regions_draw(user=bench.operator, reference=first, drawn=[CORNER])
+    assert (first.regions, drawn.regions, drawn.picture) == ([], [CORNER], first.picture)
+    with pytest.raises(Conflict, match="cam_high has a newer reference here, by ann"):
+        looking.regions_draw(user=bench.operator, reference=first, drawn=[])
+    looking.references_take(user=bench.operator, station=bench.station, position=laid.position)
+    assert high(laid).pk > drawn.pk
+    assert high(laid).regions == [CORNER]
+    looking.regions_draw(user=bench.operator, reference=high(laid), drawn=[])
+    assert high(laid).regions == []
+
+
+def test_regions_are_not_changed_under_a_running_plan_that_has_judged_by_them(bench, laid, plan, owner):
+    looking.achieve(user=bench.operator, trial=laid)
+    with pytest.raises(Conflict, match="is running and has judged trials by the reference of cam_high here"):
+        looking.regions_draw(user=bench.operator, reference=high(laid), drawn=[CORNER])
+    builders.over(laid)
+    trials.trial_score(user=bench.operator, trial=laid, milestones=bench.ticks(True, True, True))
+    plan_close(user=owner, plan=plan, reason="enough")
+    assert looking.regions_draw(user=bench.operator, reference=high(laid), drawn=[CORNER]).regions == [CORNER]
+
+
+def test_regions_are_operators_and_of_positions(bench, laid):
+    with pytest.raises(NotAllowed):
+        looking.regions_draw(user=builders.user("vera", "viewer"), reference=high(laid), drawn=[CORNER])
+    of_camera = looking.references(station=bench.station, position=None)["cam_high"]
+    with pytest.raises(EvaError, match="allowed: regions of a position's"):
+        looking.regions_draw(user=bench.operator, reference=of_camera, drawn=[CORNER])
+    with pytest.raises(EvaError, match="beyond the picture"):
+        looking.regions_draw(user=bench.operator, reference=high(laid), drawn=[CORNER | {"x": 0.9}])
+
+
+def test_how_the_bench_lies_is_told_by_rest_and_the_page_draws_regions(bench, laid, shown, client):
+    client.force_login(bench.operator)
+    page = client.get(f"/references/{high(laid).pk}/").content.decode()
+    assert f'"save": "/api/v1/references/{high(laid).pk}/regions"' in page
+    address = f"/api/v1/references/{high(laid).pk}/regions"
+    made = client.post(address, {"regions": [CORNER]}, content_type="application/json")
+    assert (made.status_code, made.json()["regions"]) == (201, [CORNER])
+    shown["cam_high"] = without_block(shown["cam_high"])
+    seen = {one["camera"]: one for one in client.get(f"/api/v1/trials/{laid.pk}/bench").json()}
+    (block,) = seen["cam_high"]["regions"]
+    assert (block["name"], block["words"]) == ("block", "not recognised here or nearby")
+    assert block["at"] == [CORNER[key] for key in ("x", "y", "width", "height")]
+    assert seen["cam_left_wrist"]["regions"] == []
+    assert Achieved.objects.count() == 0
+    older = client.get(address.replace("/api/v1", "").replace("regions", "")).content.decode()
+    assert "There is a newer one, which counts" in older
+    assert "save-regions" not in older
+    builders.over(laid)
+    assert client.get(f"/api/v1/trials/{laid.pk}/bench").status_code == 409

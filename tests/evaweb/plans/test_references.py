@@ -162,3 +162,41 @@ def test_the_admin_pages_and_the_command_write_and_take_archives(
     assert f"Reference pictures of scene {taken.scene.name}: 2 new" in page
     call_command("plans", "import", str(tmp_path / "lab.zip"), "--user", "adam")
     assert Reference.objects.count() == 2
+
+
+BLOCK = {"name": "block", "x": 0.25, "y": 0.34, "width": 0.25, "height": 0.33}
+
+
+def test_regions_go_with_their_picture(taken, admin, settings, tmp_path):
+    row = Reference.objects.filter(camera="top", position__number=1).first()
+    Reference.objects.create(
+        station=row.station,
+        position=row.position,
+        camera="top",
+        picture=row.picture,
+        regions=[BLOCK],
+        by=admin,
+    )
+    content = exported_with_pictures(scenes=[taken.scene])
+    lose()
+    elsewhere(settings, tmp_path)
+    assert take(content, admin)[1].endswith(": 2 new")
+    assert [found.regions for found in Reference.objects.order_by("camera")] == [[], [BLOCK]]
+    assert take(content, admin)[1].endswith(": 2 the same")
+    own = Reference.objects.get(camera="top")
+    Reference.objects.create(
+        station=own.station, position=own.position, camera="top", picture=own.picture, by=admin
+    )
+    assert take(content, admin)[1].endswith(": 1 the same, 1 left out, for this lab has its own")
+
+
+def test_regions_of_a_file_that_cannot_be_are_refused(taken, admin):
+    text = exported(scenes=[taken.scene])
+    lose()
+    for given, said in (
+        ("{name = 'block', x = 0.9, y = 0.1, width = 0.2, height = 0.2}", "beyond the picture"),
+        ("{name = 'block', x = 0.9, y = 0.1, width = 0.01, height = 0.2}", "8 x 8 or more"),
+    ):
+        with pytest.raises(EvaError, match=said):
+            imported(user=admin, text=text + f"regions = [{given}]\n")
+    assert Reference.objects.count() == 0

@@ -223,6 +223,9 @@ def test_the_checklist_says_what_the_record_says(revealed):
     assert kept["Question and comparison before the first trial"].kept == "yes"
 
 
+REGION = {"name": "block", "at": [0.1, 0.2, 0.1, 0.1], "match": 0.41, "dx": None, "dy": None, "words": "gone"}
+
+
 @pytest.fixture
 def laid_out(revealed, bench, owner):
     """The first trial's bench, with its reference, and another's whose picture was lost."""
@@ -231,7 +234,9 @@ def laid_out(revealed, bench, owner):
     row = {"station": bench.station, "position": first.position, "camera": "top", "by": owner}
     reference = Reference.objects.create(picture=before, **row)
     seen = {"camera": "top", "by": bench.operator}
-    Achieved.objects.create(trial=first, picture=now, reference=reference, match=0.93, **seen)
+    Achieved.objects.create(
+        trial=first, picture=now, reference=reference, match=0.93, regions=[REGION], **seen
+    )
     Achieved.objects.create(trial=second, picture=lost, override="the lamp", **seen)
     pictures._path(lost).unlink()
     return first, before, now, lost
@@ -244,7 +249,7 @@ def test_it_has_the_pictures_of_how_benches_were_laid_out(revealed, laid_out, tm
     assert {path.stem for path in (data / "pictures").iterdir()} == {before, now}
     assert (data / "pictures" / f"{now}.jpg").read_bytes() == jpeg(2)
     assert f'href="data/pictures/{now}.jpg">top</a>' in page
-    assert f'match 0.93 of <a href="data/pictures/{before}.jpg">' in page
+    assert f'match 0.93 of <a href="data/pictures/{before}.jpg">reference</a>, block 0.41' in page
     assert lost not in page
     assert "1 picture of benches is not in this report" in page
     rows = list(csv.DictReader((data / "laid_out.csv").open(encoding="utf-8", newline="")))
@@ -252,6 +257,8 @@ def test_it_has_the_pictures_of_how_benches_were_laid_out(revealed, laid_out, tm
         (str(first.pk), now, ""),
         (str(first.pk + 1), lost, "the lamp"),
     ]
+    assert json.loads(rows[0]["regions"]) == [REGION]
+    assert rows[1]["regions"] == ""
 
 
 def test_a_download_has_so_many_pictures_and_says_so(revealed, laid_out, tmp_path):
