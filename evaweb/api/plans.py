@@ -127,7 +127,7 @@ class RegionsIn(Schema):
 
 
 class RegionOut(Schema):
-    """Match of one region, from 1 to 0, and where its object lies: pixels to the right and down, null if it is not seen."""
+    """Match of one region, from 1 to 0; its object lies so many pixels to the right and down, null: it is not seen."""
 
     name: str
     at: list[float]
@@ -138,13 +138,18 @@ class RegionOut(Schema):
 
 
 class SeenOut(Schema):
-    """Picture of one camera, its reference ("": none), how well they match, from 1 down, and each region of it."""
+    """Picture of one camera, its reference ("": none), and how well they match, from 1 down."""
 
     camera: str
     picture: str
     reference: str
     match: float | None
-    regions: list[RegionOut] = []
+
+
+class AchievedOut(SeenOut):
+    """The same with each region of the reference."""
+
+    regions: list[RegionOut]
 
 
 class BenchOut(Schema):
@@ -359,7 +364,7 @@ def lies(request: HttpRequest, id: int) -> Any:
 
 @router.post(
     "/trials/{int:id}/achieved",
-    response={201: list[SeenOut], **FAILURES},
+    response={201: list[AchievedOut], **FAILURES},
     summary="Keep how the bench is laid out",
     url_name="achieved",
 )

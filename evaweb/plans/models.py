@@ -104,9 +104,9 @@ class Plan(models.Model):
         null=True,
         blank=True,
         validators=[MinValueValidator(0), MaxValueValidator(1)],
-        help_text="Of the bench with the position's reference picture, 0 to 1, before a trial runs: of its worst region "
-        "where regions are drawn (0.75 is a good value), else of the whole picture. A lower one needs a reason. Empty: it "
-        "is measured, and stops nothing.",
+        help_text="Of the bench with the position's reference picture, 0 to 1, before a trial runs: of its worst "
+        "region where regions are drawn (0.75 is a good value), else of the whole picture. A lower one needs a reason. "
+        "Empty: it is measured, and stops nothing.",
     )
 
     evaluation = models.OneToOneField(

@@ -21,7 +21,7 @@ WIDEST = 640  # pixels of a picture that is compared
 TOLERANCE = 4  # pixels of these: what a camera gives way, far less than an object that was laid elsewhere
 REACH = 40  # pixels of these: how far an object that lies elsewhere is looked for
 _LEAST = 8  # pixels of a region's side
-_SEEN = 0.7  # match at another place from which the object is said to lie there
+_SEEN = 0.75  # match at another place from which the object is said to lie there
 _FLAT = 1.5  # grey levels of spread below which a picture shows nothing
 _FINE, _COARSE = 2, 16  # pixels to each side: means over these are what is left of noise, and of light
 
@@ -82,7 +82,7 @@ def check_sizes(found: list[Region], jpeg: bytes) -> None:
 
 
 def matched(found: list[Region], reference: bytes, now: bytes) -> list[dict[str, Any]]:
-    """Of each region {"name", "at", "match", "dx", "dy", "words"}; dx and dy are None where the object is not seen nearby.
+    """Of each region {"name", "at", "match", "dx", "dy", "words"}; dx and dy are None where its object is not seen.
 
     `at` is the region, [x, y, width, height] as shares; `match` goes from 1, the same, to 0; `dx` to the right and `dy`
     down say by how many pixels of the live picture the object lies elsewhere, `words` the same in words.
@@ -110,8 +110,11 @@ def _found(region: Region, before: _Pixels, after: _Pixels, scale: tuple[float, 
     across = np.arange(places.shape[1]) + first_column - left
     near = places[np.ix_(np.abs(down) <= TOLERANCE, np.abs(across) <= TOLERANCE)]
     row, column = np.unravel_index(int(places.argmax()), places.shape)
-    seen = places[row, column] >= _SEEN
-    dx, dy = round(float(across[column]) * scale[0]), round(float(down[row]) * scale[1])
+    right, below = int(across[column]), int(down[row])
+    seen = (
+        places[row, column] >= _SEEN and max(abs(right), abs(below)) < REACH
+    )  # at the end it goes on rising
+    dx, dy = round(right * scale[0]), round(below * scale[1])
     return {
         "match": round(float(np.clip(near.max(), 0, 1)), 4),
         "dx": dx if seen else None,

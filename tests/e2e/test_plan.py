@@ -70,6 +70,32 @@ def scored(operator, ticks, failure=()):
     operator.page.locator("[data-next]").wait_for()
 
 
+def drawn(operator):
+    """A region is drawn on the position's reference, and the panel says how the bench lies in it."""
+    page = operator.page
+    page.locator("[data-take-reference]").click()
+    with page.context.expect_page() as opened:
+        page.locator("#panel a[href^='/references/']", has_text="cam_high").click()
+    drawing = opened.value
+    picture = drawing.locator("#drawing img")
+    picture.click(trial=True)
+    box = picture.bounding_box()
+    left, top = box["x"], box["y"]
+    drawing.mouse.move(left + 0.2 * box["width"], top + 0.3 * box["height"])
+    drawing.mouse.down()
+    drawing.mouse.move(left + 0.7 * box["width"], top + 0.8 * box["height"], steps=4)
+    drawing.mouse.up()
+    drawing.keyboard.type("bench")  # its name is chosen, to be typed over
+    drawing.locator("[data-of=x]").fill("25")
+    with drawing.expect_navigation():
+        drawing.locator("#save-regions").click()
+    assert drawing.locator("[data-of=name]").input_value() == "bench"
+    assert drawing.locator("[data-of=x]").input_value() == "25.0"
+    drawing.close()
+    page.locator("#aid-regions li", has_text="cam_high, bench").wait_for()
+    page.locator("[data-camera=cam_high] canvas.region-over").wait_for()
+
+
 def test_trials_of_a_blind_plan_are_made_through_the_tab(operator, patient):
     page = operator.page
     operator.at_rest()
@@ -105,6 +131,7 @@ def test_trials_of_a_blind_plan_are_made_through_the_tab(operator, patient):
 
     second = handed(operator)
     assert second != first
+    drawn(operator)
     page.locator("summary", has_text="Give it back").click()
     page.fill("#return-why", "the block fell off the table")
     page.locator("[data-return]").click()

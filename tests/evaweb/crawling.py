@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 from django.urls import get_resolver, reverse
 
 from evaweb.jobs.models import Job
+from evaweb.plans.models import Reference
 from evaweb.preflights.models import Preflight
 from tests.evaweb.blind_lab import AIM, KEYS, NAMES, SECRETS
 from tests.evaweb.console.test_consumers import Page
@@ -30,6 +31,8 @@ def addresses(lab):
             "preflight": [preflight],
             "api:preflight": [preflight],
             "api:job-retry": [job.pk for job in Job.objects.all()[:1]] or [1],
+            "reference": [row.pk for row in Reference.objects.all()[:1]] or [1],
+            "api:reference-regions": [row.pk for row in Reference.objects.all()[:1]] or [1],
             "": [lab.trial.pk if lab.trial else 1],
         },
         "uuid": {"": [lab.episode.uuid if lab.episode else uuids.uuid4()]},

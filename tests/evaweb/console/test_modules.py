@@ -797,3 +797,35 @@ def test_what_happens_to_cameras_is_weighed() -> None:
         ["video as camera", "warn"],
         ["camera is back", "good"],
     ]
+
+
+def test_rectangles_are_drawn_from_any_corner_moved_and_typed_and_stay_inside_the_picture() -> None:
+    found = run(
+        "../plans/rectangles.js",
+        """
+        const drawn = m.between({ x: 0.6, y: 0.9 }, { x: 0.2, y: -0.1 });
+        const typed = m.changed({ name: "cup", x: 0.5, y: 0.5, width: 0.2, height: 0.2 }, "width", 0.8);
+        const pushed = [m.moved(drawn, 0.9, 0.9), typed, m.changed(typed, "y", 7), m.changed(typed, "x", NaN)];
+        return [drawn, ...pushed, m.fresh(["object 1", "cup"])];
+        """,
+    )
+    assert found == [
+        {"x": 0.2, "y": 0, "width": 0.4, "height": 0.9},
+        {"x": 0.6, "y": 0.1, "width": 0.4, "height": 0.9},
+        {"name": "cup", "x": 0.2, "y": 0.5, "width": 0.8, "height": 0.2},
+        {"name": "cup", "x": 0.2, "y": 1, "width": 0.8, "height": 0},
+        {"name": "cup", "x": 0, "y": 0.5, "width": 0.8, "height": 0.2},
+        "object 2",
+    ]
+
+
+def test_a_region_is_said_in_words_and_shown_with_what_lies_around_it_inside_the_picture() -> None:
+    found = run(
+        "trial/region_look.js",
+        """
+        const low = { name: "block", match: 0.434, words: "18 px to the left", low: true };
+        return [m.inWords(low), m.around([0.4, 0.4, 0.2, 0.2]), m.around([0, 0.9, 0.2, 0.1])];
+        """,
+    )
+    assert found[0] == "block: 0.43 !, 18 px to the left"
+    assert np.allclose(found[1:], [[0.3, 0.3, 0.4, 0.4], [0, 0.85, 0.3, 0.15]])

@@ -10,7 +10,7 @@ import simplejpeg
 
 from evaweb.errors import EvaError
 from evaweb.plans import pictures
-from evaweb.plans.regions import Region, check_sizes, matched, regions_of, _words
+from evaweb.plans.regions import Region, _words, check_sizes, matched, regions_of
 
 HEIGHT, WIDTH = 480, 640
 LEAST = 0.75  # what the administrator's page proposes
