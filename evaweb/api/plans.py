@@ -153,11 +153,11 @@ class AchievedOut(SeenOut):
 
 
 class BenchOut(Schema):
-    """What one camera shows now: its reference ("": none), how well they match, and each region of it."""
+    """What one camera shows now: its reference, how well they match, from 1 down, and each region of it."""
 
     camera: str
     reference: str
-    match: float | None
+    match: float
     regions: list[RegionOut]
 
 
@@ -349,16 +349,17 @@ def regions(request: HttpRequest, id: int, given: RegionsIn) -> Any:
     url_name="bench",
 )
 def lies(request: HttpRequest, id: int) -> Any:
-    """Of each camera how well it now matches the references of the trial's position; nothing is kept."""
-    seen = bench.bench_now(trial=trials.trial_get(id=id), patience_s=1.0)
+    """Of each camera that has a reference of the trial's position, how well it matches now; nothing is kept."""
+    seen = bench.bench_now(trial=trials.trial_get(id=id))
     return [
         {
             "camera": one.camera,
-            "reference": one.reference.picture if one.reference else "",
+            "reference": one.reference.picture,
             "match": one.match,
             "regions": one.regions,
         }
         for one in seen
+        if one.reference
     ]
 
 

@@ -183,14 +183,19 @@ class Seen:
         return None if self.match is None else (self.match, f"{self.camera} {self.match:.2f}")
 
 
-def bench_now(*, trial: Trial, patience_s: float = 3.0) -> list[Seen]:
-    """What each camera shows now, and how well it matches the references of the trial's position, before its run."""
+def bench_now(*, trial: Trial) -> list[Seen]:
+    """What each camera that has a reference of the trial's position shows now, before the run, and how well it matches."""
+    known = references(station=trial.station, position=trial.position)
+    return _look(trial, [camera for camera in cameras_of(trial.station) if camera in known], 1.0)
+
+
+def _look(trial: Trial, cameras: Sequence[str], patience_s: float) -> list[Seen]:
     if trial.status != TrialStatus.PREPARED:
         raise Conflict(
             f"trial {trial.pk} is {trial.get_status_display()}: the bench is looked at before the run"
         )
     known = references(station=trial.station, position=trial.position)
-    found = pictures.now(trial.station, cameras_of(trial.station), patience_s)
+    found = pictures.now(trial.station, cameras, patience_s)
     return [_seen(camera, jpeg, known.get(camera)) for camera, jpeg in found.items()]
 
 
@@ -210,7 +215,7 @@ def achieve(*, user: User, trial: Trial, override: str = "") -> list[Achieved]:
     """
     require(user, Role.OPERATOR)
     why = text("override", override, LONGEST_NOTE)
-    seen = bench_now(trial=trial)
+    seen = _look(trial, cameras_of(trial.station), 3.0)
     _require_match(trial, seen, why)
     return [
         Achieved.objects.create(

@@ -3,7 +3,8 @@
 import { get } from "../../site/api.js";
 
 const LOOK_MS = 2000;
-const CROP = 72; // pixels of a picture's longer side
+const CROP = 96; // pixels of a picture's longer side
+const LEAST = 0.75; // where the plan has none: what lies between an object in its place and one that is not
 const AROUND = 0.5; // of a region's size, to each side of it: an object that lies beside it is seen
 
 /** Keeps the panel's list of regions and their outlines over the cameras; returns the names of the cameras that have any. */
@@ -34,7 +35,7 @@ async function asked(address) {
 }
 
 function show(aid, seen, trouble, regional, images) {
-  const least = Number(aid.dataset.least || Number.NaN);
+  const least = Number(aid.dataset.least || LEAST);
   const found = seen.flatMap(({ camera, reference, regions }) => regions.map((region) => ({ camera, reference, low: region.match < least, ...region })));
   if (!trouble) {
     regional.clear();
