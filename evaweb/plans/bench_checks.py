@@ -184,7 +184,7 @@ class Seen:
 
 
 def bench_now(*, trial: Trial) -> list[Seen]:
-    """What each camera that has a reference of the trial's position shows now, before the run, and how well it matches."""
+    """What each camera with a reference of the trial's position shows now, before the run, and how well it matches."""
     known = references(station=trial.station, position=trial.position)
     return _look(trial, [camera for camera in cameras_of(trial.station) if camera in known], 1.0)
 
