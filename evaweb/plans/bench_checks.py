@@ -91,6 +91,7 @@ def references_take(*, user: User, station: Station, position: Position | None) 
     """
     require(user, Role.OPERATOR)
     found = pictures.now(station, cameras_of(station))
+    Station.objects.select_for_update().get(pk=station.pk)  # regions are drawn on the newest alone
     before = references(station=station, position=position)
     return [
         Reference.objects.create(

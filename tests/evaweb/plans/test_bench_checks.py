@@ -128,7 +128,7 @@ def without_block(picture):
     return pictures.simplejpeg.encode_jpeg(pixels, quality=85)
 
 
-def test_the_least_match_is_of_the_worst_region_and_each_is_kept(bench, laid, shown):
+def test_the_least_match_is_of_the_worst_region_and_each_is_kept(bench, laid, shown, client):
     user = bench.operator
     looking.regions_draw(user=user, reference=high(laid), drawn=[CORNER, CORNER | {"name": "cup", "x": 0.7}])
     shown["cam_high"] = without_block(shown["cam_high"])
@@ -143,6 +143,9 @@ def test_the_least_match_is_of_the_worst_region_and_each_is_kept(bench, laid, sh
     assert row.match == pictures.match(jpeg(0), shown["cam_high"])
     assert row.reference.regions[0] == CORNER
     assert Achieved.objects.get(trial=laid, camera="cam_left_wrist").regions == []
+    client.force_login(user)
+    page = client.get(f"/result/trials/{laid.pk}/").content.decode()
+    assert f"block {row.regions[0]['match']:.2f}, not recognised here or nearby" in page
 
 
 def test_regions_that_match_let_a_run_begin_although_the_rest_of_the_picture_is_another(bench, laid, shown):
