@@ -132,11 +132,11 @@ def _words(dx: int, dy: int) -> str:
 def _correlations(wanted: _Pixels, around: _Pixels) -> _Pixels:
     """Match of `wanted` with each place of `around` at which all of it lies inside."""
     height, width, _ = wanted.shape
-    shape = [-(-side // 32) * 32 for side in around.shape[:2]]  # a transform of a prime length takes long
+    shape = around.shape[:2]
     centred = wanted - wanted.mean(axis=(0, 1))
     mine = max(float((centred**2).sum()), 1e-9)
     spectrum = np.fft.rfft2(around, axes=(0, 1)) * np.conj(np.fft.rfft2(centred, s=shape, axes=(0, 1)))
-    rows, columns = around.shape[0] - height + 1, around.shape[1] - width + 1
+    rows, columns = shape[0] - height + 1, shape[1] - width + 1
     both = np.fft.irfft2(spectrum.sum(axis=2), s=shape, axes=(0, 1))[:rows, :columns]
     pixels = height * width
     sums, squares = _sums(around, height, width), _sums(around**2, height, width)
