@@ -6,8 +6,9 @@ trial of either checkpoint ends what is looked at. A station that is fast cannot
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from typing import Any
@@ -86,30 +87,74 @@ class Pairs:
         ]
 
 
-def tried(plan: Plan) -> Pairs:
-    """The pairs of a frozen plan as they are now; none without a comparison. One query."""
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """An attempt of one of the compared checkpoints that was judged or broken off, in block `block`.
+
+    `counts`: its score is the one that counts; `outcome` is that of its newest score and `first` of its first one, None
+    where it has none. `attempt` is above 1 where one before it did not count.
+    """
+
+    block: int
+    checkpoint: str
+    counts: bool
+    outcome: float | None
+    first: float | None
+    trial: int
+    attempt: int
+    operator: str
+    station: str
+
+
+def attempts_of(plan: Plan) -> list[Attempt]:
+    """Those of a frozen plan's comparison, in the order in which they were handed out; one query."""
     document = plan.document or {}
     found = frozen(document)
     if found is None:
-        return Pairs([], [], [])
-    names = document["comparison"]
+        return []
     value = "success" if found.outcome == SUCCESS else "score"
     first = Score.objects.filter(trial=OuterRef("trial")).order_by("pk").values(value)[:1]
+    rows = plan.handouts.filter(
+        trial__status__in=(*JUDGED, TrialStatus.INTERRUPTED),
+        slot__checkpoint__name__in=document["comparison"],
+    ).order_by("number")
+    named = ("trial_id", "trial__attempt", "trial__operator__username", "trial__station__name")
+    told = ("slot__block", "slot__checkpoint__name", "trial__status", f"trial__verdict__{value}")
+    return [
+        Attempt(
+            block,
+            name,
+            status == TrialStatus.SCORED,
+            None if outcome is None else float(outcome),
+            None if before is None else float(before),
+            *who,
+        )
+        for block, name, status, outcome, before, *who in rows.values_list(*told, Subquery(first), *named)
+    ]
+
+
+def tried(plan: Plan) -> Pairs:
+    """The pairs of a frozen plan as they are now; none without a comparison. One query."""
+    found = frozen(plan.document or {})
+    return (
+        paired_up(found, (plan.document or {})["comparison"], attempts_of(plan))
+        if found
+        else Pairs([], [], [])
+    )
+
+
+def paired_up(found: Design, names: Sequence[str], attempts: Iterable[Attempt]) -> Pairs:
+    """The pairs of these attempts, which are in the order in which they were handed out."""
     counted: dict[int, dict[str, float]] = defaultdict(dict)
     at_first: dict[int, dict[str, float]] = defaultdict(dict)
     thrown: set[tuple[int, str]] = set()
-    rows = plan.handouts.filter(
-        trial__status__in=(*JUDGED, TrialStatus.INTERRUPTED), slot__checkpoint__name__in=names
-    )
-    for block, name, status, outcome, before in rows.order_by("number").values_list(
-        "slot__block", "slot__checkpoint__name", "trial__status", f"trial__verdict__{value}", Subquery(first)
-    ):
-        if outcome is None:
-            thrown.add((block, name))
+    for each in attempts:
+        if each.outcome is None or each.first is None:
+            thrown.add((each.block, each.checkpoint))
             continue
-        at_first[block].setdefault(name, float(before))
-        if status == TrialStatus.SCORED:
-            counted[block][name] = float(outcome)
+        at_first[each.block].setdefault(each.checkpoint, each.first)
+        if each.counts:
+            counted[each.block][each.checkpoint] = each.outcome
 
     def made(blocks: Mapping[int, Mapping[str, float]]) -> list[int]:
         return list(takewhile(lambda block: len(blocks.get(block, ())) == len(names), range(found.pairs)))
@@ -146,15 +191,33 @@ def told_reason(plan: Plan, sealed: bool) -> str:
 
 
 def at_the_reveal(plan: Plan) -> dict[str, Any] | None:
-    """The pairs that count, kept with their digest: what is corrected later makes no other headline."""
+    """The pairs that count and the sums of each checkpoint, kept with their digest: what is corrected later makes no
+    other headline.
+    """
     if frozen(plan.document or {}) is None:
         return None
-    pairs = [list(pair) for pair in pairs_of(plan)]
-    return {
-        "pairs": pairs,
-        "digest": digest({"plan": plan.digest, "pairs": pairs}),
-        "at": timezone.now().isoformat(),
-    }
+    kept = {"pairs": [list(pair) for pair in pairs_of(plan)], "arms": _sums(plan)}
+    return {**kept, "digest": digest({"plan": plan.digest, **kept}), "at": timezone.now().isoformat()}
+
+
+def _sums(plan: Plan) -> list[dict[str, Any]]:
+    """Of each checkpoint the trials that count, successes and mean score, in the order of the document."""
+    rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).order_by("number")
+    found: dict[str, list[tuple[bool, float]]] = defaultdict(list)
+    for name, success, score in rows.values_list(
+        "slot__checkpoint__name", "trial__verdict__success", "trial__verdict__score"
+    ):
+        found[name].append((success, score))
+    return [
+        {
+            "checkpoint": row["name"],
+            "n": len(scored),
+            "successes": sum(success for success, _ in scored),
+            "score": math.fsum(score for _, score in scored) / len(scored) if scored else None,
+        }
+        for row in (plan.document or {})["checkpoints"]
+        for scored in (found[row["name"]],)
+    ]
 
 
 def looks_of(given: Any) -> list[int]:

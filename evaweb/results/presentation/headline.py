@@ -37,17 +37,24 @@ def headline(plan: Plan) -> Headline | None:
     pairs = tried(plan)
     now, whole = pairs.counted, pairs.at_first
     at_reveal = [(one, other) for one, other in plan.at_reveal["pairs"]] if plan.at_reveal else now
-    sentence = _sentence(plan, found, at_reveal)
-    later = _sentence(plan, found, now) if now != at_reveal else ""
-    at_first = _sentence(plan, found, whole) if whole != at_reveal else ""
+    sentence = sentence_of(plan, found, at_reveal)
+    later = sentence_of(plan, found, now) if now != at_reveal else ""
+    at_first = sentence_of(plan, found, whole) if whole != at_reveal else ""
     winner = conclude(found, at_reveal).winner
     least = pairs.against(winner) if winner else now
-    worst = _sentence(plan, found, least) if least != now else ""
-    design = str(plan.get_stopping_display()).partition(":")[0]
-    return Headline(sentence, f"{design}, alpha {found.alpha:g}", later, at_first, worst, _versions(plan))
+    worst = sentence_of(plan, found, least) if least != now else ""
+    return Headline(
+        sentence, f"{rule_words(plan)}, alpha {found.alpha:g}", later, at_first, worst, _versions(plan)
+    )
 
 
-def _sentence(plan: Plan, found: Design, pairs: list[tuple[float, float]]) -> str:
+def rule_words(plan: Plan) -> str:
+    """The rule of its design in one or two words."""
+    return str(plan.get_stopping_display()).partition(":")[0]
+
+
+def sentence_of(plan: Plan, found: Design, pairs: list[tuple[float, float]]) -> str:
+    """What the design says of these pairs, in one sentence."""
     conclusion = conclude(found, pairs)
     first, second = (plan.document or {})["comparison"]
     if not conclusion.ended:
@@ -76,7 +83,7 @@ def _versions(plan: Plan) -> tuple[str, ...]:
         found = frozen(version.document) if version.document else None
         if found is not None:
             pairs = version.at_reveal["pairs"] if version.at_reveal else tried(version).counted
-            sentence = _sentence(version, found, [(one, other) for one, other in pairs])
+            sentence = sentence_of(version, found, [(one, other) for one, other in pairs])
             told.append(f"Version {version.version}: {sentence}. Amended because: {_amended(version)}")
         version = version.amends
     return tuple(told)

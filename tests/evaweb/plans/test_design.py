@@ -173,7 +173,8 @@ def test_what_is_corrected_after_the_reveal_makes_no_other_headline(bench, early
     plan_reveal(user=owner, plan=early)
     before = headline(early)
     assert before.corrected == ""
-    assert early.at_reveal["digest"] == digest({"plan": early.digest, "pairs": early.at_reveal["pairs"]})
+    held = {name: early.at_reveal[name] for name in ("pairs", "arms")}
+    assert early.at_reveal["digest"] == digest({"plan": early.digest, **held})
     for handout in early.handouts.all():
         scored(bench, handout.trial, success=True, reason="looked again")
     after = headline(early)

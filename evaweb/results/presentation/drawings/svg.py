@@ -40,6 +40,48 @@ def drawing(width: float, height: float, title: str, words: str, *parts: str, ki
     return found
 
 
+_PRINTED = {
+    "grid": 'fill="none" stroke="#cccccc"',
+    "band": 'fill="#bbbbbb"',
+    "mark": 'fill="#000000"',
+    "tick": 'font-size="12.5"',
+    "value": "",
+}
+
+
+def printable(figure: Drawing, above: Sequence[str], below: Sequence[str]) -> str:
+    """A figure of rates as a file of its own: black on white, each look written at its element, with lines of text
+    above and below it. The same figure gives the same bytes.
+    """
+    size = re.search(r'viewBox="0 0 (\S+) (\S+)"', figure)
+    inner = re.search(r"</desc>(.*)</svg>", figure, re.DOTALL)
+    if size is None or inner is None:
+        raise ValueError(f"{figure!r:.80} is no drawing")
+    width, height = float(size[1]), float(size[2])
+    most = int(width / _LETTER)
+    head = [row for text in above for row in wrapped(text, most, len(text))]
+    foot = [row for text in below for row in wrapped(text, most, len(text))]
+    step = LINE + 3
+    top = step * len(head) + 12
+    drawn = re.sub(r' class="(\w*)[^"]*"', lambda found: f" {_PRINTED[found[1]]}".rstrip(), inner[1])
+    rows = [words(0, step * (i + 1) - 4, row) for i, row in enumerate(head)]
+    rows += [words(0, top + height + step * (i + 1), row) for i, row in enumerate(foot)]
+    total = top + height + step * len(foot) + 12
+    title = element("title", escape(figure.heading)) + element("desc", escape(figure.words))
+    ground = element("rect", width=width, height=total, fill="#ffffff")
+    return element(
+        "svg",
+        title + ground + "".join(rows) + element("g", drawn, transform=f"translate(0 {_n(top)})"),
+        xmlns="http://www.w3.org/2000/svg",
+        viewBox=f"0 0 {_n(width)} {_n(total)}",
+        width=width,
+        height=total,
+        font_family="Helvetica, Arial, sans-serif",
+        font_size=14.0,
+        fill="#000000",
+    )
+
+
 def element(tag: str, content: str = "", /, **attributes: object) -> str:
     """One element; `class_` is class, underscores become hyphens, `content` is markup already."""
     written = "".join(

@@ -79,7 +79,8 @@ def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapp
     if digest(plan) != seal["digest"]:
         found.append(f"plan.json has the digest {digest(plan)}, the plan that was frozen {seal['digest']}")
     kept = seal["at_reveal"]
-    if kept and digest({"plan": seal["digest"], "pairs": kept["pairs"]}) != kept["digest"]:
+    said = {name: kept[name] for name in ("pairs", "arms") if name in kept} if kept else {}  # arms came later
+    if kept and digest({"plan": seal["digest"], **said}) != kept["digest"]:
         found.append(f"the pairs of the reveal have not the digest {kept['digest']}")
     if not seal["key"]:
         return found

@@ -162,7 +162,9 @@ def test_pairs_of_the_reveal_that_were_forged_with_their_digest_are_found(report
     data = report / "data"
     seal, plan = (json.loads((data / name).read_text("utf-8")) for name in ("seal.json", "plan.json"))
     seal["at_reveal"]["pairs"] = [[other, one] for one, other in seal["at_reveal"]["pairs"]]
-    seal["at_reveal"]["digest"] = digest({"plan": digest(plan), "pairs": seal["at_reveal"]["pairs"]})
+    seal["at_reveal"]["digest"] = digest(
+        {"plan": digest(plan), **{name: seal["at_reveal"][name] for name in ("pairs", "arms")}}
+    )
     (data / "seal.json").write_text(json.dumps(seal), "utf-8")
     assert "the pairs of the reveal are not those of the scores that stood then" in recompute(report).stdout
 

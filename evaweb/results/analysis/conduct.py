@@ -1,0 +1,360 @@
+"""How an evaluation was carried out: everything in its record by which a reader can doubt it.
+
+Plain values throughout, times of the database included: pages, REST and reports show the same.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from statistics import median
+from typing import Any
+
+from django.db.models import F, Min
+
+from evaweb.memo import Kept
+from evaweb.plans.bench_checks import HOLDS
+from evaweb.plans.models import CameraCheck, Plan
+from evaweb.results.analysis.integrity import changes_of
+from evaweb.statistics.many import holm
+from evaweb.statistics.permutation import sign_flips
+from evaweb.trials.models import Score, Trial, TrialStatus, VoidRequest
+
+DELAYS = {
+    "wait": "from hand-out to run",
+    "connect": "set-up: connecting to the policy",
+    "warm_up": "set-up: warming up the policy",
+    "latency": "policy's latency, median of the run",
+    "gap": "since the trial before at the station",
+}
+"""What is compared between the checkpoints, all in s."""
+_DAY = timedelta(days=1)
+_delays: Kept[list[dict[str, Any]]] = Kept()
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """An attempt as it was handed out; delays are in s, None where they are not known."""
+
+    number: int
+    code: str
+    slot: int
+    block: int
+    handed_at: datetime
+    trial: int
+    checkpoint: str
+    status: str
+    attempt: int
+    operator: str
+    station: str
+    started_at: datetime | None
+    ended_at: datetime | None
+    match: float | None
+    connect: float | None
+    warm_up: float | None
+    latency: float | None
+
+    @property
+    def counts(self) -> bool:
+        """Whether its score is the one that counts."""
+        return self.status == TrialStatus.SCORED
+
+    @property
+    def wait(self) -> float | None:
+        """From hand-out to run [s]."""
+        return _seconds(self.handed_at, self.started_at)
+
+
+def conduct_of(plan: Plan) -> dict[str, Any]:
+    """All of it; as many queries whatever the number of trials, but for each version of the plan before this one."""
+    runs = runs_of(plan)
+    events = list(plan.events.order_by("pk").values("at", "what", "text", by_name=F("by__username")))
+    return {
+        "looks": list(plan.looks.order_by("at").values("at", by_name=F("user__username"))),
+        "checkpoints": _checkpoints(plan, runs),
+        "voids": _voids(plan, runs),
+        "corrections": _corrections(plan, runs),
+        "amendments": _amendments(plan),
+        "deviations": _deviations(runs, [row for row in events if row["what"] == "given back"]),
+        "operators": balance(runs, "operator"),
+        "stations": balance(runs, "station"),
+        "cameras": _cameras(plan, runs),
+        "delays": _compared(plan, runs),
+    }
+
+
+def runs_of(plan: Plan) -> list[Run]:
+    """Every attempt in the order in which it was handed out; one query."""
+    fields = (
+        "number",
+        "code",
+        "slot__index",
+        "slot__block",
+        "handed_at",
+        "trial_id",
+        "slot__checkpoint__name",
+    )
+    own = ("status", "attempt", "operator__username", "station__name", "started_at", "ended_at")
+    rows = plan.handouts.annotate(match=Min("trial__achieved__match")).order_by("number")
+    told = ("match", "trial__setup_took", "trial__episode__policy")
+    found = []
+    for *plain, took, policy in rows.values_list(*fields, *(f"trial__{name}" for name in own), *told):
+        latency = _number(policy, "latency_ms", "p50")
+        delays = (_number(took, "connect_s"), _number(took, "warm_up_s"), latency and latency / 1000)
+        found.append(Run(*plain, *delays))
+    return found
+
+
+def balance(runs: Iterable[Run], name: str) -> dict[str, Any]:
+    """Trials that count of each operator or station with each checkpoint; `uneven` is the widest difference."""
+    counts: dict[str, Counter[str]] = defaultdict(Counter)
+    counted = [run for run in runs if run.counts]
+    names = sorted({run.checkpoint for run in counted})
+    for run in counted:
+        counts[getattr(run, name)][run.checkpoint] += 1
+    rows = [{"name": who, "trials": [of[each] for each in names]} for who, of in sorted(counts.items())]
+    uneven = max((max(row["trials"]) - min(row["trials"]) for row in rows), default=0)
+    return {"checkpoints": names, "rows": rows, "uneven": uneven}
+
+
+def _checkpoints(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
+    again = Counter(run.checkpoint for run in runs if run.attempt > 1)
+    return [
+        {
+            **asdict(row),
+            "voided": row.voided,
+            "repeated": again[row.checkpoint],
+            "operators": sorted(row.operators),
+            "stations": sorted(row.stations),
+        }
+        for row in changes_of(plan)
+    ]
+
+
+def _voids(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Every void with what became of it: those that were asked for, then those that needed one operator alone."""
+    known = {run.trial: run for run in runs}
+    asked = VoidRequest.objects.filter(trial__handout__plan=plan).order_by("pk")
+    fields = ("trial_id", "reason", "at", "answer", "answer_reason", "answered_at")
+    rows = [
+        {**row, "answer": row["answer"] or "not answered"}
+        for row in asked.values(
+            *fields, by_name=F("by__username"), answered_by_name=F("answered_by__username")
+        )
+    ]
+    granted = {row["trial_id"] for row in rows if row["answer"] == VoidRequest.Answer.AGREED}
+    alone = Trial.objects.filter(handout__plan=plan, status=TrialStatus.VOIDED).exclude(pk__in=granted)
+    rows += [
+        {"trial_id": pk, "reason": why, "at": at, "by_name": by, "answer": "", "answer_reason": ""}
+        | {"answered_at": None, "answered_by_name": None}
+        for pk, why, at, by in alone.order_by("pk").values_list(
+            "pk", "reason", "voided_at", "voided_by__username"
+        )
+    ]
+    return [
+        {**row, "code": known[row["trial_id"]].code, "checkpoint": known[row["trial_id"]].checkpoint}
+        for row in rows
+    ]
+
+
+def _corrections(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Every score but the first of its trial, and first scores that came after the reveal; `late`: after it."""
+    known, before, found = {run.trial: run for run in runs}, dict[int, tuple[bool, float]](), []
+    scores = Score.objects.filter(trial__handout__plan=plan).order_by("pk")
+    for row in scores.values(
+        "trial_id", "success", "score", "reason", at=F("scored_at"), by_name=F("rater__username")
+    ):
+        earlier = before.get(row["trial_id"])
+        before[row["trial_id"]] = (row["success"], row["score"])
+        late = bool(plan.revealed_at and row["at"] >= plan.revealed_at)
+        if earlier is None and not late:
+            continue
+        run = known[row["trial_id"]]
+        was = {"before": earlier and earlier[0], "score_before": earlier and earlier[1], "late": late}
+        found.append({**row, **was, "code": run.code, "checkpoint": run.checkpoint})
+    return found
+
+
+def _amendments(plan: Plan) -> list[dict[str, Any]]:
+    """The versions before this one, the newest first, and the one after it."""
+    found, version = [], plan
+    while version.amends is not None:
+        found.append(
+            {"version": version.version, "amends": version.amends.version, "because": version.amended_because}
+        )
+        version = version.amends
+    later = Plan.objects.filter(amends=plan).first()
+    if later is not None:
+        found.insert(0, {"version": later.version, "amends": plan.version, "because": later.amended_because})
+    return found
+
+
+def _deviations(runs: Sequence[Run], given_back: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """From the schedule: what a block should have had in common, and the turn in which trials come."""
+    blocks: dict[int, list[Run]] = defaultdict(list)
+    for run in runs:
+        if run.status != TrialStatus.ABANDONED:
+            blocks[run.block].append(run)
+    spans = {block: span for block, rows in blocks.items() if (span := _span(rows)) is not None}
+    longest = max(spans, key=lambda block: spans[block], default=None)
+    return {
+        "blocks": len(blocks),
+        "split_stations": [b for b, rows in sorted(blocks.items()) if len({run.station for run in rows}) > 1],
+        "split_operators": [
+            b for b, rows in sorted(blocks.items()) if len({run.operator for run in rows}) > 1
+        ],
+        "order": [block for block, rows in sorted(blocks.items()) if _disordered(rows)],
+        "out_of_turn": _out_of_turn(runs),
+        "span_median_s": median(spans.values()) if spans else None,
+        "span_longest_s": spans[longest] if longest is not None else None,
+        "span_longest_block": longest,
+        "over_a_day": [block for block, span in sorted(spans.items()) if span > _DAY.total_seconds()],
+        "given_back": [dict(row) for row in given_back],
+    }
+
+
+def _span(rows: Iterable[Run]) -> float | None:
+    """Between the first and the last start of the trials of a block that count [s]."""
+    starts = [run.started_at for run in rows if run.counts and run.started_at is not None]
+    return (max(starts) - min(starts)).total_seconds() if len(starts) > 1 else None
+
+
+def _disordered(rows: Iterable[Run]) -> bool:
+    """True if the trials that count were not run in the order that was drawn."""
+    slots = [run.slot for run in rows if run.counts]
+    return slots != sorted(slots)
+
+
+def _out_of_turn(runs: Iterable[Run]) -> list[str]:
+    """Codes of first attempts that came after a later one of the schedule at the same station."""
+    reached: dict[str, int] = {}
+    begun: set[int] = set()
+    found = []
+    for run in runs:
+        if run.slot not in begun and run.slot < reached.get(run.station, -1):
+            found.append(run.code)
+        begun.add(run.slot)
+        reached[run.station] = max(reached.get(run.station, -1), run.slot)
+    return found
+
+
+def _cameras(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
+    """When somebody confirmed them at the plan's stations while its trials were made, and trials without that."""
+    handed = [run.handed_at for run in runs]
+    if not handed:
+        return {"checks": [], "unchecked": []}
+    rows = CameraCheck.objects.filter(
+        station__name__in={run.station for run in runs}, at__gte=min(handed) - HOLDS, at__lte=max(handed)
+    ).order_by("pk")
+    checks = [
+        {
+            **{name: row[name] for name in ("at", "station_name", "by_name")},
+            "cameras": len(row["seen"]),
+            "match": min(
+                (seen["match"] for seen in row["seen"].values() if seen["match"] is not None), default=None
+            ),
+        }
+        for row in rows.values("at", "seen", station_name=F("station__name"), by_name=F("by__username"))
+    ]
+    times: dict[tuple[str, str], list[datetime]] = defaultdict(list)
+    for check in checks:
+        times[check["station_name"], check["by_name"]].append(check["at"])
+    unchecked = [
+        run.code
+        for run in runs
+        if not any(run.handed_at - HOLDS <= at <= run.handed_at for at in times[run.station, run.operator])
+    ]
+    return {"checks": checks, "unchecked": unchecked}
+
+
+# --- delays ---------------------------------------------------------------------------------------------------
+
+
+def _compared(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
+    """Each delay of each checkpoint, and of the compared ones a test within pairs, corrected for how many there are."""
+    names = (plan.document or {})["comparison"] or []
+    gaps = _gaps(runs)
+    values = tuple(
+        (
+            name,
+            tuple(
+                (run.block, run.checkpoint, gaps.get(run.number) if name == "gap" else getattr(run, name))
+                for run in runs
+                if run.counts
+            ),
+        )
+        for name in DELAYS
+    )
+    key: Hashable = (values, tuple(names))
+    rows = _delays.get(plan.pk, key, lambda: _tested(values, names))
+    differing = [row for row in rows if row["corrected"] is not None and row["corrected"] <= plan.alpha]
+    return {"alpha": plan.alpha, "rows": rows, "differing": [row["what"] for row in differing]}
+
+
+def _tested(
+    values: Iterable[tuple[str, Sequence[tuple[int, str, float | None]]]], names: Sequence[str]
+) -> list[dict[str, Any]]:
+    rows = []
+    for name, told in values:
+        known = [(block, checkpoint, value) for block, checkpoint, value in told if value is not None]
+        if not known:
+            continue
+        arms: dict[str, list[float]] = defaultdict(list)
+        blocks: dict[int, dict[str, float]] = defaultdict(dict)
+        for block, checkpoint, value in known:
+            arms[checkpoint].append(value)
+            blocks[block][checkpoint] = value
+        pairs = [
+            found[names[0]] - found[names[1]]
+            for found in blocks.values()
+            if names and set(names) <= set(found)
+        ]
+        widest = max(map(abs, pairs), default=0.0)
+        test = sign_flips(pairs, widest) if widest else None
+        rows.append(
+            {
+                "what": DELAYS[name],
+                "arms": [
+                    {"checkpoint": each, "n": len(of), "median": median(of), "longest": max(of)}
+                    for each, of in sorted(arms.items())
+                ],
+                "pairs": len(pairs),
+                "difference": test.value if test else 0.0 if pairs else None,
+                "p": test.p if test else 1.0 if pairs else None,
+            }
+        )
+    tested = [row for row in rows if row["p"] is not None]
+    for row, corrected in zip(tested, holm([row["p"] for row in tested]), strict=True):
+        row["corrected"] = corrected
+    return [{"corrected": None, **row} for row in rows]
+
+
+def _gaps(runs: Iterable[Run]) -> dict[int, float]:
+    """Of each attempt that ran, by its number, the time since the one before at its station ended [s]."""
+    ended: dict[str, datetime] = {}
+    found = {}
+    for run in sorted(
+        (run for run in runs if run.started_at is not None), key=lambda run: (run.started_at, run.number)
+    ):
+        gap = _seconds(ended.get(run.station), run.started_at)
+        if gap is not None:
+            found[run.number] = gap
+        if run.ended_at is not None:
+            ended[run.station] = run.ended_at
+    return found
+
+
+def _seconds(since: datetime | None, until: datetime | None) -> float | None:
+    """None where either is not known, or clocks ran apart."""
+    if since is None or until is None or until < since:
+        return None
+    return (until - since).total_seconds()
+
+
+def _number(table: Any, *names: str) -> float | None:
+    """A number within tables that came from a station; None where there is none."""
+    for name in names:
+        table = table.get(name) if isinstance(table, dict) else None
+    return float(table) if isinstance(table, (int, float)) and not isinstance(table, bool) else None

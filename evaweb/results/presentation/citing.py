@@ -1,0 +1,285 @@
+"""A result that travels: one sentence, one table and one figure, with the design named, as text, LaTeX and SVG."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from evaweb.errors import Conflict
+from evaweb.plans.design import at_the_reveal, frozen
+from evaweb.plans.models import Plan, PlanState
+from evaweb.results.presentation.drawings import rates
+from evaweb.results.presentation.drawings.svg import Drawing, printable
+from evaweb.results.presentation.headline import rule_words, sentence_of
+from evaweb.results.presentation.latex import escaped, foreign
+from evaweb.results.presentation.wording import ends, rate_words
+from evaweb.statistics.designs import ANYTIME, FIXED, SUCCESS, Design
+from evaweb.statistics.proportions import Proportion, proportion
+
+_HEAD = ("Checkpoint", "n", "Successes", "Rate, 95 % Wilson", "Mean score")
+_AXIS = 40  # letters of it, in text
+_NAMES_MM, _AXIS_MM, _STEP_MM = 45, 60, 6
+
+
+@dataclass(frozen=True, slots=True)
+class Cited:
+    """A row of the table; `success` and `score` (0 to 1) are None where the reveal did not keep them."""
+
+    checkpoint: str
+    n: int
+    success: Proportion | None
+    score: float | None
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Name, n, successes, rate with interval, mean score, in words."""
+        known = self.success
+        rate = "not kept"
+        if known is not None:
+            rate = (
+                f"{100 * known.rate:.0f} % [{ends(known.interval)}]"
+                if known.rate is not None and known.interval
+                else "–"
+            )
+        return (
+            self.checkpoint,
+            str(self.n),
+            "not kept" if known is None else str(known.successes),
+            rate,
+            "–" if self.score is None else f"{self.score:.2f}",
+        )
+
+
+@dataclass(frozen=True)
+class Citation:
+    """The result of a plan: `kept` at its reveal, or as it is now; `digest` is empty without a reveal.
+
+    `address` is where it stands for good.
+    """
+
+    plan: Plan
+    found: Design
+    kept: Mapping[str, Any]
+    digest: str
+    address: str
+
+    @cached_property
+    def sentence(self) -> str:
+        """The headline."""
+        return sentence_of(self.plan, self.found, [(one, other) for one, other in self.kept["pairs"]]) + "."
+
+    @cached_property
+    def design(self) -> str:
+        """What was foreseen: rule, looks, pairs, alpha, question, outcome."""
+        document = self.plan.document or {}
+        first, second = document["comparison"]
+        found = self.found
+        asks = f"whether {first} and {second} differ"
+        if found.margin is not None:
+            asks = f"whether {first} is not worse than {second} by {100 * found.margin:g} points or more"
+        outcome = "success" if found.outcome == SUCCESS else "score (partial credit)"
+        blind = "operators blind" if document["blind"] else "operators not blind"
+        return (
+            f"Design: {rule_words(self.plan)}, {_looks(found)}, {found.pairs} pairs foreseen, alpha {found.alpha:g}; "
+            f"asks {asks}, by {outcome}; {blind}."
+        )
+
+    @cached_property
+    def source(self) -> str:
+        """Where it is from: plan, version, digests, address."""
+        document = self.plan.document or {}
+        said = f"EVA Web, plan {document['name']} v{document['version']}, plan digest {self.plan.digest}"
+        where = (
+            f", as revealed {self.kept['at'][:10]}, digest {self.digest}" if self.digest else ", not revealed"
+        )
+        return f"{said}{where}: {self.address}"
+
+    @cached_property
+    def rows(self) -> list[Cited]:
+        """The table, in the order of the frozen plan."""
+        if "arms" in self.kept:
+            return [
+                Cited(row["checkpoint"], row["n"], proportion(row["successes"], row["n"]), row["score"])
+                for row in self.kept["arms"]
+            ]
+        return [self._of_pairs(i, name) for i, name in enumerate((self.plan.document or {})["comparison"])]
+
+    def _of_pairs(self, i: int, name: str) -> Cited:
+        """Of a reveal that kept the pairs alone."""
+        values = [pair[i] for pair in self.kept["pairs"]]
+        n = len(values)
+        if self.found.outcome != SUCCESS:
+            return Cited(name, n, None, sum(values) / n if n else None)
+        return Cited(name, n, proportion(int(sum(values)), n), None)
+
+    @cached_property
+    def known(self) -> list[tuple[str, Proportion]]:
+        """The rows of the figure."""
+        return [(row.checkpoint, row.success) for row in self.rows if row.success is not None]
+
+    @cached_property
+    def text(self) -> dict[str, str]:
+        """Sentence, table and figure as plain text."""
+        return {
+            "sentence": f"{self.sentence}\n{self.design}\n{self.source}\n",
+            "table": _text_table([row.cells for row in self.rows]),
+            "figure": _text_figure(self.known),
+        }
+
+    @cached_property
+    def latex(self) -> dict[str, str]:
+        """The same as LaTeX that needs no package."""
+        rows = [row.cells for row in self.rows]
+        sentence = "\n".join(escaped(line) for line in (self.sentence, self.design, self.source)) + "\n"
+        return {"sentence": sentence, "table": _latex_table(rows), "figure": _latex_figure(self.known)}
+
+    @cached_property
+    def drawn(self) -> Drawing:
+        """The figure as a page shows it."""
+        order = {name: i for i, (name, _) in enumerate(self.known)}
+        return rates.intervals("Success rates", [(name, found, "") for name, found in self.known], order)
+
+    @cached_property
+    def svg(self) -> str:
+        """Figure with sentence, design and source, black on white, needing nothing beside it."""
+        return printable(self.drawn, above=[self.sentence], below=[self.design, self.source])
+
+    def whole(self, form: str) -> str:
+        """All of it as a file: "txt", "tex" or "svg"."""
+        if form == "svg":
+            return '<?xml version="1.0" encoding="UTF-8"?>\n' + self.svg
+        if form == "txt":
+            return "\n".join(self.text.values())
+        strange = foreign("".join(cell for row in self.rows for cell in row.cells) + self.sentence)
+        note = f"% pdfLaTeX does not print {' '.join(strange)}: use LuaLaTeX or XeLaTeX\n" if strange else ""
+        return note + "\n".join(self.latex.values())
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """All of it as plain JSON."""
+        document, looks = self.plan.document or {}, self.found.boundary
+        return {
+            "plan": document["name"],
+            "version": document["version"],
+            "title": document["title"],
+            "digest": self.digest,
+            "plan_digest": self.plan.digest,
+            "commitment": self.plan.commitment,
+            "key": bytes(self.plan.key or b"").hex(),
+            "revealed_at": self.kept["at"],
+            "revealed_by": self.plan.revealed_by.get_username() if self.plan.revealed_by else "",
+            "comparison": document["comparison"],
+            "design": {
+                "rule": self.found.rule,
+                "pairs": self.found.pairs,
+                "alpha": self.found.alpha,
+                "outcome": self.found.outcome,
+                "margin": self.found.margin,
+                "looks": [look.first for look in looks.looks] if looks else [],
+                "words": self.design,
+            },
+            "pairs": self.kept["pairs"],
+            "headline": self.sentence,
+            "arms": [
+                {
+                    "checkpoint": row.checkpoint,
+                    "n": row.n,
+                    "successes": row.success.successes if row.success else None,
+                    "rate": row.success.rate if row.success else None,
+                    "wilson": [row.success.interval.low, row.success.interval.high]
+                    if row.success and row.success.interval
+                    else None,
+                    "score": row.score,
+                }
+                for row in self.rows
+            ],
+            "address": self.address,
+            "text": self.text,
+            "latex": self.latex,
+            "svg": self.svg,
+        }
+
+
+def citation(plan: Plan, address: str) -> Citation:
+    """That of a revealed plan as its reveal kept it, else of one that is closed as it is now.
+
+    Conflict where trials are still made, or no comparison was planned.
+    """
+    found = frozen(plan.document) if plan.document else None
+    if found is None:
+        raise Conflict(
+            f"{plan} has no comparison: there is no one sentence to cite; its report has all figures"
+        )
+    if plan.state not in (PlanState.CLOSED, PlanState.REVEALED):
+        raise Conflict(f"{plan} is {plan.get_state_display()}: a result is cited once the plan is closed")
+    kept = plan.at_reveal or at_the_reveal(plan) or {}
+    return Citation(plan, found, kept, plan.at_reveal["digest"] if plan.at_reveal else "", address)
+
+
+def _looks(found: Design) -> str:
+    if found.rule == FIXED:
+        return "one test at the end"
+    firsts = [look.first for look in found.boundary.looks] if found.boundary else []
+    every = len(firsts) > 2 and firsts == list(range(firsts[0], firsts[-1] + 1))
+    if found.rule == ANYTIME or every:
+        return "looked at after every pair"
+    return f"looked at after {', '.join(map(str, firsts))} pairs"
+
+
+def _text_table(rows: list[tuple[str, ...]]) -> str:
+    widths = [max(len(row[i]) for row in (_HEAD, *rows)) for i in range(len(_HEAD))]
+    lines = [
+        "  ".join(cell.ljust(wide) for cell, wide in zip(row, widths, strict=True)).rstrip()
+        for row in (_HEAD, tuple("-" * wide for wide in widths), *rows)
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _text_figure(rows: list[tuple[str, Proportion]]) -> str:
+    wide = max((len(name) for name, _ in rows), default=0)
+    lines = []
+    for name, found in rows:
+        axis = [" "] * (_AXIS + 1)
+        if found.rate is not None and found.interval is not None:
+            low, high = round(found.interval.low * _AXIS), round(found.interval.high * _AXIS)
+            axis[low : high + 1] = "-" * (high + 1 - low)
+            axis[round(found.rate * _AXIS)] = "o"
+        lines.append(f"{name.ljust(wide)}  |{''.join(axis)}|  {rate_words(found)}")
+    lines.append(f"{' ' * wide}   0 %{'100 %'.rjust(_AXIS - 2)}")
+    return "\n".join(lines) + "\n"
+
+
+def _latex_table(rows: list[tuple[str, ...]]) -> str:
+    def said(row: tuple[str, ...]) -> str:
+        return "  {}" + " & ".join(escaped(cell) for cell in row) + r" \\"  # {}: a name may begin with [ or *
+
+    lines = [r"\begin{tabular}{lrrlr}", r"  \hline", said(_HEAD), r"  \hline", *map(said, rows), r"  \hline"]
+    return "\n".join([*lines, r"\end{tabular}"]) + "\n"
+
+
+def _latex_figure(rows: list[tuple[str, Proportion]]) -> str:
+    """As a picture of LaTeX's own, in mm."""
+    high = _STEP_MM * (len(rows) + 1)
+    lines = [
+        r"\begingroup\setlength{\unitlength}{1mm}%",
+        rf"\begin{{picture}}({_NAMES_MM + _AXIS_MM + 40},{high})",
+        rf"  \put({_NAMES_MM},{_STEP_MM}){{\line(1,0){{{_AXIS_MM}}}}}",
+    ]
+    for percent in (0, 25, 50, 75, 100):
+        x = _NAMES_MM + _AXIS_MM * percent / 100
+        lines.append(rf"  \put({x:g},{_STEP_MM}){{\line(0,-1){{1}}}}")
+        lines.append(rf"  \put({x:g},2){{\makebox(0,0){{\footnotesize {percent}\,\%}}}}")
+    for i, (name, found) in enumerate(rows):
+        y = high - _STEP_MM * i - _STEP_MM / 2
+        lines.append(rf"  \put({_NAMES_MM - 3},{y:g}){{\makebox(0,0)[r]{{{escaped(name)}}}}}")
+        if found.rate is not None and found.interval is not None:
+            low, wide = found.interval.low * _AXIS_MM, (found.interval.high - found.interval.low) * _AXIS_MM
+            lines.append(rf"  \put({_NAMES_MM + low:.2f},{y:g}){{\line(1,0){{{wide:.2f}}}}}")
+            lines.append(rf"  \put({_NAMES_MM + found.rate * _AXIS_MM:.2f},{y:g}){{\circle*{{1.6}}}}")
+        words = escaped(rate_words(found))
+        lines.append(
+            rf"  \put({_NAMES_MM + _AXIS_MM + 3},{y:g}){{\makebox(0,0)[l]{{\footnotesize {words}}}}}"
+        )
+    return "\n".join([*lines, r"\end{picture}\endgroup"]) + "\n"

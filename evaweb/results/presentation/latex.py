@@ -1,0 +1,76 @@
+"""Words of people as LaTeX that compiles: names of checkpoints have underscores, titles whatever was typed."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+_ASCII = {
+    **{letter: f"\\{letter}" for letter in "{}%_&#$"},
+    "\\": r"\textbackslash{}",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"\textquotedblright{}",
+    "`": r"\textquoteleft{}",
+    "'": r"\textquoteright{}",
+}
+_SIGNS = {
+    **{"−": "$-$", "–": r"\textendash{}", "—": r"\textemdash{}", "…": r"\ldots{}", "\u00a0": "~"},
+    **{"“": r"\textquotedblleft{}", "”": r"\textquotedblright{}"},
+    **{"‘": r"\textquoteleft{}", "’": r"\textquoteright{}"},
+    **{"×": r"$\times$", "±": r"$\pm$", "·": r"$\cdot$", "°": r"$^{\circ}$", "µ": r"$\mu$"},
+    **{"≤": r"$\leq$", "≥": r"$\geq$", "≠": r"$\neq$", "→": r"$\rightarrow$", "²": "$^{2}$", "³": "$^{3}$"},
+    **{"ß": r"\ss{}", "æ": r"\ae{}", "Æ": r"\AE{}", "ø": r"\o{}", "Ø": r"\O{}", "œ": r"\oe{}", "Œ": r"\OE{}"},
+    **{"ł": r"\l{}", "Ł": r"\L{}", "ı": r"\i{}"},
+}
+_ACCENTS = {
+    **{"\u0300": "`", "\u0301": "'", "\u0302": "^", "\u0303": "~", "\u0304": "=", "\u0306": "u"},
+    **{"\u0307": ".", "\u0308": '"', "\u030a": "r", "\u030b": "H", "\u030c": "v", "\u0327": "c"},
+}
+_SMALL = frozenset(
+    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi pi rho sigma tau upsilon phi "
+    "chi psi omega".split()
+)
+_CAPITAL = frozenset("Gamma Delta Theta Lambda Xi Pi Sigma Upsilon Phi Psi Omega".split())
+_GREEK = re.compile(r"GREEK (SMALL|CAPITAL) LETTER (\w+)")
+
+
+def escaped(text: str) -> str:
+    """`text` as LaTeX prints it letter by letter, without a package.
+
+    Letters that have no command there stay as they are: LuaLaTeX and XeLaTeX print them. Line breaks are blanks.
+    """
+    said = "".join(_letter(letter) for letter in unicodedata.normalize("NFC", text))
+    return re.sub(r"-(?=-)", "-{}", said)  # two would be a dash
+
+
+def foreign(text: str) -> list[str]:
+    """The letters of it that pdfLaTeX does not print."""
+    return sorted({letter for letter in unicodedata.normalize("NFC", text) if not _letter(letter).isascii()})
+
+
+def _letter(letter: str) -> str:
+    found = _ASCII.get(letter) or _SIGNS.get(letter)
+    if found is not None:
+        return found
+    if unicodedata.category(letter).startswith(("C", "Z")) and letter != " ":
+        return " "
+    return letter if letter.isascii() else _accented(letter) or _greek(letter) or letter
+
+
+def _accented(letter: str) -> str:
+    base, *marks = unicodedata.normalize("NFD", letter)
+    known = base.isascii() and len(marks) == 1 and marks[0] in _ACCENTS
+    return f"\\{_ACCENTS[marks[0]]}{{{base}}}" if known else ""
+
+
+def _greek(letter: str) -> str:
+    found = _GREEK.fullmatch(unicodedata.name(letter, ""))
+    if found is None:
+        return ""
+    name = found[2].lower().replace("lamda", "lambda")
+    name = name.capitalize() if found[1] == "CAPITAL" else name
+    return f"$\\{name}$" if name in _SMALL | _CAPITAL else ""
