@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from uuid import UUID
 
 from django.http import HttpRequest
+from django.urls import reverse
 from ninja import Field, Query, Router, Schema
 from pydantic import create_model
 
@@ -21,10 +22,13 @@ from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import Chosen, chosen
 from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.models import Judgement, Preference, Rating
+from evaweb.results.presentation.addresses import frozen_address
+from evaweb.results.presentation.citing import citation
+from evaweb.results.presentation.integrity import integrity_document
 from evaweb.results.ratings.unblinding import require_seen
 from evaweb.results.reports.document import analysis_document, arm_document, comparison_document
 from evaweb.results.reports.tables import COLUMNS, outcome_page, outcome_pages
-from evaweb.results.selectors import plan_get
+from evaweb.results.selectors import plan_at_reveal, plan_get
 from evaweb.tabular_export import in_pages
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import Score
@@ -190,6 +194,32 @@ def results(request: HttpRequest, name: str, version: int, only: Query[Only]) ->
         "judges": judges_of(plan),
         "preferences": preferences_of(plan),
     }
+
+
+@router.get(
+    _PLAN + "/integrity",
+    response={200: dict[str, Any], **FAILURES},
+    summary="How the trials were made",
+    url_name="plan-integrity",
+)
+def integrity(request: HttpRequest, name: str, version: int) -> Any:
+    """Looks, voids, corrections, amendments, deviations, delays, and what the headline would be under each doubt."""
+    plan, _ = _seen(request, name, version, Only())
+    return {"plan": plan.name, "version": plan.version, "digest": plan.digest, **integrity_document(plan)}
+
+
+@router.get(
+    "/results/frozen/{digest}",
+    response={200: dict[str, Any], **FAILURES},
+    summary="A result as its reveal kept it",
+    url_name="result-frozen",
+)
+def frozen(request: HttpRequest, digest: str) -> Any:
+    """One sentence, one table and one figure with the design; no later correction changes them."""
+    plan = plan_at_reveal(digest)
+    require_seen(plan, request.auth)
+    later = reverse("api:plan-integrity", args=[plan.name, plan.version])
+    return {**citation(plan, frozen_address(request, digest)).document, "later": later}
 
 
 @router.get(

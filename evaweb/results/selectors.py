@@ -92,6 +92,16 @@ class Question:
         return urlencode({name: value for name, value in asdict(self).items() if value})
 
 
+def plan_at_reveal(digest: str) -> Plan:
+    """The plan whose reveal has this digest; NotFound where none has."""
+    found = Plan.objects.filter(state=PlanState.REVEALED, at_reveal__digest=digest).first()
+    if found is None:
+        raise NotFound(
+            f"no reveal has the digest {digest!r:.80}: it stands under Record on the page of its plan"
+        )
+    return found
+
+
 def plan_get(*, name: str, version: int | None = None) -> Plan:
     """That version of the plan, or its newest; NotFound says which versions there are."""
     rows = Plan.objects.select_related("owner", "first", "second", "evaluation", "revealed_by", "amends")

@@ -7,6 +7,7 @@ from django.urls import path
 from evaweb.results.pages import views, views_judging, views_lab
 
 _PLAN = "result/plans/<slug:name>/<int:version>/"
+_FROZEN = "result/frozen/<digest:digest>/"
 urlpatterns = [
     path("result/lab/", views_lab.dashboard, name="lab-dashboard"),
     path("result/wall/", views_lab.wall, name="lab-wall"),
@@ -19,6 +20,13 @@ urlpatterns = [
     path(_PLAN + "compare/", views.compare, name="result-compare"),
     path(_PLAN + "evidence/", views.evidence, name="result-evidence"),
     path(_PLAN + "report.zip", views.report, name="result-report"),
+    path(_PLAN + "integrity/", views.integrity, name="result-integrity"),
+    path(_PLAN + "cite/", views.cite, name="result-cite"),
+    path(_FROZEN, views.frozen, name="result-frozen"),
+    *(
+        path(f"{_FROZEN}result.{form}", views.frozen_file, {"form": form}, name=f"result-frozen-{form}")
+        for form in ("txt", "tex", "svg")
+    ),
     path(_PLAN + "trials/", views.trials, name="result-plan-trials"),
     *(
         path(f"{_PLAN}{what}", views.act, {"what": what}, name=f"result-{what}")

@@ -41,7 +41,7 @@ def addresses(lab):
         "camera": {"": ["cam_high"]},
         "index": {"": [0]},
         "robot": {"": ["agilex_piper"]},
-        "digest": {"": ["0" * 64]},
+        "digest": {"": [(lab.plan.at_reveal or {}).get("digest", "0" * 64)]},
         "checkpoint": {"": KEYS},
         "rest": {"": ["nowhere"]},
         "name": {

@@ -19,6 +19,7 @@ from evaweb.blinding import sight_for
 from evaweb.errors import EvaError
 from evaweb.plans import services
 from evaweb.plans.blinding_rules import look, may_look
+from evaweb.plans.design import pairs_of
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results import selectors
 from evaweb.results.analysis import caching
@@ -26,6 +27,9 @@ from evaweb.results.analysis.agreement import agreement_of, judges_of, preferenc
 from evaweb.results.analysis.filters import chosen
 from evaweb.results.pages import pages
 from evaweb.results.presentation import listings
+from evaweb.results.presentation.addresses import frozen_address
+from evaweb.results.presentation.citing import HEAD, Citation, citation
+from evaweb.results.presentation.integrity import delays_banner, integrity_document
 from evaweb.results.ratings.automatic import judge_ask, judges_ready
 from evaweb.results.ratings.unblinding import has_results, require_seen, sealing, why_sealed
 from evaweb.results.reports.reporting import write_report
@@ -36,6 +40,8 @@ from evaweb.trials.voids import voids_waiting
 
 PER_PAGE = 50
 PLANS_PER_PAGE = 25
+MOST_LINES = 200  # of a list on the page of integrity; REST and the report have all
+_FORMS = {"txt": "text/plain", "tex": "application/x-tex", "svg": "image/svg+xml"}
 MOST_PICTURES = 32_000_000  # bytes of a report that is packed in memory; the command has no such limit
 
 
@@ -139,6 +145,59 @@ def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
     )
 
 
+@require_GET
+def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
+    """How its trials were made, and what the headline would be under each doubt."""
+    found = _found(name, version)
+    sealed = _sealed_page(request, found)
+    if sealed:
+        return sealed
+    record = integrity_document(found)
+    context = {
+        "record": record,
+        "banner": delays_banner(record),
+        "most": MOST_LINES,
+        **_common(request, found),
+    }
+    return render(request, "results/conduct.html", context)
+
+
+@require_GET
+def cite(request: HttpRequest, name: str, version: int) -> HttpResponse:
+    """The result as it is copied; of a revealed plan at the address that stays."""
+    found = _found(name, version)
+    sealed = _sealed_page(request, found)
+    if sealed:
+        return sealed
+    if found.at_reveal:
+        return redirect("result-frozen", digest=found.at_reveal["digest"])
+    try:
+        return _citation_page(request, citation(found, request.build_absolute_uri()))
+    except EvaError as fault:
+        return _plan_page(request, found, fault)
+
+
+@require_GET
+def frozen(request: HttpRequest, digest: str) -> HttpResponse:
+    """The result as its reveal kept it: whatever is corrected later, nothing here changes."""
+    found = selectors.plan_at_reveal(digest)
+    sealed = _sealed_page(request, found)
+    return sealed or _citation_page(request, citation(found, frozen_address(request, digest)))
+
+
+@require_GET
+def frozen_file(request: HttpRequest, digest: str, form: str) -> HttpResponse:
+    """The same as a file: "txt", "tex" or "svg"."""
+    found = selectors.plan_at_reveal(digest)
+    require_seen(found, request.user)
+    title = f"{found.name}-v{found.version}-{digest[:8]}.{form}"
+    return HttpResponse(
+        citation(found, frozen_address(request, digest)).whole(form),
+        content_type=f"{_FORMS[form]}; charset=utf-8",
+        headers={"Content-Disposition": f'attachment; filename="{title}"'},
+    )
+
+
 @require_POST
 def act(request: HttpRequest, name: str, version: int, what: str) -> HttpResponse:
     """Freeze, amend, close or reveal it, look behind the blind, or have it judged: by its owner, with what is due."""
@@ -161,6 +220,30 @@ def act(request: HttpRequest, name: str, version: int, what: str) -> HttpRespons
     return redirect("result-plan", name=shown.name, version=shown.version)
 
 
+def _citation_page(request: HttpRequest, cited: Citation) -> HttpResponse:
+    parts = [
+        (
+            title,
+            {
+                "text": cited.text[part],
+                "LaTeX": cited.latex[part],
+                **({"SVG": cited.svg} if part == "figure" else {}),
+            },
+        )
+        for part, title in (("sentence", "Sentence"), ("table", "Table"), ("figure", "Figure"))
+    ]
+    later = cited.digest and pairs_of(cited.plan) != [tuple(pair) for pair in cited.kept["pairs"]]
+    context = {
+        **_common(request, cited.plan),
+        "cited": cited,
+        "head": HEAD,
+        "parts": parts,
+        "forms": _FORMS,
+        "later": later,
+    }
+    return render(request, "results/cite.html", context)
+
+
 def _found(name: str, version: int | None) -> Plan:
     return selectors.plan_get(name=name, version=version)
 
@@ -180,8 +263,11 @@ def _plan_page(
         "judges": judges_of(found),
         "preferences": preferences_of(found),
     }
+    record = integrity_document(found)
     context = {
         **pages.summary_page(found, only),
+        "banner": delays_banner(record),
+        "remarks": record["remarks"],
         **judged,
         **_common(request, found),
         "fault": fault,

@@ -18,7 +18,7 @@ from evaweb.results.presentation.wording import ends, rate_words
 from evaweb.statistics.designs import ANYTIME, FIXED, SUCCESS, Design
 from evaweb.statistics.proportions import Proportion, proportion
 
-_HEAD = ("Checkpoint", "n", "Successes", "Rate, 95 % Wilson", "Mean score")
+HEAD = ("Checkpoint", "n", "Successes", "Rate, 95 % Wilson", "Mean score")
 _AXIS = 40  # letters of it, in text
 _NAMES_MM, _AXIS_MM, _STEP_MM = 45, 60, 6
 
@@ -229,10 +229,10 @@ def _looks(found: Design) -> str:
 
 
 def _text_table(rows: list[tuple[str, ...]]) -> str:
-    widths = [max(len(row[i]) for row in (_HEAD, *rows)) for i in range(len(_HEAD))]
+    widths = [max(len(row[i]) for row in (HEAD, *rows)) for i in range(len(HEAD))]
     lines = [
         "  ".join(cell.ljust(wide) for cell, wide in zip(row, widths, strict=True)).rstrip()
-        for row in (_HEAD, tuple("-" * wide for wide in widths), *rows)
+        for row in (HEAD, tuple("-" * wide for wide in widths), *rows)
     ]
     return "\n".join(lines) + "\n"
 
@@ -255,7 +255,7 @@ def _latex_table(rows: list[tuple[str, ...]]) -> str:
     def said(row: tuple[str, ...]) -> str:
         return "  {}" + " & ".join(escaped(cell) for cell in row) + r" \\"  # {}: a name may begin with [ or *
 
-    lines = [r"\begin{tabular}{lrrlr}", r"  \hline", said(_HEAD), r"  \hline", *map(said, rows), r"  \hline"]
+    lines = [r"\begin{tabular}{lrrlr}", r"  \hline", said(HEAD), r"  \hline", *map(said, rows), r"  \hline"]
     return "\n".join([*lines, r"\end{tabular}"]) + "\n"
 
 

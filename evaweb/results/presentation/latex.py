@@ -18,24 +18,55 @@ _ASCII = {
     "'": r"\textquoteright{}",
 }
 _SIGNS = {
-    **{"−": "$-$", "–": r"\textendash{}", "—": r"\textemdash{}", "…": r"\ldots{}", "\u00a0": "~"},
-    **{"“": r"\textquotedblleft{}", "”": r"\textquotedblright{}"},
-    **{"‘": r"\textquoteleft{}", "’": r"\textquoteright{}"},
-    **{"×": r"$\times$", "±": r"$\pm$", "·": r"$\cdot$", "°": r"$^{\circ}$", "µ": r"$\mu$"},
-    **{"≤": r"$\leq$", "≥": r"$\geq$", "≠": r"$\neq$", "→": r"$\rightarrow$", "²": "$^{2}$", "³": "$^{3}$"},
-    **{"ß": r"\ss{}", "æ": r"\ae{}", "Æ": r"\AE{}", "ø": r"\o{}", "Ø": r"\O{}", "œ": r"\oe{}", "Œ": r"\OE{}"},
-    **{"ł": r"\l{}", "Ł": r"\L{}", "ı": r"\i{}"},
+    "−": "$-$",
+    "–": r"\textendash{}",
+    "—": r"\textemdash{}",
+    "…": r"\ldots{}",
+    "\u00a0": "~",
+    "“": r"\textquotedblleft{}",
+    "”": r"\textquotedblright{}",
+    "‘": r"\textquoteleft{}",
+    "’": r"\textquoteright{}",
+    "×": r"$\times$",
+    "±": r"$\pm$",
+    "·": r"$\cdot$",
+    "°": r"$^{\circ}$",
+    "µ": r"$\mu$",
+    "≤": r"$\leq$",
+    "≥": r"$\geq$",
+    "≠": r"$\neq$",
+    "→": r"$\rightarrow$",
+    "²": "$^{2}$",
+    "³": "$^{3}$",
+    "ß": r"\ss{}",
+    "æ": r"\ae{}",
+    "Æ": r"\AE{}",
+    "ø": r"\o{}",
+    "Ø": r"\O{}",
+    "œ": r"\oe{}",
+    "Œ": r"\OE{}",
+    "ł": r"\l{}",
+    "Ł": r"\L{}",
+    "ı": r"\i{}",
 }
 _ACCENTS = {
-    **{"\u0300": "`", "\u0301": "'", "\u0302": "^", "\u0303": "~", "\u0304": "=", "\u0306": "u"},
-    **{"\u0307": ".", "\u0308": '"', "\u030a": "r", "\u030b": "H", "\u030c": "v", "\u0327": "c"},
+    "\u0300": "`",
+    "\u0301": "'",
+    "\u0302": "^",
+    "\u0303": "~",
+    "\u0304": "=",
+    "\u0306": "u",
+    "\u0307": ".",
+    "\u0308": '"',
+    "\u030a": "r",
+    "\u030b": "H",
+    "\u030c": "v",
+    "\u0327": "c",
 }
-_SMALL = frozenset(
-    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi pi rho sigma tau upsilon phi "
-    "chi psi omega".split()
+_GREEK = re.compile(
+    "GREEK (?:SMALL LETTER (ALPHA|BETA|GAMMA|DELTA|EPSILON|ZETA|ETA|THETA|IOTA|KAPPA|LAMDA|MU|NU|XI|PI|RHO|"
+    "SIGMA|TAU|UPSILON|PHI|CHI|PSI|OMEGA)|CAPITAL LETTER (GAMMA|DELTA|THETA|LAMDA|XI|PI|SIGMA|UPSILON|PHI|PSI|OMEGA))"
 )
-_CAPITAL = frozenset("Gamma Delta Theta Lambda Xi Pi Sigma Upsilon Phi Psi Omega".split())
-_GREEK = re.compile(r"GREEK (SMALL|CAPITAL) LETTER (\w+)")
 
 
 def escaped(text: str) -> str:
@@ -71,6 +102,5 @@ def _greek(letter: str) -> str:
     found = _GREEK.fullmatch(unicodedata.name(letter, ""))
     if found is None:
         return ""
-    name = found[2].lower().replace("lamda", "lambda")
-    name = name.capitalize() if found[1] == "CAPITAL" else name
-    return f"$\\{name}$" if name in _SMALL | _CAPITAL else ""
+    name = found[1].lower() if found[1] else found[2].capitalize()
+    return f"$\\{name.replace('lamda', 'lambda').replace('Lamda', 'Lambda')}$"

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from evaweb.results.analysis.integrity import changes_of
 from evaweb.results.models import Judgement, Rating
 from evaweb.results.presentation import facts, listings
 from evaweb.results.presentation.drawings import conditions, courses, rates
+from evaweb.results.presentation.integrity import delays_banner, integrity_document
 from evaweb.results.reports import bench_photos as laid_out
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.document import analysis_document
@@ -36,6 +38,7 @@ _STYLES = (
     *("css/tokens.css", "css/base.css", "css/card.css", "css/table.css", "css/chip.css"),
     *("result/result.css", "result/figures.css", "result/plans.css"),
 )
+MOST_LINES = 1000  # of a list in the report's page; its data have all
 _PROGRAM = Path(__file__).parent / "recompute"
 _RATINGS = (
     *("trial", "rater", "success", "score", "milestones", "failure", "failure_phase", "note", "blind", "at"),
@@ -73,6 +76,8 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     _json(data / "plan.json", plan.document or {})
     _json(data / "seal.json", seal_of(plan))
     _json(data / "numbers.json", numbers_of(plan, analysis))
+    record = integrity_document(plan)
+    _json(data / "integrity.json", record)
     _csv(data / "trials.csv", list(COLUMNS), outcome_pages(plan))
     _csv(data / "scores.csv", _SCORES, _scores(plan))
     _csv(data / "ratings.csv", _RATINGS, _ratings(plan))
@@ -82,7 +87,13 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     left = laid_out.write_pictures(plan, data / "pictures", most_pictures)
     shutil.copytree(_PROGRAM, out / "recompute", ignore=shutil.ignore_patterns("__pycache__"))
     page = out / "index.html"
-    context = {**report_context(plan, analysis), "benches": _benches(plan, data / "pictures"), "left": left}
+    told = {"record": record, "banner": delays_banner(record), "most": MOST_LINES}
+    context = {
+        **report_context(plan, analysis),
+        **told,
+        "benches": _benches(plan, data / "pictures"),
+        "left": left,
+    }
     page.write_text(render_to_string("results/report.html", context), "utf-8")
     return page
 
@@ -232,7 +243,11 @@ def _preferences(plan: Plan) -> Iterator[list[dict[str, Any]]]:
 
 
 def _json(path: Path, content: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", "utf-8")
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False, default=_time) + "\n", "utf-8")
+
+
+def _time(value: datetime) -> str:
+    return value.isoformat()
 
 
 def _csv(path: Path, columns: Sequence[str], rows: Iterator[list[dict[str, Any]]]) -> None:

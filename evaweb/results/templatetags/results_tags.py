@@ -19,6 +19,7 @@ from evaweb.results.presentation import wording
 from evaweb.statistics.proportions import Proportion
 
 register = template.Library()
+_MOST_NAMED = 12
 _TONES = {
     PlanState.DRAFT: "active",
     PlanState.FROZEN: "ok",
@@ -99,6 +100,16 @@ def export_links(plan: Plan, only: Chosen) -> SafeString:
 
 
 _FORMATS = (("csv", "Trials as CSV"), ("parquet", "as Parquet"), ("json", "as JSON"))
+
+
+@register.filter
+def listed(found: list[Any], what: str) -> str:
+    """How many, and the first of them by their names."""
+    if not found:
+        return "none"
+    names = ", ".join(str(each) for each in found[:_MOST_NAMED])
+    more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    return f"{len(found)}: {what} {names}{more}"
 
 
 @register.filter

@@ -1,0 +1,26 @@
+// Copies what stands beside its button, also where the browser keeps its clipboard to pages over HTTPS.
+
+const SAID_MS = 2000;
+
+async function copy(area) {
+  if (navigator.clipboard) {
+    try {
+      await navigator.clipboard.writeText(area.value);
+      return true;
+    } catch {
+      // not allowed: as without it
+    }
+  }
+  area.focus();
+  area.select();
+  return document.execCommand("copy");
+}
+
+for (const button of document.querySelectorAll("[data-copy]")) {
+  const words = button.textContent;
+  button.addEventListener("click", async () => {
+    const done = await copy(button.closest("details").querySelector("textarea"));
+    button.textContent = done ? "Copied" : "Marked: copy it with the keyboard";
+    setTimeout(() => (button.textContent = words), SAID_MS);
+  });
+}

@@ -1,0 +1,140 @@
+"""A result that travels: what the reveal kept, as text, LaTeX and SVG, at an address that does not change."""
+
+import re
+from xml.etree import ElementTree
+
+import pytest
+from django.test import Client
+
+from evaweb.plans.design import at_the_reveal
+from evaweb.plans.services import plan_reveal
+from evaweb.results.presentation.citing import citation
+from evaweb.results.presentation.latex import escaped, foreign
+from evaweb.trials import services
+from tests.evaweb.trials import builders
+
+FORMS = {"txt": "text/plain", "tex": "application/x-tex", "svg": "image/svg+xml"}
+# All that LaTeX may be given: plain letters, commands with their ends, and nothing else that it acts upon.
+PLAIN = re.compile(
+    r"""(?:[A-Za-z0-9 .,:;!?()\[\]/*+=@-]|[^\x00-\x7f]|\\[{}%_&#$]|\\[A-Za-z]+\{\}|\\[`'^~="a-zA-Z.]\{[A-Za-z]\}"""
+    r"""|\$[-A-Za-z\\^{}0-9]+\$|-\{\}-|\{\}|~)*"""
+)
+
+
+@pytest.fixture
+def client(db):
+    made = Client()
+    made.force_login(builders.user("vera", "viewer"))
+    return made
+
+
+@pytest.fixture
+def address(revealed):
+    return f"/result/frozen/{revealed.at_reveal['digest']}/"
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("a_b & c% #1 $x$ {y}", r"a\_b \& c\% \#1 \$x\$ \{y\}"),
+        ("~^\\", r"\textasciitilde{}\textasciicircum{}\textbackslash{}"),
+        ("a<b>c|d", r"a\textless{}b\textgreater{}c\textbar{}d"),
+        ("pi0--new---", r"pi0-{}-new-{}-{}-"),
+        ("Müller, Łódź, ñ, ç", r"M\"{u}ller, \L{}\'{o}d\'{z}, \~{n}, \c{c}"),
+        ("λ Ω − ×", r"$\lambda$ $\Omega$ $-$ $\times$"),
+        ("e\u0301", r"\'{e}"),
+        ("one\ntwo\x00\u200b", "one two  "),
+        ("方块", "方块"),
+        ("\\input{/etc/passwd}", r"\textbackslash{}input\{/etc/passwd\}"),
+    ],
+)
+def test_what_was_typed_is_printed_and_never_run(typed, said):
+    assert escaped(typed) == said
+    assert PLAIN.fullmatch(said), said
+
+
+def test_no_letter_at_all_gets_by():
+    every = "".join(map(chr, [*range(0x250), *range(0x370, 0x400), *range(0x2000, 0x2300), 0x65B9, 0x1F600]))
+    for letter in every:
+        assert PLAIN.fullmatch(escaped(letter)), (letter, escaped(letter))
+
+
+def test_letters_that_need_another_latex_are_named():
+    assert foreign("Müller 方 λ") == ["方"]
+
+
+def test_the_sentence_names_the_design_and_the_table_has_n_rate_interval_and_score(revealed):
+    cited = citation(revealed, "https://lab/x")
+    assert cited.text["sentence"].startswith(cited.sentence)
+    assert cited.sentence.startswith(("pi0-new succeeded more often than", "No significant difference"))
+    assert "Design: fixed, one test at the end, 8 pairs foreseen, alpha 0.05" in cited.text["sentence"]
+    assert revealed.at_reveal["digest"] in cited.text["sentence"]
+    rows = {row.checkpoint: row.cells for row in cited.rows}
+    assert rows["pi0-new"][1:3] == ("8", "6")
+    assert re.fullmatch(r"75 % \[\d+, \d+\]", rows["pi0-new"][3])
+    assert rows["pi0-new"][4] == "0.88"
+    assert "pi0-block" in cited.text["table"]
+    assert r"75 \% [" in cited.latex["table"]
+    assert cited.latex["table"].count(r"\hline") == 3
+    assert cited.latex["figure"].count(r"\circle*") == 2
+
+
+def test_the_figure_needs_nothing_beside_it(revealed):
+    svg = citation(revealed, "https://lab/x").svg
+    root = ElementTree.fromstring(svg)
+    tags = {each.tag.removeprefix("{http://www.w3.org/2000/svg}") for each in root.iter()}
+    assert tags <= {"svg", "title", "desc", "rect", "g", "text", "path"}
+    assert not any({"class", "style", "href", "id"} & set(each.attrib) for each in root.iter())
+    colours = {each.get(name) for each in root.iter() for name in ("fill", "stroke")} - {None, "none"}
+    assert all(re.fullmatch(r"#(\w\w)\1\1", colour) for colour in colours)
+    assert svg == citation(revealed, "https://lab/x").svg
+
+
+def test_what_is_corrected_later_changes_no_byte(revealed, bench, client, address):
+    before = {form: client.get(f"{address}result.{form}") for form in FORMS}
+    told = client.get(f"/api/v1/results/frozen/{revealed.at_reveal['digest']}").json()
+    for handout in revealed.handouts.all():
+        ticks = bench.ticks(True, True, True)
+        services.trial_score(user=bench.operator, trial=handout.trial, milestones=ticks, reason="seen again")
+    for form, kind in FORMS.items():
+        answer = client.get(f"{address}result.{form}")
+        assert answer.content == before[form].content
+        assert answer.headers["Content-Type"] == f"{kind}; charset=utf-8"
+        name = f"blocks-v1-{revealed.at_reveal['digest'][:8]}.{form}"
+        assert answer.headers["Content-Disposition"] == f'attachment; filename="{name}"'
+    assert client.get(f"/api/v1/results/frozen/{revealed.at_reveal['digest']}").json() == told
+    page = client.get(address).content.decode()
+    assert "Scores were corrected after the reveal" in page
+    assert told["headline"] in page
+    assert (told["digest"], told["pairs"]) == (revealed.at_reveal["digest"], revealed.at_reveal["pairs"])
+    assert told["key"] == bytes(revealed.key).hex()
+    assert told["later"] == "/api/v1/plans/blocks/1/integrity"
+
+
+def test_the_plan_leads_to_its_address_and_no_other_digest_to_anything(revealed, client, address):
+    assert client.get("/result/plans/blocks/1/cite/").headers["Location"] == address
+    assert 'href="/result/plans/blocks/1/cite/"' in client.get("/result/plans/blocks/1/").content.decode()
+    for wrong in ("/result/frozen/" + "0" * 64 + "/", "/api/v1/results/frozen/" + "0" * 64):
+        assert client.get(wrong).status_code == 404
+    assert Client().get(address).status_code == 302
+    assert Client().get(f"/api/v1/results/frozen/{revealed.at_reveal['digest']}").status_code == 401
+
+
+def test_before_the_reveal_there_is_nothing_to_cite(plan, owner, carry_out, client):
+    carry_out(plan, 16)
+    address = "/result/plans/blocks/1/cite/"
+    page = client.get(address).content.decode()
+    assert "Sealed" in page
+    assert "pi0-new" not in page
+    plan.refresh_from_db()
+    digest = at_the_reveal(plan)["digest"]  # that it will have: not known, and worth nothing
+    assert client.get(f"/result/frozen/{digest}/").status_code == 404
+    plan_reveal(user=owner, plan=plan)
+    assert client.get(f"/result/frozen/{digest}/").status_code == 200
+
+
+def test_a_reveal_that_kept_its_pairs_alone_is_cited_by_them(revealed):
+    revealed.at_reveal = {name: revealed.at_reveal[name] for name in ("pairs", "digest", "at")}
+    rows = {row.checkpoint: row.cells for row in citation(revealed, "https://lab/x").rows}
+    assert rows["pi0-new"][1:3] == ("8", "6")
+    assert rows["pi0-new"][4] == "–"
