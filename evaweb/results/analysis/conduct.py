@@ -20,7 +20,7 @@ from evaweb.plans.models import CameraCheck, Plan
 from evaweb.results.analysis.integrity import changes_of
 from evaweb.statistics.many import holm
 from evaweb.statistics.permutation import sign_flips
-from evaweb.trials.models import Score, Trial, TrialStatus, VoidRequest
+from evaweb.trials.models import Score, TrialStatus, VoidRequest
 
 DELAYS = {
     "wait": "from hand-out to run",
@@ -51,6 +51,9 @@ class Run:
     station: str
     started_at: datetime | None
     ended_at: datetime | None
+    reason: str
+    voided_at: datetime | None
+    voided_by: str | None
     match: float | None
     connect: float | None
     warm_up: float | None
@@ -67,17 +70,16 @@ class Run:
         return _seconds(self.handed_at, self.started_at)
 
 
-def conduct_of(plan: Plan) -> dict[str, Any]:
-    """All of it; as many queries whatever the number of trials, but for each version of the plan before this one."""
-    runs = runs_of(plan)
-    events = list(plan.events.order_by("pk").values("at", "what", "text", by_name=F("by__username")))
+def conduct_of(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
+    """All of it, `runs` being all attempts; one query more for each version of the plan before this one."""
+    given_back = plan.events.filter(what="given back").order_by("pk")
     return {
         "looks": list(plan.looks.order_by("at").values("at", by_name=F("user__username"))),
         "checkpoints": _checkpoints(plan, runs),
         "voids": _voids(plan, runs),
         "corrections": _corrections(plan, runs),
         "amendments": _amendments(plan),
-        "deviations": _deviations(runs, [row for row in events if row["what"] == "given back"]),
+        "deviations": _deviations(runs, list(given_back.values("at", "text", by_name=F("by__username")))),
         "operators": balance(runs, "operator"),
         "stations": balance(runs, "station"),
         "cameras": _cameras(plan, runs),
@@ -97,10 +99,13 @@ def runs_of(plan: Plan) -> list[Run]:
         "slot__checkpoint__name",
     )
     own = ("status", "attempt", "operator__username", "station__name", "started_at", "ended_at")
+    voided = ("reason", "voided_at", "voided_by__username")
     rows = plan.handouts.annotate(match=Min("trial__achieved__match")).order_by("number")
     told = ("match", "trial__setup_took", "trial__episode__policy")
     found = []
-    for *plain, took, policy in rows.values_list(*fields, *(f"trial__{name}" for name in own), *told):
+    for *plain, took, policy in rows.values_list(
+        *fields, *(f"trial__{name}" for name in (*own, *voided)), *told
+    ):
         latency = _number(policy, "latency_ms", "p50")
         delays = (_number(took, "connect_s"), _number(took, "warm_up_s"), latency and latency / 1000)
         found.append(Run(*plain, *delays))
@@ -145,13 +150,17 @@ def _voids(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
         )
     ]
     granted = {row["trial_id"] for row in rows if row["answer"] == VoidRequest.Answer.AGREED}
-    alone = Trial.objects.filter(handout__plan=plan, status=TrialStatus.VOIDED).exclude(pk__in=granted)
     rows += [
-        {"trial_id": pk, "reason": why, "at": at, "by_name": by, "answer": "", "answer_reason": ""}
-        | {"answered_at": None, "answered_by_name": None}
-        for pk, why, at, by in alone.order_by("pk").values_list(
-            "pk", "reason", "voided_at", "voided_by__username"
-        )
+        {
+            "trial_id": run.trial,
+            "reason": run.reason,
+            "at": run.voided_at,
+            "by_name": run.voided_by,
+            "answer": "",
+        }
+        | {"answer_reason": "", "answered_at": None, "answered_by_name": None}
+        for run in runs
+        if run.status == TrialStatus.VOIDED and run.trial not in granted
     ]
     return [
         {**row, "code": known[row["trial_id"]].code, "checkpoint": known[row["trial_id"]].checkpoint}
@@ -274,7 +283,7 @@ def _cameras(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
 
 def _compared(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
     """Each delay of each checkpoint, and of the compared ones a test within pairs, corrected for how many there are."""
-    names = (plan.document or {})["comparison"] or []
+    names = (plan.document or {}).get("comparison") or []
     gaps = _gaps(runs)
     values = tuple(
         (
@@ -290,7 +299,13 @@ def _compared(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
     key: Hashable = (values, tuple(names))
     rows = _delays.get(plan.pk, key, lambda: _tested(values, names))
     differing = [row for row in rows if row["corrected"] is not None and row["corrected"] <= plan.alpha]
-    return {"alpha": plan.alpha, "rows": rows, "differing": [row["what"] for row in differing]}
+    tested = sum(row["p"] is not None for row in rows)
+    return {
+        "alpha": plan.alpha,
+        "rows": rows,
+        "tested": tested,
+        "differing": [row["what"] for row in differing],
+    }
 
 
 def _tested(

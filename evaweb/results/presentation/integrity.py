@@ -6,14 +6,16 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from evaweb.plans.models import Plan
-from evaweb.results.analysis.conduct import conduct_of
+from evaweb.results.analysis.conduct import conduct_of, runs_of
 from evaweb.results.presentation.wording import probability
 from evaweb.results.presentation.would_be import would_be
 
 
 def integrity_document(plan: Plan) -> dict[str, Any]:
     """What the record says, what the headline would be under each doubt, and `remarks` that sum both up."""
-    found = {**conduct_of(plan), "headline": would_be(plan)}
+    runs = runs_of(plan)
+    matches = {run.trial: run.match for run in runs if run.match is not None}
+    found = {**conduct_of(plan, runs), "headline": would_be(plan, matches)}
     return {**found, "remarks": list(_remarks(found))}
 
 
@@ -29,7 +31,7 @@ def delays_banner(found: Mapping[str, Any]) -> str:
     )
     return (
         f"The compared checkpoints were not treated alike in time: {said}. Were delays the same but for chance, a "
-        f"difference as wide would come about so rarely (sign flips within pairs, Holm over {len(delays['rows'])})"
+        f"difference as wide would come about so rarely (sign flips within pairs, Holm over {delays['tested']})"
     )
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
-
-from django.db.models import Min
 
 from evaweb.memo import Kept
 from evaweb.plans.design import Attempt, attempts_of, frozen, paired_up
@@ -17,22 +15,17 @@ from evaweb.statistics.designs import Design, Values, conclude
 _kept: Kept[list[dict[str, Any]]] = Kept()
 
 
-def would_be(plan: Plan) -> list[dict[str, Any]]:
+def would_be(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
     """As it was decided, then each other way to count: what, the pairs that it leaves, the sentence, and whether the
     same checkpoint is ahead by the design. None without a comparison.
 
     A part is left out by whole pairs. What is left is judged by the rule of the design as if it had foreseen so many
-    pairs; where the design did not end nothing is left out, for nothing was concluded.
+    pairs; where the design did not end nothing is left out, for nothing was concluded. `matches` is the lowest of each trial's bench, where one was measured.
     """
     found = frozen(plan.document) if plan.document else None
     if found is None:
         return []
     attempts = attempts_of(plan)
-    matches = dict(
-        plan.handouts.annotate(match=Min("trial__achieved__match"))
-        .exclude(match=None)
-        .values_list("trial_id", "match")
-    )
     kept = tuple((one, other) for one, other in plan.at_reveal["pairs"]) if plan.at_reveal else None
     at = (tuple(attempts), kept, tuple(sorted(matches.items())), plan.state)
     return _kept.get(plan.pk, at, lambda: list(_ways(plan, found, attempts, matches, kept)))
@@ -42,7 +35,7 @@ def _ways(
     plan: Plan,
     found: Design,
     attempts: Sequence[Attempt],
-    matches: dict[int, float],
+    matches: Mapping[int, float],
     kept: Sequence[Values] | None,
 ) -> Iterator[dict[str, Any]]:
     names = (plan.document or {})["comparison"]
