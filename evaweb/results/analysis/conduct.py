@@ -103,9 +103,9 @@ def runs_of(plan: Plan) -> list[Run]:
     rows = plan.handouts.annotate(match=Min("trial__achieved__match")).order_by("number")
     told = ("match", "trial__setup_took", "trial__episode__policy")
     found = []
-    for *plain, took, policy in rows.values_list(
-        *fields, *(f"trial__{name}" for name in (*own, *voided)), *told
-    ):
+    named = [f"trial__{name}" for name in (*own, *voided)]
+    for row in rows.values_list(*fields, *named, *told):
+        plain, took, policy = row[:-2], row[-2], row[-1]
         latency = _number(policy, "latency_ms", "p50")
         delays = (_number(took, "connect_s"), _number(took, "warm_up_s"), latency and latency / 1000)
         found.append(Run(*plain, *delays))
@@ -119,8 +119,9 @@ def balance(runs: Iterable[Run], name: str) -> dict[str, Any]:
     names = sorted({run.checkpoint for run in counted})
     for run in counted:
         counts[getattr(run, name)][run.checkpoint] += 1
-    rows = [{"name": who, "trials": [of[each] for each in names]} for who, of in sorted(counts.items())]
-    uneven = max((max(row["trials"]) - min(row["trials"]) for row in rows), default=0)
+    trials = {who: [of[each] for each in names] for who, of in sorted(counts.items())}
+    uneven = max((max(made) - min(made) for made in trials.values()), default=0)
+    rows = [{"name": who, "trials": made} for who, made in trials.items()]
     return {"checkpoints": names, "rows": rows, "uneven": uneven}
 
 
@@ -302,6 +303,7 @@ def _compared(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
     tested = sum(row["p"] is not None for row in rows)
     return {
         "alpha": plan.alpha,
+        "comparison": names,
         "rows": rows,
         "tested": tested,
         "differing": [row["what"] for row in differing],
@@ -311,7 +313,7 @@ def _compared(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
 def _tested(
     values: Iterable[tuple[str, Sequence[tuple[int, str, float | None]]]], names: Sequence[str]
 ) -> list[dict[str, Any]]:
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, told in values:
         known = [(block, checkpoint, value) for block, checkpoint, value in told if value is not None]
         if not known:
@@ -340,20 +342,17 @@ def _tested(
                 "p": test.p if test else 1.0 if pairs else None,
             }
         )
-    tested = [row for row in rows if row["p"] is not None]
-    for row, corrected in zip(tested, holm([row["p"] for row in tested]), strict=True):
-        row["corrected"] = corrected
-    return [{"corrected": None, **row} for row in rows]
+    corrected = iter(holm([row["p"] for row in rows if row["p"] is not None]))
+    return [{**row, "corrected": None if row["p"] is None else next(corrected)} for row in rows]
 
 
 def _gaps(runs: Iterable[Run]) -> dict[int, float]:
     """Of each attempt that ran, by its number, the time since the one before at its station ended [s]."""
     ended: dict[str, datetime] = {}
     found = {}
-    for run in sorted(
-        (run for run in runs if run.started_at is not None), key=lambda run: (run.started_at, run.number)
-    ):
-        gap = _seconds(ended.get(run.station), run.started_at)
+    begun = [(run.started_at, run.number, run) for run in runs if run.started_at is not None]
+    for started_at, _, run in sorted(begun, key=lambda row: row[:2]):
+        gap = _seconds(ended.get(run.station), started_at)
         if gap is not None:
             found[run.number] = gap
         if run.ended_at is not None:

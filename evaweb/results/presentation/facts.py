@@ -12,7 +12,7 @@ from evaweb.results.analysis.filters import Chosen
 from evaweb.results.presentation.addresses import compare_address
 from evaweb.results.presentation.drawings import rates
 from evaweb.results.presentation.headline import headline
-from evaweb.results.presentation.wording import evidence_words, missed, points, probability, verdict
+from evaweb.results.presentation.wording import evidence_words, missed, p_words, points, probability, verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,17 +56,17 @@ def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator
     fixed = "n as planned" if plan.stopping == StoppingRule.NONE else "as if n had been fixed"
     yield Fact("How much better?", "Newcombe, 95 %", points(found.difference))
     corrected = f", Holm {probability(found.corrected)}" if len(analysis.comparisons) > 1 else ""
-    chance = f"p = {probability(found.test.p)}{corrected}"
+    chance = f"{p_words(found.test.p)}{corrected}"
     yield Fact("Could it be chance?", f"Barnard, two-sided, {fixed}", chance)
     if found.paired:
         split = (
             f"only {found.first} {found.paired.first_only}, only {found.second} {found.paired.second_only}"
         )
-        of_pairs = f"p = {probability(found.paired.p)} of {found.pairs} pairs ({split})"
+        of_pairs = f"{p_words(found.paired.p)} of {found.pairs} pairs ({split})"
         yield Fact("The same, pair by pair?", "McNemar, exact", of_pairs)
     if found.scored:
         gain = f"{100 * found.scored.value:+.0f} points".replace("-", "−")
-        of_scores = f"{gain} of the score, p = {probability(found.scored.p)} of {found.pairs} pairs"
+        of_scores = f"{gain} of the score, {p_words(found.scored.p)} of {found.pairs} pairs"
         yield Fact("With partial credit, n as planned?", "sign flips within pairs, exact", of_scores)
     if found.clustered:
         yield Fact(
@@ -97,7 +97,7 @@ def _beyond(found: Comparison) -> Iterator[Fact]:
         by = f"{abs(found.sooner.value):.1f} s"
         lead = f"{ahead} by {by}, failures counted in full" if found.sooner.value else "neither"
         how = "sign flips of times within pairs, exact"
-        yield Fact("Sooner?", how, f"{lead}, p = {probability(found.sooner.p)} of {found.sooner.pairs} pairs")
+        yield Fact("Sooner?", how, f"{lead}, {p_words(found.sooner.p)} of {found.sooner.pairs} pairs")
     believed = f"{found.first} is better with probability {_chance(found.better)}"
     yield Fact("What to believe?", "uniform priors", believed)
 

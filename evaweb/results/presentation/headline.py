@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from evaweb.plans.design import frozen, tried
 from evaweb.plans.models import Plan, PlanState
-from evaweb.results.presentation.wording import points, probability
+from evaweb.results.presentation.wording import p_words, points
 from evaweb.statistics.designs import SUCCESS, Conclusion, Design, conclude
 from evaweb.statistics.difference import newcombe
 
@@ -97,13 +97,11 @@ def _counts(found: Design, conclusion: Conclusion, pairs: list[tuple[float, floa
     n = len(pairs)
     one, other = sum(a for a, _ in pairs), sum(b for _, b in pairs)
     if found.outcome != SUCCESS:
-        chance = "" if conclusion.p is None else f", p = {probability(conclusion.p)},"
+        chance = "" if conclusion.p is None else f", {p_words(conclusion.p)},"
         return f"mean scores {one / n:.2f} and {other / n:.2f}{chance} after {n} pairs"
     words = f"{one:.0f}/{n} against {other:.0f}/{n}"
     if (
         conclusion.p is not None
     ):  # of a fixed number of pairs: an interval of the difference means what it says
-        words += (
-            f", difference {points(newcombe(int(one), n, int(other), n))}, p = {probability(conclusion.p)}"
-        )
+        words += f", difference {points(newcombe(int(one), n, int(other), n))}, {p_words(conclusion.p)}"
     return f"{words}, after {n} of {found.pairs} pairs"

@@ -7,7 +7,7 @@ from typing import Any
 
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.conduct import conduct_of, runs_of
-from evaweb.results.presentation.wording import probability
+from evaweb.results.presentation.wording import p_words
 from evaweb.results.presentation.would_be import would_be
 
 
@@ -25,20 +25,17 @@ def delays_banner(found: Mapping[str, Any]) -> str:
     rows = [row for row in delays["rows"] if row["what"] in delays["differing"]]
     if not rows:
         return ""
+    first, second = delays["comparison"]
     said = "; ".join(
-        f"{row['what']}, by {_seconds(row['difference'])} s, p = {probability(row['corrected'])}"
-        for row in rows
+        f"{row['what']}, by {_seconds(row['difference'])} s, {p_words(row['corrected'])}" for row in rows
     )
     return (
-        f"The compared checkpoints were not treated alike in time: {said}. Were delays the same but for chance, a "
+        f"Delays of {first} and {second} differ: {said}. Were delays the same but for chance, a "
         f"difference as wide would come about so rarely (sign flips within pairs, Holm over {delays['tested']})"
     )
 
 
 def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
-    banner = delays_banner(found)
-    if banner:
-        yield banner
     other = [row["what"] for row in found["headline"] if row["same"] is False]
     if other:
         yield f"The headline would be another one {'; '.join(other)}"

@@ -32,6 +32,11 @@ def probability(p: float) -> str:
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
+def p_words(p: float) -> str:
+    """ "p = 0.03" or "p < 0.001"."""
+    return f"p {said}" if (said := probability(p)).startswith("<") else f"p = {said}"
+
+
 def verdict(found: Comparison, one: Proportion, other: Proportion, alpha: float) -> str:
     """The comparison in one sentence, with its evidence; says only what the corrected exact test says."""
     difference = found.difference

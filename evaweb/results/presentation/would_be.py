@@ -20,7 +20,8 @@ def would_be(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
     same checkpoint is ahead by the design. None without a comparison.
 
     A part is left out by whole pairs. What is left is judged by the rule of the design as if it had foreseen so many
-    pairs; where the design did not end nothing is left out, for nothing was concluded. `matches` is the lowest of each trial's bench, where one was measured.
+    pairs; where the design did not end nothing is left out, for nothing was concluded. `matches` is the lowest match
+    of each trial's bench, where one was measured.
     """
     found = frozen(plan.document) if plan.document else None
     if found is None:

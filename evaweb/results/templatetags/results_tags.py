@@ -53,6 +53,12 @@ def probability(p: float) -> str:
 
 
 @register.filter
+def p_words(p: float) -> str:
+    """The same with its p."""
+    return wording.p_words(p)
+
+
+@register.filter
 def outcome_words(run: Outcome) -> str:
     """Success or failure, and the score where that says more."""
     said = "success" if run.success else ": ".join(filter(None, ("failure", run.why)))
@@ -109,7 +115,7 @@ def listed(found: list[Any], what: str) -> str:
         return "none"
     names = ", ".join(str(each) for each in found[:_MOST_NAMED])
     more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
-    return f"{len(found)}: {what} {names}{more}"
+    return f"{len(found)} ({what}{'s' * (len(found) > 1)} {names}{more})"
 
 
 @register.filter

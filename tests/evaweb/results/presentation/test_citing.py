@@ -7,9 +7,11 @@ import pytest
 from django.test import Client
 
 from evaweb.plans.design import at_the_reveal
-from evaweb.plans.services import plan_reveal
+from evaweb.plans.models import Plan
+from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
 from evaweb.results.presentation.citing import citation
 from evaweb.results.presentation.latex import escaped, foreign
+from evaweb.results.presentation.wording import p_words
 from evaweb.trials import services
 from tests.evaweb.trials import builders
 
@@ -131,6 +133,57 @@ def test_before_the_reveal_there_is_nothing_to_cite(plan, owner, carry_out, clie
     assert client.get(f"/result/frozen/{digest}/").status_code == 404
     plan_reveal(user=owner, plan=plan)
     assert client.get(f"/result/frozen/{digest}/").status_code == 200
+
+
+def test_it_is_sealed_while_another_blind_plan_compares_the_same_checkpoint(
+    revealed, owner, bench, client, address
+):
+    again = Plan.objects.create(name="again", title="Again", owner=owner)
+    again.checkpoints.set([bench.checkpoint])
+    again.positions.set(bench.scene.positions.all())
+    plan_freeze(user=owner, plan=again)
+    page = client.get(address).content.decode()
+    assert "Sealed" in page
+    for answer in (
+        *(client.get(f"{address}result.{form}") for form in FORMS),
+        client.get(f"/api/v1/results/frozen/{revealed.at_reveal['digest']}"),
+        client.get("/api/v1/plans/blocks/1/integrity"),
+    ):
+        assert answer.status_code == 403
+        assert "pi0-new" not in answer.content.decode()
+    assert "pi0-new" not in page + client.get("/result/plans/blocks/1/integrity/").content.decode()
+
+
+def test_an_open_plan_that_has_ended_is_cited_as_it_is_now(plan, owner, bench, carry_out, client):
+    other = Plan.objects.create(
+        name="open",
+        title="Open",
+        owner=owner,
+        blind=False,
+        first=plan.first,
+        second=plan.second,
+        repetitions=1,
+    )
+    other.checkpoints.set([plan.first, plan.second])
+    other.positions.set(bench.scene.positions.all())
+    carry_out(plan, 16)
+    plan_reveal(user=owner, plan=plan)
+    plan_freeze(user=owner, plan=other)
+    carry_out(other, 2)
+    address = "/result/plans/open/1/cite/"
+    going_on = client.get(address)
+    assert (
+        going_on.status_code,
+        "a result is cited once the plan is closed" in going_on.content.decode(),
+    ) == (409, True)
+    plan_close(user=owner, plan=other, reason="enough")
+    page = client.get(address).content.decode()
+    assert "As it is now: a correction changes it" in page
+    assert "were not compared: closed after 1 of 2 pairs" in page
+
+
+def test_a_p_below_all_that_is_told_has_one_sign():
+    assert [p_words(p) for p in (0.0001, 0.0123, 0.5)] == ["p < 0.001", "p = 0.012", "p = 0.50"]
 
 
 def test_a_reveal_that_kept_its_pairs_alone_is_cited_by_them(revealed):

@@ -15,7 +15,8 @@ from evaweb.results.analysis.caching import analysis_of
 from evaweb.results.models import Judgement
 from evaweb.results.ratings import judging
 from evaweb.results.reports.checklist import checklist
-from evaweb.results.reports.reporting import write_report
+from evaweb.results.reports.recompute.sealed import faults
+from evaweb.results.reports.reporting import seal_of, write_report
 from evaweb.trials import services
 from tests.evaweb.plans.lab import jpeg
 from tests.evaweb.trials import builders
@@ -267,3 +268,18 @@ def test_a_download_has_so_many_pictures_and_says_so(revealed, laid_out, tmp_pat
     page = write_report(revealed, tmp_path / "few", most_pictures=len(jpeg(2))).read_text("utf-8")
     assert len(list((tmp_path / "few" / "data" / "pictures").iterdir())) == 1
     assert "2 pictures of benches are not in this report" in page
+
+
+def test_it_says_how_the_trials_were_made(revealed, tmp_path):
+    page = write_report(revealed, tmp_path / "whole").read_text("utf-8")
+    record = json.loads((tmp_path / "whole" / "data" / "integrity.json").read_text("utf-8"))
+    assert record["headline"][0]["what"] == "as it was decided"
+    assert "Deviations from the schedule" in page
+    assert "/result/plans/" not in page
+
+
+def test_the_sums_that_the_reveal_kept_are_under_its_digest(revealed):
+    seal = json.loads(json.dumps(seal_of(revealed)))
+    assert faults(seal, revealed.document, []) == []
+    seal["at_reveal"]["arms"][0]["successes"] += 1
+    assert "not the digest" in faults(seal, revealed.document, [])[0]
