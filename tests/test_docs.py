@@ -146,7 +146,9 @@ def test_every_key_of_a_page_is_in_the_operators_document():
 
 def test_every_address_of_the_interface_is_in_its_document():
     described = set(re.findall(r'"(/api/v1/[^"]*)": \{', text("docs/openapi.json")))
-    parameters = {f"{{{name}}}": name.upper() for name in ("name", "id", "uuid", "version", "checkpoint")}
+    parameters = {
+        f"{{{name}}}": name.upper() for name in ("name", "id", "uuid", "version", "checkpoint", "digest")
+    }
     for address in described:
         shown = address
         for given, word in parameters.items():

@@ -71,10 +71,22 @@ def kept_faults(
         if said != kept and (newest or row["status"] == "scored"):
             found.append(f"trial {row['trial']} is said to be {said}, its newest score is {kept}")
     if at_reveal is not None and not found:
-        pairs = [list(pair) for pair in pairs_of([_stood(row, given, at_reveal["at"]) for row in rows], plan)]
+        stood = [_stood(row, given, at_reveal["at"]) for row in rows]
+        pairs = [list(pair) for pair in pairs_of(stood, plan)]
         if pairs != [[float(one), float(other)] for one, other in at_reveal["pairs"]]:
             found.append("the pairs of the reveal are not those of the scores that stood then")
+        found += [
+            f"the sums of {arm['checkpoint']} at the reveal are not those of the scores that stood then"
+            for arm in at_reveal.get("arms", ())  # which came later than the pairs
+            if not _adds_up(arm, [row for row in stood if row.status and row.checkpoint == arm["checkpoint"]])
+        ]
     return found
+
+
+def _adds_up(arm: Mapping[str, Any], rows: Sequence[_Stood]) -> bool:
+    if (arm["n"], arm["successes"]) != (len(rows), sum(row.success for row in rows)):
+        return False
+    return not rows or abs(arm["score"] - sum(row.score for row in rows) / len(rows)) < 1e-9
 
 
 @dataclass(frozen=True)

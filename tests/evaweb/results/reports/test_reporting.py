@@ -159,15 +159,29 @@ def test_a_trial_that_was_taken_out_or_of_another_checkpoint_is_found(report):
     assert "is not what the schedule foresaw" in recompute(report).stdout
 
 
-def test_pairs_of_the_reveal_that_were_forged_with_their_digest_are_found(report):
+def forged(report, change):
+    """What the program says of a seal whose reveal was changed, with a digest that fits."""
     data = report / "data"
     seal, plan = (json.loads((data / name).read_text("utf-8")) for name in ("seal.json", "plan.json"))
-    seal["at_reveal"]["pairs"] = [[other, one] for one, other in seal["at_reveal"]["pairs"]]
-    seal["at_reveal"]["digest"] = digest(
-        {"plan": digest(plan), **{name: seal["at_reveal"][name] for name in ("pairs", "arms")}}
-    )
+    held = {name: seal["at_reveal"][name] for name in ("pairs", "arms")}
+    change(held)
+    seal["at_reveal"] |= {**held, "digest": digest({"plan": digest(plan), **held})}
     (data / "seal.json").write_text(json.dumps(seal), "utf-8")
-    assert "the pairs of the reveal are not those of the scores that stood then" in recompute(report).stdout
+    return recompute(report).stdout
+
+
+def test_pairs_of_the_reveal_that_were_forged_with_their_digest_are_found(report):
+    said = forged(report, lambda held: held.update(pairs=[[two, one] for one, two in held["pairs"]]))
+    assert "the pairs of the reveal are not those of the scores that stood then" in said
+
+
+def test_sums_of_the_reveal_that_were_forged_with_their_digest_are_found(report):
+    def change(held):
+        held["arms"][0]["score"] += 0.01
+
+    said = forged(report, change)
+    assert "the sums of pi0-block at the reveal are not those of the scores that stood then" in said
+    assert "sums of pi0-new" not in said
 
 
 @pytest.mark.parametrize(("column", "value"), [("success", None), ("score", "0.125"), ("trial", "99999")])
