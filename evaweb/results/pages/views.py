@@ -19,7 +19,6 @@ from evaweb.blinding import sight_for
 from evaweb.errors import EvaError
 from evaweb.plans import services
 from evaweb.plans.blinding_rules import look, may_look
-from evaweb.plans.design import pairs_of
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results import selectors
 from evaweb.results.analysis import caching
@@ -232,14 +231,12 @@ def _citation_page(request: HttpRequest, cited: Citation) -> HttpResponse:
         )
         for part, title in (("sentence", "Sentence"), ("table", "Table"), ("figure", "Figure"))
     ]
-    later = cited.digest and pairs_of(cited.plan) != [tuple(pair) for pair in cited.kept["pairs"]]
     context = {
         **_common(request, cited.plan),
         "cited": cited,
         "head": HEAD,
         "parts": parts,
         "forms": _FORMS,
-        "later": later,
     }
     return render(request, "results/cite.html", context)
 

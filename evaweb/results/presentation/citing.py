@@ -119,6 +119,12 @@ class Citation:
         """The rows of the figure."""
         return [(row.checkpoint, row.success) for row in self.rows if row.success is not None]
 
+    @property
+    def corrected(self) -> bool:
+        """Whether scores were corrected, or came, after the reveal."""
+        now = at_the_reveal(self.plan) or {}
+        return any(now[name] != self.kept[name] for name in ("pairs", "arms") if name in self.kept)
+
     @cached_property
     def text(self) -> dict[str, str]:
         """Sentence, table and figure as plain text."""

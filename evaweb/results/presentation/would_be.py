@@ -29,7 +29,7 @@ def would_be(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
     attempts = attempts_of(plan)
     kept = tuple((one, other) for one, other in plan.at_reveal["pairs"]) if plan.at_reveal else None
     at = (tuple(attempts), kept, tuple(sorted(matches.items())), plan.state)
-    return _kept.get(plan.pk, at, lambda: list(_ways(plan, found, attempts, matches, kept)))
+    return _kept.get((plan.pk, plan.digest), at, lambda: list(_ways(plan, found, attempts, matches, kept)))
 
 
 def _ways(

@@ -6,7 +6,6 @@ import pytest
 from django.db import connection
 from django.test import Client
 from django.test.utils import CaptureQueriesContext
-from django.utils import timezone
 
 from evaweb.plans.allocation import give_back, hand_out
 from evaweb.plans.blinding_rules import look
@@ -24,16 +23,13 @@ ADDRESS = "/result/plans/blocks/1/integrity/"
 
 @pytest.fixture
 def make(bench, plan):
-    """Makes the next trial: `wait` [s] from hand-out to run by checkpoint, everything else a moment apart."""
-    at = timezone.now() - timedelta(hours=5)
+    """Makes the next trial: `wait` [s] from hand-out to run by checkpoint."""
 
     def one(wait=None, success=None, user=bench.operator, station=bench.station, **facts):
-        nonlocal at
         trial = hand_out(user=user, station=station, plan=plan).trial
         builders.over(trial, 9.0, **facts)
         name = trial.checkpoint.name
         seconds = (wait or {}).get(name, 10 + trial.number % 2)
-        at += timedelta(seconds=60)
         begun = trial.handout.handed_at + timedelta(seconds=seconds)
         took = {"connect_s": 1.0, "warm_up_s": 2.0}
         Trial.objects.filter(pk=trial.pk).update(

@@ -113,6 +113,17 @@ def test_what_is_corrected_later_changes_no_byte(revealed, bench, client, addres
     assert told["later"] == "/api/v1/plans/blocks/1/integrity"
 
 
+def test_a_correction_of_points_alone_is_said_too(revealed, bench, client, address):
+    said = "Scores were corrected after the reveal"
+    assert said not in client.get(address).content.decode()
+    trial = revealed.handouts.filter(trial__verdict__success=False).first().trial
+    reached = not trial.verdict.outcomes.get(order=1).reached
+    services.trial_score(
+        user=bench.operator, trial=trial, milestones=bench.ticks(reached, reached, False), reason="seen again"
+    )
+    assert said in client.get(address).content.decode()
+
+
 def test_the_plan_leads_to_its_address_and_no_other_digest_to_anything(revealed, client, address):
     assert client.get("/result/plans/blocks/1/cite/").headers["Location"] == address
     assert 'href="/result/plans/blocks/1/cite/"' in client.get("/result/plans/blocks/1/").content.decode()
