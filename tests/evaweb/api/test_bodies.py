@@ -22,7 +22,7 @@ def posts():
     """The addresses that take a body."""
     for path, methods in sorted(api.get_openapi_schema()["paths"].items()):
         if "requestBody" in methods.get("post", {}):
-            numbered = path.startswith("/api/v1/trials/")
+            numbered = path.startswith(("/api/v1/trials/", "/api/v1/references/"))
             yield path.replace("{id}", "1" if numbered else str(uuid.UUID(int=1)))
 
 
