@@ -24,7 +24,7 @@ _LABS = (  # whole labs and stations in real time: so many of their files at onc
     "tests/runtime/sim/test_ros2_node.py",
 )
 _AT_ONCE = max(2, os.cpu_count() or 1)
-_GIVES_WAY = 5
+_GIVES_WAY = 2
 _OF_ONE_LAB = {  # fixtures of tests/e2e, and the files that use them: side by side each would start a lab of its own
     "patient": "story curves datasets debug_modes layout policy preflight replay_on_robot review plan",
     "shared": "faults stop_process lifetime",

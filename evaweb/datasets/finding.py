@@ -23,6 +23,7 @@ _OWN = frozenset(
         *(
             "episodes",
             "previews",
+            "reveals",
             "exports",
             "labels",
             "quality",

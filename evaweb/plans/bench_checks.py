@@ -185,7 +185,12 @@ class Seen:
 
 
 def bench_now(*, trial: Trial) -> list[Seen]:
-    """What each camera with a reference of the trial's position shows now, before the run, and how well it matches."""
+    """What each camera with a reference of the trial's position shows now, before the run, and how well it matches.
+
+    Nothing once it is not prepared any more: a page that asks again and again may be a moment late.
+    """
+    if trial.status != TrialStatus.PREPARED:
+        return []
     known = references(station=trial.station, position=trial.position)
     return _look(trial, [camera for camera in cameras_of(trial.station) if camera in known], 1.0)
 

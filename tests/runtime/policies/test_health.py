@@ -99,7 +99,7 @@ def test_a_server_that_hangs_up_is_lost() -> None:
 
 
 def built(url: str, **settings: str) -> OpenpiPolicy:
-    config = openpi.Config(url=url, connect_deadline=10.0, **settings)  # type: ignore[arg-type]
+    config = openpi.Config(url=url, connect_deadline=60.0, **settings)  # type: ignore[arg-type]
     return openpi.build(config, FRANKA, MonotonicClock(), 30.0)
 
 
