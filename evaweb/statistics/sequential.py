@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from evaweb.statistics.base import check_alpha, check_share
 
 ALPHA = 0.05
-_STAKES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of all that a gambler has, on each pair
+STAKES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of all that a gambler has, on each pair
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +92,9 @@ def _bets(differences: Sequence[float]) -> list[float]:
     """Log worth after each of `differences` (-1 to 1) of gamblers who bet that their mean is above 0, each a stake of
     its own, with equal shares of the money: which stake is good need not be guessed from what came before.
     """
-    worths, path = [0.0] * len(_STAKES), []
+    worths, path = [0.0] * len(STAKES), []
     for d in differences:
-        worths = [worth + math.log1p(stake * d) for worth, stake in zip(worths, _STAKES, strict=True)]
+        worths = [worth + math.log1p(stake * d) for worth, stake in zip(worths, STAKES, strict=True)]
         most = max(worths)
         path.append(most + math.log(math.fsum(math.exp(worth - most) for worth in worths) / len(worths)))
     return path
