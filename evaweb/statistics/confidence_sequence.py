@@ -61,6 +61,6 @@ def _most(shares: NDArray[np.float64], seen: NDArray[np.float64]) -> float:
     """
     import numpy as np
 
-    stakes = np.array(STAKES)
-    worths = seen @ np.log1p(stakes * (shares[:, None] - 1))
-    return float(np.logaddexp.reduce(worths, axis=1).max()) - math.log(len(stakes))
+    worths = seen @ np.log1p(np.array(STAKES) * (shares[:, None] - 1))
+    most = float(worths.max())
+    return most + math.log(float(np.exp(worths - most).sum(axis=1).max()) / len(STAKES))

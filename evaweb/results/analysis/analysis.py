@@ -15,6 +15,7 @@ from evaweb.results.analysis.outcomes import Interruption, Outcome, Pair, by_che
 from evaweb.statistics import strata
 from evaweb.statistics.base import LEVEL, Interval, StatisticsError
 from evaweb.statistics.bounded import Mean, bounded_mean
+from evaweb.statistics.confidence_sequence import confidence_sequence
 from evaweb.statistics.difference import Difference, ExactTest, barnard, newcombe, probability_better
 from evaweb.statistics.many import holm, letters
 from evaweb.statistics.means import Average, average
@@ -94,7 +95,9 @@ class Comparison:
 
     `test` is Barnard's and `corrected` its probability after Holm's correction for all pairs of the evaluation; valid
     for a number of trials fixed beforehand, as is `scored`, of the pairs' scores. `evidence` and `score_evidence` may
-    be looked at any time. `sooner` is of times to success [s], pair by pair, failures counted as the horizon.
+    be looked at any time, as may `anytime` and `score_anytime`: what the mean difference of the pairs' successes, and
+    scores, can be, at 1 less the evidence's alpha; None where no one difference fits all pairs. `sooner` is of times
+    to success [s], pair by pair, failures counted as the horizon.
     """
 
     first: str
@@ -110,6 +113,8 @@ class Comparison:
     stratified: strata.Stratified | None
     evidence: Evidence
     score_evidence: Evidence
+    anytime: Interval | None
+    score_anytime: Interval | None
     sooner: Flips | None
     notes: tuple[str, ...]
 
@@ -297,6 +302,8 @@ def _comparison(
         _said(notes, lambda: _stratified(first, second)),
         success_evidence([(p.first.success, p.second.success) for p in pairs], alpha),
         score_evidence([(p.first.score, p.second.score) for p in pairs], alpha),
+        confidence_sequence([float(p.first.success) - p.second.success for p in pairs], alpha),
+        confidence_sequence([p.first.score - p.second.score for p in pairs], alpha),
         _sooner(pairs, timing),
         (*notes, *_waiting(pairs, first, second)),
     )

@@ -20,7 +20,7 @@ from evaweb.results.presentation.drawings.svg import Drawing
 from evaweb.results.presentation.facts import comparison_facts, comparison_sentence, missed_words, primary_of
 from evaweb.results.presentation.headline import headline
 from evaweb.results.presentation.listings import MOST_PAIRS, arm_rows, failure_tables, pair_rows, scene_rows
-from evaweb.results.presentation.wording import evidence_words
+from evaweb.results.presentation.wording import anytime_words, evidence_words
 from evaweb.trials.failures import in_order
 
 
@@ -130,6 +130,9 @@ def _evidence(plan: Plan, at: Hashable) -> dict[str, Any]:
         "headline": headline(plan),
         "words": evidence_words(found.evidence),
         "score_words": evidence_words(found.score_evidence),
+        "difference": anytime_words(found.anytime, found.pairs),
+        "score_difference": anytime_words(found.score_anytime, found.pairs),
+        "level": 100 * (1 - plan.alpha),
         "wanted": 2 / plan.alpha,
         "missed": missed_words(analysis, found),
     }

@@ -12,7 +12,15 @@ from evaweb.results.analysis.filters import Chosen
 from evaweb.results.presentation.addresses import compare_address
 from evaweb.results.presentation.drawings import rates
 from evaweb.results.presentation.headline import headline
-from evaweb.results.presentation.wording import evidence_words, missed, p_words, points, probability, verdict
+from evaweb.results.presentation.wording import (
+    anytime_words,
+    evidence_words,
+    missed,
+    p_words,
+    points,
+    probability,
+    verdict,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +91,12 @@ def _of_the_evidence(found: Comparison) -> Iterator[Fact]:
         "betting e-process on scores",
         evidence_words(found.score_evidence),
     )
+    for question, interval in (
+        ("How much better, at any time?", found.anytime),
+        ("With partial credit, how much at any time?", found.score_anytime),
+    ):
+        how = f"confidence sequence, {100 * (1 - found.evidence.alpha):.3g} %"
+        yield Fact(question, how, anytime_words(interval, found.pairs))
 
 
 def _beyond(found: Comparison) -> Iterator[Fact]:

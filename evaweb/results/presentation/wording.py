@@ -76,6 +76,11 @@ def evidence_words(found: Evidence) -> str:
     return f"not enough after {found.pairs} pairs (e = {_power(e)}, wanted {2 / found.alpha:.0f})"
 
 
+def anytime_words(found: Interval | None, pairs: int) -> str:
+    """ "[−3, 55] points, of 40 pairs"."""
+    return f"[{ends(found)}] points, of {pairs} pairs" if found else "no one difference fits all pairs"
+
+
 def _power(log_e: float) -> str:
     return f"{2.718281828459045**log_e:.2g}" if log_e < 12 else f"10^{log_e / 2.302585:.0f}"
 

@@ -103,6 +103,11 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
         },
         "evidence": _evidence(found.evidence),
         "score_evidence": _evidence(found.score_evidence),
+        "anytime": {
+            "level": 1 - found.evidence.alpha,
+            "success": _ends(found.anytime),
+            "score": _ends(found.score_anytime),
+        },
         "sooner": found.sooner
         and {"pairs": found.sooner.pairs, "value_s": found.sooner.value, "p": found.sooner.p},
     }

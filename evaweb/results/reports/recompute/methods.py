@@ -15,6 +15,8 @@ def solve(rises: Callable[[float], float], wanted: float, low: float, high: floa
     """Argument, from `low` to `high`, at which a rising function has the `wanted` value."""
     for _ in range(200):
         middle = (low + high) / 2
+        if not low < middle < high:
+            break  # there is no number between them
         low, high = (middle, high) if rises(middle) < wanted else (low, middle)
     return (low + high) / 2
 
@@ -227,11 +229,27 @@ def score_bets(differences: Sequence[float]) -> list[float]:
     """
     log_e, path, owned = 0.0, [], {stake / 10: 0.2 for stake in (1, 3, 5, 7, 9)}
     for difference in differences:
-        gain = 1 + difference * sum(stake * share for stake, share in owned.items())
-        owned = {stake: share * (1 + difference * stake) / gain for stake, share in owned.items()}
+        grown = {stake: share * (1 + difference * stake) for stake, share in owned.items()}
+        gain = sum(grown.values())
+        owned = {stake: share / gain for stake, share in grown.items()}
         log_e += math.log(gain)
         path.append(log_e)
     return path
+
+
+def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
+    """The means that no bet has refuted after any pair: those of `score_bets`, of how far each difference is from m
+    on a scale on which the least, -1, is at -1 and m at 0."""
+
+    def refuted(given: Sequence[float]) -> float:
+        def stands(mean: float) -> float:
+            return -max(score_bets([(1 + d) / (1 + mean) - 1 for d in given]), default=0.0)
+
+        least = -1 + 1e-12
+        return solve(stands, math.log(alpha / 2), least, 1.0) if stands(least) < math.log(alpha / 2) else -1.0
+
+    low, high = refuted(differences), -refuted([-d for d in differences])
+    return [low, high] if low <= high else None
 
 
 def sign_flips(differences: Sequence[float], widest: float = 1.0) -> float:

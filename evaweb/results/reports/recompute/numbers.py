@@ -291,6 +291,11 @@ def _comparison(
             methods.score_bets([b.score - a.score for a, b in pairs]),
             alpha,
         ),
+        "anytime": {
+            "level": 1 - alpha,
+            "success": methods.anytime([a.success - b.success for a, b in pairs], alpha),
+            "score": methods.anytime([a.score - b.score for a, b in pairs], alpha),
+        },
         "sooner": _sooner(pairs, timing),
     }
 

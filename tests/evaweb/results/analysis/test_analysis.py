@@ -73,6 +73,8 @@ def test_a_comparison_has_all_its_evidence():
     )  # of five positions, not of 40 trials
     assert compared.stratified is None
     assert compared.evidence.winner == compared.score_evidence.winner == "second"
+    assert compared.anytime.low < compared.difference.value < compared.anytime.high < 0
+    assert compared.score_anytime.high < 0
 
 
 def timed(name, rows):
@@ -120,6 +122,7 @@ def test_three_checkpoints_are_corrected_for_three_comparisons():
     assert found.letters["a"] == found.letters["b"] == "a"
     assert found.letters["c"] == "b"
     assert {c.evidence.alpha for c in found.comparisons} == {0.05 / 3}
+    assert {c.anytime.level for c in found.comparisons} == {1 - 0.05 / 3}
     planned = analyse(trials({"a": 0.9, "b": 0.85, "c": 0.2}), primary=("a", "c"))
     shares = {(c.first, c.second): c.evidence.alpha for c in planned.comparisons}
     assert shares == {("a", "b"): 0.05 / 3, ("a", "c"): 0.05, ("b", "c"): 0.05 / 3}

@@ -94,6 +94,7 @@ def test_the_owner_looks_by_an_act_of_their_own(plan, owner, bench, carry_out, a
     meter = client.get(f"{PLAN}evidence/").content.decode()
     assert "Evidence (e-value) after each pair" in meter
     assert "do not show this page" in meter
+    assert "at any time (95 %): by success [" in meter
     assert "Sealed" in as_(bench.operator).get(f"{PLAN}evidence/").content.decode()
 
 
@@ -115,7 +116,15 @@ def test_the_page_says_the_comparison_with_n_and_interval(revealed, as_, viewer)
     text = as_(viewer).get(PLAN).content.decode()
     found = caching.analysis_of(revealed).comparisons[0]
     assert f"difference {100 * found.difference.value:.0f} points [" in text
-    for method in ("Newcombe", "Barnard", "McNemar", "e-process", "uniform priors", "would be missed"):
+    for method in (
+        "Newcombe",
+        "Barnard",
+        "McNemar",
+        "e-process",
+        "confidence sequence, 95 %",
+        "uniform priors",
+        "would be missed",
+    ):
         assert method in text
     assert text.count('<svg class="drawing') >= 7
     assert "Clopper-Pearson" in text

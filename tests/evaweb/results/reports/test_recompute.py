@@ -11,9 +11,11 @@ from evaweb.results.reports.document import analysis_document
 from evaweb.results.reports.recompute import judged, methods
 from evaweb.results.reports.recompute.__main__ import differences
 from evaweb.results.reports.recompute.numbers import Trial, numbers
+from evaweb.statistics.confidence_sequence import confidence_sequence
 from evaweb.statistics.many import holm, letters
 from evaweb.statistics.preference import Comparison, NotIdentifiedError, preferences
 from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha
+from evaweb.statistics.sequential import score_evidence
 
 
 def outcomes(checkpoints, n, scenes, seed):
@@ -139,6 +141,22 @@ def test_letters_and_holm_come_to_the_same():
         methods.letters("ABCD", apart) == letters("ABCD", apart) == {"A": "a", "B": "ab", "C": "bc", "D": "c"}
     )
     assert methods.holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx(holm([0.01, 0.04, 0.03, 0.005]))
+
+
+@pytest.mark.parametrize(
+    "differences",
+    [[], [-1.0], [0.0] * 40, [1.0] * 30 + [-1.0] * 60, [1.0] * 9, [-1.0] * 250, [0.25, -0.5, 1.0] * 30],
+)
+def test_what_a_difference_can_be_at_any_time_comes_to_the_same(differences):
+    found = confidence_sequence(differences, 0.05)
+    mine = methods.anytime(differences, 0.05)
+    assert mine == (found and pytest.approx([found.low, found.high], rel=1e-9, abs=1e-10))
+
+
+def test_a_bet_on_scores_comes_to_the_same_after_its_luck_has_turned():
+    differences = [1.0] * 125 + [-1.0] * 125
+    lab = score_evidence([(max(d, 0.0), max(-d, 0.0)) for d in differences])
+    assert methods.score_bets(differences) == pytest.approx(lab.first)
 
 
 def test_published_values():

@@ -110,6 +110,7 @@ WAYS = (
     ("arms", "pi0-block", "smoothness_commanded", "mean"),
     ("comparisons", 0, "barnard", "p"),
     ("comparisons", 0, "evidence", "log_e_first", 3),
+    ("comparisons", 0, "anytime", "success", 0),
     ("agreement", "success", "ac1"),
     ("judges", 0, "milestones", "held", "agreement", "kappa"),
     ("judges", 0, "milestones", "lifted", "brier"),
