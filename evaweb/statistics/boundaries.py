@@ -173,14 +173,15 @@ class Boundary:
         import numpy as np
 
         alive, before = np.ones((1, 1)), (0, 0)
-        for look, region in zip(self.looks, self._regions, strict=True):
+        for look, region in zip(self.looks, self.regions, strict=True):
             alive = _grown(alive, look.first - before[0], look.second - before[1], rates)
             before = (look.first, look.second)
             yield look, np.where(region, alive, 0.0)
             alive = np.where(region, 0.0, alive)
 
     @cached_property
-    def _regions(self) -> list[NDArray[np.bool_]]:
+    def regions(self) -> list[NDArray[np.bool_]]:
+        """The tables at which each look stops: bool [first + 1, second + 1]."""
         return [_region(look, self.margin) for look in self.looks]
 
 

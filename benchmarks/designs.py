@@ -1,0 +1,258 @@
+"""How each design of a comparison errs and what it finds: exact where outcomes are successes and failures, simulated
+else; and the coverage of every interval that is shown beside it.
+
+Source of the anchors: STEP (Snyder et al. 2025), a near-optimal sequential test of two policies, as measured by us.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import coverage
+from benchmarks.report import Figure, Report
+from evaweb.statistics.boundaries import Boundary, Look, extremeness
+from evaweb.statistics.courses import course
+from evaweb.statistics.designs import ANYTIME, FIXED, SCORE, conclude, design
+from evaweb.statistics.difference import barnard
+
+SECONDS = coverage.SECONDS
+ALPHA, LOOSE = 0.05, 0.1
+MARGIN = 0.2
+_STEPS = 3  # milestones of a trial with partial credit: its score is how many of them were reached
+_RATES = tuple(round(0.05 * i, 2) for i in range(1, 20))  # at which simulated designs err
+_RUNS_OF_RATES, _SIMULATED = 4000, 0.003  # of `courses`, and what standard error that has at alpha .05
+_RUNS = 1000
+_GRID, _ROUNDS = 15, 6  # of the search over drifts
+Rates = tuple[float, float]
+Courses = list[dict[str, object]]
+
+
+class Case(NamedTuple):
+    """A design as it is frozen, but for its number of pairs; `every` so many of them there is a look."""
+
+    rule: str
+    alpha: float = ALPHA
+    margin: float | None = None
+    every: int = 1
+    outcome: str = "success"
+
+
+class Found(NamedTuple):
+    """Power, the median number of pairs, and the standard error of the power where it was simulated."""
+
+    power: float
+    median: float
+    error: float = 0.0
+
+
+DESIGNS = {
+    "fixed": Case(FIXED),
+    "late": Case("late"),
+    "early": Case("early"),
+    "late_in_tens": Case("late", every=10),
+    "early_in_tens": Case("early", every=10),
+    "fixed_margin": Case(FIXED, margin=MARGIN),
+    "late_margin": Case("late", margin=MARGIN),
+    "early_margin": Case("early", margin=MARGIN),
+    "anytime": Case(ANYTIME),
+    "fixed_scores": Case(FIXED, outcome=SCORE),
+    "anytime_scores": Case(ANYTIME, outcome=SCORE),
+}
+DRIFTING = {
+    **{name: (DESIGNS[name], 50) for name in ("fixed", "late", "early", "late_margin", "early_margin")},
+    "early_at_0.1": (Case("early", LOOSE), 30),
+    "early_margin_at_0.1": (Case("early", LOOSE, MARGIN), 30),
+}
+DIFFERENT: tuple[tuple[Rates, int], ...] = (((0.5, 0.7), 50), ((0.5, 0.8), 50), ((0.5, 0.7), 100))
+SAME: tuple[tuple[Rates, int], ...] = (((0.7, 0.7), 50), ((0.7, 0.7), 100))  # what a margin asks about
+STEP = {((0.5, 0.7), 50): (0.464, 50), ((0.5, 0.8), 50): (0.838, 29), ((0.5, 0.7), 100): (0.780, 68)}
+
+
+def measure(seconds: float, long: bool = False) -> Report:
+    """`type1.DESIGN.N`, `power.` and `median_pairs.DESIGN.P0.P1.N`, `drift.DESIGN.N`, and those of `coverage`; `long`
+    has designs of 250 pairs too.
+    """
+    rows: Courses = []
+    sizes = (50, 100, 250) if long else (50, 100)
+    figures = [*errors(sizes, rows), *powers(rows), *drifts(rows)]
+    covered = coverage.measure(seconds)
+    return Report("designs", [*figures, *covered.figures], [*rows, *covered.rows])
+
+
+def errors(sizes: Sequence[int], rows: Courses) -> Iterator[Figure]:
+    """The largest error over all common rates, with a bound between them; simulated ones may be above alpha by three
+    standard errors.
+    """
+    looser = [(name, case, n) for name, (case, n) in DRIFTING.items() if name not in DESIGNS]
+    for name, case, n in [*((name, case, n) for n in sizes for name, case in DESIGNS.items()), *looser]:
+        if exact := boundary_of(case, n):
+            largest, bound = exact.error()
+            rows.append({"type1": name, "pairs": n, "largest": largest, "bound": bound})
+            yield Figure(f"type1.{name}.{n}", bound, "", f"<= {case.alpha}")
+        else:
+            found = max(
+                (_found(case, (rate, rate), n) for rate in _some(case)), key=lambda found: found.power
+            )
+            rows.append({"type1": name, "pairs": n, "simulated": found.power, "error": found.error})
+            allowed = case.alpha + 3 * math.sqrt(case.alpha * (1 - case.alpha) / _runs(case))
+            yield Figure(f"type1.{name}.{n}", found.power, "", f"<= {allowed:.4f}")
+
+
+def powers(rows: Courses) -> Iterator[Figure]:
+    """Of each design, with scipy's Barnard beside: *late* is wanted within .05 of a fixed number's, *early* within
+    .02 of STEP's after at most a tenth more pairs.
+    """
+    for name, case in DESIGNS.items():
+        for rates, n in SAME if case.margin else DIFFERENT:
+            found, wanted, soon = _found(case, rates, n), "", ""
+            if name == "late":
+                wanted = f">= {_found(DESIGNS['fixed'], rates, n).power - 0.05:.4f}"
+            if name == "early":
+                power, median = STEP[rates, n]
+                wanted, soon = f">= {power - 0.02:.4f}", f"<= {1.1 * median:.1f}"
+            at = f"{name}.{rates[0]}.{rates[1]}.{n}"
+            rows.append({"course": at, **found._asdict()})
+            yield Figure(f"power.{at}", found.power, "", wanted)
+            yield Figure(f"median_pairs.{at}", found.median, "", soon)
+    for rates, n in DIFFERENT:
+        yield Figure(f"power.scipy_barnard.{rates[0]}.{rates[1]}.{n}", _of_scipy(rates, n), "")
+
+
+def drifts(rows: Courses) -> Iterator[Figure]:
+    """The largest error that a search over common rates which change through the day came to: reported, for the
+    designs claim constant rates alone. `type1` beside it is that of constant ones.
+    """
+    for name, (case, n) in DRIFTING.items():
+        exact = boundary_of(case, n)
+        assert exact is not None
+        error, knots = worst_drift(exact)
+        rows.append({"drift": name, "pairs": n, "error": error, "start, middle, end": knots})
+        yield Figure(f"drift.{name}.{n}", error, "")
+
+
+@lru_cache(maxsize=64)
+def boundary_of(case: Case, pairs: int) -> Boundary | None:
+    """What stops it, as an exact boundary; None of an e-process, or of scores. Barnard's test is one of one look."""
+    if case.rule == ANYTIME or case.outcome == SCORE:
+        return None
+    if case.rule == FIXED and case.margin is None:
+        return Boundary((Look(pairs, pairs, _least(pairs, case.alpha)),), case.alpha)
+    looks = range(case.every, pairs, case.every) if case.every > 1 else ()
+    found = design(rule=case.rule, pairs=pairs, alpha=case.alpha, margin=case.margin, looks=looks)
+    return found.boundary
+
+
+def _least(n: int, alpha: float) -> tuple[int, int] | None:
+    """The least extreme table that Barnard's test says something of: it says it of all that are more so."""
+    tables = sorted(
+        ((a, b) for a in range(n + 1) for b in range(a)),
+        key=lambda table: (lambda over, under: over / under)(*extremeness(table[0], n, table[1], n, None)),
+    )
+    low, high = 0, len(tables)
+    while low < high:
+        middle = (low + high) // 2
+        a, b = tables[middle]
+        low, high = (low, middle) if barnard(a, n, b, n).p <= alpha else (middle + 1, high)
+    return tables[low] if low < len(tables) else None
+
+
+def worst_drift(exact: Boundary) -> tuple[float, tuple[float, ...]]:
+    """The largest error found, and the rates at start, middle and end between which the common rate is linear.
+
+    Straight lines from a grid of angles, then ever finer steps of all three around the best one.
+    """
+    angles = np.linspace(0.05, math.pi / 2 - 0.05, _GRID)
+    lines = [(one, (one + other) / 2, other) for one, other in product(angles, repeat=2)]
+    error, best = _worst(exact, lines)
+    step = float(angles[1] - angles[0]) / 2
+    for _ in range(_ROUNDS):
+        around = product((-step, 0.0, step), repeat=3)
+        near = [tuple(float(a + m) for a, m in zip(best, moved, strict=True)) for moved in around]
+        error, best = max((error, best), _worst(exact, near))
+        step *= 0.7
+    return error, tuple(round(math.sin(angle) ** 2, 4) for angle in best)
+
+
+def _worst(exact: Boundary, knots: Sequence[tuple[float, ...]]) -> tuple[float, tuple[float, ...]]:
+    pairs = exact.looks[-1].first
+    places = np.linspace(0, 2, pairs)
+    rates = np.array([np.interp(places, range(3), np.sin(angles) ** 2) for angles in knots])
+    found = errors_at(exact, rates)
+    at = int(found.argmax())
+    return float(found[at]), knots[at]
+
+
+def errors_at(exact: Boundary, rates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Errors where the common rate, before each pair, is one of `rates` [courses, pairs]: float64 [courses]; with a
+    margin both rates keep it, the second `1 - margin` of it.
+    """
+    margin = exact.margin or 0.0
+    pairs = exact.looks[-1].first
+    alive, stopped = np.zeros((len(rates), pairs + 1, pairs + 1)), np.zeros(len(rates))
+    alive[:, 0, 0] = 1.0
+    looks = {look.first: region for look, region in zip(exact.looks, exact.regions, strict=True)}
+    for pair in range(1, pairs + 1):
+        common = (1 - margin) * rates[:, pair - 1, None, None]
+        for axis, rate in ((1, margin + common), (2, common)):
+            alive = alive * (1 - rate) + np.roll(alive * rate, 1, axis=axis)  # nothing is at the last one yet
+        if pair in looks:
+            region = looks[pair]
+            there = alive[:, : pair + 1, : pair + 1]
+            stopped += there[:, region].sum(axis=1)
+            there[:, region] = 0.0
+    return stopped
+
+
+def _some(case: Case) -> tuple[float, ...]:
+    return _RATES if case.outcome != SCORE else _RATES[1::4]
+
+
+def _runs(case: Case) -> int:
+    return _RUNS if case.outcome == SCORE else _RUNS_OF_RATES
+
+
+@lru_cache(maxsize=256)
+def _found(case: Case, rates: Rates, pairs: int) -> Found:
+    """How it ends at these rates, exact where it can be."""
+    if exact := boundary_of(case, pairs):
+        ended = exact.course(*rates)
+        return Found(ended.power, ended.median // 2)
+    if case.outcome == SCORE:
+        return _simulated(case, rates, pairs)
+    of_runs = course(case.rule, pairs, *rates, case.alpha)
+    return Found(of_runs.power, of_runs.median, _error(of_runs.power, _RUNS_OF_RATES))
+
+
+def _simulated(case: Case, rates: Rates, pairs: int) -> Found:
+    """Of scores, each the share of milestones that were reached, at these chances each."""
+    chance = np.random.default_rng(pairs)
+    planned = design(rule=case.rule, pairs=pairs, alpha=case.alpha, outcome=case.outcome)
+    scores = chance.binomial(_STEPS, rates, size=(_RUNS, pairs, 2)) / _STEPS
+    ended = [conclude(planned, [(one, other) for one, other in run]) for run in scores.tolist()]
+    power = sum(found.winner is not None for found in ended) / _RUNS
+    return Found(power, float(np.median([found.at or pairs for found in ended])), _error(power, _RUNS))
+
+
+def _error(share: float, runs: int) -> float:
+    return math.sqrt(share * (1 - share) / runs)
+
+
+def _of_scipy(rates: Rates, n: int) -> float:
+    """Power of scipy's test, table by table; what is as extreme by symmetry is asked once."""
+    from scipy.stats import barnard_exact, binom
+
+    first, second = (binom.pmf(np.arange(n + 1), n, rate) for rate in rates)
+    power = 0.0
+    for a in range(n + 1):
+        for b in range(min(a, n - a + 1)):
+            if barnard_exact([[a, b], [n - a, n - b]]).pvalue <= ALPHA:
+                alike = {(a, b), (b, a), (n - a, n - b), (n - b, n - a)}
+                power += sum(float(first[one] * second[other]) for one, other in alike)
+    return power
