@@ -11,6 +11,7 @@ from robots.broken_pipe import unread_ends
 
 _BENCHMARKS = (
     "coverage",
+    "designs",
     "estop",
     "ik",
     "latency",
@@ -27,7 +28,7 @@ _BENCHMARKS = (
     "wires",
 )
 _SETTABLE = ("latency", "loop")
-_LONG = ("recording",)
+_LONG = ("designs", "recording")
 _SECONDS = 20.0
 
 
@@ -50,7 +51,7 @@ def main() -> int:
         help=f"on top of the deployment, for {' and '.join(_SETTABLE)}: control.realtime=off",
     )
     parser.add_argument(
-        "--long", action="store_true", help=f"more and longer cases, for {' and '.join(_LONG)}"
+        "--long", "--full", action="store_true", help=f"more and longer cases, for {' and '.join(_LONG)}"
     )
     given = parser.parse_args()
     if given.assignments and given.name not in _SETTABLE:

@@ -1,7 +1,8 @@
-"""How often the 95 % intervals of means hold the true mean, from the fewest trials on and with lopsided outcomes."""
+"""How often the 95 % intervals that are shown hold the truth, from the fewest trials on and with lopsided outcomes."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,8 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Figure, Report
+from evaweb.statistics.base import Interval
 from evaweb.statistics.bounded import bounded_mean
+from evaweb.statistics.confidence_sequence import confidence_sequence
+from evaweb.statistics.difference import newcombe
+from evaweb.statistics.means import average
 from evaweb.statistics.paired import over_conditions
+from evaweb.statistics.preference import Comparison, NotIdentifiedError, preferences
+from evaweb.statistics.proportions import clopper_pearson, posterior, wilson
+from evaweb.statistics.rates import rate
 
 SECONDS = 10.0
 _WANTED = ">= 0.93"
@@ -21,19 +29,24 @@ Chance = np.random.Generator
 
 
 class Case(NamedTuple):
-    """A way in which outcomes come about: does the interval of `n` of them hold the mean, and from which n on it is."""
+    """A way in which outcomes come about: does the interval of `n` of them hold the truth, from which n on it is
+    shown, and how often it should; "" where that is only told.
+    """
 
     holds: Callable[[Chance, int, int], bool]
     fewest: int = 1
+    wanted: str = _WANTED
 
 
 def measure(seconds: float) -> Report:
-    """`coverage.NAME.N`: the share of runs whose interval holds the truth, of N trials (each scene) or conditions."""
+    """`coverage.NAME.N`: the share of runs whose interval holds the truth, of N trials (each scene), conditions, pairs
+    or, of rates per hour, events to be expected.
+    """
     figures, rows, runs = [], [], max(1, round(_RUNS_PER_SECOND * seconds))
     for name, case in CASES.items():
         for n in sorted({case.fewest, *(size for size in _SIZES if size > case.fewest)}):
             share = covered(case, n, runs=runs, draws=_DRAWS)
-            figures.append(Figure(f"coverage.{name}.{n}", share, "", _WANTED))
+            figures.append(Figure(f"coverage.{name}.{n}", share, "", case.wanted))
             rows.append({"name": name, "n": n, "runs": runs, "coverage": share})
     return Report("coverage", figures, rows)
 
@@ -78,11 +91,88 @@ def _conditions(first: float, second: float, spread: float, trials: int) -> Case
     return Case(holds, fewest=2)
 
 
+def _rate_of_two(interval: Callable[[int, int, int, int], Interval]) -> Case:
+    """Successes of two checkpoints, rates drawn evenly."""
+
+    def holds(chance: Chance, n: int, draws: int) -> bool:
+        rates = chance.random(2)
+        first, second = chance.binomial(n, rates).tolist()
+        return interval(first, n, second, n).holds(rates[0] - rates[1])
+
+    return Case(holds)
+
+
+def _rate(
+    interval: Callable[[int, int], Interval | None], given: float | None = None, wanted: str = _WANTED
+) -> Case:
+    """Successes of one checkpoint, at a rate that is drawn evenly or is `given`."""
+
+    def holds(chance: Chance, n: int, draws: int) -> bool:
+        truth = chance.random() if given is None else given
+        found = interval(int(chance.binomial(n, truth)), n)
+        return found is not None and found.holds(truth)
+
+    return Case(holds, wanted=wanted)
+
+
+def _per_hour(chance: Chance, n: int, draws: int) -> bool:
+    return rate(int(chance.poisson(n)), 3600.0).interval.holds(n)
+
+
+def _student(draw: Callable[[Chance, int], NDArray[np.float64]], truth: float, wanted: str) -> Case:
+    """Figures that each trial has one of."""
+
+    def holds(chance: Chance, n: int, draws: int) -> bool:
+        found = average(draw(chance, n).tolist())
+        return found is not None and found.interval is not None and found.interval.holds(truth)
+
+    return Case(holds, fewest=2, wanted=wanted)
+
+
+def _anytime(first: float, second: float) -> Case:
+    """Successes of two checkpoints, pair by pair: held after every pair so far, for what is left out stays out."""
+
+    def holds(chance: Chance, n: int, draws: int) -> bool:
+        one, other = (chance.random((2, n)) < [[first], [second]]).astype(float)
+        found = confidence_sequence((one - other).tolist())
+        return found is not None and found.holds(first - second)
+
+    return Case(holds)
+
+
+def _preferred(chance: Chance, n: int, draws: int) -> bool:
+    """Comparisons of two checkpoints, one worth e times the other; where nothing is ranked nothing is shown."""
+    weights = np.array([math.e, math.exp(0.5), 1.0])  # Davidson's, with as many ties
+    said = chance.choice(["first", "tie", "second"], n, p=weights / weights.sum()).tolist()
+    turned = {"first": "second", "tie": "tie", "second": "first"}
+    rows = [
+        Comparison("a", "b", word) if i % 2 else Comparison("b", "a", turned[word])
+        for i, word in enumerate(said)
+    ]
+    try:
+        found = preferences(rows, order_effect=True)
+    except NotIdentifiedError:
+        return True
+    return found.contrasts["a", "b"].interval.holds(1.0)
+
+
 def _seed(chance: Chance) -> int:
     return int(chance.integers(2**32))
 
 
 CASES = {
+    "wilson": _rate(wilson),
+    "wilson_at_0.1": _rate(wilson, 0.1, ""),
+    "clopper_pearson": _rate(clopper_pearson),
+    "clopper_pearson_at_0.1": _rate(clopper_pearson, 0.1),
+    "posterior": _rate(lambda x, n: posterior(x, n).interval()),
+    "newcombe": _rate_of_two(lambda *counts: newcombe(*counts).interval),
+    "garwood": Case(_per_hour),
+    "student_normal": _student(lambda chance, n: chance.normal(size=n), 0.0, _WANTED),
+    "student_skewed": _student(lambda chance, n: chance.exponential(size=n), 1.0, ""),
+    "preference": Case(_preferred, fewest=5),
+    "anytime": _anytime(0.8, 0.5),
+    "anytime_same": _anytime(0.95, 0.95),
     "score_successes": _mean(0.9, lambda chance, n: (chance.random(n) < 0.9).astype(float)),
     "score_thirds": _mean(0.5, lambda chance, n: chance.integers(0, 4, n) / 3),
     "score_skewed": _mean(0.3 / 3.3, lambda chance, n: chance.beta(0.3, 3, n)),

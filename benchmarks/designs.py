@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from benchmarks import coverage
 from benchmarks.report import Figure, Report
-from evaweb.statistics.boundaries import Boundary, Look, extremeness
+from evaweb.statistics.boundaries import MOST, Boundary, Look, extremeness
 from evaweb.statistics.courses import course
 from evaweb.statistics.designs import ANYTIME, FIXED, SCORE, conclude, design
 from evaweb.statistics.difference import barnard
 
 SECONDS = coverage.SECONDS
+SIZES = (50, 100)  # pairs
 ALPHA, LOOSE = 0.05, 0.1
 MARGIN = 0.2
 _STEPS = 3  # milestones of a trial with partial credit: its score is how many of them were reached
@@ -80,8 +81,7 @@ def measure(seconds: float, long: bool = False) -> Report:
     has designs of 250 pairs too.
     """
     rows: Courses = []
-    sizes = (50, 100, 250) if long else (50, 100)
-    figures = [*errors(sizes, rows), *powers(rows), *drifts(rows)]
+    figures = [*errors((*SIZES, MOST) if long else SIZES, rows), *powers(rows), *drifts(rows)]
     covered = coverage.measure(seconds)
     return Report("designs", [*figures, *covered.figures], [*rows, *covered.rows])
 

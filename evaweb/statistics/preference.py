@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Outcome = Literal["first", "second", "tie"]
 _STEPS = 100
 _CLOSE = 1e-8  # largest component of the gradient at the solution
+_ROUNDED = 1e-13  # relative: by what a likelihood may be off
 
 
 class NotIdentifiedError(StatisticsError):
@@ -232,9 +233,10 @@ def _fit(design: _Design) -> tuple[NDArray[np.float64], float, NDArray[np.float6
             return x, height, information
         step = np.linalg.solve(information, gradient)
         length, slope = 1.0, float(gradient @ step)
+        least = height - _ROUNDED * abs(height)  # near the top it rises by less than it is rounded by
         while True:
             tried = _likelihood(design, x + length * step)
-            if tried[0] >= height + 1e-4 * length * slope or length < 1e-10:
+            if tried[0] >= least + 1e-4 * length * slope or length < 1e-10:
                 break
             length /= 2
         x = x + length * step
