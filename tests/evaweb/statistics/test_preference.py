@@ -125,6 +125,8 @@ def test_what_several_people_say_of_the_same_two_weighs_as_one():
     )
     assert thrice.worth == pytest.approx(once.worth)
     assert thrice.error == pytest.approx(once.error)
+
+
 @pytest.mark.parametrize("counts", [(8, 2, 0, 3, 5, 2), (12, 3, 10, 4, 10, 11), (14, 3, 8, 3, 13, 9)])
 def test_the_fit_ends_where_the_likelihood_rises_by_less_than_it_is_rounded_by(counts):
     """Counts of first, second and tie, with a first and with b first."""
