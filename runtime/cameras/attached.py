@@ -8,10 +8,19 @@ from types import MappingProxyType
 from typing import Any
 
 from runtime.cameras.base import Camera, Condition, Health
+from runtime.cameras.complaints import NOT_LIVE
 from runtime.core.clock import Clock
+from runtime.core.sentences import Pattern
 from runtime.core.types import Observation
 from runtime.ipc.messages import Event
 from runtime.transports.base import Source
+
+_BACK = Pattern("cameras.back", "camera {camera} ({source}) gives pictures after {seconds:.1f} s")
+_ABSENT = Pattern("cameras.absent", "camera {camera} ({source}): {why}")
+_PLAYS_VIDEO = Pattern(
+    "cameras.plays_video",
+    "camera {camera} plays the video {video}: it does not show what is there",
+)
 
 
 class Attached(Source):
@@ -87,23 +96,24 @@ class Attached(Source):
         return events
 
     def _event(self, camera: Camera, health: Health, before: Health | None) -> Event | None:
-        name = f"camera {camera.key} ({camera.shown})"
+        which = {"camera": camera.key, "source": camera.shown}
         if health.condition is Condition.LIVE:
             if before is None or before.condition is Condition.LIVE:
                 return None
             away = health.since - before.since
-            kind, text = "camera_back", f"{name} gives pictures after {away:.1f} s"
+            kind, text = "camera_back", _BACK(**which, seconds=away)
         elif health.condition is Condition.OPENING:
             if not health.failed:
                 return None
-            kind, text = "camera_absent", f"{name}: {health.why}"
+            kind, text = "camera_absent", _ABSENT(**which, why=health.why)
         else:
-            kind, text = f"camera_{health.condition}", f"{name} is {health.condition}: {health.why}"
+            kind = f"camera_{health.condition}"
+            text = NOT_LIVE(**which, condition=health.condition, why=health.why)
         return Event(kind, text, self._clock.now(), data={"camera": camera.key, **self._told(camera)})
 
     def _warning(self, camera: Camera) -> Event:
         """A policy that moves a robot by a video acts on what is not there: whoever stands beside it is told."""
-        text = f"camera {camera.key} plays the video {camera.shown}: it does not show what is there"
+        text = _PLAYS_VIDEO(camera=camera.key, video=camera.shown)
         return Event("camera_is_a_video", text, self._clock.now(), data={"camera": camera.key})
 
     def _told(self, camera: Camera) -> dict[str, Any]:

@@ -6,13 +6,16 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from runtime.cameras.base import Condition
+from runtime.core.sentences import Pattern
+
+NOT_LIVE = Pattern("cameras.not_live", "camera {camera} ({source}) is {condition}: {why}")
 
 
 def complaints(cameras: Mapping[str, Mapping[str, Any]], keys: Iterable[str] | None = None) -> list[str]:
     """A sentence for each camera, or each of `keys`, that is not live: which, where, how, why."""
     chosen = cameras if keys is None else [key for key in keys if key in cameras]
     return [
-        f"camera {key} ({told['source']}) is {told['condition']}: {told['why']}"
+        NOT_LIVE(camera=key, source=told["source"], condition=told["condition"], why=told["why"])
         for key in chosen
         if (told := cameras[key])["condition"] != Condition.LIVE
     ]

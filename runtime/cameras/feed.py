@@ -64,6 +64,7 @@ class Feed:
                 format=address.format,
                 options={**_QUICK, **address.options} if address.format else dict(address.options),
                 timeout=(open_s, read_s),
+                metadata_errors="replace",  # a camera's title is written as its maker likes
             )
         except (av.error.FFmpegError, OSError, ValueError) as error:
             raise CameraError(found(error, address, time.monotonic() - begun, open_s, True)) from None

@@ -28,6 +28,7 @@ __all__ = [
     "load",
     "resolve",
     "server_of",
+    "tree_of",
 ]
 
 
@@ -47,6 +48,11 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Resolved:
     """
     tree, origin = _read(path, ())
     return assigned(tree, origin, str(path), assignments)
+
+
+def tree_of(path: Path) -> dict[str, Any]:
+    """What a file says, with what it extends, unchecked; raises ConfigurationError where it cannot be read."""
+    return _read(path, ())[0]
 
 
 def assigned(

@@ -75,26 +75,27 @@ def _kind(model: type[BaseModel]) -> str:
 def _section(title: str, model: type[BaseModel]) -> Iterator[str]:
     """A heading and a table of keys."""
     schema = model.model_json_schema()
-    yield f"## {title}\n\n{_first_line(model)}\n\n| key | type | default | meaning |\n|---|---|---|---|"
-    for name, field in _own_first(model):
+    yield f"## {title}\n\n{first_line(model)}\n\n| key | type | default | meaning |\n|---|---|---|---|"
+    for name, field in own_first(model):
         tells = name == "kind" and _kind(model) != ""
         cells = (
             f"`{name}`",
             _type(schema["properties"][name]),
             "required" if tells else _default(field),
-            "Tells this kind of table from the others." if tells else _meaning(model, name, field),
+            "Tells this kind of table from the others." if tells else meaning(model, name, field),
         )
         yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
 
 
-def _own_first(model: type[BaseModel]) -> list[tuple[str, FieldInfo]]:
-    """Its own keys, then those that it shares with others."""
+def own_first(model: type[BaseModel]) -> list[tuple[str, FieldInfo]]:
+    """A table's own keys, then those that it shares with others."""
     own = model.__annotations__
     return sorted(model.model_fields.items(), key=lambda key: key[0] not in own)
 
 
-def _first_line(model: type[BaseModel]) -> str:
+def first_line(model: type[BaseModel]) -> str:
+    """What a table is, in a sentence."""
     return (model.__doc__ or "").splitlines()[0]
 
 
@@ -136,12 +137,13 @@ def _default(field: FieldInfo) -> str:
     return f"`{json.dumps(value)}`"
 
 
-def _meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
+def meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
+    """What a key of a table means, as the string below it says."""
     for owner in model.__mro__:
         if name in inspect.get_annotations(owner) and (said := _said_of_keys(owner).get(name)):
             return " ".join(said.split())
     models = [model for _, model in _models(name, field.annotation)]
-    return _first_line(models[0]) if len(models) == 1 else "One of the kinds below." if models else ""
+    return first_line(models[0]) if len(models) == 1 else "One of the kinds below." if models else ""
 
 
 @functools.cache  # cache: of sources, which do not change while this runs

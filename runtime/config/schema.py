@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -165,6 +166,41 @@ class LeaseSettings(Settings):
 
     ttl_s: float = Field(default=5.0, gt=0)
     """Time after which a lease that is not renewed ends and the robot holds [s]."""
+    lost: Literal["hold", "finish"] = "hold"
+    """What a run does whose lease ends because nothing is heard of its holder: "hold"; or "finish": a scored run with a
+    time limit goes on to its end, other runs hold. "finish" needs a [panel], and holds where that is not served."""
+
+
+class PanelSettings(Settings):
+    """The station's own panel, a page on its own machine for whoever stands beside the robot."""
+
+    host: str = "127.0.0.1"
+    """Address at which it listens; beyond this machine only with a certificate."""
+    port: int = Field(default=8480, ge=0, le=65535)
+    """Port at which it listens; 0 for a free one, which is left in the station's folder."""
+    names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]{1,253}$")]] = Field(default_factory=list)
+    """Names by which browsers reach it, beside localhost and addresses in numbers; others are refused."""
+    certificate: str | None = None
+    """File of its certificate, with the chain, as PEM."""
+    key: str | None = None
+    """File of the certificate's key, as PEM."""
+
+    @model_validator(mode="after")
+    def _is_encrypted_beyond_this_machine(self) -> PanelSettings:
+        if (self.certificate is None) != (self.key is None):
+            raise ConfigurationError("panel.certificate and panel.key belong together: give both, or neither")
+        try:
+            address = ip_address(self.host)
+        except ValueError:
+            raise ConfigurationError(
+                f"panel.host = {self.host!r:.100}: must be an address in numbers, as 127.0.0.1 or 0.0.0.0"
+            ) from None
+        if self.certificate is None and not address.is_loopback:
+            raise ConfigurationError(
+                f"panel.host = {self.host!r}: beyond this machine it needs panel.certificate and panel.key; allowed "
+                "without: 127.0.0.1"
+            )
+        return self
 
 
 class BusSettings(Settings):
@@ -269,6 +305,8 @@ class Deployment(Settings):
     publish: PublishSettings = PublishSettings()
     publication: PublicationSettings = PublicationSettings()
     lease: LeaseSettings = LeaseSettings()
+    panel: PanelSettings | None = None
+    """The station's own panel; a station without it has none."""
     bus: BusSettings = BusSettings()
     control_channel: ControlChannelSettings = ControlChannelSettings()
     security: SecuritySettings = SecuritySettings()
@@ -279,6 +317,15 @@ class Deployment(Settings):
         if self.policy.kind == "none" and self.collection is None:
             raise ConfigurationError(
                 "policy is missing and has no default; it may be left out with a [collection]"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _can_be_stopped_without_the_lab(self) -> Deployment:
+        if self.lease.lost == "finish" and self.panel is None:
+            raise ConfigurationError(
+                'lease.lost = "finish": the robot goes on while nobody commands it, so somebody beside it must be able '
+                'to stop it; allowed with a [panel], else "hold"'
             )
         return self
 

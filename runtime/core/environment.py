@@ -8,11 +8,12 @@ from collections.abc import Mapping
 
 from runtime.core.errors import ConfigurationError
 
-# What signs sessions, opens the database and the broker, and logs in at the hub: no station has a use for it.
+# What signs sessions, opens the database, broker and store, and logs in at the hub: no station has a use for it.
 WEB_ALONE = frozenset(
     (
         *("EVA_SECRET_KEY", "DATABASE_URL", "REDIS_URL", "DJANGO_SUPERUSER_PASSWORD"),
         *("PGPASSWORD", "PGPASSFILE", "PGSERVICEFILE"),
+        *("EVA_STORE_KEY", "EVA_STORE_SECRET"),
         *("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN", "HF_TOKEN_PATH"),
     )
 )

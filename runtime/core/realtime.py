@@ -9,10 +9,21 @@ import os
 import resource
 import struct
 
+from runtime.core.sentences import Pattern
+
+_NOT_PERMITTED = Pattern(
+    "timing.not_permitted",
+    "control runs in the class {scheduling!r}: SCHED_FIFO is not permitted, so that ticks can be "
+    "milliseconds late on a busy machine; give the station's user an rtprio limit of {priority} "
+    "(LimitRTPRIO={priority} where systemd starts it), then start the station anew: "
+    "docs/administrator.md, Real time",
+)
+
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 _SLICE_NS = 100_000
+_LARGE = 8 << 20  # bytes of one mapping
 LOCKSTEP = "lockstep"  # the class of ticks that keep no time
 
 
@@ -24,7 +35,9 @@ def enter(priority: int) -> str:
     """
     libc = ctypes.CDLL(None, use_errno=True)
     _fine_timers(libc)
-    locked = _locked_memory(libc, _MCL_CURRENT | _MCL_FUTURE)
+    locked = _locked_memory(libc, _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
+    if locked:
+        _read_in(libc)
     _quiet_gc()
     return _class(libc, priority, locked)
 
@@ -60,11 +73,7 @@ def advice(scheduling: str, priority: int) -> str:
     """Advice to make a station punctual, for control that got `scheduling`; "" where it need not be."""
     if scheduling.startswith("FIFO") or scheduling == LOCKSTEP:
         return ""
-    return (
-        f"control runs in the class {scheduling!r}: SCHED_FIFO is not permitted, so that ticks can be milliseconds "
-        f"late on a busy machine; give the station's user an rtprio limit of {priority} (LimitRTPRIO={priority} "
-        "where systemd starts it), then start the station anew: docs/administrator.md, Real time"
-    )
+    return _NOT_PERMITTED(scheduling=scheduling, priority=priority)
 
 
 def _fine_timers(libc: ctypes.CDLL) -> None:
@@ -74,6 +83,21 @@ def _fine_timers(libc: ctypes.CDLL) -> None:
 
 def _locked_memory(libc: ctypes.CDLL, what: int) -> bool:
     return int(libc.mlockall(what)) == 0
+
+
+def _read_in(libc: ctypes.CDLL) -> None:
+    """Have what is mapped by now in memory: code that has not run yet would come from the disk in the middle of a tick.
+
+    Large memory without a file is locked as it is used, which takes a microsecond a page and no disk: of the buffers of
+    BLAS (32 MB each) and the stacks of threads (8 MB) hardly any ever is.
+    """
+    with open("/proc/self/maps", encoding="utf-8") as maps:
+        for line in maps:
+            span, rights, _, _, file, *name = line.split(maxsplit=5)
+            start, end = (int(bound, 16) for bound in span.split("-"))
+            unnamed = file == "0" and not name
+            if rights[0] == "r" and not (unnamed and end - start >= _LARGE):
+                libc.mlock(ctypes.c_void_p(start), ctypes.c_size_t(end - start))
 
 
 def _quiet_gc() -> None:

@@ -34,6 +34,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+MOST = 100_000  # episodes that an order names
 Folder = Callable[[str], Path]  # of what a person calls a dataset, or an episode
 
 
@@ -195,15 +196,23 @@ def _push(options: argparse.Namespace) -> int:
     return 0
 
 
-def episodes(text: str) -> list[int]:
-    """Indices of episodes from "3", "0:4" (without 4) or several of them with commas between."""
+def episodes(text: str, most: int = MOST) -> list[int]:
+    """Indices of at most so many episodes from "3", "0:4" (without 4) or several of them with commas between."""
     found: list[int] = []
     for part in text.split(","):
         first, colon, end = part.partition(":")
-        if not first.isdecimal() or (colon and not (end.isdecimal() and int(first) < int(end))):
-            raise RecordingError(f"{text!r} names no episodes: expected 3, or 0:4 (without 4), or 0:4,7")
-        found += range(int(first), int(end)) if colon else [int(first)]
+        if not is_index(first) or (colon and not (is_index(end) and int(first) < int(end))):
+            raise RecordingError(f"{text!r:.80} names no episodes: expected 3, or 0:4 (without 4), or 0:4,7")
+        some = range(int(first), int(end)) if colon else [int(first)]
+        if len(found) + len(some) > most:  # a typing error, which would fill the memory
+            raise RecordingError(f"{text!r:.80} names too many episodes: at most {MOST:,} in one order")
+        found += some
     return found
+
+
+def is_index(text: str) -> bool:
+    """True if the text is an index of an episode."""
+    return text.isascii() and text.isdecimal() and len(text) < 10
 
 
 def _say(done: Assembled) -> int:

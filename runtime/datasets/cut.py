@@ -97,7 +97,7 @@ def _copy(source: Path, target: Path, ticks: list[int], fps: float) -> None:
     rank = {tick: number for number, tick in enumerate(ticks)}
     try:
         with (
-            av.open(str(source)) as recorded,
+            av.open(str(source), metadata_errors="replace") as recorded,
             av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
         ):
             packets = list(_coded(source, recorded, rank))

@@ -107,6 +107,7 @@ def _line(dataset: Dataset, index: int) -> dict[str, Any]:
         "task": ", ".join(entry.tasks),
         "kind": IMPORTED,
         "success": None,
+        "result": None,
     }
 
 

@@ -6,6 +6,7 @@ import fcntl
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -78,10 +79,15 @@ def split(
             if target.exists() and any(target.iterdir()):
                 raise RecordingError(f"{target} is there already and not empty")
         made = version or _kept(source)
-        done = []
-        for target, parts in wanted.items():
-            said = partial(_of_part, tell, target.name)
-            done.append(assemble(target, made, parts, reencode=reencode, tell=said))
+        done: list[Assembled] = []
+        try:
+            for target, parts in wanted.items():
+                said = partial(_of_part, tell, target.name)
+                done.append(assemble(target, made, parts, reencode=reencode, tell=said))
+        except BaseException:  # all parts or none: one that was left would be in the way of the next try
+            for target in list(wanted)[: len(done)]:
+                shutil.rmtree(target)
+            raise
         return done
 
 

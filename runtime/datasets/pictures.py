@@ -79,7 +79,7 @@ class Pictures(PictureSequence):
         if not path.is_file():
             raise RecordingError(f"there is no video {path}")
         try:
-            self._container = av.open(str(path))
+            self._container = av.open(str(path), metadata_errors="replace")
         except self._errors as error:
             raise RecordingError(f"{path} cannot be opened as a video: {error}") from error
         try:

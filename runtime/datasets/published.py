@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from runtime.core.errors import RecordingError
+from runtime.core.types import Result
 from runtime.datasets import features as declared
 from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog
@@ -30,6 +31,7 @@ from runtime.datasets.stats import Statistic, video_statistic
 from runtime.recording.base import IMPORTED
 from runtime.recording.export import exported
 from runtime.recording.labels import newest
+from runtime.recording.layout import simulated
 from runtime.recording.scrub import require_sound
 
 if TYPE_CHECKING:
@@ -78,10 +80,12 @@ def publish(
     _require_publishable(journal, include_interrupted)
     if success is None and isinstance(journal.outcome.get("success"), bool):
         success = journal.outcome["success"]
+    result: Result | None = None if success is None else "success" if success else "fail"
     if success is None and (
         label := newest(journal.folder.absolute().parent.parent, str(journal.manifest["uuid"]))
     ):
-        success = None if label.result is None else label.result == "success"
+        result = label.result
+        success = None if result is None else result == "success"
     root = Path(dataset)
     with locked(root):
         recover(root)
@@ -93,7 +97,7 @@ def publish(
                 f"{root} is of version {catalog.version}, not {version}: publish to another folder, or convert it"
             )
         beside = {STREAMS: exported(journal.folder), **given}
-        done = _publish(journal, catalog, success, version or layout.DEFAULT_VERSION, beside)
+        done = _publish(journal, catalog, (success, result), version or layout.DEFAULT_VERSION, beside)
     return replace(done, remark=verdict.text if verdict.state == "unsealed" else "")
 
 
@@ -142,11 +146,11 @@ def _require_publishable(journal: RecordedJournal, include_interrupted: bool) ->
 def _publish(
     journal: RecordedJournal,
     catalog: Catalog,
-    success: bool | None,
+    said: tuple[bool | None, Result | None],
     version: str,
     beside: Mapping[str, bytes],
 ) -> Published:
-    root = catalog.root
+    root, success = catalog.root, said[0]
     features = _features(journal, _with_success(journal, catalog, success))
     if catalog.info:
         features = without_later(features, catalog.features)
@@ -173,7 +177,7 @@ def _publish(
         )
         write_table(table(columns, features), staging.path(entry.data))
         statistics |= column_statistics(columns, features)
-        catalog = catalog.including(line, statistics, _eva(journal, columns, success))
+        catalog = catalog.including(line, statistics, _eva(journal, columns, *said))
         staging.place(catalog.documents_before_data(), catalog.documents_after_data())
     return Published(root, index, journal.frames, created)
 
@@ -226,8 +230,10 @@ def _stage_video(journal: RecordedJournal, camera: str, staged: Path) -> Statist
     return video_statistic(staged, journal.frames)
 
 
-def _eva(journal: RecordedJournal, columns: Columns, success: bool | None) -> dict[str, Any]:
-    """Our own line about the episode: what LeRobot's files have no place for."""
+def _eva(
+    journal: RecordedJournal, columns: Columns, success: bool | None, result: Result | None
+) -> dict[str, Any]:
+    """Our own line about the episode: what LeRobot's files have no place for, as that a success was a partial one."""
     manifest = journal.manifest
     told = ("station", "kind", "mode", "strategy", "started_wall", "configuration_hash", "versions")
     return {
@@ -235,8 +241,10 @@ def _eva(journal: RecordedJournal, columns: Columns, success: bool | None) -> di
         "frames": journal.frames,
         "task": journal.task,
         **{key: manifest[key] for key in told if key in manifest},
+        "simulated": simulated(manifest),
         "outcome": dict(journal.outcome),
         "success": success,
+        "result": result,
         "eef_state": _provenance(columns, "eef_measured", "measured", "forward kinematics"),
         "eef_action": _provenance(columns, "eef_action_reported", "reported", "forward kinematics"),
     }

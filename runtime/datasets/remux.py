@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from runtime.core.errors import RecordingError
 
@@ -29,7 +29,7 @@ def coded(video: Path) -> str:
     import av
 
     try:
-        with av.open(str(video)) as container:
+        with av.open(str(video), metadata_errors="replace") as container:
             return str(container.streams.video[0].codec.canonical_name)
     except (av.FFmpegError, OSError, IndexError) as error:
         raise RecordingError(f"{video} cannot be read: {error}") from error
@@ -52,7 +52,7 @@ def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
     copied = 0
     try:
         with (
-            av.open(str(source)) as recorded,
+            av.open(str(source), metadata_errors="replace") as recorded,
             av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
         ):
             stream = recorded.streams.video[0]
@@ -71,6 +71,42 @@ def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
     if copied != frames:
         raise RecordingError(f"{source} has {copied} frames for {frames} rows")
     return facts
+
+
+def cut(source: Path, target: BinaryIO, begin: float, end: float) -> float:
+    """Copy the coded pictures of `source` from `begin` to `end` [s] to `target`; where the copy begins [s].
+
+    Nothing is re-encoded: it begins with the key frame before. RecordingError where there are no pictures then.
+    """
+    import av
+
+    first = None
+    try:
+        with (
+            av.open(str(source)) as recorded,
+            av.open(target, "w", format="mp4") as container,
+        ):
+            stream = recorded.streams.video[0]
+            base = stream.time_base
+            if base is None:
+                raise RecordingError(f"{source} does not say when its pictures are")
+            recorded.seek(int(begin / base), stream=stream)
+            copy = copied_stream(container, stream)
+            copy.time_base = base
+            for packet in recorded.demux(stream):
+                if packet.pts is None or packet.dts is None:
+                    continue
+                if packet.pts * base >= end:
+                    break
+                first = packet.pts if first is None else first
+                packet.pts, packet.dts = packet.pts - first, packet.dts - first
+                packet.stream = copy
+                container.mux(packet)
+    except (av.FFmpegError, OSError, IndexError) as error:
+        raise RecordingError(f"{source} cannot be copied from {begin:.2f} s: {error}") from error
+    if first is None:
+        raise RecordingError(f"{source} has no pictures from {begin:.2f} to {end:.2f} s")
+    return float(first * base)
 
 
 def _in_order(source: Path, recorded: av.container.InputContainer, frames: int) -> Iterator[Any]:

@@ -51,7 +51,7 @@ def video_statistic(path: Path, frames: int) -> Statistic:
     sums = _Histogram()
     decoded = 0
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             for frame in container.decode(video=0):
                 if decoded in wanted:
                     sums.add(np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)[::2, ::2])

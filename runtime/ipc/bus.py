@@ -10,6 +10,7 @@ import logging
 import os
 import time
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,9 +20,19 @@ import zmq
 
 from runtime.core.errors import CodecError, ConfigurationError, TransportError
 from runtime.core.msgpack_arrays import pack, unpack
+from runtime.core.sentences import Pattern
 from runtime.ipc.endpoints import LOOK_S, Endpoints, account, fresh_path, identity
 from runtime.ipc.identity import Key
-from runtime.ipc.messages import Ack, Command, Event, decode, encode
+from runtime.ipc.messages import Ack, Command, Event, decode, encode, told_by
+from runtime.ipc.readable import readable
+
+_TOO_MANY = Pattern(
+    "bus.too_many",
+    "more than {most} requests at once over one connection: wait for answers; stops are obeyed",
+)
+_NO_COMMAND = Pattern("bus.no_command", "expected a Command, got {kind}")
+_NO_ANSWER = Pattern("bus.no_answer", "no answer to {kind} within {seconds:g} s: outcome unknown")
+_TOO_LARGE = Pattern("bus.too_large", "{kind} has {given} bytes; allowed: {most}")
 
 # What a client needs to talk to a station, with the errors that it may meet: this module is a door.
 __all__ = [
@@ -60,7 +71,7 @@ _UNREAD = (
 )
 GREEDY = 32  # requests of one connection that may wait; what is beyond is refused
 TURN = 1000  # messages that are taken from a socket in one turn
-TOO_MANY = f"more than {GREEDY} requests at once over one connection: wait for answers; stops are obeyed"
+TOO_MANY = _TOO_MANY(most=GREEDY)
 
 
 class Listener:
@@ -185,6 +196,8 @@ class CommandServer(Listener):
 
     def next(self) -> Call | None:
         """The next message, unread; None where there is none."""
+        if not readable(self.socket):
+            return None
         try:
             return _call(self.socket.recv_multipart(zmq.NOBLOCK, copy=False))
         except zmq.Again:
@@ -199,7 +212,7 @@ class CommandServer(Listener):
             return None
         if isinstance(message, Command):
             return message
-        self.refuse(call, f"expected a Command, got {type(message).__name__}")
+        self.refuse(call, _NO_COMMAND(kind=type(message).__name__))
         return None
 
     def refuse(self, call: Call, reason: str) -> None:
@@ -209,6 +222,10 @@ class CommandServer(Listener):
     def answer(self, call: Call, ack: Ack) -> None:
         """Send the answer; a client that is gone, or reads none of them, loses it."""
         self._send(call, encode(ack))
+
+    def pass_on(self, call: Call, payload: bytes) -> None:
+        """Send an answer as another station has packed it."""
+        self._send(call, payload)
 
     def _send(self, call: Call, payload: bytes) -> None:
         self.socket.send_multipart([*call.address, payload], zmq.NOBLOCK)
@@ -237,7 +254,7 @@ class CommandClient:
         self._connect()
 
     def _connect(self) -> None:
-        self._socket = self._context.socket(zmq.DEALER)
+        self._socket: zmq.Socket[Any] = self._context.socket(zmq.DEALER)
         self._socket.linger = 200
         self._socket.connect(self._endpoint)
 
@@ -256,7 +273,7 @@ class CommandClient:
             return answer
         self._socket.close(linger=0)
         self._connect()
-        raise TransportError(f"no answer to {command.kind} within {timeout:g} s: outcome unknown")
+        raise TransportError(_NO_ANSWER(kind=command.kind, seconds=timeout))
 
     def heard(self, command: Command, timeout: float) -> Ack | None:
         """The answer to what was posted; None where none came in time."""
@@ -264,22 +281,39 @@ class CommandClient:
         while (left := deadline - time.monotonic()) > 0:
             if not self._socket.poll(int(left * 1000) + 1):
                 continue
-            frame = self._socket.recv(copy=False)
-            uid, pid = _peer(frame)
-            if uid is not None and uid not in self._believed:
-                self.strangers = (
-                    f"the process {pid} of {account(uid)} answers at {self._endpoint}: not believed"
-                )
+            if (packed := self.packed_answer()) is None:
                 continue
-            answer = decode(frame.bytes)
+            answer = decode(packed)
             if isinstance(answer, Ack) and answer.uuid in (command.uuid, ""):
                 return answer
         return None
 
+    @property
+    def socket(self) -> zmq.Socket[Any]:
+        """For a poller: it can be read where an answer has come."""
+        return self._socket
+
+    def forward(self, payload: bytes, signature: bytes) -> None:
+        """Send a command as another process has packed it, with that signature."""
+        self._socket.send_multipart([payload, signature], zmq.NOBLOCK)
+
+    def packed_answer(self) -> bytes | None:
+        """The next answer that has come, unread; None where there is none, or a stranger gave it."""
+        try:
+            frame = self._socket.recv(zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return None
+        uid, pid = _peer(frame)
+        if uid is not None and uid not in self._believed:
+            self.strangers = f"the process {pid} of {account(uid)} answers at {self._endpoint}: not believed"
+            return None
+        packed: bytes = frame.bytes
+        return packed
+
     def _sealed(self, command: Command) -> list[bytes]:
         payload = encode(command)
         if len(payload) > LARGEST:
-            raise CodecError(f"{command.kind} has {len(payload)} bytes; allowed: {LARGEST}")
+            raise CodecError(_TOO_LARGE(kind=command.kind, given=len(payload), most=LARGEST))
         if self._key is None:
             return [payload]
         try:
@@ -293,10 +327,29 @@ class CommandClient:
 
 
 class Publisher(Listener):
-    """Sends newest-wins streams; a reader that is too slow misses some."""
+    """Sends newest-wins streams; a reader that is too slow misses some. Knows which of them anybody reads."""
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path, name: str, high_water: int) -> None:
-        super().__init__(context, zmq.PUB, station_dir, name, high_water, high_water)
+        super().__init__(context, zmq.XPUB, station_dir, name, high_water, high_water)
+        self.topics: set[str] = set()  # how the names of the streams begin that somebody reads
+
+    def hear(self) -> list[str]:
+        """Learn who reads what by now; the topics that nobody read before."""
+        begun = []
+        with suppress(zmq.Again):
+            while readable(self.socket):
+                told = self.socket.recv(zmq.NOBLOCK)
+                topic = told[1:].decode("utf-8", "replace")
+                if told[:1] == b"\x01":
+                    self.topics.add(topic)
+                    begun.append(topic)
+                elif told[:1] == b"\x00":
+                    self.topics.discard(topic)
+        return begun
+
+    def wanted(self, stream: str) -> bool:
+        """True if somebody reads `stream`, as far as was heard."""
+        return any(stream.startswith(topic) for topic in self.topics)
 
     def publish(self, stream: str, payload: object) -> None:
         """Send `payload` under the name `stream`; never waits."""
@@ -363,6 +416,7 @@ class EventLog:
             "wall": time.time(),
             "step": event.step,
             "data": dict(event.data),
+            **told_by(event),
         }
         self._events.append(row)
         return row

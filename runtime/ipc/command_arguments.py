@@ -9,9 +9,12 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator, Field, JsonValue, ValidationError
 
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern
 from runtime.core.settings import Settings, explanation
 from runtime.core.types import Result
 from runtime.ipc.messages import Mode
+
+_TAKES_NONE = Pattern("commands.takes_none", "{kind} takes no arguments; given: {given}")
 
 LARGEST = 64 * 1024  # characters of JSON that a command may carry into a manifest
 _HIGHEST_SEED = 2**53 - 1  # beyond it a browser counts no more
@@ -244,7 +247,7 @@ Request = TypeVar("Request", bound=Settings)
 def read(kind: str, model: type[Request], arguments: Mapping[str, Any]) -> Request:
     """The arguments of a command `kind`; RuntimeFault names the key, what was given, what is allowed."""
     if arguments and not model.model_fields:
-        raise RuntimeFault(f"{kind} takes no arguments; given: {', '.join(map(str, arguments))}")
+        raise RuntimeFault(_TAKES_NONE(kind=kind, given=", ".join(map(str, arguments))))
     try:
         return model.model_validate(dict(arguments))
     except ValidationError as invalid:

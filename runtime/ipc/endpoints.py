@@ -211,6 +211,16 @@ class Endpoints:
                 threading.Thread(target=self._retry, name="endpoints", daemon=True).start()
         return failure is None
 
+    def withdraw(self, process: str) -> None:
+        """Nobody finds this process any more; what it wrote, or was about to write, is gone."""
+        with self._lock:
+            self._wanted.pop(process, None)
+            self._said.pop(process, None)
+            try:
+                self._file(process).unlink(missing_ok=True)
+            except OSError as error:  # of a disk that takes no more: what listens there ends for no file
+                log.error("clients still find the process %s: %s", process, error)
+
     def _retry(self) -> None:
         while True:
             time.sleep(RETRY_S)
@@ -244,6 +254,16 @@ class Endpoints:
                 f"start it with python -m runtime DEPLOYMENT, or name another data folder (looked in "
                 f"{station.parent}, running or once run: {known})"
             ) from None
+
+    def served(self, process: str) -> bool:
+        """True if `process` has said where it listens, and lives."""
+        try:
+            os.kill(int(self._content(process)["pid"]), 0)
+        except PermissionError:  # of another account: it is there
+            return True
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError):
+            return False
+        return True
 
     def _content(self, process: str) -> dict[str, Any]:
         found = json.loads(self._file(process).read_text("utf-8"))

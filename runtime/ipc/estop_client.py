@@ -8,9 +8,17 @@ from typing import Any
 import zmq
 
 from runtime.core.errors import TransportError
+from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CommandClient, Endpoints, Key
 from runtime.ipc.endpoints import LOOK_S, trouble
 from runtime.ipc.messages import Ack, Command
+
+_NO_ANSWER = Pattern(
+    "bus.no_answer_because", "no answer to {kind} within {seconds:g} s: outcome unknown{why}"
+)
+_BECAUSE = Pattern("bus.because", "; {why}")
+_NOT_SENT = Pattern("bus.not_sent", "{kind} was not sent: {why}")
+_NO_SOCKET = Pattern("bus.no_socket", "{process} has no socket {name!r}: start the station again")
 
 _AGAIN_S = 0.02
 
@@ -23,8 +31,8 @@ class NoAnswer(TransportError):
     """It may have been carried out: nobody knows. `why`, as far as that can be told."""
 
     def __init__(self, kind: str, seconds: float, why: str) -> None:
-        self.why = f"; {why}" if why else ""
-        super().__init__(f"no answer to {kind} within {seconds:g} s: outcome unknown{self.why}")
+        self.why = _BECAUSE(why=why) if why else ""
+        super().__init__(_NO_ANSWER(kind=kind, seconds=seconds, why=self.why))
 
 
 def urgent(
@@ -68,7 +76,7 @@ def urgent(
         if client is not None:
             client.close()
     if not heard:
-        raise NotSent(f"{command.kind} was not sent: {why}")
+        raise NotSent(_NOT_SENT(kind=command.kind, why=why))
     raise NoAnswer(command.kind, timeout, why)
 
 
@@ -79,7 +87,7 @@ def _now(endpoints: Endpoints, where: tuple[str, str], before: str) -> str:
         return str(endpoints.read(process)[name])
     except KeyError:
         if not before:
-            raise TransportError(f"{process} has no socket {name!r}: start the station again") from None
+            raise TransportError(_NO_SOCKET(process=process, name=name)) from None
     except TransportError:
         if not before:
             raise

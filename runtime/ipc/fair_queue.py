@@ -9,9 +9,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection
 
+from runtime.core.sentences import Pattern
 from runtime.ipc.bus import GREEDY, LARGEST, TOO_MANY, TURN, Call, CommandServer
 from runtime.ipc.estop_requests import in_packed, kind_of
 from runtime.ipc.messages import Command
+
+_TOO_LONG = Pattern("bus.too_long", "{given} bytes; allowed here: {allowed}")
 
 Asked = tuple[Call, Command]
 LONGEST_STOP = 4096  # bytes; what is longer is no stop of our clients, and waits its turn
@@ -64,7 +67,7 @@ class Turns:
         if press is not None:
             return call, press
         if len(call.payload) > self._longest:
-            self._server.refuse(call, f"{len(call.payload)} bytes; allowed here: {self._longest}")
+            self._server.refuse(call, _TOO_LONG(given=len(call.payload), allowed=self._longest))
             return None
         if len(call.payload) <= LONGEST_STOP and kind_of(call.payload) in self._urgent:
             command = self._server.read(call)  # what cannot be read is answered here

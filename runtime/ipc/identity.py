@@ -15,10 +15,20 @@ from dataclasses import replace
 from pathlib import Path
 
 from runtime.core.errors import ConfigurationError
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.endpoints import account
 from runtime.ipc.messages import Command
 
+_NEEDS_OPERATOR = Pattern("rights.needs_operator", "{kind} needs an operator; {user} is {role}")
+_WITHOUT_ROLE = fixed("rights.without_role", "signed for without a role")
+_FORGED = Pattern(
+    "rights.forged",
+    "{kind} is not signed by this lab's web, and not given by a program of the station's account: "
+    "refused; stops are obeyed",
+)
+
 SIGNED = "web:"  # how the names of holders begin that only a signature may use
+PANEL = "panel:"  # of holders at the station's own panel, which this account's program serves
 SCRIPTS = "channel:"  # of holders who are scripts: the channel passes on what they say, and cannot know who they are
 # Roles of those who have none of the web's: programs of this account, scripts that these pass on, everybody else.
 LOCAL, SCRIPT, UNVERIFIED = "local", "script", "unverified"
@@ -112,7 +122,13 @@ def identified(command: Command, payload: bytes, signature: bytes, uid: int | No
         return _unverified(command, UNVERIFIED)
     if command.holder.startswith(SCRIPTS):
         return _unverified(command, SCRIPT)
-    return replace(command, user=f"account:{account(uid)}", role=LOCAL)
+    user = command.holder if command.holder.startswith(PANEL) else f"account:{account(uid)}"
+    return replace(command, user=user, role=LOCAL)
+
+
+def at_the_panel(command: Command) -> bool:
+    """True if what was `identified` comes from the station's own panel."""
+    return command.role == LOCAL and command.holder.startswith(PANEL)
 
 
 def _unverified(command: Command, role: str) -> Command:
@@ -125,19 +141,14 @@ def forged(command: Command) -> str:
     """Why what was `identified` is obeyed in nothing but stops; "" where it may be."""
     if command.role != UNVERIFIED:
         return ""
-    return (
-        f"{command.kind} is not signed by this lab's web, and not given by a program of the station's account: "
-        "refused; stops are obeyed"
-    )
+    return _FORGED(kind=command.kind)
 
 
 def lacking(command: Command) -> str:
     """Why the role of who gave the command is too little for it; "" where it will do."""
     if command.kind in _OPEN or command.role in _MAY:
         return ""
-    return (
-        f"{command.kind} needs an operator; {command.user} is {command.role or 'signed for without a role'}"
-    )
+    return _NEEDS_OPERATOR(kind=command.kind, user=command.user, role=command.role or _WITHOUT_ROLE)
 
 
 def named(command: Command) -> str:

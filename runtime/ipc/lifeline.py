@@ -10,10 +10,10 @@ class Lifeline:
     """Standard input, held open by the supervisor; its end is the supervisor's end, however it came."""
 
     def __init__(self, descriptor: int = 0) -> None:
-        self._descriptor = descriptor
+        self.descriptor = descriptor
 
     @property
     def cut(self) -> bool:
         """True if the supervisor is gone."""
-        readable, _, _ = select.select([self._descriptor], [], [], 0)
-        return bool(readable) and os.read(self._descriptor, 4096) == b""
+        readable, _, _ = select.select([self.descriptor], [], [], 0)
+        return bool(readable) and os.read(self.descriptor, 4096) == b""

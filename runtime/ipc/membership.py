@@ -9,6 +9,12 @@ from runtime.ipc.shared_state import SharedState
 
 # [s] how long guard and reception stay after control's own end: to the last it can see, and be stopped
 _OUTLIVES_S = 1.0
+_REST_S = 0.1
+
+
+def rest_s(heartbeat_timeout: float) -> float:
+    """How long a process sleeps that nobody wakes [s]: others count the seconds since it last said that it lives."""
+    return min(_REST_S, heartbeat_timeout / 10.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,8 @@
 
 A message is a frozen dataclass; on the wire it is a map of its fields with its class name under "type". What
 comes in is checked against the fields' annotations, so that nothing behind `decode` meets what it cannot use.
+Those that say a sentence have its `id` and `arguments` beside it, which follow from it; behind `decode` it is a
+`Sentence` again.
 """
 
 from __future__ import annotations
@@ -14,12 +16,24 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.core import sentences
 from runtime.core.errors import CodecError
 from runtime.core.msgpack_arrays import pack, unpack
 from runtime.core.types import Float32, Float64, UInt8
 
 # Kinds of events that control gives and the coordinator reads: whether anybody listens to commands.
 UNHEARD, HEARD = "commands_unheard", "commands_heard"
+
+
+def _complete(message: Any, name: str) -> None:
+    """Say the sentence in that field by its id, or make one of it that another process has told with its id."""
+    text = getattr(message, name)
+    if not isinstance(text, sentences.Sentence):
+        text = sentences.heard(text, message.id, message.arguments)
+        object.__setattr__(message, name, text)
+    for part, value in sentences.identity(text).items():
+        object.__setattr__(message, part, value)
+
 
 # --- the coordinator -> control ---------------------------------------------------------------------------------------
 
@@ -132,6 +146,11 @@ class Event:
     time: float
     step: int = -1
     data: Mapping[str, Any] = field(default_factory=dict)
+    id: str = ""
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _complete(self, "text")
 
 
 # --- the coordinator -> media -----------------------------------------------------------------------------------------
@@ -175,6 +194,11 @@ class EndEpisode:
     status: str
     reason: str
     details: Mapping[str, Any] = field(default_factory=dict)
+    id: str = ""
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _complete(self, "reason")
 
 
 # --- media -> the coordinator -----------------------------------------------------------------------------------------
@@ -188,6 +212,11 @@ class EpisodeOpened:
     uuid: str
     path: str
     error: str = ""
+    id: str = ""
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _complete(self, "error")
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +230,11 @@ class EpisodeClosed:
     rows: int
     error: str = ""
     waits: bool = False  # for room on the disk: told again when it is closed
+    id: str = ""
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _complete(self, "reason")
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,6 +354,11 @@ class Ack:
     sequence: int = 0
     data: Mapping[str, Any] = field(default_factory=dict)
     kind: str = ""  # of the command that this answers
+    id: str = ""
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _complete(self, "reason")
 
 
 Message = (
@@ -412,7 +451,7 @@ def decode(payload: bytes) -> Message:
             raise CodecError(f"message {name}: {field_} = {value!r:.80}; expected {expected}")
     try:
         message: Message = kind(**known)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise CodecError(f"message {name}: {error}") from None
     return message
 
@@ -425,4 +464,10 @@ def event_row(event: Event) -> dict[str, Any]:
         "time": event.time,
         "step": event.step,
         "data": dict(event.data),
+        **told_by(event),
     }
+
+
+def told_by(message: Event | Ack) -> dict[str, Any]:
+    """Id and arguments of what it says, for a row that keeps its text; {} where it has none."""
+    return {"id": message.id, "arguments": message.arguments} if message.id else {}

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from enum import StrEnum
 from typing import Any, Literal
 
+from runtime.core.sentences import Sentence, checked, fixed
+
 Tone = Literal["neutral", "ok", "active", "warn", "danger"]  # the colours of pages
 
 
@@ -14,7 +16,7 @@ Tone = Literal["neutral", "ok", "active", "warn", "danger"]  # the colours of pa
 class Meaning:
     """What a state says: clients ask these, so that a state that they have never heard of is read right."""
 
-    label: str
+    label: str  # a Sentence where it is one of ours
     tone: Tone
     connected: bool = True  # complete observations arrive, or did until it was stopped
     preparing: bool = False  # a set-up or a way home goes on, which Stop cancels
@@ -67,6 +69,11 @@ class SessionState(StrEnum):
     FAULTED = "faulted"
 
     @property
+    def sentence(self) -> Sentence:
+        """Its name in sentences."""
+        return _NAMES[self]
+
+    @property
     def meaning(self) -> Meaning:
         """Its row."""
         return MEANINGS[self]
@@ -81,21 +88,27 @@ class SessionState(StrEnum):
         return cls(word).meaning if word in cls._value2member_map_ else None
 
 
+def _label(state: SessionState, english: str) -> Sentence:
+    return fixed(f"state.{state}.label", english)
+
+
 S = SessionState
 MEANINGS: dict[SessionState, Meaning] = {
-    S.DISCONNECTED: Meaning("disconnected", "neutral", connected=False),
-    S.IDLE: Meaning("idle", "neutral"),
-    S.SETTING_UP: Meaning("setting up", "active", preparing=True, moving=True),
-    S.READY: Meaning("ready", "active", set_up=True),
-    S.RUNNING: Meaning("running", "ok", set_up=True, run_open=True, moving=True),
-    S.HOLDING: Meaning("holding", "warn", set_up=True, run_open=True),
-    S.FAULTED: Meaning("faulted", "danger", latched=True),
+    S.DISCONNECTED: Meaning(_label(S.DISCONNECTED, "disconnected"), "neutral", connected=False),
+    S.IDLE: Meaning(_label(S.IDLE, "idle"), "neutral"),
+    S.SETTING_UP: Meaning(_label(S.SETTING_UP, "setting up"), "active", preparing=True, moving=True),
+    S.READY: Meaning(_label(S.READY, "ready"), "active", set_up=True),
+    S.RUNNING: Meaning(_label(S.RUNNING, "running"), "ok", set_up=True, run_open=True, moving=True),
+    S.HOLDING: Meaning(_label(S.HOLDING, "holding"), "warn", set_up=True, run_open=True),
+    S.FAULTED: Meaning(_label(S.FAULTED, "faulted"), "danger", latched=True),
 }
+_NAMES = {state: fixed(f"state.{state}", state.value) for state in SessionState}
 
 
 def with_meaning(said: Mapping[str, Any]) -> dict[str, Any]:
     """`said` of a station of whatever version, its "state_is" whole: what it leaves out follows from its "state".
 
+    Of its "sentences" those are kept that are some.
     A state that is not known here is neutral: nothing goes on, and that it is idle only the station may say.
     """
     word, told = str(said["state"]), said.get("state_is") or {}
@@ -103,4 +116,5 @@ def with_meaning(said: Mapping[str, Any]) -> dict[str, Any]:
     unknown = {} if row else {"idle": False}
     row = row or Meaning(word.replace("_", " "), "neutral")
     row = replace(row, **{field.name: told[field.name] for field in fields(row) if field.name in told})
-    return {**said, "state_is": {**row.told(), **unknown, **told}}
+    known = {"sentences": checked(said["sentences"])} if "sentences" in said else {}
+    return {**said, "state_is": {**row.told(), **unknown, **told}, **known}

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from runtime.core.errors import RuntimeFault
+from runtime.ipc.bells import Bell
 
 _LENGTH_CRC = struct.Struct("<II")
 _ALIGN = 64  # one cache line, so that two writers never share one
@@ -120,6 +121,7 @@ class Ring:
         self._data = offset + 2 * _ALIGN
         self._capacity = capacity
         self.refused = 0
+        self.bell: Bell | None = None  # rung after each message, where its reader sleeps
 
     @staticmethod
     def size(capacity: int) -> int:
@@ -140,6 +142,8 @@ class Ring:
             return False
         self._write(head, _LENGTH_CRC.pack(len(payload), zlib.crc32(payload)) + payload)
         self._head[0] = head + needed
+        if self.bell is not None:
+            self.bell.ring()
         return True
 
     def drain(self) -> Iterator[bytes]:

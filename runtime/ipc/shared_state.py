@@ -14,9 +14,15 @@ from enum import IntEnum
 
 import numpy as np
 
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Observation, UInt8
 from runtime.ipc import shared_memory as memory
+from runtime.ipc.bells import Bell
 from runtime.ipc.shared_memory import Record, Ring, aligned
+
+_FOR_SECONDS = Pattern("shared.for_seconds", "for {seconds:.1f} s")
+_SINCE_RESTART = fixed("shared.since_restart", "since it was restarted")
+_JOINTS_NOT_SEEN = fixed("shared.joints_not_seen", "control has not seen the joints for long enough yet")
 
 _LINE = 64
 PICTURE_SLOTS = 12  # 0.4 s of a camera at 30 Hz: for so long may media be late
@@ -31,6 +37,13 @@ RING_BYTES = {
     "media_events": 1 << 19,  # media -> the coordinator
     "presses": 1 << 14,  # the coordinator -> guard: presses of the e-stop that came to the coordinator
 }
+# Processes that sleep until there is something for them, and the rings that wake each. Control and reception wake by
+# themselves; what control records of its ticks is read with what is observed.
+WOKEN = {
+    "coordinator": ("control_events", "reception_events", "media_events"),
+    "media": ("minutes", "observations"),
+    "guard": ("presses",),
+}
 DOUBT_BYTES = 200
 PROCESSES = ("control", "coordinator", "reception", "media", "guard")
 
@@ -41,6 +54,9 @@ class EStop(IntEnum):
     UNKNOWN = 0
     CLEAR = 1
     LATCHED = 2
+
+
+_ESTOPS = tuple(EStop)
 
 
 @functools.cache  # cache: every observation asks
@@ -127,6 +143,7 @@ class SharedState:
     def __init__(self, layout: SharedStateLayout, shared: mmap.mmap) -> None:
         self.layout = layout
         self._shared = shared
+        self.bells: dict[str, Bell] = {}  # of processes that sleep; none where all of them are one
         offset = 0
         self._beats = {name: memory.real(shared, _LINE * index) for index, name in enumerate(PROCESSES)}
         offset += _LINE * len(PROCESSES)
@@ -135,6 +152,7 @@ class SharedState:
         }
         self._estop = offset
         self._release = memory.word(shared, offset + 8)
+        self._unrecorded = memory.word(shared, offset + 16)
         offset += _LINE
         self.observation = Record(shared, offset, layout.observation_dtype())
         offset += Record.size(layout.observation_dtype())
@@ -172,6 +190,17 @@ class SharedState:
         """The page behind an inherited descriptor; without `pictures` for who locks its memory (control)."""
         return cls(layout, memory.attach(descriptor, 0 if pictures else cls._size_of_numbers(layout)))
 
+    def hang(self, bells: Sequence[Bell]) -> None:
+        """Wake by these who sleeps, in the order of WOKEN."""
+        self.bells = dict(zip(WOKEN, bells, strict=True))
+        for process, rings in WOKEN.items():
+            for ring in rings:
+                self.rings[ring].bell = self.bells[process]
+
+    def _wake(self, process: str) -> None:
+        if (bell := self.bells.get(process)) is not None:
+            bell.ring()
+
     def beat(self, process: str, now: float) -> None:
         """Say that `process` is alive at `now` (our monotonic clock)."""
         self._beats[process][0] = now
@@ -187,7 +216,7 @@ class SharedState:
     def silence(self, process: str, now: float) -> str:
         """For how long `process` has given no sign of life at `now`, as a sentence ends with it."""
         beat = self.last_beat(process)
-        return f"for {now - beat:.1f} s" if beat else "since it was restarted"
+        return _FOR_SECONDS(seconds=now - beat) if beat else _SINCE_RESTART
 
     def generation(self, process: str) -> int:
         """Number of starts of `process` by the supervisor; a change means that it died and was restarted."""
@@ -205,22 +234,33 @@ class SharedState:
     def ask_release(self) -> None:
         """Main's half of a release; the guard does it and clears the flag."""
         self._release[0] = self.releases + 1
+        self._wake("guard")
+
+    @property
+    def unrecorded(self) -> bool:
+        """True while media has no use for records of ticks."""
+        return bool(self._unrecorded[0])
+
+    def set_unrecorded(self, unrecorded: bool) -> None:
+        """Written by media alone."""
+        self._unrecorded[0] = unrecorded
 
     @property
     def estop(self) -> EStop:
         """The guard's flag; control reads it before every send."""
-        return EStop(self._shared[self._estop])
+        return _ESTOPS[self._shared[self._estop]]
 
     def set_estop(self, state: EStop) -> None:
         """Lowered by the guard alone; the coordinator raises it for a press that came to the coordinator's socket."""
         self._shared[self._estop] = int(state)
+        self._wake("coordinator")
 
     @property
     def doubt(self) -> str:
         """Why nothing may begin to move, by what control says of the joints; "" where it may."""
         status = self.control.read()
         doubt = bytes(status["doubt"]).decode(errors="ignore")
-        return doubt or ("" if status["believed"] else "control has not seen the joints for long enough yet")
+        return doubt or ("" if status["believed"] else _JOINTS_NOT_SEEN)
 
     def publish_observation(self, observation: Observation, pictures: Mapping[str, int]) -> None:
         """Reception's half: the observation's numbers, and for each camera the number of its newest picture."""

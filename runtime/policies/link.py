@@ -26,11 +26,80 @@ from runtime.core.errors import (
     UnsolicitedError,
     WrongProtocolError,
 )
+from runtime.core.sentences import Pattern, fixed
 from runtime.policies.connection import Dial, Place, reached
 from runtime.policies.watchdog import Watchdog
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
+
+_ITS_METADATA = fixed("policy.server.its_metadata", "its metadata")
+_NOT_CONNECTED = Pattern("policy.server.not_connected", "there is no connection to {url}; connect first")
+_AN_ANSWER = fixed("policy.server.an_answer", "an answer")
+_AN_ACKNOWLEDGEMENT = fixed("policy.server.an_acknowledgement", "an acknowledgement")
+_CLOSED_BY_US = Pattern("policy.server.closed_by_us", "the connection to {url} was closed from our side")
+_NO_ADDRESS = Pattern("policy.server.no_address", "{url} is no websocket address, e.g. ws://127.0.0.1:8000")
+_NO_HANDSHAKE = Pattern(
+    "policy.server.no_handshake",
+    "{url} gave no websocket handshake within {seconds:g} s: what listens there is stuck, or no "
+    "websocket server",
+)
+_NO_TLS = Pattern(
+    "policy.server.no_tls",
+    "{url}: no encrypted connection ({error}): correct its certificate, name the authority in "
+    "SSL_CERT_FILE, or use ws:// where the server has no TLS",
+)
+_POINTS_ELSEWHERE = Pattern(
+    "policy.server.points_elsewhere",
+    "{url} points elsewhere ({error}): correct policy.url",
+)
+_HANDSHAKE_FAILED = Pattern(
+    "policy.server.handshake_failed",
+    "the connection to {url} failed in the websocket handshake ({error}): see that the policy server "
+    "runs, and check host, port and policy.kind: a server of another kind hangs up too",
+)
+_NO_WEBSOCKET = Pattern(
+    "policy.server.no_websocket",
+    "what listens at {url} does not speak websocket ({error}): check host, port and policy.kind",
+)
+_WANTS_KEY = Pattern(
+    "policy.server.wants_key",
+    "{url} refused the websocket with HTTP {status}: it wants an API key; policy.api_key_env names the "
+    "environment variable that holds it",
+)
+_NO_SERVER_BEHIND = Pattern(
+    "policy.server.no_server_behind",
+    "{url} has no policy server behind it at the moment (HTTP {status})",
+)
+_REFUSED = Pattern(
+    "policy.server.refused",
+    "{url} refused the websocket with HTTP {status}: another web server listens there, or the path or "
+    "the API key is wrong; correct policy.url",
+)
+_REQUEST_NOT_TAKEN = Pattern(
+    "policy.server.request_not_taken",
+    "{url} did not take the request within {seconds:g} s",
+)
+_UNSOLICITED = Pattern(
+    "policy.server.unsolicited",
+    "{url} sent a message of {bytes} bytes that nobody had asked for: an answer came twice, by the "
+    "server or by what stands before it, and the last one may have been another question's; the "
+    "connection is dropped",
+)
+_SERVER_SAYS = Pattern("policy.server.server_says", "the policy server at {url} reports an error: {error}")
+_NOT_IN_TIME = Pattern(
+    "policy.server.not_in_time",
+    "{url} did not send {what} within {seconds:g} s; the connection is dropped",
+)
+_TOO_LARGE = Pattern(
+    "policy.server.too_large",
+    "{url} sent a message that is too large ({why}): it is no policy's answer, or pictures are among "
+    "it; the connection is dropped",
+)
+_CLOSED = Pattern(
+    "policy.server.closed",
+    "the policy server at {url} closed the connection ({error}): see that it runs",
+)
 
 ANSWER_LIMIT = 64 * 1024 * 1024  # bytes of a message, metadata too; a chunk of 50 rows is some kilobytes
 _TOO_BIG = 1009  # the close code for it
@@ -94,18 +163,18 @@ class WebsocketLink:
             self._shaking = None
         with self._dropping_on_error():
             self._require_not_aborted()
-            return self._receive(self._connection, deadline, "its metadata", self._connect_deadline)
+            return self._receive(self._connection, deadline, _ITS_METADATA, self._connect_deadline)
 
     def exchange(self, request: bytes, seconds: float) -> bytes:
         """The answer to `request`; PolicyTimeout after `seconds`, PolicyGone, or the server's error."""
         connection = self._connection
         if connection is None:
-            raise PolicyError(f"there is no connection to {self._url}; connect first")
+            raise PolicyError(_NOT_CONNECTED(url=self._url))
         deadline = time.monotonic() + seconds
         with self._dropping_on_error():
             self._require_silence(connection)
             self._send(connection, request, seconds)
-            return self._receive(connection, deadline, "an answer", seconds)
+            return self._receive(connection, deadline, _AN_ANSWER, seconds)
 
     def acknowledged(self, request: bytes, seconds: float, text: str) -> bytes | None:
         """Answer to a request: None if it is `text`, with which some servers acknowledge it, else the bytes.
@@ -114,12 +183,12 @@ class WebsocketLink:
         """
         connection = self._connection
         if connection is None:
-            raise PolicyError(f"there is no connection to {self._url}; connect first")
+            raise PolicyError(_NOT_CONNECTED(url=self._url))
         deadline = time.monotonic() + seconds
         with self._dropping_on_error():
             self._require_silence(connection)
             self._send(connection, request, seconds)
-            answer = self._frame(connection, deadline, "an acknowledgement", seconds)
+            answer = self._frame(connection, deadline, _AN_ACKNOWLEDGEMENT, seconds)
             return None if answer == text else self._binary(answer)
 
     def abort(self) -> None:
@@ -135,7 +204,7 @@ class WebsocketLink:
 
     def _require_not_aborted(self) -> None:
         if self._aborted:
-            raise PolicyError(f"the connection to {self._url} was closed from our side")
+            raise PolicyError(_CLOSED_BY_US(url=self._url))
 
     def leave(self) -> None:
         """End the connection with a close frame, without which servers print a traceback; waits for nothing."""
@@ -160,7 +229,7 @@ class WebsocketLink:
         try:
             uri = parse_uri(self._url)
         except InvalidURI as error:
-            raise PolicyError(f"{self._url} is no websocket address, e.g. ws://127.0.0.1:8000") from error
+            raise PolicyError(_NO_ADDRESS(url=self._url)) from error
         return self._dial() if self._dial else (uri.host, uri.port)
 
     def _connect(self, deadline: float) -> ClientConnection:
@@ -202,49 +271,29 @@ class WebsocketLink:
             found = self._shaking and self._shaking.protocol.handshake_exc
             if isinstance(found, Exception) and not isinstance(found.__cause__, OSError | EOFError):
                 raise self._foreign(found) from error  # it has said something else, and stays
-            raise PolicyTimeout(
-                f"{self._url} gave no websocket handshake within {self._connect_deadline:g} s: "
-                "what listens there is stuck, or no websocket server"
-            ) from error
+            raise PolicyTimeout(_NO_HANDSHAKE(url=self._url, seconds=self._connect_deadline)) from error
         except InvalidStatus as error:
             raise self._refused(error.response.status_code) from error
         except ssl.SSLError as error:
-            raise TlsError(
-                f"{self._url}: no encrypted connection ({error}): correct its certificate, name the authority in "
-                "SSL_CERT_FILE, or use ws:// where the server has no TLS"
-            ) from error
+            raise TlsError(_NO_TLS(url=self._url, error=error)) from error
         except (InvalidURI, ValueError) as error:  # what websockets raises where it is told to go elsewhere
-            raise WrongProtocolError(f"{self._url} points elsewhere ({error}): correct policy.url") from error
+            raise WrongProtocolError(_POINTS_ELSEWHERE(url=self._url, error=error)) from error
         except (WebSocketException, OSError, EOFError) as error:
             gone = isinstance(error, OSError | ConnectionClosed)  # or in the middle of a word
             if gone or isinstance(error.__cause__, OSError | EOFError):
-                raise PolicyLostError(
-                    f"the connection to {self._url} failed in the websocket handshake ({error}): see that the policy "
-                    "server runs, and check host, port and policy.kind: a server of another kind hangs up too"
-                ) from error
+                raise PolicyLostError(_HANDSHAKE_FAILED(url=self._url, error=error)) from error
             raise self._foreign(error) from error
 
     def _foreign(self, error: Exception) -> PolicyError:
-        return WrongProtocolError(
-            f"what listens at {self._url} does not speak websocket ({error}): "
-            "check host, port and policy.kind"
-        )
+        return WrongProtocolError(_NO_WEBSOCKET(url=self._url, error=error))
 
     def _refused(self, status: int) -> PolicyError:
         """A gateway before a server that restarts says 502 to 504; whatever else is said stays so."""
         if status in (401, 403):
-            return RefusedError(
-                f"{self._url} refused the websocket with HTTP {status}: it wants an API key; policy.api_key_env names "
-                "the environment variable that holds it"
-            )
+            return RefusedError(_WANTS_KEY(url=self._url, status=status))
         if status in (502, 503, 504):
-            return PolicyLostError(
-                f"{self._url} has no policy server behind it at the moment (HTTP {status})"
-            )
-        return WrongProtocolError(
-            f"{self._url} refused the websocket with HTTP {status}: "
-            "another web server listens there, or the path or the API key is wrong; correct policy.url"
-        )
+            return PolicyLostError(_NO_SERVER_BEHIND(url=self._url, status=status))
+        return WrongProtocolError(_REFUSED(url=self._url, status=status))
 
     def _send(self, connection: ClientConnection, request: bytes, seconds: float) -> None:
         """Send, but not for ever: a server that stopped reading leaves our socket full."""
@@ -255,9 +304,7 @@ class WebsocketLink:
                 connection.send(request)
             except ConnectionClosed as error:
                 if was_cut():
-                    raise PolicyTimeout(
-                        f"{self._url} did not take the request within {seconds:g} s"
-                    ) from error
+                    raise PolicyTimeout(_REQUEST_NOT_TAKEN(url=self._url, seconds=seconds)) from error
                 raise self._gone(error) from error
 
     def _require_silence(self, connection: ClientConnection) -> None:
@@ -270,11 +317,7 @@ class WebsocketLink:
             return
         except ConnectionClosed as error:
             raise self._gone(error) from error
-        raise UnsolicitedError(
-            f"{self._url} sent a message of {len(self._binary(waiting))} bytes that nobody had asked for: an answer "
-            "came twice, by the server or by what stands before it, and the last one may have been another question's; "
-            "the connection is dropped"
-        )
+        raise UnsolicitedError(_UNSOLICITED(url=self._url, bytes=len(self._binary(waiting))))
 
     def _cut(self) -> None:
         if self._connection is not None:
@@ -285,7 +328,7 @@ class WebsocketLink:
 
     def _binary(self, answer: str | bytes) -> bytes:
         if isinstance(answer, str):
-            raise ServerSaysError(f"the policy server at {self._url} reports an error: {headline(answer)}")
+            raise ServerSaysError(_SERVER_SAYS(url=self._url, error=headline(answer)))
         return answer
 
     def _frame(self, connection: ClientConnection, deadline: float, what: str, seconds: float) -> str | bytes:
@@ -294,24 +337,17 @@ class WebsocketLink:
         try:
             return connection.recv(timeout=max(0.0, deadline - time.monotonic()))
         except TimeoutError as error:
-            raise PolicyTimeout(
-                f"{self._url} did not send {what} within {seconds:g} s; the connection is dropped"
-            ) from error
+            raise PolicyTimeout(_NOT_IN_TIME(url=self._url, what=what, seconds=seconds)) from error
         except ConnectionClosed as error:
             raise self._gone(error) from error
 
     def _gone(self, error: Exception) -> PolicyError:
         if self._aborted:
-            return PolicyError(f"the connection to {self._url} was closed from our side")
+            return PolicyError(_CLOSED_BY_US(url=self._url))
         sent = getattr(error, "sent", None)
         if sent is not None and sent.code == _TOO_BIG:
-            return WrongProtocolError(
-                f"{self._url} sent a message that is too large ({sent.reason}): it is no policy's answer, or pictures "
-                "are among it; the connection is dropped"
-            )
-        return PolicyGone(
-            f"the policy server at {self._url} closed the connection ({error}): see that it runs"
-        )
+            return WrongProtocolError(_TOO_LARGE(url=self._url, why=sent.reason))
+        return PolicyGone(_CLOSED(url=self._url, error=error))
 
     @contextlib.contextmanager
     def _dropping_on_error(self) -> Iterator[None]:

@@ -14,16 +14,24 @@ from runtime.core import msgpack_arrays
 from runtime.core.environment import secret
 from runtime.core.errors import CodecError, PolicyError, WrongProtocolError
 from runtime.core.machine_names import Variable
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.settings import Settings
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.health import require_healthy
 from runtime.policies.link import ANSWER_LIMIT, WebsocketLink
 from runtime.policies.tunnel.settings import TunnelSettings
 
+_POLICY_CLOSED = Pattern("policy.server.policy_closed", "the policy at {url} is closed; connect first")
+_NO_MAP = Pattern("policy.server.no_map", "{url} sent {what} that is a {kind}; expected a map")
+_OTHER_PROTOCOL = Pattern(
+    "policy.server.other_protocol",
+    "{url} sent {what} that is not the {protocol} protocol: {error}",
+)
+
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 log = logging.getLogger(__name__)
-_REPEATED = "the answer is byte for byte the one before, to another question"
+_REPEATED = fixed("policy.server.repeated", "the answer is byte for byte the one before, to another question")
 
 
 class ServerSettings(Settings):
@@ -102,7 +110,7 @@ class WebsocketPolicy(Policy):
     def _require_open(self) -> None:
         """A connection, another one where there is none any more; PolicyError after `close`."""
         if self._closed:
-            raise PolicyError(f"the policy at {self._server.url} is closed; connect first")
+            raise PolicyError(_POLICY_CLOSED(url=self._server.url))
         if not self._link.is_open:
             self._open()
 
@@ -156,9 +164,7 @@ class WebsocketPolicy(Policy):
         message = self._value(payload, what)
         if not isinstance(message, dict):
             self._link.leave()
-            raise WrongProtocolError(
-                f"{self._server.url} sent {what} that is a {type(message).__name__}; expected a map"
-            )
+            raise WrongProtocolError(_NO_MAP(url=self._server.url, what=what, kind=type(message).__name__))
         return message
 
     def _value(self, payload: bytes, what: str) -> Any:
@@ -167,7 +173,7 @@ class WebsocketPolicy(Policy):
         except CodecError as error:
             self._link.leave()
             raise WrongProtocolError(
-                f"{self._server.url} sent {what} that is not the {self.PROTOCOL} protocol: {error}"
+                _OTHER_PROTOCOL(url=self._server.url, what=what, protocol=self.PROTOCOL, error=error)
             ) from error
 
 

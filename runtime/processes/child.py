@@ -7,6 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 from runtime.core import logs as log
+from runtime.ipc.bells import bells
 from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.membership import Membership
 from runtime.ipc.shared_state import SharedState
@@ -26,8 +27,11 @@ def join(process: str, pictures: bool = True, unread: Collection[str] = ()) -> M
     parser.add_argument("--resolved", required=True)
     parser.add_argument("--capabilities", required=True)
     parser.add_argument("--shared", required=True, type=int)
+    parser.add_argument("--bells", required=True, type=bells)
     parser.add_argument("--boot", required=True)
     given = parser.parse_args()
     log.start(process)
     made = planned(given.resolved, given.capabilities, unread)
-    return Member(SharedState.attach(made.layout, given.shared, pictures), given.boot, Lifeline(), made)
+    shared = SharedState.attach(made.layout, given.shared, pictures)
+    shared.hang(given.bells)
+    return Member(shared, given.boot, Lifeline(), made)

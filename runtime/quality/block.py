@@ -96,6 +96,7 @@ class Source(ABC):
     ends: Mapping[str, VideoEnd]  # of the videos that were lost, by camera
     schema: Mapping[str, Any]  # of a collection: may hold max_skew_s, min_length_s
     remarks: Sequence[tuple[str, Severity, str]]  # kind, severity and sentence of what its documents say
+    drawn: bool = False  # its pictures are those of a simulated bench
 
     @abstractmethod
     def blocks(self) -> Iterator[Block]:

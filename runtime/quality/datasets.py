@@ -42,7 +42,8 @@ class DatasetSource(Source):
         self._features = dataset.features
         self._state = self._found(state)
         ours = layout.read_lines(dataset.root / layout.EVA_EPISODES)
-        uuid = next((str(line.get("uuid", "")) for line in ours if line.get("episode_index") == index), "")
+        told = next((line for line in ours if line.get("episode_index") == index), {})
+        uuid, self.drawn = str(told.get("uuid", "")), told.get("simulated") is True
         self.name = uuid or f"{dataset.root.name}#{index}"
         self.fps = dataset.fps
         self.frames = self._entry.length

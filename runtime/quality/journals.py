@@ -16,7 +16,7 @@ from runtime.quality.joints import known_joints, unknown_joints
 from runtime.quality.luma import Film, VideoFilm
 from runtime.quality.report import Severity
 from runtime.recording.files import read_document
-from runtime.recording.layout import Layout
+from runtime.recording.layout import Layout, simulated
 from runtime.recording.scrub import verify
 from runtime.recording.sealing import DIGESTS, OUTCOME, read_outcome
 from runtime.recording.tables import added, rows_schema
@@ -41,6 +41,7 @@ class JournalSource(Source):
         self.frames, self.remarks = self._outcome()
         self.cameras = dict(self._layout.cameras)
         self.schema = _table(self._manifest, "collection")
+        self.drawn = simulated(self._manifest)
         self.vectors = {name: self._vector(name) for name in ("qpos", "action", *self._layout.streams)}
 
     def _outcome(self) -> tuple[int | None, list[tuple[str, Severity, str]]]:

@@ -53,7 +53,7 @@ class VideoFilm:
         self._sampling = sampling
         self._stretch = stretch
         try:
-            self._container = av.open(str(path))
+            self._container = av.open(str(path), metadata_errors="replace")
         except (av.FFmpegError, ValueError) as error:
             raise RecordingError(f"{path} cannot be opened as a video: {error}") from error
         if not self._container.streams.video:

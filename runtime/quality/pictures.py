@@ -31,7 +31,7 @@ class Pictures:
         self._shots: Iterator[Shot] = iter(())
         self._shown = 0  # pictures that were taken
         self._before: Float32 | None = None
-        self._repeats = _Repeats(camera, self._fps, settings, flags)
+        self._repeats = _Repeats(camera, self._fps, settings, flags, drawn=source.drawn)
         self._losses = Losses(camera, self._fps, settings, flags, end)
         self._runs = {
             "black": Runs(self._black),
@@ -158,14 +158,18 @@ class _Repeats:
     """Pictures that are the one before again: said so by the recorder, or seen so while the robot moved.
 
     A picture that stays the same is no proof where the robot stands. One that is coded by itself after such as are
-    not differs from them also where it shows the same: it neither begins nor ends anything.
+    not differs from them also where it shows the same: it neither begins nor ends anything. A `drawn` picture is the
+    same wherever nothing moves in its sight: no camera has stopped.
     """
 
-    def __init__(self, camera: str, fps: float, settings: QualitySettings, flags: Flags) -> None:
+    def __init__(
+        self, camera: str, fps: float, settings: QualitySettings, flags: Flags, *, drawn: bool
+    ) -> None:
         self._camera = camera
         self._fps = fps
         self._settings = settings
         self._flags = flags
+        self._drawn = drawn
         self._repeated = self._skipped = 0
         self._spans = {"repeated": [-1, -1], "skipped": [-1, -1]}
         self._said = Runs(self._no_new)
@@ -187,6 +191,8 @@ class _Repeats:
         said = repeated | lost
         self._count("repeated", first, repeated & ~lost)
         self._said.add(first, repeated & ~lost)
+        if self._drawn:
+            return
         neutral = keys & ~np.concatenate([[self._key], keys[:-1]])
         same = change <= self._settings.same
         self._seen.add(first, (same | neutral) & moving & ~said & ~dull, same.astype(np.float64))

@@ -10,7 +10,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float32, Space, UInt8
+
+_VIDEO_ENDS = Pattern(
+    "recording.video_ends",
+    "{why}; its video ends at row {row}, all else is recorded on",
+)
+
 
 ControlSource = Literal["none", "hold", "motion", "policy", "teleop", "estop", "sim", "unknown"]
 Status = Literal["finished", "interrupted", "failed"]
@@ -42,6 +49,7 @@ class Row:
     intervention: bool = False
     stale: frozenset[str] = frozenset()  # cameras that have given no new picture for too long
     lost: frozenset[str] = frozenset()  # cameras that gave one which could not be kept
+    bench: str | None = None  # what a simulated bench says, see bench_truth; None: as in the row before
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +112,7 @@ class Loss:
     @property
     def text(self) -> str:
         """For a person."""
-        return f"{self.reason}; its video ends at row {self.row}, all else is recorded on"
+        return _VIDEO_ENDS(why=self.reason, row=self.row)
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,6 +57,7 @@ def rows_columns(layout: Layout, records: Sequence[RecordedRow]) -> dict[str, An
         columns[f"repeated.{camera}"] = [camera in record.repeated for record in records]
         columns[f"lost.{camera}"] = [camera in record.lost for record in records]
         columns[f"stale.{camera}"] = [camera in record.row.stale for record in records]
+    columns["bench"] = [row.bench for row in rows]
     return columns
 
 

@@ -79,7 +79,7 @@ def count_frames(path: Path) -> int:
     try:
         if whole_bytes(path) == 0:
             return 0
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             return _count(container)
     except av.FFmpegError:
         return 0

@@ -6,7 +6,7 @@ import math
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from runtime.core.errors import RecordingError
 
@@ -121,3 +121,10 @@ def _captured(size: Mapping[str, object]) -> tuple[int, int]:
     """Height and width of a camera's pictures: those of its video where it is not scaled."""
     names = ("captured_height", "captured_width") if "captured_height" in size else ("height", "width")
     return _count(size, names[0]), _count(size, names[1])
+
+
+def simulated(manifest: Mapping[str, Any]) -> bool:
+    """Whether the deployment that an episode was recorded with declares its bench simulated: its pictures are drawn."""
+    configuration = manifest.get("configuration")
+    transport = configuration.get("transport") if isinstance(configuration, Mapping) else None
+    return isinstance(transport, Mapping) and transport.get("simulated") is True

@@ -45,6 +45,7 @@ def rows_schema(layout: Layout) -> Any:
             *captures,
             pa.field("skewed", pa.bool_()),
             *flags,
+            pa.field("bench", pa.string()),
         ]
     )
 
@@ -118,6 +119,7 @@ ADDED = (
     frozenset({"strategy", "overlap", "woke"}),
     frozenset({"ik_position_error", "ik_rotation_error", "ik_flags", "eef_source"}),
     frozenset({"skewed", "lost.", "stale."}),
+    frozenset({"bench"}),
 )
 
 

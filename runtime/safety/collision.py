@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 
 from robots import Robot
 from robots.clearance import clearance_of
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
+
+_WOULD_COLLIDE = Pattern("safety.would_collide", "{one} and {other} would collide ({mm:.0f} mm deep)")
+_WOULD_BE_NEAR = Pattern("safety.would_be_near", "{one} and {other} would be {mm:.0f} mm apart")
 
 _NEARER = 1e-6  # [m] that is rounding
 
@@ -28,8 +32,8 @@ class Collision:
 
     def __str__(self) -> str:
         if self.distance < 0:
-            return f"{self.one} and {self.other} would collide ({-1000 * self.distance:.0f} mm deep)"
-        return f"{self.one} and {self.other} would be {1000 * self.distance:.0f} mm apart"
+            return _WOULD_COLLIDE(one=self.one, other=self.other, mm=-1000 * self.distance)
+        return _WOULD_BE_NEAR(one=self.one, other=self.other, mm=1000 * self.distance)
 
 
 class Collisions:

@@ -8,11 +8,24 @@ from typing import Literal
 
 import numpy as np
 
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 from runtime.motion.trajectories import Brake
 from runtime.safety.collision import Collision, Collisions
 from runtime.safety.limits import Limits
 from runtime.safety.settings import SafetySettings, WorkspaceBox
+
+_JOINTS_OLD = Pattern("safety.joints_old", "joints are {seconds:.2f} s old, allowed {allowed:g}")
+_PICTURE_OLD = Pattern("safety.picture_old", "picture {camera} is {seconds:.2f} s old, allowed {allowed:g}")
+_LEAVES_WORKSPACE = Pattern("safety.leaves_workspace", "{arms} would leave the workspace box")
+_AWAY_FROM_MEASURED = Pattern(
+    "safety.away_from_measured",
+    "{joint} would be {distance:.2f} rad from where it is measured, allowed {allowed:g}",
+)
+_JUMPS = Pattern("safety.jumps", "{joint} jumps {distance:.2f} rad, allowed {allowed:g}")
+_LIMITED = Pattern("safety.limited", "{joint} limited from {wanted:.4f} to {reachable:.4f}")
+_OUTSIDE = Pattern("safety.outside", "{joint} {value:.4f} is outside {lower:g}..{upper:g}")
+_SHAPE = Pattern("safety.shape", "action has shape {given}, expected {expected}")
 
 __all__ = [
     "Limits",
@@ -137,13 +150,13 @@ class SafetyFilter:
         allowed = self._settings.joint_age_s
         if state.doubt or state.joint_age <= allowed:
             return state.doubt
-        return f"joints are {state.joint_age:.2f} s old, allowed {allowed:g}"
+        return _JOINTS_OLD(seconds=state.joint_age, allowed=allowed)
 
     def _stale(self, state: RobotState) -> str:
         allowed = self._settings.picture_age_s
         for camera, age in state.picture_ages.items():
             if not age <= allowed:  # also refuses NaN: a picture that never came
-                return f"picture {camera} is {age:.2f} s old, allowed {allowed:g}"
+                return _PICTURE_OLD(camera=camera, seconds=age, allowed=allowed)
         return ""
 
     def _place(self, action: Float64, state: RobotState, path: Path) -> str:
@@ -156,7 +169,7 @@ class SafetyFilter:
         if arms and self._outside and path == "motion":
             before = self._outside(state.previous)
             arms = tuple(arm for arm in arms if arm not in before)
-        return f"{', '.join(arms)} would leave the workspace box" if arms else ""
+        return _LEAVES_WORKSPACE(arms=", ".join(arms)) if arms else ""
 
     def _collides(self, action: Float64, state: RobotState, path: Path) -> str:
         if self._collisions is None or (path == "policy" and self._settings.collision != "refuse"):
@@ -185,14 +198,14 @@ class SafetyFilter:
             return ""
         worst = int(excess.argmax())
         name = self._limits.names[worst]
-        return f"{name} would be {excess[worst]:.2f} rad from where it is measured, allowed {allowed:g}"
+        return _AWAY_FROM_MEASURED(joint=name, distance=excess[worst], allowed=allowed)
 
     def _jumps(self, action: Float64, state: RobotState) -> str:
         jump = np.where(self._angles, np.abs(action - state.previous), 0.0)
         worst = int(jump.argmax())
         if jump[worst] <= self._settings.jump:
             return ""
-        return f"{self._limits.names[worst]} jumps {jump[worst]:.2f} rad, allowed {self._settings.jump:g}"
+        return _JUMPS(joint=self._limits.names[worst], distance=jump[worst], allowed=self._settings.jump)
 
     def _arrival(self, action: Float64, reachable: Float64, state: RobotState, path: Path) -> str:
         """The same of what is really sent, and of the way on which the robot would come to a stand after it."""
@@ -266,7 +279,7 @@ class SafetyFilter:
         )
 
     def _change(self, i: int | np.intp, action: Float64, reachable: Float64) -> str:
-        return f"{self._limits.names[i]} limited from {action[i]:.4f} to {reachable[i]:.4f}"
+        return _LIMITED(joint=self._limits.names[i], wanted=action[i], reachable=reachable[i])
 
     def _changed(self, action: Float64, reachable: Float64, notes: tuple[str, ...]) -> Verdict:
         change = np.abs(reachable - action) / self._reach
@@ -282,12 +295,12 @@ class SafetyFilter:
         if not worse.any():
             return ""
         i = int(np.flatnonzero(worse)[0])
-        return f"{limits.names[i]} {action[i]:.4f} is outside {limits.lower[i]:g}..{limits.upper[i]:g}"
+        return _OUTSIDE(joint=limits.names[i], value=action[i], lower=limits.lower[i], upper=limits.upper[i])
 
     def _excess(self, action: Float64) -> tuple[str, ...]:
         limits = self._limits
         return tuple(
-            f"{limits.names[i]} {action[i]:.4f} is outside {limits.lower[i]:g}..{limits.upper[i]:g}"
+            _OUTSIDE(joint=limits.names[i], value=action[i], lower=limits.lower[i], upper=limits.upper[i])
             for i in np.flatnonzero(limits.outside(action) > _TOLERANCE)
         )
 
@@ -309,7 +322,7 @@ def _usable(action: Float64, state: RobotState) -> bool:
 
 def _unusable(action: Float64, limits: Limits) -> str:
     if action.shape != limits.lower.shape:
-        return f"action has shape {action.shape}, expected {limits.lower.shape}"
+        return _SHAPE(given=action.shape, expected=limits.lower.shape)
     i = int(np.flatnonzero(~np.isfinite(action))[0])
     return f"{limits.names[i]} is {action[i]}"
 

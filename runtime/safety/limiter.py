@@ -6,9 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 from runtime.safety.limits import Limits
 from runtime.safety.settings import SafetySettings
+
+_LAST_CHECK = Pattern("safety.last_check", "last check: {joint} {wanted:.4f} was to be sent, {sent:.4f} is")
 
 _MARGIN = 1.05  # rounding, and ticks that are not alike, are no excess
 _TOLERANCE = 1e-6  # [rad, or what a gripper's travel is worth]
@@ -70,6 +73,5 @@ class CommandLimiter:
     def _notes(self, action: Float64, sent: Float64, changed: np.ndarray) -> tuple[str, ...]:
         names = self._limits.names
         return tuple(
-            f"last check: {names[i]} {action[i]:.4f} was to be sent, {sent[i]:.4f} is"
-            for i in np.flatnonzero(changed)
+            _LAST_CHECK(joint=names[i], wanted=action[i], sent=sent[i]) for i in np.flatnonzero(changed)
         )

@@ -69,11 +69,14 @@ def linked(made: StationSpec, clock: Clock, around: Surroundings, options: argpa
 
 
 def station(
-    path: Path, assignments: Sequence[str], seed: int, clock: VirtualClock, bench: str = "tabletop"
+    path: Path, assignments: Sequence[str], clock: VirtualClock, *bench_options: str
 ) -> ServedLockstep:
-    """The station of a deployment at its bench, laid out by `seed`; RuntimeFault where it cannot be."""
+    """The station of a deployment at its bench, which has the options of a simulated node; RuntimeFault where it
+    cannot be.
+    """
     made = checked_spec(loader.load(path, assignments))
-    options = node_parser().parse_args(["--robot", made.robot.name, "--bench", bench, "--seed", str(seed)])
+    given = ("--robot", made.robot.name, "--bench", "tabletop", *bench_options)
+    options = node_parser().parse_args(given)
     around = surroundings.surroundings(made.robot, options)
     peers = linked(made, clock, around, options)
     return ServedLockstep(made, clock, Rested(around.truth, clock), peers=peers)
@@ -94,6 +97,8 @@ def parser() -> argparse.ArgumentParser:
         metavar="LINE",
         help="a policy server of this process, as a command line of runtime.sim.serve; the first is the deployment's",
     )
+    line.add_argument("--width", type=int, default=640, help="of each picture")
+    line.add_argument("--height", type=int, default=480)
     standin.add_arguments(line)
     return line
 
@@ -113,7 +118,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 server = stack.enter_context(closing(serve.made(given, clock)))
                 urls[str(given.name or len(urls))] = str(server.start()["url"])
             own = [f'policy.url="{url}"' for url in [*urls.values()][:1]] + (_PATIENT if urls else [])
-            served = station(options.deployment, [*own, *options.assignments], options.seed, clock)
+            bench = ("--seed", options.seed, "--width", options.width, "--height", options.height)
+            served = station(options.deployment, [*own, *options.assignments], clock, *map(str, bench))
             stack.enter_context(closing(served))
             standin.announce({"policies": urls}, options.ready_file)
             served.serve(told.is_set)

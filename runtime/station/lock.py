@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 from typing import IO
 
 from runtime.config.schema import Deployment
 from runtime.core.errors import SetupError
+from runtime.ipc.station_lock import Taken, take
 
 
 def hold(settings: Deployment) -> IO[str]:
@@ -27,16 +26,10 @@ def unwritable(settings: Deployment, error: OSError) -> SetupError:
 
 
 def _locked(settings: Deployment) -> IO[str]:
-    settings.station_dir.mkdir(parents=True, exist_ok=True)
-    lock = (settings.station_dir / "lock").open("a+", encoding="utf-8")
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.seek(0)
+        return take(settings.station_dir)
+    except Taken as taken:
         raise SetupError(
-            f"station {settings.station!r} is already running (process {lock.read().strip() or '?'}); "
+            f"station {settings.station!r} is already running (process {taken.by}); "
             "end it first, or give this one another name with --set station=NAME"
         ) from None
-    lock.truncate(0)
-    os.write(lock.fileno(), str(os.getpid()).encode())
-    return lock

@@ -14,8 +14,28 @@ from runtime.config.loader import Resolved, changed
 from runtime.config.schema import Deployment
 from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.core.machine_names import Names, named
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.identity import LOCAL, SCRIPT
 from runtime.ipc.messages import Command
+
+_TABLES_FOR_ADMINISTRATORS = Pattern(
+    "rights.tables_for_administrators",
+    "{kind}: {key} by {user}, whose role is {role}: tables are for administrators; allowed: a "
+    "checkpoint, or a recorded episode, by its name",
+)
+_VARIABLES_OF_WEB = Pattern(
+    "rights.variables_of_web",
+    "a table from the web may name {allowed}, and what security.variables of the station's deployment lists",
+)
+_WRITTEN_FILES_OF_WEB = Pattern(
+    "rights.written_files_of_web",
+    "a table from the web may have a file written below {folder} alone",
+)
+_LISTED_FILES = fixed("rights.listed_files", "what security.files of the station's deployment lists")
+_FILES_OF_WEB = Pattern(
+    "rights.files_of_web",
+    "a table from the web may name files below {where}, and {listed}",
+)
 
 # Roles of who gives a command: a program of the station's account, a script on the channel.
 OWN_ACCOUNT = (LOCAL, SCRIPT)
@@ -35,8 +55,9 @@ def require(command: Command, own: Resolved) -> None:
         written = command.role == ADMINISTRATOR or key in command.vouched
         if command.args.get(key) is not None and not written:
             raise RuntimeFault(
-                f"{command.kind}: {key} by {command.user or 'somebody'}, whose role is {command.role}: tables are for "
-                "administrators; allowed: a checkpoint, or a recorded episode, by its name"
+                _TABLES_FOR_ADMINISTRATORS(
+                    kind=command.kind, key=key, user=command.user or "somebody", role=command.role
+                )
             )
     table = command.args.get("policy")
     if isinstance(table, Mapping):
@@ -72,12 +93,12 @@ def _is_allowed(own: Deployment, what: Names, value: str) -> bool:
 def _advice(own: Deployment, what: Names) -> str:
     if what is Names.VARIABLE:
         allowed = ", ".join(own.security.variables) or "none"
-        return f"a table from the web may name {allowed}, and what security.variables of the station's deployment lists"
+        return _VARIABLES_OF_WEB(allowed=allowed)
     if what is Names.WRITTEN:
-        return f"a table from the web may have a file written below {own.ssh_dir} alone"
+        return _WRITTEN_FILES_OF_WEB(folder=own.ssh_dir)
     where = own.data if what is Names.RECORDING else own.ssh_dir
-    listed = "what security.files of the station's deployment lists"
-    return f"a table from the web may name files below {where}, and {listed}"
+    listed = _LISTED_FILES
+    return _FILES_OF_WEB(where=where, listed=listed)
 
 
 def _recordings(own: Deployment) -> Iterable[Path]:

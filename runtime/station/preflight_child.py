@@ -17,7 +17,22 @@ from runtime.config.loader import Resolved, changed
 from runtime.config.schema import Deployment
 from runtime.core.environment import without_secrets
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.command_arguments import PreflightRequest
+
+_UNDER_WAY = Pattern("preflight.under_way", "a preflight of {about} is under way: wait for it")
+_NOT_STARTED = Pattern("preflight.not_started", "the process of a preflight cannot be started: {error}")
+_NOT_IN_TIME = fixed("preflight.not_in_time", "it did not end in time")
+_UNKNOWN = Pattern(
+    "preflight.unknown",
+    "preflight {identity!r:.80} is not known here; the last {kept} since the start are kept",
+)
+_STATION_ENDS = fixed("preflight.station_ends", "the station ends")
+_UNREADABLE = fixed(
+    "preflight.unreadable",
+    "the station failed to read what its process said: see the station's log",
+)
+_SAID_NOTHING = Pattern("preflight.said_nothing", "its process ended with {code} and said nothing")
 
 _ROOM_S = 10.0  # beside the deadlines of the policy's own calls: kinematics, a slow machine
 _GRACE_S = 180.0  # beyond the deadline, for a process that may have kinematics to compile
@@ -71,13 +86,13 @@ class Preflights:
         if asked.id in self._kept:  # asked again: the answer to the first one was lost
             return max(0.0, self._kept[asked.id].ends - self._now())
         if self._flight is not None:
-            raise RuntimeFault(f"a preflight of {self._flight.about} is under way: wait for it")
+            raise RuntimeFault(_UNDER_WAY(about=self._flight.about))
         deadline = asked.deadline_s or _patience(resolved, asked)
         line = {"tree": dict(resolved.tree), "changes": asked.changes, "deadline_s": deadline}
         try:
             child = self._spawn()
         except OSError as error:
-            raise RuntimeFault(f"the process of a preflight cannot be started: {error}") from error
+            raise RuntimeFault(_NOT_STARTED(error=error)) from error
         longest = deadline + _GRACE_S
         self._flight = flight = Flight(asked.id, asked.about, child, self._now() + longest)
         self._kept[asked.id] = flight
@@ -95,7 +110,7 @@ class Preflights:
             self._flight = None
             return flight
         if self._now() > flight.ends and not flight.failure:
-            flight.end("it did not end in time")
+            flight.end(_NOT_IN_TIME)
         return None
 
     def cancel(self, why: str) -> None:
@@ -106,16 +121,14 @@ class Preflights:
     def report(self, id: str) -> dict[str, Any]:
         """The preflight of that id, as by `Flight.plain`; RuntimeFault where it is not known (any more)."""
         if id not in self._kept:
-            raise RuntimeFault(
-                f"preflight {id!r:.80} is not known here; the last {_KEPT} since the start are kept"
-            )
+            raise RuntimeFault(_UNKNOWN(identity=id, kept=_KEPT))
         return self._kept[id].plain()
 
     def close(self) -> None:
         """End what is under way, and wait for it."""
         flight = self._flight
         if flight is not None:
-            self.cancel("the station ends")
+            self.cancel(_STATION_ENDS)
             flight.over.wait(2.0)
 
 
@@ -156,7 +169,7 @@ def fly(asked: Mapping[str, Any], longest: float) -> dict[str, Any]:
 def _attend(flight: Flight, asked: Mapping[str, Any]) -> None:
     """Whatever becomes of the child, the flight is over at its end."""
     report: dict[str, Any] = {}
-    failure = "the station failed to read what its process said: see the station's log"
+    failure: str = _UNREADABLE
     try:
         report, failure = _told(flight.child, asked)
     finally:
@@ -178,7 +191,7 @@ def _told(child: subprocess.Popen[bytes], asked: Mapping[str, Any]) -> tuple[dic
     with contextlib.suppress(BrokenPipeError):  # the same once more, for what was still in its buffer
         child.stdin.close()
     report = _report(said)
-    return report, "" if report else f"its process ended with {code} and said nothing"
+    return report, "" if report else _SAID_NOTHING(code=code)
 
 
 def _report(said: bytes) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError, PolicyLostError
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import ActionChunk, Conditioning, Float64, Observation
 from runtime.motion.timeline import difference
 from runtime.policies.base import Policy, PolicyInfo
@@ -19,6 +20,20 @@ from runtime.teleoperators.base import Leader, LeaderPose
 
 if TYPE_CHECKING:
     from robots import Robot
+
+_BECAUSE = Pattern("leader.because", ": {why}")
+_SAYS_NOTHING = Pattern("leader.says_nothing", "{who} says nothing")
+_SILENT = Pattern(
+    "leader.silent",
+    "{who} has said nothing for {seconds:.2f} s, allowed {allowed:g} (collection.max_age_s){because}",
+)
+_SAID_NOTHING = Pattern("leader.said_nothing", "{who} has said nothing{because}")
+_JOINTS_SHAPE = Pattern("leader.joints_shape", "the observation has joints of shape {shape}")
+_NODE_LEADER = fixed("leader.node_leader", "the node's own leader")
+_NODE_DRIVES = fixed(
+    "leader.node_drives",
+    "the node drives the robot by its own leader: there is nothing to ask",
+)
 
 Following = Literal["absolute", "relative"]
 _FOUND_S = 5.0  # for a leader to say something when the station is set up
@@ -55,26 +70,25 @@ class Relay(Policy):
         deadline = self._clock.now() + _FOUND_S
         while self.leader.newest is None:
             if self._clock.now() > deadline:
-                raise PolicyLostError(self.silence() or f"{self.leader.name} says nothing")
+                raise PolicyLostError(self.silence() or _SAYS_NOTHING(who=self.leader.name))
             self._clock.sleep_until(self._clock.now() + _LOOK_S)
         return PolicyInfo(self.leader.name, action_space="joint")
 
     def silence(self) -> str:
         """Why the leader cannot be followed just now, "" where it can."""
         newest, why = self.leader.newest, self.leader.refused
-        because = f": {why}" if why else ""
+        because = _BECAUSE(why=why) if why else ""
         if newest is None:
-            return f"{self.leader.name} has said nothing{because}"
+            return _SAID_NOTHING(who=self.leader.name, because=because)
         age = self._clock.now() - newest.arrived
         if age > self._max_age:
-            allowed = f"allowed {self._max_age:g} (collection.max_age_s)"
-            return f"{self.leader.name} has said nothing for {age:.2f} s, {allowed}{because}"
+            return _SILENT(who=self.leader.name, seconds=age, allowed=self._max_age, because=because)
         return ""
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         """Rows float32 [H, D], all equal; PolicyLostError where the leader is silent for too long."""
         if observation.qpos.shape != (self._dim,):
-            raise PolicyError(f"the observation has joints of shape {list(observation.qpos.shape)}")
+            raise PolicyError(_JOINTS_SHAPE(shape=list(observation.qpos.shape)))
         pose = self._pose()
         if self._last is None:
             self._wanted = np.asarray(observation.qpos, np.float64).copy()
@@ -121,10 +135,10 @@ class NodeLed(Policy):
     sees_pictures = False
 
     def connect(self) -> PolicyInfo:
-        return PolicyInfo("the node's own leader")
+        return PolicyInfo(_NODE_LEADER)
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        raise PolicyError("the node drives the robot by its own leader: there is nothing to ask")
+        raise PolicyError(_NODE_DRIVES)
 
     def reset(self) -> None:
         """Nothing to forget."""

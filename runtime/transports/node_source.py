@@ -16,8 +16,10 @@ import zmq
 
 from runtime.core.clock import Clock, ClockMap
 from runtime.core.errors import TransportError
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Observation, UInt8
 from runtime.ipc.messages import Event
+from runtime.ipc.readable import readable
 from runtime.transports import node_link
 from runtime.transports.base import Source
 from runtime.transports.freshness import FROZEN_S, Freshness
@@ -34,14 +36,73 @@ if TYPE_CHECKING:
     from runtime.transports.node_settings import NodeSettings
 
 log = logging.getLogger(__name__)
+_REFUSED_LATE = fixed(
+    "node.refused_late",
+    "commands came too late for the node: this machine, or the way to it, is too slow",
+)
+_REFUSED_LIMITS = fixed(
+    "node.refused_limits",
+    "commands were beyond the node's own limits",
+)
+_REFUSED_DIMENSION = fixed(
+    "node.refused_dimension",
+    "commands had another number of joints than the node",
+)
+_REFUSED_NOT_FINITE = fixed("node.refused_not_finite", "commands had numbers that are none")
+_REFUSED_MALFORMED = fixed(
+    "node.refused_malformed",
+    "commands could not be read by the node",
+)
+_REFUSED_COLLECTING = fixed(
+    "node.refused_collecting",
+    "a person drives the robot: the node takes no commands",
+)
+_CANNOT_LISTEN = Pattern("node.cannot_listen", "cannot listen to the node at {endpoint}: {error}")
+_SEVERAL_CLIENTS = Pattern(
+    "node.several_clients",
+    "several clients command the node, which obeys {client} alone",
+)
+_NOTHING_USABLE = Pattern(
+    "node.nothing_usable",
+    "waiting for the node at {endpoint}: nothing usable for {seconds:.1f} s: {why}",
+)
+_STOPPED = Pattern(
+    "node.stopped",
+    "waiting for the node at {endpoint}: nothing for {seconds:.1f} s: it has stopped, or the way to it is cut",
+)
+_NEVER_CAME = Pattern(
+    "node.never_came",
+    "waiting for the node at {endpoint}: nothing has come for {seconds:.1f} s: see that it runs, and that it "
+    "publishes where transport.sub_endpoint says",
+)
+_TRUTH_UNDECLARED = fixed(
+    "node.truth_undeclared",
+    "it says the truth of a bench, but transport.simulated is false",
+)
+_FROZEN_PICTURE = Pattern(
+    "node.frozen_picture",
+    "{camera} shows the same picture for over {seconds:g} s",
+)
+_CLOCK_BACK = fixed(
+    "node.clock_back",
+    "the node's clock went back: it was started anew, or its clock was set",
+)
+_CLOCK_AHEAD = fixed(
+    "node.clock_ahead",
+    "the node's clock leapt ahead: it was set",
+)
+_FRAMES_LOST = fixed(
+    "node.frames_lost",
+    "the node's numbers have gaps: this machine, or the way, is too slow for it",
+)
 # Reasons of the nodes that are known; others say theirs in their own words.
 _REFUSED = {
-    "node_refused.stale": "commands came too late for the node: this machine, or the way to it, is too slow",
-    "node_refused.limits": "commands were beyond the node's own limits",
-    "node_refused.dimension": "commands had another number of joints than the node",
-    "node_refused.not_finite": "commands had numbers that are none",
-    "node_refused.malformed": "commands could not be read by the node",
-    "node_refused.collecting": "a person drives the robot: the node takes no commands",
+    "node_refused.stale": _REFUSED_LATE,
+    "node_refused.limits": _REFUSED_LIMITS,
+    "node_refused.dimension": _REFUSED_DIMENSION,
+    "node_refused.not_finite": _REFUSED_NOT_FINITE,
+    "node_refused.malformed": _REFUSED_MALFORMED,
+    "node_refused.collecting": _REFUSED_COLLECTING,
 }
 _QUEUED_FRAMES = 4
 _WAKE_MS = 50  # how soon the reader notices that it is to end
@@ -82,7 +143,7 @@ class NodeSource(Source):
         try:
             socket = self._subscribed()
         except zmq.ZMQError as error:
-            raise TransportError(f"cannot listen to the node at {self._endpoint}: {error}") from error
+            raise TransportError(_CANNOT_LISTEN(endpoint=self._endpoint, error=error)) from error
         self._thread = threading.Thread(target=self._read, args=(socket,), name="node-source", daemon=True)
         self._thread.start()
 
@@ -115,7 +176,7 @@ class NodeSource(Source):
     def why(self, fault: str) -> str:
         """The newest sentence of a fault; of what the node refused, what that means."""
         if fault == "node_refused.other_master":
-            return f"several clients command the node, which obeys {self._status.master} alone"
+            return _SEVERAL_CLIENTS(client=self._status.master)
         if fault in _REFUSED:
             return _REFUSED[fault]
         with self._changed:
@@ -159,15 +220,10 @@ class NodeSource(Source):
         self._told = ""
 
     def _waiting(self, silent: float, refusal: str | None) -> str:
-        what = f"waiting for the node at {self._endpoint}: nothing"
+        told = {"endpoint": self._endpoint, "seconds": silent}
         if refusal:
-            return f"{what} usable for {silent:.1f} s: {refusal}"
-        if self._count:
-            return f"{what} for {silent:.1f} s: it has stopped, or the way to it is cut"
-        return (
-            f"{what} has come for {silent:.1f} s: see that it runs, and that it publishes where "
-            "transport.sub_endpoint says"
-        )
+            return _NOTHING_USABLE(**told, why=refusal)
+        return _STOPPED(**told) if self._count else _NEVER_CAME(**told)
 
     def _subscribed(self) -> zmq.Socket[bytes]:
         """A socket that hears the node; raises ZMQError."""
@@ -229,7 +285,7 @@ class NodeSource(Source):
     def _ignore_truth(self) -> None:
         """Said once: every message of such a node has it."""
         if "truth_ignored" not in self._faults:
-            text = "it says the truth of a bench, but transport.simulated is false"
+            text = _TRUTH_UNDECLARED
             self._blame("truth_ignored", text)
 
     def _captured(self, frame: NodeFrame, arrived: float) -> dict[str, float]:
@@ -239,7 +295,7 @@ class NodeSource(Source):
         if self._detect_frozen:
             times |= self._freshness.captured(frame.pictures, time)
             for camera in self._freshness.newly_frozen(time):
-                self._blame(f"frozen_{camera}", f"{camera} shows the same picture for over {FROZEN_S:g} s")
+                self._blame(f"frozen_{camera}", _FROZEN_PICTURE(camera=camera, seconds=FROZEN_S))
         return times
 
     def _mapped(self, stamp: float, arrived: float) -> float:
@@ -247,19 +303,15 @@ class NodeSource(Source):
         restarts, leaps = self._map.restarts, self._map.leaps
         time = self._map.map(stamp, arrived)
         if self._map.restarts > restarts:
-            self._blame(
-                "clock_backwards", "the node's clock went back: it was started anew, or its clock was set"
-            )
+            self._blame("clock_backwards", _CLOCK_BACK)
         if self._map.leaps > leaps:
-            self._blame("clock_forwards", "the node's clock leapt ahead: it was set")
+            self._blame("clock_forwards", _CLOCK_AHEAD)
         return time
 
     def _count_lost(self, sequence: int | None) -> None:
         if sequence is not None and self._peer_sequence is not None and sequence > self._peer_sequence + 1:
             self._faults["frames_lost"] += sequence - self._peer_sequence - 1
-            self._sentences["frames_lost"] = (
-                "the node's numbers have gaps: this machine, or the way, is too slow for it"
-            )
+            self._sentences["frames_lost"] = _FRAMES_LOST
         self._peer_sequence = sequence
 
     def _blame(self, fault: str, text: str) -> None:
@@ -282,7 +334,7 @@ def _drain(socket: zmq.Socket[bytes]) -> list[memoryview]:
     """
     payloads: list[memoryview] = []
     with contextlib.suppress(zmq.Again):
-        while len(payloads) < 4 * _QUEUED_FRAMES:
+        while len(payloads) < 4 * _QUEUED_FRAMES and readable(socket):
             payloads.append(socket.recv(zmq.NOBLOCK, copy=False).buffer)
     return payloads
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from runtime.config.schema import Answer
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern, fixed, series
 from runtime.core.types import Float32, Float64, RobotCommand
 from runtime.ipc.observation_reader import LatestObservation
 from runtime.ipc.shared_state import EStop, SharedState
@@ -23,6 +24,14 @@ from runtime.safety.filter import Limits, RobotState, SafetySettings, braking
 from runtime.safety.limiter import CommandLimiter, Limited
 from runtime.spaces.binary_grippers import Switch, open_or_closed
 from runtime.transports.base import Sink
+
+_TAKEN_OVER = fixed("control.taken_over", "taken over inside its limits")
+_STEPPED = Pattern("control.stepped", "{why}: {joint} stepped {distance:.3f} rad")
+_PRESSED_WITHIN_TICK = fixed("control.pressed_within_tick", "e-stop pressed within the tick")
+_NOT_PASSED_ON = Pattern(
+    "control.not_passed_on",
+    "{word} is not passed on to the node while the e-stop is not known to be clear",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +108,7 @@ class Actuator(ABC):
         limits = self._settings.limits
         measured = limits.standing(np.where(limits.grippers & self.engaged, self.commanded, measured))
         inside = np.clip(measured, limits.lower, limits.upper) if self._settings.guarded else measured
-        self._note_step(measured, inside, "taken over inside its limits")
+        self._note_step(measured, inside, _TAKEN_OVER)
         self.commanded = inside
         self.rest_here()
         self.engaged = True
@@ -129,7 +138,9 @@ class Actuator(ABC):
         apart = np.where(self._settings.limits.places, np.abs(after - before), 0.0)
         if apart.any():
             worst = int(apart.argmax())
-            self._stepped = (f"{why}: {self._settings.limits.names[worst]} stepped {apart[worst]:.3f} rad",)
+            self._stepped = (
+                _STEPPED(why=why, joint=self._settings.limits.names[worst], distance=apart[worst]),
+            )
 
     @property
     def rest(self) -> Float64:
@@ -162,7 +173,7 @@ class Actuator(ABC):
             # Since this tick looked: the next one takes over, this one repeats the last command.
             action, notes, stop = (
                 self._settings.limits.standing(self.commanded),
-                ("e-stop pressed within the tick",),
+                (_PRESSED_WITHIN_TICK,),
                 True,
             )
         action, corrected = self._checked(action, elapsed, stop)
@@ -175,7 +186,7 @@ class Actuator(ABC):
             self._ends = np.where(action == target.action, target.velocity, self.velocity)
         self.commanded = action
         notes, self._stepped = (*self._stepped, *notes, *corrected), ()
-        return Sent(time, target, action, notes, corrected="; ".join(corrected))
+        return Sent(time, target, action, notes, corrected=series(corrected))
 
     @property
     def _pressed(self) -> bool:
@@ -231,7 +242,7 @@ class RobotActuator(Actuator):
         While the e-stop is pressed only the word that ends what the node does by itself is.
         """
         if self._page.estop is not EStop.CLEAR and word != END:
-            return f"{word} is not passed on to the node while the e-stop is not known to be clear"
+            return _NOT_PASSED_ON(word=word)
         try:
             self._sink.tell(word, data)
         except RuntimeFault as error:

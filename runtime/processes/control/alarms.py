@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 from runtime.ipc.observation_reader import LatestObservation
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.control.actuator import RobotActuator, TickSettings
 from runtime.processes.control.plausibility import Plausibility
+
+_SIBLING_SILENT = Pattern("control.sibling_silent", "no sign of life from {process} {since}")
+_HELD_ELSEWHERE = Pattern(
+    "control.held_elsewhere",
+    "{joint} reads {measured:.3f} rad and is held at {held:.3f}: look whether the robot stands as it is"
+    " shown, then set up again",
+)
 
 _RETURNED_AWAY = 0.1  # [rad] that an arm may be off after it was not seen, by sagging
 _AGREES_S = 1.0  # that a joint reads where it is told to be, before its readings lead its command again
@@ -20,7 +28,7 @@ def silent_sibling(shared: SharedState, now: float, allowed: float) -> str:
     """The process whose heartbeat is older than `allowed` seconds, in a sentence; "" where none is."""
     for process in ("coordinator", "guard"):
         if not shared.alive(process, now, allowed):
-            return f"no sign of life from {process} {shared.silence(process, now)}"
+            return _SIBLING_SILENT(process=process, since=shared.silence(process, now))
     return ""
 
 
@@ -131,9 +139,8 @@ class Displacement:
         if not far.any():
             return ""
         worst = int(np.where(far, away, 0.0).argmax())
-        return (
-            f"{self._settings.limits.names[worst]} reads {measured[worst]:.3f} rad and is held at "
-            f"{robot.commanded[worst]:.3f}: look whether the robot stands as it is shown, then set up again"
+        return _HELD_ELSEWHERE(
+            joint=self._settings.limits.names[worst], measured=measured[worst], held=robot.commanded[worst]
         )
 
     @property

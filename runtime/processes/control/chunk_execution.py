@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from runtime.core.errors import ConfigurationError
 from runtime.core.plugins import variants
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 from runtime.ipc.messages import ChunkMerged, Mode, PostedChunk
 from runtime.motion.timeline import DimensionKinds, Timeline, difference
@@ -21,6 +22,18 @@ from runtime.recording.base import ControlSource
 from runtime.strategies.base import Arrival, Merge, Merged, join
 
 log = logging.getLogger(__name__)
+_CHUNK_UNUSABLE = Pattern("control.chunk_unusable", "control cannot use it: {kind}: {error}")
+_CHUNK_SHAPE = Pattern("control.chunk_shape", "it has the shape {shape}; expected [H, {width}], H from 1 on")
+_CHUNK_BEGIN = Pattern("control.chunk_begin", "it means to begin at {given} numbers; expected {expected}")
+_TOO_FAR = Pattern(
+    "control.too_far",
+    "{where}, allowed {allowed:g} (safety.jump): approach it, or start elsewhere",
+)
+_BLENDED_IN = Pattern("control.blended_in", "{where}: blended in")
+_FIRST_ACTION_FAR = Pattern(
+    "control.first_action_far",
+    "{joint}: the first action is {distance:.2f} rad from where the robot stands",
+)
 _JOINED_AT_ONCE = 0.05  # [rad] that a run's first action may be off without being blended in
 _ONE_BY_ONE: tuple[Mode, ...] = ("step", "preview")  # a person asks for each chunk
 
@@ -104,9 +117,7 @@ class ExecuteChunks(Behaviour):
             joined = self._join(chunk, step, commanded)
         except Exception as error:  # about one chunk: it must not end what keeps the robot held
             log.exception("chunk %d cannot be used", chunk.chunk_id)
-            joined = JoinResult(
-                dropped(chunk, step, f"control cannot use it: {type(error).__name__}: {error}")
-            )
+            joined = JoinResult(dropped(chunk, step, _CHUNK_UNUSABLE(kind=type(error).__name__, error=error)))
         self._expecting = False
         self._useless = bool(joined.merged.dropped) and chunk.waited
         return joined
@@ -114,22 +125,20 @@ class ExecuteChunks(Behaviour):
     def _join(self, chunk: PostedChunk, step: int, commanded: Float64) -> JoinResult:
         rows, dim = chunk.rows, len(commanded)
         if rows.ndim != 2 or rows.shape[1] != dim or not len(rows):
-            shape = f"it has the shape {list(rows.shape)}; expected [H, {dim}], H from 1 on"
+            shape = _CHUNK_SHAPE(shape=list(rows.shape), width=dim)
             return JoinResult(dropped(chunk, step, shape))
         arrival = Arrival(chunk.chunk_id, chunk.observation_step, rows.astype(np.float64), chunk.waited)
         safety = self._settings.safety
         # A policy that means to begin elsewhere is told by its first row; a late one has gone on by the first used.
         begin = arrival.rows[0] if chunk.meant is None else chunk.meant.astype(np.float64)
         if begin.shape != (dim,):
-            return JoinResult(
-                dropped(chunk, step, f"it means to begin at {list(begin.shape)} numbers; expected {dim}")
-            )
+            return JoinResult(dropped(chunk, step, _CHUNK_BEGIN(given=list(begin.shape), expected=dim)))
         meant, where = self._away(begin, commanded)
         if meant > safety.jump:
-            far = f"{where}, allowed {safety.jump:g} (safety.jump): approach it, or start elsewhere"
-            return JoinResult(dropped(chunk, step, far), far, too_far=True)
+            reason = _TOO_FAR(where=where, allowed=safety.jump)
+            return JoinResult(dropped(chunk, step, reason), reason, too_far=True)
         away, where = self._away_where_used(arrival, step, commanded)
-        far = f"{where}: blended in" if away > safety.first_action_far else ""
+        far = _BLENDED_IN(where=where) if away > safety.first_action_far else ""
         held = commanded if away > _JOINED_AT_ONCE or self.starved else None
         switched = self._switched
         merged = join(
@@ -160,7 +169,7 @@ class ExecuteChunks(Behaviour):
         apart = difference(row, commanded, settings.dims.wrapping)
         away = np.where(settings.limits.places, np.abs(apart), 0.0)
         worst, name = float(away.max()), settings.limits.names[int(away.argmax())]
-        return worst, f"{name}: the first action is {worst:.2f} rad from where the robot stands"
+        return worst, _FIRST_ACTION_FAR(joint=name, distance=worst)
 
     def _told(self, chunk: PostedChunk, merged: Merged) -> ChunkMerged:
         return ChunkMerged(

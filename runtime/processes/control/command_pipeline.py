@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Float64
 from runtime.ipc.observation_reader import LatestObservation
 from runtime.motion.timeline import difference
@@ -18,6 +19,17 @@ from runtime.processes.control.gripper_locks import GripperLocks
 from runtime.processes.control.telemetry import Telemetry
 from runtime.safety.filter import SafetyFilter
 from runtime.spaces.binary_grippers import Dwell, open_or_closed
+
+_ACTIONS_AGAIN = Pattern("control.actions_again", "actions again after {seconds:.2f} s")
+_IN_A_ROW = Pattern("control.refused_in_a_row", "{count} actions refused in a row, the last one: {why}")
+_OF_THE_LAST = Pattern(
+    "control.refused_of_the_last",
+    "{count} actions refused of the last {of}, the last one: {why}",
+)
+_STARVED = Pattern("control.starved", "no usable chunk for {seconds:.1f} s")
+_STARVED_AT_ONCE = fixed("control.starved_at_once", "no usable chunk for this step")
+_ARRIVED_THERE = fixed("control.arrived", "arrived")
+_NO_ACTION = fixed("control.no_action", "no action for this step: slowing down and holding")
 
 _ARRIVED = 1e-4  # [rad] of a motion's end: it may have been limited on its last steps
 _QUIET_S = 1.0  # without a refusal: the next one is told again
@@ -174,7 +186,7 @@ class CommandPipeline:
         self.refused, self._standing, self._aim = 0, None, action
         self._verdicts.append(False)
         if self.run is not None and (gap := self.run.fed(planned)) is not None:
-            self._report.say("recovered", f"actions again after {gap:.2f} s")
+            self._report.say("recovered", _ACTIONS_AGAIN(seconds=gap))
         sent = self.actuator.send(step, planned, target, verdict.action, (*notes, *verdict.notes))
         return sent._replace(limited=verdict.most, change=verdict.change, near=verdict.near)
 
@@ -226,8 +238,9 @@ class CommandPipeline:
         self._refused_at = planned
         refused = sum(self._verdicts)
         if refused >= self._settings.safety.refusals_to_hold:
-            how = "in a row" if refused == self.refused else f"of the last {len(self._verdicts)}"
-            self.hold_because("refusals", f"{refused} actions refused {how}, the last one: {notes[-1]}")
+            told = {"count": refused, "why": notes[-1]}
+            in_row, of = refused == self.refused, len(self._verdicts)
+            self.hold_because("refusals", _IN_A_ROW(**told) if in_row else _OF_THE_LAST(**told, of=of))
         return self._stand(step, planned, seen)._replace(target=target, notes=notes, refused=True)
 
     def _nothing_planned(self, step: int, planned: float, seen: LatestObservation) -> Sent:
@@ -237,10 +250,9 @@ class CommandPipeline:
         self._brace()
         starved = run.starve(planned)
         if starved == 0.0:
-            self._report.say("starved", "no action for this step: slowing down and holding")
+            self._report.say("starved", _NO_ACTION)
         if starved is not None and starved >= self._settings.starvation_patience:
-            why = f"no usable chunk for {starved:.1f} s" if starved else "no usable chunk for this step"
-            self.hold_because("starvation", why)
+            self.hold_because("starvation", _STARVED(seconds=starved) if starved else _STARVED_AT_ONCE)
         return self._stand(step, planned, seen)
 
     def _stand(self, step: int, planned: float, seen: LatestObservation) -> Sent:
@@ -265,4 +277,4 @@ class CommandPipeline:
         left = np.where(self._locks.on, 0.0, np.abs(sent.executed - move.goal))
         if move.finished and left.max() <= _ARRIVED:
             self.hold_here()
-            self._report.say("motion_done", "arrived")
+            self._report.say("motion_done", _ARRIVED_THERE)

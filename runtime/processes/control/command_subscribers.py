@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern, fixed, series
 from runtime.ipc.messages import HEARD, UNHEARD
 from runtime.ipc.shared_state import SharedState
 from runtime.transports.base import Sink
+
+_UNHEARD = Pattern("control.unheard", "nobody listens to {place}")
+_HEARD = fixed("control.heard", "all commands are heard")
 
 _EVERY_S = 2.0
 Say = Callable[[str, str, Mapping[str, object]], None]
@@ -37,7 +41,7 @@ class SubscriberCheck:
             return
         self._told = unheard
         if unheard:
-            said = [why or f"nobody listens to {place}" for place, why in sorted(unheard.items())]
-            self._say(UNHEARD, "; ".join(said), {"unheard": unheard})
+            said = [why or _UNHEARD(place=place) for place, why in sorted(unheard.items())]
+            self._say(UNHEARD, series(said), {"unheard": unheard})
         else:
-            self._say(HEARD, "all commands are heard", {"unheard": {}})
+            self._say(HEARD, _HEARD, {"unheard": {}})

@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from runtime.core.sentences import Pattern, fixed, series
 from runtime.core.types import Float64
 from runtime.safety.filter import Limits
 from runtime.spaces.binary_grippers import Switch, open_or_closed
+
+_LOCKS_OF_OTHER_SHAPE = Pattern(
+    "control.locks_of_other_shape",
+    "locks are {kind} {shape}; expected float {expected}",
+)
+_NO_GRIPPER = Pattern("control.no_gripper", "{joint} is no gripper: only grippers are locked")
+_LOCKED_AT = Pattern("control.locked_at", "{joint} locked at {value:g}")
+_GRIPPERS_FREE = fixed("control.grippers_free", "every gripper is free")
 
 _SAME = 1e-9
 
@@ -30,15 +39,15 @@ class GripperLocks:
         """
         limits = self._limits
         if values.shape != limits.lower.shape or values.dtype.kind != "f":
-            return f"locks are {values.dtype} {values.shape}; expected float {limits.lower.shape}"
+            return _LOCKS_OF_OTHER_SHAPE(kind=values.dtype, shape=values.shape, expected=limits.lower.shape)
         wrong = np.flatnonzero(~np.isnan(values) & ~limits.grippers)
         if len(wrong):
-            return f"{limits.names[wrong[0]]} is no gripper: only grippers are locked"
+            return _NO_GRIPPER(joint=limits.names[wrong[0]])
         within = np.clip(values.astype(np.float64), limits.lower, limits.upper)
         self.values = open_or_closed(self._switches, within, commanded)
         self.on = ~np.isnan(self.values)
         self._notes = {
-            int(i): f"{limits.names[i]} locked at {round(float(self.values[i]), 4):g}"
+            int(i): _LOCKED_AT(joint=limits.names[i], value=round(float(self.values[i]), 4))
             for i in np.flatnonzero(self.on)
         }
         return ""
@@ -53,4 +62,4 @@ class GripperLocks:
         )
 
     def __str__(self) -> str:
-        return ", ".join(self._notes.values()) or "every gripper is free"
+        return series(list(self._notes.values()), ",") or _GRIPPERS_FREE

@@ -9,10 +9,32 @@ from typing import NamedTuple
 
 import numpy as np
 
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 from runtime.ipc.observation_reader import LatestObservation
 from runtime.motion.timeline import DimensionKinds, difference
 from runtime.safety.limits import Limits
+
+_BEYOND_LIMITS = Pattern(
+    "control.beyond_limits",
+    "{joint} reads {value:.3f} rad, beyond its limits {lower:.3f}..{upper:.3f}",
+)
+_NOT_SEEN_LONG_ENOUGH = Pattern(
+    "control.not_seen_long_enough",
+    "joints have not been seen for {seconds:g} s yet",
+)
+_TOO_FAST = Pattern(
+    "control.too_fast",
+    "{joint} reads {value:.3f} rad, {before:.3f} just before: faster than it moves ({speed:.2f} rad/s)",
+)
+_EXCHANGED = Pattern("control.exchanged", "{joints} read each other's values: are they swapped?")
+_ENCODER_DEAD = Pattern("control.encoder_dead", "{what}: is an encoder dead?")
+_STUCK = Pattern("control.stuck", "{joint} jumped to {value:.3f} rad and reads exactly that: is it stuck?")
+_ZERO_AFTER = Pattern("control.zero_after", "{joints} read exactly 0 rad after {before}")
+_UNMOVED = Pattern(
+    "control.unmoved",
+    "{joint} has read exactly {value:.4f} rad for {seconds:.1f} s while its command moved {distance:.2f} rad",
+)
 
 UNSEEN_S = 0.5  # without joints: whatever has happened to the robot meanwhile was not seen
 CONSISTENT_S = 0.1  # that samples agree for before they are believed against what was known
@@ -217,9 +239,11 @@ class Plausibility:
         worst = int(beyond.argmax())
         if beyond[worst] <= _BEYOND:
             return ""
-        return (
-            f"{limits.names[worst]} reads {joints[worst]:.3f} rad, beyond its limits "
-            f"{limits.lower[worst]:.3f}..{limits.upper[worst]:.3f}"
+        return _BEYOND_LIMITS(
+            joint=limits.names[worst],
+            value=joints[worst],
+            lower=limits.lower[worst],
+            upper=limits.upper[worst],
         )
 
     def _faster(self, before: _Sample, after: _Sample, longest: float = _LONGEST_S) -> np.ndarray:
@@ -232,13 +256,15 @@ class Plausibility:
     def _jump(self, sample: _Sample) -> str:
         """Contradiction of a sample to what was known, in words."""
         if self._chain is None:
-            return f"joints have not been seen for {CONSISTENT_S:g} s yet"
+            return _NOT_SEEN_LONG_ENOUGH(seconds=CONSISTENT_S)
         before = self._chain.newest
         jumped = self._faster(before, sample)
         worst = int(np.where(jumped, np.abs(sample.joints - before.joints), 0.0).argmax())
-        return (
-            f"{self._limits.names[worst]} reads {sample.joints[worst]:.3f} rad, {before.joints[worst]:.3f} just "
-            f"before: faster than it moves ({self._limits.velocity[worst]:.2f} rad/s)"
+        return _TOO_FAST(
+            joint=self._limits.names[worst],
+            value=sample.joints[worst],
+            before=before.joints[worst],
+            speed=self._limits.velocity[worst],
         )
 
     def _never(self, sample: _Sample) -> str:
@@ -247,9 +273,9 @@ class Plausibility:
             return ""
         before = self._chain.newest
         if exchanged := self._exchanged(before, sample):
-            return f"{exchanged} read each other's values: are they swapped?"
+            return _EXCHANGED(joints=exchanged)
         if dead := self._dies(self._chain, sample):
-            return f"{dead}: is an encoder dead?"
+            return _ENCODER_DEAD(what=dead)
         return ""
 
     def _exchanged(self, before: _Sample, after: _Sample) -> str:
@@ -298,7 +324,7 @@ class Plausibility:
         if not which.any():
             return ""
         first = int(which.argmax())
-        return f"{self._limits.names[first]} jumped to {joints[first]:.3f} rad and reads exactly that: is it stuck?"
+        return _STUCK(joint=self._limits.names[first], value=joints[first])
 
     def _dies(self, chain: _Chain, sample: _Sample) -> str:
         """The joints that jump to exactly 0, and neither come by it on their way nor go back to it."""
@@ -318,7 +344,7 @@ class Plausibility:
         if not len(dead):
             return ""
         was = ", ".join(f"{before[i]:.3f}" for i in dead)
-        return f"{', '.join(self._limits.names[i] for i in dead)} read exactly 0 rad after {was}"
+        return _ZERO_AFTER(joints=", ".join(self._limits.names[i] for i in dead), before=was)
 
     def _away(self, joints: Float64, held: Float64, but: np.ndarray | bool) -> float:
         apart = np.abs(difference(joints, held, self._wrapping))
@@ -407,7 +433,9 @@ class _Frozen:
         if not frozen.any():
             return ""
         worst = int(np.where(frozen, high - low, 0.0).argmax())
-        return (
-            f"{self._limits.names[worst]} has read exactly {joints[worst]:.4f} rad for "
-            f"{captured - self._since[worst]:.1f} s while its command moved {high[worst] - low[worst]:.2f} rad"
+        return _UNMOVED(
+            joint=self._limits.names[worst],
+            value=joints[worst],
+            seconds=captured - self._since[worst],
+            distance=high[worst] - low[worst],
         )

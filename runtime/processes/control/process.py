@@ -13,6 +13,7 @@ from runtime.core import realtime
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault
 from runtime.core.plugins import variants
+from runtime.core.quantiles import quantiles
 from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.child import join
@@ -106,7 +107,7 @@ class Lateness:
         status, late = self._status, self._late[: min(self._count, _LATENESS_KEPT)]
         status["ticks"], status["missed"] = self._ticks, self._missed
         if len(late):
-            p50, p99, p999, worst = np.percentile(late, (50, 99, 99.9, 100))
+            p50, p99, p999, worst = quantiles(late, (0.5, 0.99, 0.999, 1.0))
             status["lateness_p50"], status["lateness_p99"] = p50, p99
             status["lateness_p999"], status["lateness_max"] = p999, worst
 

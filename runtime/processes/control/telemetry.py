@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float32, Float64
 from runtime.ipc.messages import ChunkMerged, Event, Message, TickDone, encode
 from runtime.ipc.observation_reader import LatestObservation
@@ -18,6 +19,9 @@ from runtime.processes.control.actuator import Actuator, Sent
 from runtime.processes.control.behaviours import Behaviour, EStopped
 from runtime.recording.base import ControlSource
 from runtime.safety.collision import Collision
+
+_LIMITED_SUM = Pattern("control.limited_sum", "{count} actions were limited, worst: {worst}")
+_NEAR_SUM = Pattern("control.near_sum", "{count} actions came too near, nearest: {nearest}")
 
 StatusRecord = np.ndarray[Any, np.dtype[np.void]]  # of PageLayout.control_dtype, without dimensions
 _TOLD = 1e-4  # [rad] less than that is rounding at a limit, no news
@@ -63,7 +67,7 @@ class Limiting:
     def close(self) -> None:
         """Whatever was limited is over."""
         if self._count:
-            self._say("limited_sum", f"{self._count} actions were limited, worst: {self._most}")
+            self._say("limited_sum", _LIMITED_SUM(count=self._count, worst=self._most))
         self._count, self._worst, self._most = 0, 0.0, ""
 
 
@@ -91,7 +95,7 @@ class Nearing:
     def close(self) -> None:
         """Whatever was near is apart."""
         if self._count:
-            self._say("near_sum", f"{self._count} actions came too near, nearest: {self._nearest}")
+            self._say("near_sum", _NEAR_SUM(count=self._count, nearest=self._nearest))
         self._count, self._nearest = 0, None
 
 
@@ -126,7 +130,7 @@ class Telemetry:
         self._outbox.append(merged)
 
     def record(self, seen: LatestObservation, sent: Sent, simulated: bool) -> None:
-        """The tick, for the episode; `simulated`: it was the simulated robot that was told."""
+        """The tick, for the episode if there is one; `simulated`: it was the simulated robot that was told."""
         self.limiting.note(sent, self.planned)
         self._note_corrected(sent)
         self.nearing.note(sent, self.planned)
@@ -134,6 +138,9 @@ class Telemetry:
         wanted = target is not None and target.path is not None
         self._smoothed = target.action.astype(np.float32) if target and wanted else None
         makers = target.makers if target else ()
+        self._tell_makers(makers, sent)
+        if self._page.unrecorded:
+            return
         done = TickDone(
             step=self._step,
             run=self.run,
@@ -151,7 +158,6 @@ class Telemetry:
             woke=self._woke,
         )
         self._push("ticks", done)
-        self._tell_makers(makers, sent)
 
     def publish(self, seen: LatestObservation, standing: TickState) -> None:
         """Control's status, and only then the events: the coordinator decides by it, so that none may overtake it.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from runtime.core.errors import CodecError, ConfigurationError
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Float64
 from runtime.ipc.messages import LockGrippers, Message, NodeRequest, Order, PostedChunk, Tune, decode
 from runtime.ipc.observation_reader import ObservationReader
@@ -24,6 +25,35 @@ from runtime.processes.control.plausibility import Plausibility, Unquestioned
 from runtime.processes.control.telemetry import StatusRecord, Telemetry, TickState
 from runtime.safety.filter import SafetyFilter
 from runtime.transports.base import Sink
+
+_OTHER_RUN = fixed("control.other_run", "control is not following that run any more")
+_MERGED_BY = Pattern("control.merged_by", "chunks are merged by {strategy} from now on")
+_LEFT_ALONE = fixed(
+    "control.left_alone",
+    "nobody knows where the robot is since it was left alone: set up again",
+)
+_NO_MOTION = Pattern("control.no_motion", "a motion to {goal} is none: expected {expected} numbers")
+_MOTION_SPEED = Pattern("control.motion_speed", "a motion at {speed} of its speed; allowed: above 0 up to 1")
+_ESTOP = fixed("control.estop", "e-stop")
+_CONTRADICTION = fixed("control.contradiction", "joints contradict each other")
+_NO_FRESH_JOINTS = fixed("control.no_fresh_joints", "no fresh joints")
+_SIMULATION_UNPLACED = Pattern(
+    "control.simulation_unplaced",
+    "{why}: nobody knows where the simulation is to begin",
+)
+_ROBOT_UNSEEN = Pattern("control.robot_unseen", "{why}: nothing is sent to a robot unseen")
+_RELEASED = fixed("control.released", "e-stop released")
+_WHAT_ESTOP = fixed("control.what_estop", "e-stop, towards where the robot is")
+_SUPERVISOR_GONE = fixed("control.supervisor_gone", "the supervisor is gone")
+_AFTER_MISSING_JOINTS = Pattern(
+    "control.after_missing_joints",
+    "{what}, after joints were missing: nothing is sent; set up again",
+)
+_WHAT_HELD = fixed("control.what_held", "held where the robot is")
+_MOVED_AWAY = Pattern(
+    "control.moved_away",
+    "the robot is {distance:.2f} rad from where it was told to hold: holding where it is",
+)
 
 __all__ = ["Tick", "TickSettings"]
 _QUIET_S = 1.0  # without an implausible measurement: the next one is told again
@@ -175,7 +205,7 @@ class Tick:
     def _merge(self, chunk: PostedChunk, step: int) -> None:
         lane, run = self._led, self._led.run
         if run is None or chunk.run != run.number:
-            self._report.merged(dropped(chunk, step, "control is not following that run any more"))
+            self._report.merged(dropped(chunk, step, _OTHER_RUN))
             return
         joined = run.join(chunk, step, lane.actuator.commanded)
         self._report.merged(joined.merged)
@@ -194,7 +224,7 @@ class Tick:
         if run is not None:
             run.tune(chosen, step)
         if chosen.kind != before:
-            self._report.say("tuned", f"chunks are merged by {chosen.kind} from now on")
+            self._report.say("tuned", _MERGED_BY(strategy=chosen.kind))
 
     def _lock(self, values: Float64) -> None:
         before, refusal = str(self._locks), self._locks.set(values, self._led.actuator.commanded)
@@ -228,9 +258,7 @@ class Tick:
         elif order.mode == "sim":
             self._begin_simulation(order, now)
         elif order.run == self._left_run and not self._actuator.engaged:
-            self._report.say(
-                "unmeasured", "nobody knows where the robot is since it was left alone: set up again"
-            )
+            self._report.say("unmeasured", _LEFT_ALONE)
         elif self._engage(now):
             self._robot.follow(self._run(order))
 
@@ -241,12 +269,10 @@ class Tick:
         goal = order.goal
         if goal is None or goal.shape != self._locks.values.shape or np.isinf(goal).any():
             self._robot.hold()
-            self._report.say(
-                "refusals", f"a motion to {goal} is none: expected {len(self._locks.on)} numbers"
-            )
+            self._report.say("refusals", _NO_MOTION(goal=goal, expected=len(self._locks.on)))
         elif not 0.0 < order.speed <= 1.0:
             self._robot.hold()
-            self._report.say("refusals", f"a motion at {order.speed} of its speed; allowed: above 0 up to 1")
+            self._report.say("refusals", _MOTION_SPEED(speed=order.speed))
         elif self._engage(now):
             if not order.run:  # a set-up: where joints are believed to be is looked at anew
                 self._displacement.forget()
@@ -258,8 +284,8 @@ class Tick:
         if self._simulated is None:
             measured = self._measured(now)
             if measured is None:
-                why = self._seen.doubt or "no fresh joints"
-                self._report.say("unmeasured", f"{why}: nobody knows where the simulation is to begin")
+                why = self._seen.doubt or _NO_FRESH_JOINTS
+                self._report.say("unmeasured", _SIMULATION_UNPLACED(why=why))
                 return
             start = SimulatedActuator(measured, self._settings, self._clock)
             self._simulated, self._simulated_run = self._lane(start), order.run
@@ -276,10 +302,8 @@ class Tick:
         if not self._actuator.engaged:
             measured = self._measured(now)
             if measured is None or not self._plausibility.settled:
-                why = self._seen.doubt or (
-                    "no fresh joints" if measured is None else "joints contradict each other"
-                )
-                self._report.say("unmeasured", f"{why}: nothing is sent to a robot unseen")
+                why = self._seen.doubt or (_NO_FRESH_JOINTS if measured is None else _CONTRADICTION)
+                self._report.say("unmeasured", _ROBOT_UNSEEN(why=why))
                 return False
             self._plausibility.trust()
             self._actuator.engage(measured)
@@ -298,10 +322,10 @@ class Tick:
             # Or a gripper that is on its way to its lock would go on after the release.
             self._lock(np.full(len(self._locks.on), np.nan))
             self._robot.behaviour, self._simulated = stopped, None
-            self._report.say("estopped", "e-stop")
+            self._report.say("estopped", _ESTOP)
         elif not latched and stopped is not None:
             self._robot.release()
-            self._report.say("released", "e-stop released")
+            self._report.say("released", _RELEASED)
             return
         measured = None if stopped is None else self._measured(now)
         if stopped is not None and measured is not None:
@@ -321,12 +345,12 @@ class Tick:
                 self._displacement.follow(actuator, measured)
             measured = self._displacement.trusted(actuator, measured)
             if not stopped.seen:
-                actuator.step_to(measured, "e-stop, towards where the robot is", stopped.rest)
+                actuator.step_to(measured, _WHAT_ESTOP, stopped.rest)
             # An object in the gripper keeps it open: its command stays, or it would let go.
             stopped.see(limits.standing(np.where(limits.grippers, actuator.commanded, measured)))
 
     def _check_family(self, now: float) -> None:
-        kind, reason = "orphaned", "the supervisor is gone" if self._orphaned else ""
+        kind, reason = "orphaned", str(_SUPERVISOR_GONE if self._orphaned else "")
         if not reason:
             kind, reason = "family", silent_sibling(self._page, now, self._settings.heartbeat_timeout)
         if reason:
@@ -361,20 +385,16 @@ class Tick:
         if where is None:
             return
         if self._plausibility.dead:
-            self._leave(
-                f"{self._plausibility.dead}, after joints were missing: nothing is sent; set up again"
-            )
+            self._leave(_AFTER_MISSING_JOINTS(what=self._plausibility.dead))
             return
         away = self._displacement.distance(self._actuator, where)
         farthest = self._displacement.speed * self._actuator.elapsed(now)
-        self._actuator.step_to(where, "held where the robot is", farthest)
+        self._actuator.step_to(where, _WHAT_HELD, farthest)
         if isinstance(behaviour, EStopped):
             behaviour.stay(self._actuator.commanded.copy())
             return
         if self._displacement.begins:
-            self._tell_displaced(
-                f"the robot is {away:.2f} rad from where it was told to hold: holding where it is"
-            )
+            self._tell_displaced(_MOVED_AWAY(distance=away))
         self._robot.hold_here()
 
     def _name_followed_twice(self) -> None:

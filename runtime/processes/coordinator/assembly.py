@@ -6,7 +6,7 @@ import uuid
 from functools import partial
 
 from runtime.core.clock import Clock
-from runtime.ipc.bus import EventLog
+from runtime.ipc.bus import Endpoints, EventLog
 from runtime.ipc.messages import Event, ReceptionReport
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
@@ -64,8 +64,9 @@ def assemble(
     kinematics = Loading(ChainForward(spec.robot), partial(make_kinematics, spec), runner.aside)
     spaces = ActionSpaces(spec.robot, kinematics, spec.rate)
     inference = _inference(spec, shared, clock, runner, orders, kinematics, make_policy)
+    endpoints = Endpoints(spec.deployment.station_dir)
     setup = SetUp(spec, inference, orders, shared, clock, reception)
-    health = HealthMonitor(spec, shared, lease, clock, people, reception)
+    health = HealthMonitor(spec, shared, lease, clock, people, reception, partial(endpoints.served, "panel"))
     runs = Runs(
         spec,
         shared,

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import fixed
 from runtime.core.types import Float64
 from runtime.ipc.messages import (
     LockGrippers,
@@ -22,6 +23,10 @@ from runtime.ipc.messages import (
 from runtime.ipc.shared_state import SharedState
 
 log = logging.getLogger(__name__)
+_CONTROL_DOES_NOT_READ = fixed(
+    "orders.control_does_not_read",
+    "control does not read its orders: the ring is full; restart the station",
+)
 
 
 class ControlQueue:
@@ -79,4 +84,4 @@ class ControlQueue:
 
     def _push(self, message: Message) -> None:
         if not self._page.rings["orders"].push(encode(message)):
-            raise RuntimeFault("control does not read its orders: the ring is full; restart the station")
+            raise RuntimeFault(_CONTROL_DOES_NOT_READ)

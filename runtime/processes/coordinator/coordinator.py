@@ -10,6 +10,7 @@ from typing import Any
 from runtime.config.loader import Resolved
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError, RuntimeFault
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.bus import EventLog
 from runtime.ipc.estop_requests import why_of
 from runtime.ipc.identity import named
@@ -42,6 +43,15 @@ from runtime.station.run import Run
 from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
+_CHANGED = Pattern("session.changed", "{before} -> {after}: {reason}")
+_ANSWERED = Pattern("command.answered", "{command} by {who}: {status}")
+_ANSWERED_WITH = Pattern("command.answered_with", "{command} by {who}: {status}, {reason}")
+_WANTED = Pattern("session.policy_wanted", "{command} by {who}")
+_PRESSED = Pattern("session.pressed", "estop by {who}: accepted, {why}")
+_ESTOP_FLAG_RAISED = fixed(
+    "session.estop_flag_raised",
+    "the flag is raised; the guard's own socket says whether control obeys",
+)
 
 
 @dataclass(eq=False)
@@ -82,6 +92,18 @@ class Coordinator:
     def run(self) -> Run | None:
         """The open run."""
         return self.runs.open
+
+    @property
+    def rests(self) -> bool:
+        """True while nothing goes on, and nobody is there to command it: what comes wakes the coordinator."""
+        return not (
+            self.session.state.meaning.at_work
+            or self.setup.active
+            or self.runs.open is not None
+            or self.runs.alone
+            or self.inference.asked
+            or self.lease.current(self.people.now()) is not None
+        )
 
     def pump(self) -> None:
         """Hear the family, notice what happened, advance set-up and inference."""
@@ -129,7 +151,7 @@ class Coordinator:
         self.collecting.noticed(happening, reason)
         before, run = self.session.state, self.runs.open
         if self.session.observe(happening, reason):
-            text = f"{before} -> {self.session.state}: {reason}"
+            text = _CHANGED(before=before, after=self.session.state, reason=reason)
             state, told = str(self.session.state), self.session.told()
             data = {"state": state, "state_is": told, **self._unbegun(run)}
             self.say(Event("state", text, self.clock.now(), data=data))
@@ -159,7 +181,7 @@ class Coordinator:
             self.observe(SessionEvent.SETUP_FAILED, str(error))
             return
         if self.setup.stage is not stage:
-            self.say(Event("setup", str(self.setup.stage), self.clock.now()))
+            self.say(Event("setup", self.setup.stage.sentence, self.clock.now()))
         if done:
             self.observe(SessionEvent.SETUP_DONE, self.setup.outcome)
 
@@ -203,13 +225,13 @@ class Coordinator:
         before, sequence, run = self.session.state, self.session.sequence, self.runs.open
         ack = self.session.handle(command)
         if ack.status == "accepted" and command.kind in ("setup", "run"):
-            self.preflights.cancel(f"{command.kind} by {named(command)}")
+            self.preflights.cancel(_WANTED(command=command.kind, who=named(command)))
         # A lease that is kept is a stream; only its changes and refusals are worth a line.
         kept = command.kind in LEASE_COMMANDS and ack.status == "accepted" and ack.sequence == sequence
         if not kept:
             self.collecting.touch()
-            what = f"{command.kind} by {named(command)}: {ack.status}"
-            what += f", {ack.reason}" if ack.reason else ""
+            who = {"command": command.kind, "who": named(command), "status": ack.status}
+            what = _ANSWERED_WITH(**who, reason=ack.reason) if ack.reason else _ANSWERED(**who)
             told = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}
             told |= {"user": command.user, "role": command.role, "holder": command.holder}
             self.say(Event("command", what, self.clock.now(), data=told | self._unbegun(run)))
@@ -220,10 +242,9 @@ class Coordinator:
         self.shared.rings["presses"].push(encode(command))
         self.shared.set_estop(EStop.LATCHED)
         told = {"uuid": command.uuid, "user": command.user, "role": command.role, "holder": command.holder}
-        text = f"estop by {named(command)}: accepted, {why_of(command)}"
+        text = _PRESSED(who=named(command), why=why_of(command))
         self.say(Event("command", text, self.clock.now(), data=told))
-        reason = "the flag is raised; the guard's own socket says whether control obeys"
-        return Ack(command.uuid, "accepted", reason, boot=self.boot, kind=command.kind)
+        return Ack(command.uuid, "accepted", _ESTOP_FLAG_RAISED, boot=self.boot, kind=command.kind)
 
     def _beyond_rights(self, command: Command) -> str:
         """Why who gives it may not bring what it brings; "" where it may, or was answered before."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from runtime.core.clock import Clock
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.command_arguments import DiscardRequest, LabelRequest, RunRequest
 from runtime.ipc.messages import EpisodeClosed, Event
 from runtime.ipc.session_state import SessionState
@@ -26,6 +27,46 @@ from runtime.recording.schema import Schema
 from runtime.station.run import Run
 from runtime.station.spec import StationSpec
 from runtime.teleoperators.relay import Relay
+
+_NOT_YET = fixed("collect.not_armed_yet", "nobody has armed it since it was set up")
+_NOT_SET_UP = fixed("collect.not_set_up", "the station is not set up to collect")
+_SETUP_BEGUN = fixed("collect.setup_begun", "a set-up has begun")
+_ARMED = fixed("collect.armed", "armed: the next demonstration may begin")
+_DISARMED = Pattern("collect.disarmed", "disarmed: {why}")
+_SHORT = Pattern(
+    "collect.episode_short",
+    "episode {episode} has {seconds:.1f} s, shorter than {least:g} s (collection.min_length_s)",
+)
+_NOBODY_DID_ANYTHING = Pattern(
+    "collect.nobody_did_anything",
+    "nobody has done anything for {minutes:g} minutes",
+)
+_NODE_NEVER_REPORTED = Pattern(
+    "collect.node_never_reported",
+    "the node reports no action within {seconds:g} s: does it have a leader, and is that connected?",
+)
+_NODE_SILENT = Pattern("collect.node_silent", "the node has reported no action for {seconds:.1f} s")
+_LABELLED = Pattern("collect.labelled", "episode {episode}: {how}")
+_OPEN_RUN_NO_DEMONSTRATION = fixed(
+    "collect.open_run_no_demonstration",
+    "the open run is no demonstration: name the episode",
+)
+_NONE_COLLECTED = fixed(
+    "collect.none_collected",
+    "no demonstration has been collected since the station started: name the episode",
+)
+_EPISODE_OPEN = Pattern(
+    "collect.episode_open",
+    "episode {episode} is the open one: leave `episode` out, or stop first",
+)
+_NO_SUCH_EPISODE = Pattern(
+    "collect.no_such_episode",
+    "episode = {episode!r}: there is no such episode here ({error})",
+)
+_NO_DEMONSTRATION = Pattern(
+    "collect.no_demonstration",
+    "episode = {episode!r} is a {kind}; allowed: demonstrations",
+)
 
 IDLE_S = 300.0  # of nothing, after which the arm falls
 _REMEMBERED = 64  # episodes that may be spoken of before they are on disk
@@ -42,8 +83,6 @@ DISARMING = frozenset(
         SessionEvent.DISPLACED,
     }
 )
-_NOT_YET = "nobody has armed it since it was set up"
-_NOT_SET_UP = "the station is not set up to collect"
 
 
 class Demonstrations:
@@ -68,7 +107,7 @@ class Demonstrations:
         self._say = say
         self.set_up = False
         self.armed = False
-        self.why_not = _NOT_SET_UP
+        self.why_not: str = _NOT_SET_UP
         self.task = ""  # of the newest episode, where its command said one
         self.last: dict[str, Any] | None = None
         self._asked: deque[str] = deque(maxlen=_REMEMBERED)  # uuids of the newest episodes
@@ -112,20 +151,20 @@ class Demonstrations:
 
     def begin_setup(self, collects: bool) -> None:
         """A set-up begins, to collect or with a policy."""
-        self.disarm("a set-up has begun")
+        self.disarm(_SETUP_BEGUN)
         self.set_up = collects
         self.why_not = _NOT_YET if collects else _NOT_SET_UP
 
     def arm(self) -> None:
         """Switch it on."""
         self.armed, self.why_not = True, ""
-        self._event("collect_armed", "armed: the next demonstration may begin")
+        self._event("collect_armed", _ARMED)
 
     def disarm(self, why: str) -> None:
         """Switch it off; nothing where it is off."""
         if self.armed:
             self.armed, self.why_not = False, why
-            self._event("collect_disarmed", f"disarmed: {why}")
+            self._event("collect_disarmed", _DISARMED(why=why))
 
     def touch(self) -> None:
         """A person has done something."""
@@ -146,7 +185,7 @@ class Demonstrations:
             self.touch()
             return self._missed(run, state)
         if self.armed and now - self._touched > IDLE_S:
-            self.disarm(f"nobody has done anything for {IDLE_S / 60:g} minutes")
+            self.disarm(_NOBODY_DID_ANYTHING(minutes=IDLE_S / 60))
         if self.armed and (why := self.unled):
             self.disarm(why)
             self._event("leader_lost", why)
@@ -179,11 +218,7 @@ class Demonstrations:
         if silent <= NODE_SILENT_S:
             return None
         never = self._reported_at is None or self._reported_at < run.begun
-        why = (
-            f"the node reports no action within {NODE_SILENT_S:g} s: does it have a leader, and is that connected?"
-            if never
-            else f"the node has reported no action for {silent:.1f} s"
-        )
+        why = _NODE_NEVER_REPORTED(seconds=NODE_SILENT_S) if never else _NODE_SILENT(seconds=silent)
         self._event("node_silent", why)
         return (SessionEvent.RUN_FAILED if never else SessionEvent.HELD), why
 
@@ -225,8 +260,8 @@ class Demonstrations:
         }
         seconds = message.rows / self._plan.fps
         if seconds < self._settings.min_length_s:
-            allowed = f"shorter than {self._settings.min_length_s:g} s (collection.min_length_s)"
-            self._event("episode_short", f"episode {message.uuid} has {seconds:.1f} s, {allowed}")
+            text = _SHORT(episode=message.uuid, seconds=seconds, least=self._settings.min_length_s)
+            self._event("episode_short", text)
 
     def label(self, asked: LabelRequest, by: str) -> Mapping[str, Any]:
         """Write down how an episode went."""
@@ -252,7 +287,7 @@ class Demonstrations:
             "by": label.by,
         }
         how = "discarded" if label.discarded else str(label.result)
-        self._say(Event("labelled", f"episode {episode}: {how}", self._clock.now(), data=data))
+        self._say(Event("labelled", _LABELLED(episode=episode, how=how), self._clock.now(), data=data))
         return data
 
     def _named(self, given: str | None) -> tuple[str, Label]:
@@ -261,15 +296,13 @@ class Demonstrations:
         if given is None:
             episode = run.uuid if run is not None else self._newest
             if run is None and self._opened() is not None:
-                raise RuntimeFault("the open run is no demonstration: name the episode")
+                raise RuntimeFault(_OPEN_RUN_NO_DEMONSTRATION)
             if not episode:
-                raise RuntimeFault(
-                    "no demonstration has been collected since the station started: name the episode"
-                )
+                raise RuntimeFault(_NONE_COLLECTED)
         else:
             episode = given
             if run is not None and run.uuid == given:
-                raise RuntimeFault(f"episode {given} is the open one: leave `episode` out, or stop first")
+                raise RuntimeFault(_EPISODE_OPEN(episode=given))
             if given not in self._asked:
                 self._require_demonstration(given)
         before = newest(self._data, episode)
@@ -281,9 +314,9 @@ class Demonstrations:
         try:
             kind = json.loads(path.read_text("utf-8")).get("kind")
         except (OSError, ValueError, AttributeError) as error:
-            raise RuntimeFault(f"episode = {episode!r}: there is no such episode here ({error})") from None
+            raise RuntimeFault(_NO_SUCH_EPISODE(episode=episode, error=error)) from None
         if kind != "demonstration":
-            raise RuntimeFault(f"episode = {episode!r} is a {kind}; allowed: demonstrations")
+            raise RuntimeFault(_NO_DEMONSTRATION(episode=episode, kind=kind))
 
     # --- for pages -------------------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from runtime.cameras.complaints import complaints
 from runtime.core.clock import Clock
+from runtime.core.sentences import Pattern, fixed, series
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.messages import ReceptionReport
 from runtime.ipc.session_state import SessionState
@@ -17,6 +18,30 @@ from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.session.transitions import SessionEvent
 from runtime.station.run import Run
 from runtime.station.spec import StationSpec
+
+_RESTARTED = Pattern("health.restarted", "the process {process} died and was restarted: set up again")
+_SILENT = Pattern("health.silent", "no sign of life from the process {process} {since}")
+_ESTOPPED = Pattern("health.estopped", "e-stop {pressed}: make safe, then release")
+_NO_PICTURE = Pattern("health.no_picture", "no picture has arrived from {cameras}")
+_PRESSED_BY = Pattern("health.pressed_by", "by {who}: {why}")
+_PRESSED = fixed("health.pressed", "pressed")
+_RELEASED = fixed("health.released", "e-stop released: set up again")
+_LEASE_ENDED = fixed("health.lease_ended", "the lease was not renewed: claim it, then resume or stop")
+_GOES_ON = Pattern(
+    "health.goes_on",
+    "nobody commands the station: the lease was not renewed; the scored run goes on to its {seconds:g} s, and whoever "
+    "is there can stop it",
+)
+_PANEL_GONE = fixed(
+    "health.panel_gone",
+    "nobody commands the station: its panel ended as well; claim the lease, then resume or stop",
+)
+_CONNECTED = fixed("health.connected", "observations arrive: set up")
+_LINK_LOST = Pattern("health.link_lost", "no observation for {seconds:.1f} s: {who}")
+_ASK_FOR_NODE = fixed("health.ask_for_node", "is the execution node running?")
+_RECEPTION_SILENT = fixed("health.reception_silent", "our process reception gives no sign of life")
+_TIME_OVER = Pattern("health.time_over", "the run's {seconds:g} s are over")
+_SOURCE_ENDED = fixed("health.source_ended", "the recording that is the source has ended")
 
 SIBLINGS = ("control", "reception", "media", "guard")
 _LINK_LOST_S = 2.0
@@ -44,16 +69,20 @@ class HealthMonitor:
         clock: Clock,
         people: Clock,
         reception: Callable[[], ReceptionReport],
+        stoppable: Callable[[], bool],
     ) -> None:
+        """`stoppable` says whether somebody beside the robot can stop it: its panel is served."""
         self._plan = spec
         self._page = shared
         self._lease = lease
         self._clock = clock
         self._people = people  # the clock of leases
         self._reception = reception  # what it last reported
+        self._stoppable = stoppable
         self._latch = Latch(spec.deployment.station_dir)
         self._generations = {name: shared.generation(name) for name in SIBLINGS}
         self._lease_held = False
+        self._unattended = False  # a run goes on though its holder is lost
         self.estop = ""  # who pressed and why, while it is latched
         self._pressed: float | None = None  # when the flag was seen without its latch
 
@@ -61,7 +90,7 @@ class HealthMonitor:
         """News for the session, which is in `state` before the first of it."""
         yield from self._family(state)
         yield from self._estop(state)
-        yield from self._leases()
+        yield from self._leases(run if state is SessionState.RUNNING else None)
         yield from self._link()
         if run is not None and run.begun is not None and state is SessionState.RUNNING:
             yield from self._end_of(run)
@@ -83,12 +112,12 @@ class HealthMonitor:
             generation = self._page.generation(name)
             if generation != self._generations[name]:
                 self._generations[name] = generation
-                reason = f"the process {name} died and was restarted: set up again"
+                reason = _RESTARTED(process=name)
                 yield Noticed(SessionEvent.FAMILY_DIED, reason, name)
         absent = self.absent() if state is SessionState.RUNNING else ""  # a set-up looks for itself
         if absent:
             silent = self._page.silence(absent, self._clock.now())
-            yield Noticed(SessionEvent.HELD, f"no sign of life from the process {absent} {silent}")
+            yield Noticed(SessionEvent.HELD, _SILENT(process=absent, since=silent))
 
     def _estop(self, state: SessionState) -> Iterator[Noticed]:
         latched = self._page.estop is EStop.LATCHED
@@ -96,11 +125,11 @@ class HealthMonitor:
             pressed = self._latch.read()
             if not (pressed and pressed.wall) and self._just_pressed():  # absent, or half written
                 return
-            self.estop = f"by {pressed.by}: {pressed.why}" if pressed else "pressed"
-            yield Noticed(SessionEvent.ESTOPPED, f"e-stop {self.estop}: make safe, then release")
+            self.estop = _PRESSED_BY(who=pressed.by, why=pressed.why) if pressed else _PRESSED
+            yield Noticed(SessionEvent.ESTOPPED, _ESTOPPED(pressed=self.estop))
         elif not latched and state is SessionState.FAULTED:
             self.estop, self._pressed = "", None
-            yield Noticed(SessionEvent.RELEASED, "e-stop released: set up again")
+            yield Noticed(SessionEvent.RELEASED, _RELEASED)
 
     def _just_pressed(self) -> bool:
         """Control obeys the flag already; who pressed and why is on the disk a moment later."""
@@ -108,13 +137,31 @@ class HealthMonitor:
         self._pressed = now if self._pressed is None else self._pressed
         return now - self._pressed < _LATCH_S
 
-    def _leases(self) -> Iterator[Noticed]:
+    def _leases(self, going: Run | None) -> Iterator[Noticed]:
         held = self._lease.current(self._people.now()) is not None
         if self._lease_held and not held:
-            yield Noticed(
-                SessionEvent.LEASE_ENDED, "the lease was not renewed: claim it, then resume or stop"
-            )
+            limit = self._goes_on_to(going)
+            self._unattended = limit is not None
+            if limit is None:
+                yield Noticed(SessionEvent.LEASE_ENDED, _LEASE_ENDED)
+            else:
+                yield Noticed(SessionEvent.HOLDER_LOST, _GOES_ON(seconds=limit))
+        elif held or going is None:
+            self._unattended = False
+        elif self._unattended and not self._stoppable():
+            self._unattended = False
+            yield Noticed(SessionEvent.LEASE_ENDED, _PANEL_GONE)
         self._lease_held = held
+
+    def _goes_on_to(self, going: Run | None) -> float | None:
+        """The limit [s] of a run that goes on although its holder is lost; None where it is held.
+
+        Nothing begins to move that way, and nothing moves without an end, or where nobody could stop it.
+        """
+        if self._plan.deployment.lease.lost == "hold" or not self._lease.lost(self._people.now()):
+            return None
+        scored = going is not None and going.trial and going.begun is not None
+        return going.duration_s if going is not None and scored and self._stoppable() else None
 
     def _link(self) -> Iterator[Noticed]:
         record = self._page.observation.read()
@@ -123,24 +170,25 @@ class HealthMonitor:
         age = self._clock.now() - float(record["arrived"])
         missing = self.missing_cameras()
         if age < _CONNECTED_S and not missing:
-            yield Noticed(SessionEvent.CONNECTED, "observations arrive: set up")
+            yield Noticed(SessionEvent.CONNECTED, _CONNECTED)
         elif age < _CONNECTED_S:
-            why = "".join(f"; {sentence}" for sentence in complaints(self._reception().cameras, missing))
-            yield Noticed(SessionEvent.INCOMPLETE, f"no picture has arrived from {', '.join(missing)}{why}")
+            silent = _NO_PICTURE(cameras=", ".join(missing))
+            why = series([silent, *complaints(self._reception().cameras, missing)])
+            yield Noticed(SessionEvent.INCOMPLETE, why)
         elif age > _LINK_LOST_S and not record["last"]:
-            yield Noticed(SessionEvent.LINK_LOST, f"no observation for {age:.1f} s: {self._who_is_silent()}")
+            yield Noticed(SessionEvent.LINK_LOST, _LINK_LOST(seconds=age, who=self._who_is_silent()))
 
     def _who_is_silent(self) -> str:
         now, within = self._clock.now(), self._plan.deployment.control.heartbeat_timeout_s
         if self._page.alive("reception", now, within):
-            return "is the execution node running?"
-        return "our process reception gives no sign of life"
+            return _ASK_FOR_NODE
+        return _RECEPTION_SILENT
 
     def _end_of(self, run: Run) -> Iterator[Noticed]:
         limit = run.duration_s
         if limit is not None and run.elapsed(self._clock.now()) >= limit - _EARLY_S:
-            yield Noticed(SessionEvent.RUN_ENDED, f"the run's {limit:g} s are over")
+            yield Noticed(SessionEvent.RUN_ENDED, _TIME_OVER(seconds=limit))
             return
         record: np.void = self._page.observation.read()
         if record["last"] and int(self._page.control.read()["sequence"]) == int(record["sequence"]):
-            yield Noticed(SessionEvent.RUN_ENDED, "the recording that is the source has ended")
+            yield Noticed(SessionEvent.RUN_ENDED, _SOURCE_ENDED)

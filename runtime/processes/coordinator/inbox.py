@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from runtime.core.sentences import Pattern
 from runtime.ipc.messages import (
     HEARD,
     UNHEARD,
@@ -22,6 +23,10 @@ from runtime.processes.coordinator.session.transitions import SessionEvent
 
 if TYPE_CHECKING:
     from runtime.processes.coordinator.coordinator import Coordinator
+
+_CHUNK_DROPPED = Pattern("inbox.chunk_dropped", "chunk {chunk} dropped: {why}")
+_STARVED_BECAUSE = Pattern("inbox.starved_because", "{why}: {trouble}")
+_RECORDING = Pattern("inbox.recording", "recording {episode}")
 
 _RINGS = ("control_events", "reception_events", "media_events")
 # Control's own reasons to hold, as events of these kinds.
@@ -63,7 +68,7 @@ class Inbox:
         elif isinstance(message, ChunkMerged):
             to.inference.merged(message)
             if message.dropped:
-                text = f"chunk {message.chunk_id} dropped: {message.dropped}"
+                text = _CHUNK_DROPPED(chunk=message.chunk_id, why=message.dropped)
                 to.say(Event("chunk_dropped", text, to.clock.now(), message.arrival_step))
         elif isinstance(message, EpisodeOpened):
             self._episode_opened(message)
@@ -87,7 +92,7 @@ class Inbox:
         if event.kind == "starvation":
             trouble = to.inference.trouble
             stops = settings.faults.starvation == "stop"
-            why = f"{event.text}: {trouble}" if trouble else event.text
+            why = _STARVED_BECAUSE(why=event.text, trouble=trouble) if trouble else event.text
             to.observe(SessionEvent.RUN_FAILED if stops else SessionEvent.HELD, why)
         elif event.kind in _HOLDS or (
             event.kind == "recording_failed" and settings.recording.on_failure == "hold"
@@ -106,7 +111,7 @@ class Inbox:
         if opened.error:
             to.say(Event("recording_failed", opened.error, to.clock.now()))
         elif opened.uuid:
-            to.say(Event("episode_opened", f"recording {opened.uuid}", to.clock.now()))
+            to.say(Event("episode_opened", _RECORDING(episode=opened.uuid), to.clock.now()))
         failure = to.runs.opened(opened, to.session.state is SessionState.RUNNING)
         if failure:
             to.collecting.unopened()

@@ -5,17 +5,31 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+from runtime.core.sentences import Pattern, fixed
+
+_NEEDS_A_HOLDER = fixed("lease.needs_a_holder", "a lease needs the name of its holder")
+_EPOCH_IMPOSSIBLE = Pattern("lease.epoch_impossible", "epoch {epoch} is impossible; allowed: 0 to {highest}")
+_HELD_FOR_ANOTHER = Pattern("lease.held_for_another", "{holder} holds the lease for another {seconds:.1f} s")
+_EPOCH_OVER = Pattern("lease.epoch_over", "epoch {epoch} is over, the lease is in epoch {newest}")
+_NOBODY_HOLDS = fixed("lease.nobody_holds", "nobody holds the lease: claim it first")
+_HELD_BY = Pattern("lease.held_by", "{holder} holds the lease")
+_OTHER_EPOCH = Pattern("lease.other_epoch", "epoch {epoch} is not the lease's epoch {newest}")
+
 HIGHEST_EPOCH = 2**52  # of a claim; beyond 2**53 a browser counts no more
 
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """A lease as it stands: who, in which epoch, until when on our monotonic clock; `by`: as whom he is known."""
+    """A lease as it stands: who, in which epoch, until when on our monotonic clock; `by`: as whom he is known.
+
+    `hidden`: his page has said since it was last renewed that nobody looks at it.
+    """
 
     holder: str
     epoch: int
     until: float
     by: str = ""
+    hidden: bool = False
 
 
 class Lease:
@@ -37,6 +51,10 @@ class Lease:
             return {"holder": "", "by": "", "epoch": self._epoch, "expires_in": 0.0}
         return {"holder": held.holder, "by": held.by, "epoch": held.epoch, "expires_in": held.until - now}
 
+    def lost(self, now: float) -> bool:
+        """True if the newest lease ended by silence alone: it was not given up, nor was its holder's page hidden."""
+        return self._held is not None and now >= self._held.until and not self._held.hidden
+
     @property
     def epoch(self) -> int:
         return self._epoch
@@ -51,19 +69,19 @@ class Lease:
         Epoch 0 is a terminal's: it takes a free lease under the next epoch, or keeps its own.
         """
         if not holder:
-            return "a lease needs the name of its holder"
+            return _NEEDS_A_HOLDER
         if not 0 <= epoch <= HIGHEST_EPOCH:
-            return f"epoch {epoch} is impossible; allowed: 0 to {HIGHEST_EPOCH}"
+            return _EPOCH_IMPOSSIBLE(epoch=epoch, highest=HIGHEST_EPOCH)
         held = self.current(now)
         if held and held.holder == holder and epoch in (0, held.epoch):
-            self._held = replace(held, until=now + self._ttl)
+            self._held = replace(held, until=now + self._ttl, hidden=False)
             return ""
         if epoch == 0:
             if held:
-                return f"{held.holder} holds the lease for another {held.until - now:.1f} s"
+                return _HELD_FOR_ANOTHER(holder=held.holder, seconds=held.until - now)
             epoch = self._epoch + 1
         if epoch <= self._epoch:
-            return f"epoch {epoch} is over, the lease is in epoch {self._epoch}"
+            return _EPOCH_OVER(epoch=epoch, newest=self._epoch)
         self._epoch = epoch
         self._held = Held(holder, epoch, now + self._ttl, by)
         return ""
@@ -72,8 +90,13 @@ class Lease:
         """Extend the lease; "" where done, else the reason."""
         refusal = self.check(holder, epoch, now)
         if not refusal and self._held:
-            self._held = replace(self._held, until=now + self._ttl)
+            self._held = replace(self._held, until=now + self._ttl, hidden=False)
         return refusal
+
+    def hide(self, holder: str, epoch: int, now: float) -> None:
+        """The page of this holder is hidden: the lease is not renewed, and when it ends it was not lost."""
+        if not self.check(holder, epoch, now) and self._held:
+            self._held = replace(self._held, hidden=True)
 
     def give_up(self, holder: str, epoch: int, now: float, by: str = "") -> str:
         """End the lease before its time."""
@@ -86,9 +109,9 @@ class Lease:
         """ "" where this holder may command at `now`, else the reason why not."""
         held = self.current(now)
         if held is None:
-            return "nobody holds the lease: claim it first"
+            return _NOBODY_HOLDS
         if held.holder != holder:
-            return f"{held.holder} holds the lease"
+            return _HELD_BY(holder=held.holder)
         if held.epoch != epoch:
-            return f"epoch {epoch} is not the lease's epoch {held.epoch}"
+            return _OTHER_EPOCH(epoch=epoch, newest=held.epoch)
         return ""

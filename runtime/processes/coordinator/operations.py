@@ -10,6 +10,7 @@ import numpy as np
 from runtime.config import loader
 from runtime.core.clock import Clock
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.command_arguments import (
     DiscardRequest,
     GripperRequest,
@@ -26,10 +27,76 @@ from runtime.processes.coordinator.demonstrations import Demonstrations
 from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.runs import Runs
-from runtime.processes.coordinator.session.transitions import GuardFacts, Told
+from runtime.processes.coordinator.session.transitions import DISCARDED, GuardFacts, Told
 from runtime.processes.coordinator.session.tuning import strategy_of, tuned
 from runtime.processes.coordinator.setup.sequence import SetUp
 from runtime.station.spec import StationSpec
+
+_RECORDING_OPEN_OF_OTHER_MANIFEST = fixed(
+    "operations.recording_open_of_other_manifest",
+    "a recording is open, whose manifest says another policy or task: record stop first",
+)
+_COLLECT_WITHOUT_COLLECTION = fixed(
+    "operations.collect_without_collection",
+    "setup: collect = true, but the deployment has no [collection]; allowed: false",
+)
+_NO_COLLECT_WITHOUT_POLICY = fixed(
+    "operations.no_collect_without_policy",
+    "setup: collect = false, but the deployment has no [policy]; allowed: collect = true",
+)
+_GIVEN_WITH_COLLECT = Pattern(
+    "operations.given_with_collect",
+    "setup: {given} with collect = true: a person drives; leave it out",
+)
+_WHAT_RUN_MANUAL = fixed("operations.what_run_manual", "run in the mode manual")
+_WHAT_RUN_COLLECT = fixed("operations.what_run_collect", "run in the mode collect")
+_MODE_WHILE_COLLECTING = Pattern(
+    "operations.mode_while_collecting",
+    "run: mode = {mode!r}, but the station is set up to collect; allowed: collect, manual, or set up "
+    "with a policy (setup with collect = false)",
+)
+_UNCOLLECTING = fixed(
+    "operations.uncollecting",
+    "run: mode = 'collect', but the station has no [collection]: set up with collect = true first",
+)
+_NOT_SET_UP_TO_COLLECT = fixed(
+    "operations.not_set_up_to_collect",
+    "run: mode = 'collect', but the station is set up with a policy: set up with collect = true first",
+)
+_GIVEN_WITHOUT_COLLECT = Pattern(
+    "operations.given_without_collect",
+    "run: {given} with mode = {mode!r}; allowed with collect alone",
+)
+_TRIAL_MODE = Pattern(
+    "operations.trial_mode",
+    "a trial runs in the mode continuous, and {mode} was asked for",
+)
+_TRIAL_WITHOUT_RECORDING = fixed(
+    "operations.trial_without_recording",
+    "a trial counts by its recording, and recording.enabled = false; allowed: true",
+)
+_TRIAL_AFTER_TUNING = fixed(
+    "operations.trial_after_tuning",
+    "strategy or task were tuned since the set-up: set up again for a trial",
+)
+_TRIAL_WITH_LOCKED_GRIPPER = fixed(
+    "operations.trial_with_locked_gripper",
+    "a gripper is locked: unlock it, or set up again for a trial",
+)
+_TUNE_STRATEGY_WHILE_COLLECTING = fixed(
+    "operations.tune_strategy_while_collecting",
+    "tune: strategy while the station is set up to collect; allowed: task",
+)
+_TUNED_TO = Pattern("operations.tuned_to", "strategy {strategy}, task {task!r}")
+_GRIPPER_IN_SIM = Pattern(
+    "operations.gripper_in_sim",
+    "gripper: {action} would move the robot's own, and the run's mode is sim; allowed: lock, unlock",
+)
+
+_FAMILY_STARTING = Pattern(
+    "operations.family_starting",
+    "the process {process} gives no sign of life yet: try again in a moment",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,9 +176,7 @@ class SessionActions:
         changes = asked.changes | ({"strategy": {"kind": "naive"}} if collects else {})
         resolved = loader.changed(self._own.resolved, changes, "setup")
         if self.runs.alone and resolved.digest != self.spec.resolved.digest:
-            raise RuntimeFault(
-                "a recording is open, whose manifest says another policy or task: record stop first"
-            )
+            raise RuntimeFault(_RECORDING_OPEN_OF_OTHER_MANIFEST)
         return replace(self._own, resolved=resolved, collecting=collects)
 
     def _collects(self, asked: SetUpRequest) -> bool:
@@ -120,18 +185,12 @@ class SessionActions:
         absent = settings.policy.kind == "none" and asked.policy is None
         collects = absent if asked.collect is None else asked.collect
         if collects and settings.collection is None:
-            raise RuntimeFault(
-                "setup: collect = true, but the deployment has no [collection]; allowed: false"
-            )
+            raise RuntimeFault(_COLLECT_WITHOUT_COLLECTION)
         if not collects and absent:
-            raise RuntimeFault(
-                "setup: collect = false, but the deployment has no [policy]; allowed: collect = true"
-            )
+            raise RuntimeFault(_NO_COLLECT_WITHOUT_POLICY)
         given = [name for name in ("policy", "strategy", "checkpoint") if getattr(asked, name) is not None]
         if collects and given:
-            raise RuntimeFault(
-                f"setup: {', '.join(given)} with collect = true: a person drives; leave it out"
-            )
+            raise RuntimeFault(_GIVEN_WITH_COLLECT(given=", ".join(given)))
         return collects
 
     def cancel_setup(self, reason: str) -> None:
@@ -146,14 +205,14 @@ class SessionActions:
         mode = self._mode(asked)
         asked = asked.model_copy(update={"mode": mode})
         if mode == "manual":
-            self.manual.require_robot("run in the mode manual")
+            self.manual.require_robot(_WHAT_RUN_MANUAL)
             self.manual.prepare()
         # A control that was restarted during the set-up merges as the deployment says until it is told.
         self._orders.tune(self.spec.deployment.strategy.model_dump())
         collecting = self.collecting
         if mode != "collect":
             return {"episode": self.runs.begin(self.setup.info, asked, command=self.command)}
-        self.manual.require_robot("run in the mode collect")
+        self.manual.require_robot(_WHAT_RUN_COLLECT)
         episode = self.runs.begin(self.setup.info, asked, collecting.manifest(asked), self.command)
         collecting.begun(episode, asked)
         return {"episode": episode}
@@ -163,33 +222,25 @@ class SessionActions:
         collects, settings = self.spec.collecting, self.spec.deployment
         mode = asked.mode or ("collect" if collects else settings.run.mode)
         if collects and mode not in ("collect", "manual"):
-            raise RuntimeFault(
-                f"run: mode = {mode!r}, but the station is set up to collect; allowed: collect, manual, or set up with "
-                "a policy (setup with collect = false)"
-            )
+            raise RuntimeFault(_MODE_WHILE_COLLECTING(mode=mode))
         if mode == "collect" and not collects:
-            why = "has no [collection]" if settings.collection is None else "is set up with a policy"
-            raise RuntimeFault(
-                f"run: mode = 'collect', but the station {why}: set up with collect = true first"
-            )
+            raise RuntimeFault(_UNCOLLECTING if settings.collection is None else _NOT_SET_UP_TO_COLLECT)
         given = [name for name in ("task", "session") if getattr(asked, name) is not None]
         if given and mode != "collect":
-            raise RuntimeFault(f"run: {', '.join(given)} with mode = {mode!r}; allowed with collect alone")
+            raise RuntimeFault(_GIVEN_WITHOUT_COLLECT(given=", ".join(given), mode=mode))
         return mode
 
     def _require_comparable(self, asked: RunRequest) -> None:
         """Refuse a trial of anything but the set-up: nothing by hand or tuned, the policy on the robot."""
         mode = self._mode(asked)
         if mode != "continuous":
-            raise RuntimeFault(f"a trial runs in the mode continuous, and {mode} was asked for")
+            raise RuntimeFault(_TRIAL_MODE(mode=mode))
         if not self.spec.deployment.recording.enabled:
-            raise RuntimeFault(
-                "a trial counts by its recording, and recording.enabled = false; allowed: true"
-            )
+            raise RuntimeFault(_TRIAL_WITHOUT_RECORDING)
         if self._tuned:
-            raise RuntimeFault("strategy or task were tuned since the set-up: set up again for a trial")
+            raise RuntimeFault(_TRIAL_AFTER_TUNING)
         if not np.isnan(self.manual.grippers.locks).all():
-            raise RuntimeFault("a gripper is locked: unlock it, or set up again for a trial")
+            raise RuntimeFault(_TRIAL_WITH_LOCKED_GRIPPER)
 
     # --- what a person does within a run ------------------------------------------------------------
 
@@ -215,7 +266,7 @@ class SessionActions:
     def tune(self, asked: TuneRequest) -> Told:
         """Another strategy, other parameters, another instruction from now on."""
         if self.spec.collecting and asked.strategy is not None:
-            raise RuntimeFault("tune: strategy while the station is set up to collect; allowed: task")
+            raise RuntimeFault(_TUNE_STRATEGY_WHILE_COLLECTING)
         spec = tuned(self.spec, asked, self.setup.info)
         settings = spec.deployment
         strategy = settings.strategy.model_dump()
@@ -226,7 +277,7 @@ class SessionActions:
         self.runs.describe(spec=spec)
         self.inference.tune(strategy_of(spec), settings.task)
         data = {"strategy": strategy, "task": settings.task, "hash": spec.resolved.digest}
-        text = f"strategy {settings.strategy.kind}, task {settings.task!r}"
+        text = _TUNED_TO(strategy=settings.strategy.kind, task=settings.task)
         self._say(Event("tuned_to", text, self.clock.now(), data=data))
         return {"strategy": strategy, "task": settings.task}
 
@@ -238,9 +289,7 @@ class SessionActions:
     def grip(self, asked: GripperRequest) -> Told:
         run = self.runs.open
         if run is not None and run.mode == "sim" and asked.action in ("open", "close"):
-            raise RuntimeFault(
-                f"gripper: {asked.action} would move the robot's own, and the run's mode is sim; allowed: lock, unlock"
-            )
+            raise RuntimeFault(_GRIPPER_IN_SIM(action=asked.action))
         free = run is None or run.mode == "manual" or self._state() is SessionState.HOLDING
         return self.manual.grip(asked, free)
 
@@ -263,7 +312,7 @@ class SessionActions:
         """Mark an episode as discarded; the open one ends, as by `end_run`, where none is named."""
         told = self.collecting.discard(asked, self.by)
         if asked.episode is None and self.collecting.run is not None:
-            self.end_run("finished", "discarded by the operator")
+            self.end_run("finished", DISCARDED)
         return told
 
     # --- what goes on -------------------------------------------------------------------------------
@@ -294,4 +343,4 @@ class SessionActions:
         """Refuse while a process is still starting: what it is sent would be lost."""
         absent = self._absent()
         if absent:
-            raise RuntimeFault(f"the process {absent} gives no sign of life yet: try again in a moment")
+            raise RuntimeFault(_FAMILY_STARTING(process=absent))

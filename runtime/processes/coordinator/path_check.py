@@ -7,11 +7,19 @@ import math
 import numpy as np
 
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 from runtime.motion.timeline import difference
 from runtime.safety.collision import Collisions
 from runtime.safety.workspace import Workspace
 from runtime.station.spec import StationSpec
+
+_LEAVES_WORKSPACE = Pattern("path.leaves_workspace", "{what}: {arm} would leave the workspace box on its way")
+_COLLIDES = Pattern(
+    "path.collides",
+    "{what}: {collision} after {percent:.0f} % of the way: go by another pose, or move the robot by "
+    "hand first",
+)
 
 _STEP = 0.01  # [rad or m] of the joint that goes farthest, between postures that are looked at
 # What is begun must not be stopped half-way by control, which judges what is really sent, at other postures.
@@ -32,14 +40,11 @@ class PathCheck:
         """RuntimeFault for `what` where the way from `start` to `goal` [D] leaves a box it is in, or links collide."""
         way = self._way(start, goal)
         if arm := self._workspace.left_on(way):
-            raise RuntimeFault(f"{what}: {arm} would leave the workspace box on its way")
+            raise RuntimeFault(_LEAVES_WORKSPACE(what=what, arm=arm))
         found = self._collisions.on_way(way)
         if found is not None:
             collision, at = found
-            raise RuntimeFault(
-                f"{what}: {collision} after {100 * at / (len(way) - 1):.0f} % of the way: go by another pose, or move "
-                "the robot by hand first"
-            )
+            raise RuntimeFault(_COLLIDES(what=what, collision=collision, percent=100 * at / (len(way) - 1)))
 
     def _way(self, start: Float64, goal: Float64) -> Float64:
         """Postures [T, D] from `start` to `goal`, near enough to each other."""

@@ -12,12 +12,26 @@ from runtime.config.loader import changed, server_of
 from runtime.core.clock import Clock
 from runtime.core.errors import RuntimeFault
 from runtime.core.plugins import variants
+from runtime.core.sentences import Pattern
 from runtime.ipc.command_arguments import PolicyServerRequest, PreflightReportRequest, PreflightRequest, read
 from runtime.ipc.identity import named
 from runtime.ipc.messages import Ack, Command, Event
 from runtime.ipc.session_state import SessionState
 from runtime.station.preflight_child import Preflights
 from runtime.station.spec import StationSpec
+
+_ENDED = Pattern("preflight.ended", "preflight of {about}: {verdict}")
+_BEGUN = Pattern("preflight.begun", "preflight of {about} by {who}")
+_AT_WORK = Pattern(
+    "preflight.at_work",
+    "preflight is not allowed while {state}: the station's machine and policy are at work; allowed "
+    "while {allowed}",
+)
+_SERVER_IN_USE = Pattern(
+    "preflight.server_in_use",
+    "preflight: the station is ready to run with this server, and a server of policy.kind = {kind!r} "
+    "has one client's checkpoint at a time: set up with the checkpoint instead",
+)
 
 PREFLIGHT_QUERIES = ("preflight", "preflight_report", "policy_server")
 
@@ -55,7 +69,7 @@ class PreflightDesk:
         ended = self._preflights.look()
         if ended is not None:
             verdict = ended.told.get("verdict") or ended.failure
-            self._note(f"preflight of {ended.about}: {verdict}", {"id": ended.id})
+            self._note(_ENDED(about=ended.about, verdict=verdict), {"id": ended.id})
 
     def cancel(self, why: str) -> None:
         """The policy's server is wanted for something that counts."""
@@ -69,7 +83,7 @@ class PreflightDesk:
         asked = read("preflight", PreflightRequest, command.args)
         self._require_free(asked)
         longest = self._preflights.start(asked, self._own.resolved)
-        self._note(f"preflight of {asked.about} by {named(command)}", {"id": asked.id})
+        self._note(_BEGUN(about=asked.about, who=named(command)), {"id": asked.id})
         return {"id": asked.id, "longest_s": longest}
 
     def _require_free(self, asked: PreflightRequest) -> None:
@@ -77,18 +91,17 @@ class PreflightDesk:
         state = self._state()
         if state.meaning.at_work:
             raise RuntimeFault(
-                f"preflight is not allowed while {state}: the station's machine and policy are at work; allowed while "
-                f"{', '.join(other for other in SessionState if not other.meaning.at_work)}"
+                _AT_WORK(
+                    state=state,
+                    allowed=", ".join(other for other in SessionState if not other.meaning.at_work),
+                )
             )
         if not state.meaning.ready:
             return
         settings = changed(self._own.resolved, asked.changes, "preflight").deployment
         exclusive = getattr(variants("runtime.policies")[settings.policy.kind], "EXCLUSIVE", False)
         if exclusive and server_of(settings) == server_of(self._in_force().deployment):
-            raise RuntimeFault(
-                f"preflight: the station is ready to run with this server, and a server of policy.kind = "
-                f"{settings.policy.kind!r} has one client's checkpoint at a time: set up with the checkpoint instead"
-            )
+            raise RuntimeFault(_SERVER_IN_USE(kind=settings.policy.kind))
 
     def _report(self, command: Command) -> dict[str, Any]:
         return self._preflights.report(read("preflight_report", PreflightReportRequest, command.args).id)

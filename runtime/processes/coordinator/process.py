@@ -1,8 +1,8 @@
-"""Main's sockets: answers stops at once and commands in turns, publishes snapshots at 10 Hz, joints and poses at 30."""
+"""Sockets of the coordinator: stops at once, commands in turns; snapshots at 10 Hz (5 at rest), joints at 30."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -12,9 +12,11 @@ import zmq
 from runtime.core import file_limits as descriptors
 from runtime.core import malloc as heap
 from runtime.core.clock import MonotonicClock
+from runtime.core.sentences import Pattern
 from runtime.ipc.bus import STREAM_HIGH_WATER, TOO_MANY, Call, CommandServer, Endpoints, Key, Publisher
 from runtime.ipc.fair_queue import Asked, Turns
 from runtime.ipc.identity import forged, identified, lacking
+from runtime.ipc.membership import rest_s
 from runtime.ipc.messages import Ack, Command, Event
 from runtime.processes.child import join
 from runtime.processes.coordinator.assembly import assemble
@@ -24,10 +26,21 @@ from runtime.processes.coordinator.inference.inference import ShownChunk
 from runtime.processes.coordinator.inference.worker import ThreadRunner
 from runtime.processes.coordinator.session.transitions import STOPPING
 
+_REFUSED = Pattern("commands.refused", "{kind} by {who}: refused, {reason}")
+_TOO_MANY_WAIT = Pattern(
+    "commands.too_many_wait",
+    "{kind}: {most} wait already for what is still being loaded: ask again",
+)
+_TOO_MANY_REQUESTS = Pattern("commands.too_many_requests", "process {pid} of this machine is refused: {why}")
+_NOT_ON_DISK = Pattern("commands.not_journalled", "answers to commands are not on disk: {why}")
+
 _NOT_JOURNALLED = ("status", "events_since", "aim", "lease_renew", "preflight_report", "policy_server")
 _MOST_WAITING = 100  # commands
 _SHARE = 8  # commands that are carried out in one turn, besides all stops
 _FLOOD_S = 5.0  # between two events about one
+_PERIODS = {"state": 0.1, "joints": 1 / 30, "poses": 1 / 30}  # of streams [s]
+_SLOWER = 2.0  # the period of snapshots of a station at rest, where every event brings one at once
+_WORK_S = 0.004  # between two looks at what goes on
 
 
 Answered = tuple[Command, Ack, Call]
@@ -48,7 +61,13 @@ class CommandService:
         coordinator.session.remember(self._journal.answers)
         self._endpoints = Endpoints(folder)
         self._tell_where()
+        self._bell = coordinator.shared.bells.get("coordinator")
+        self._poller = zmq.Poller()
+        for woken_by in (self._server.socket, self._streams.socket, self._bell and self._bell.descriptor):
+            if woken_by is not None:
+                self._poller.register(woken_by, zmq.POLLIN)
         self._due: dict[str, float] = {}
+        self._read: list[str] = []  # streams of _PERIODS that somebody reads
         self._told = 0
         self._shown: ShownChunk | None = None
         self._unjournalled = ""
@@ -63,9 +82,14 @@ class CommandService:
         self._endpoints.write("coordinator", where)
 
     def serve(self, timeout: float) -> None:
-        """Wait up to `timeout` seconds for a command; answer all stops and some of the rest; publish what is due."""
+        """Wait up to `timeout` seconds for a command; answer all stops and some of the rest; publish what is due.
+
+        Who begins to read a stream, and a message of the family, end the wait too.
+        """
         if not self._turns.waiting:
-            self._server.socket.poll(int(timeout * 1000))
+            self._poller.poll(math.ceil(timeout * 1000))
+        if self._bell is not None:
+            self._bell.hush()
         stops, others = self._turns.take()
         stopped = self._stop([(call, self._identified(call, command)) for call, command in stops])
         loading, self._waiting = self._waiting, []
@@ -118,7 +142,7 @@ class CommandService:
         return fresh
 
     def _refuse(self, call: Call, command: Command, reason: str) -> None:
-        text = f"{command.kind} by {command.user}: refused, {reason}"
+        text = _REFUSED(kind=command.kind, who=command.user, reason=reason)
         self._say_seldom("not_allowed", text)
         self._server.answer(call, Ack(command.uuid, "refused", reason, kind=command.kind))
 
@@ -127,12 +151,12 @@ class CommandService:
         if len(self._waiting) < _MOST_WAITING:
             self._waiting.append((call, command))
         else:
-            reason = f"{command.kind}: {_MOST_WAITING} wait already for what is still being loaded: ask again"
+            reason = _TOO_MANY_WAIT(kind=command.kind, most=_MOST_WAITING)
             self._server.answer(call, Ack(command.uuid, "refused", reason))
 
     def _tell_of_flood(self) -> None:
         if (call := self._turns.refused) is not None:
-            self._say_seldom("flood", f"process {call.pid} of this machine is refused: {TOO_MANY}")
+            self._say_seldom("flood", _TOO_MANY_REQUESTS(pid=call.pid, why=TOO_MANY))
 
     def _say_seldom(self, kind: str, text: str) -> None:
         """An event, unless there was one of its kind just now: a flood is not to fill the record."""
@@ -143,27 +167,39 @@ class CommandService:
     def _tell_once(self, failure: str) -> None:
         """A disk that is full stays so for a while: one event when it begins."""
         if failure and not self._unjournalled:
-            text = f"answers to commands are not on disk: {failure}"
+            text = _NOT_ON_DISK(why=failure)
             self._coordinator.say(Event("not_journalled", text, self._coordinator.clock.now()))
         self._unjournalled = failure
 
+    def until_due(self) -> float:
+        """Seconds until a stream that somebody reads is due; inf where nobody reads any."""
+        due = min((self._due.get(stream, 0.0) for stream in self._read), default=math.inf)
+        return max(0.0, due - self._coordinator.people.now())
+
     def _publish(self) -> None:
         coordinator, now = self._coordinator, self._coordinator.people.now()
-        self._every("state", 0.1, now, coordinator.snapshot)
-        self._every("joints", 1 / 30, now, self._joints)
-        self._every("poses", 1 / 30, now, self._poses)
+        if begun := self._streams.hear():  # is shown at once what there is
+            self._due = {name: due for name, due in self._due.items() if not name.startswith(tuple(begun))}
+        self._read = [stream for stream in _PERIODS if self._streams.wanted(stream)]
+        news = coordinator.events.newest != self._told
+        if coordinator.rests and news:
+            self._due.pop("state", None)
+        contents = {"state": coordinator.snapshot, "joints": self._joints, "poses": self._poses}
+        for stream in self._read:
+            if now >= self._due.get(stream, 0.0):
+                slower = _SLOWER if stream == "state" and coordinator.rests else 1.0
+                self._due[stream] = now + slower * _PERIODS[stream]
+                self._streams.publish(stream, contents[stream]())
         self._publish_chunk(now)
-        for event in coordinator.events.since(self._told):
-            self._streams.publish("event", event)
-        self._told = coordinator.events.newest
-
-    def _every(self, stream: str, period: float, now: float, content: Callable[[], object]) -> None:
-        if now >= self._due.get(stream, 0.0):
-            self._due[stream] = now + period
-            self._streams.publish(stream, content())
+        if news:
+            for event in coordinator.events.since(self._told):
+                self._streams.publish("event", event)
+            self._told = coordinator.events.newest
 
     def _publish_chunk(self, now: float) -> None:
         """The newest chunk when there is another one, and once a second for who comes late."""
+        if not self._streams.wanted("chunk"):
+            return
         shown = self._coordinator.inference.shown
         if shown is not self._shown or (shown is not None and now >= self._due.get("chunk", 0.0)):
             self._shown = shown
@@ -229,9 +265,10 @@ def main() -> None:
     member = join("coordinator")
     deciding = assemble(member.spec, member.shared, MonotonicClock(), ThreadRunner())
     service = CommandService(deciding, zmq.Context.instance())
+    rest = rest_s(member.spec.deployment.control.heartbeat_timeout_s)
     while not member.lifeline.cut:
         deciding.pump()
-        service.serve(0.004)
+        service.serve(min(rest, service.until_due()) if deciding.rests else _WORK_S)
     deciding.close()
     service.close()
 

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern
 from runtime.ipc.bus import EventLog
 from runtime.ipc.messages import Ack, Command
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
+
+_EVENTS_SINCE_NUMBER = Pattern(
+    "queries.events_since_number",
+    "events_since number = {given!r}: must be a whole number",
+)
 
 QUERIES = ("events_since", "aim", *PREFLIGHT_QUERIES)
 
@@ -32,7 +38,7 @@ class Queries:
     def _events_since(self, command: Command) -> Ack:
         number = command.args.get("number", 0)
         if not isinstance(number, int):
-            return Ack(command.uuid, "refused", f"events_since number = {number!r}: must be a whole number")
+            return Ack(command.uuid, "refused", _EVENTS_SINCE_NUMBER(given=number))
         return Ack(command.uuid, "done", boot=self._boot, data={"events": self._events.since(number)})
 
     def _aim(self, command: Command) -> Ack:

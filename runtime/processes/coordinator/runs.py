@@ -11,6 +11,7 @@ from typing import Any
 
 from runtime.core.clock import Clock
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Float64
 from runtime.ipc.command_arguments import RunRequest
 from runtime.ipc.messages import (
@@ -26,11 +27,35 @@ from runtime.ipc.shared_state import SharedState
 from runtime.policies.base import PolicyInfo
 from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.processes.coordinator.inference.inference import Inference
+from runtime.processes.coordinator.session.transitions import STOPPED
 from runtime.recording.files import require_room
 from runtime.station.run import Provenance, Run
 from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
+_RECORDING_ALONE_OPEN = fixed(
+    "runs.recording_alone_open",
+    "a recording without a run is open: record stop first",
+)
+_NONE_OPEN = fixed("runs.none_open", "no run is open: stop, then run")
+_RECORDING_ENDED = Pattern(
+    "runs.recording_ended",
+    "the recording of this run has ended ({why}): stop, then run",
+)
+_RECORDING_OPEN = fixed("runs.recording_open", "a recording is open already")
+_NO_RECORDING_ALONE = fixed(
+    "runs.no_recording_alone",
+    "no recording is open; a run's own recording ends with the run",
+)
+_EPISODE_CLOSED = Pattern("runs.episode_closed", "episode {episode} {how}, {rows} rows: {reason}")
+_EPISODE_WAITS = Pattern(
+    "runs.episode_waits",
+    "episode {episode} waits for room on the disk, {rows} rows: {reason}",
+)
+_MEDIA_DOES_NOT_READ = fixed(
+    "runs.media_does_not_read",
+    "media does not read: the ring is full; restart the station",
+)
 
 
 class Runs:
@@ -105,7 +130,7 @@ class Runs:
         what must be recorded.
         """
         if self._alone:
-            raise RuntimeFault("a recording without a run is open: record stop first")
+            raise RuntimeFault(_RECORDING_ALONE_OPEN)
         settings = self._plan.deployment
         mode = asked.mode or settings.run.mode
         if settings.recording.enabled and self._must_record(asked.trial is not None, mode):
@@ -165,9 +190,9 @@ class Runs:
         """Go on with the open run; raises RuntimeFault where there is none, or its recording has failed."""
         run = self.open
         if run is None:
-            raise RuntimeFault("no run is open: stop, then run")
+            raise RuntimeFault(_NONE_OPEN)
         if run.unrecorded and self._evidence:
-            raise RuntimeFault(f"the recording of this run has ended ({run.unrecorded}): stop, then run")
+            raise RuntimeFault(_RECORDING_ENDED(why=run.unrecorded))
         if run.begun is not None:
             run.resume(self._clock.now())
             self._follow(run, fresh=False)
@@ -264,7 +289,7 @@ class Runs:
     def record_alone(self, info: PolicyInfo | None) -> str:
         """Open an episode of whatever control does; returns its uuid."""
         if self._alone:
-            raise RuntimeFault("a recording is open already")
+            raise RuntimeFault(_RECORDING_OPEN)
         self._require_room()
         manifest = self._provenance.manifest("observe", info)
         self._tell(BeginEpisode(0, manifest, self._generation))
@@ -274,8 +299,8 @@ class Runs:
     def stop_alone(self) -> None:
         """Close it."""
         if not self._alone:
-            raise RuntimeFault("no recording is open; a run's own recording ends with the run")
-        self._tell(self._end_alone("finished", "stopped by the operator"))
+            raise RuntimeFault(_NO_RECORDING_ALONE)
+        self._tell(self._end_alone("finished", STOPPED))
         self._alone = ""
 
     def _end_alone(self, status: str, reason: str) -> EndEpisode:
@@ -309,8 +334,8 @@ class Runs:
             "error": message.error,
             "waits": message.waits,
         }
-        how = "waits for room on the disk" if message.waits else message.status
-        text = f"episode {message.uuid} {how}, {message.rows} rows: {message.reason}"
+        told = {"episode": message.uuid, "rows": message.rows, "reason": message.reason}
+        text = _EPISODE_WAITS(**told) if message.waits else _EPISODE_CLOSED(**told, how=message.status)
         return Event("episode_closed", text, self._clock.now(), data=self.last_episode)
 
     def note(self, message: Message) -> None:
@@ -322,4 +347,4 @@ class Runs:
 
     def _tell(self, message: Message) -> None:
         if not self._page.rings["minutes"].push(encode(message)):
-            raise RuntimeFault("media does not read: the ring is full; restart the station")
+            raise RuntimeFault(_MEDIA_DOES_NOT_READ)

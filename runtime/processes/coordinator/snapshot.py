@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from robots.units import units_of
 from runtime.core.plugins import variants
+from runtime.core.sentences import within
 from runtime.ipc.messages import PolicyMode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
@@ -19,8 +20,15 @@ if TYPE_CHECKING:
 def snapshot(of: Coordinator) -> dict[str, Any]:
     """The station's state; times in seconds on the runtime's clock, ages in seconds.
 
-    "clock" is the one that commands are valid by; in lockstep it goes on while the runtime's stands.
+    "clock" is the one that commands are valid by; in lockstep it goes on while the runtime's stands. "sentences" has
+    id and arguments of those of its texts that have one, by where they stand: "reason", "guarded.run".
     """
+    told = _snapshot(of)
+    changing = {key: value for key, value in told.items() if key != "facts"}
+    return told | {"sentences": within(changing)}
+
+
+def _snapshot(of: Coordinator) -> dict[str, Any]:
     spec, settings = of.spec, of.spec.deployment
     now, people = of.clock.now(), of.people.now()
     media, reception = of.inbox.media_report, of.inbox.reception_report

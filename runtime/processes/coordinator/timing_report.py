@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from runtime.core import realtime
+from runtime.core.sentences import Pattern
 from runtime.ipc.messages import Event
 from runtime.ipc.shared_state import SharedState
+
+_LATE = Pattern("timing.late", "one tick in a hundred begins more than {ms:.1f} ms late")
+_PUNCTUAL = Pattern("timing.punctual", "ticks are on time again: 99 of 100 within {ms:.2f} ms")
 
 _LATE_S, _PUNCTUAL_S = 1e-3, 0.5e-3  # p99: from here on it is told, below the other it is over
 _MEASURED_S = 2.0  # of ticks before they are judged
@@ -45,8 +49,8 @@ class TimingReport:
     def _judge(self, p99: float) -> list[tuple[str, str]]:
         if not self._late and p99 > _LATE_S:
             self._late = True
-            return [("late_ticks", f"one tick in a hundred begins more than {p99 * 1000:.1f} ms late")]
+            return [("late_ticks", _LATE(ms=p99 * 1000))]
         if self._late and p99 < _PUNCTUAL_S:
             self._late = False
-            return [("punctual", f"ticks are on time again: 99 of 100 within {p99 * 1000:.2f} ms")]
+            return [("punctual", _PUNCTUAL(ms=p99 * 1000))]
         return []

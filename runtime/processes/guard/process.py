@@ -15,6 +15,8 @@ import zmq
 from runtime.core import file_limits as descriptors
 from runtime.core import logs
 from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.sentences import Pattern
+from runtime.ipc.bells import bells
 from runtime.ipc.bus import Call, CommandServer, Endpoints, Key
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.estop_requests import in_packed, why_of
@@ -26,7 +28,16 @@ from runtime.ipc.messages import Ack, Command
 from runtime.ipc.shared_state import EStop, SharedState, SharedStateLayout
 
 log = logging.getLogger(__name__)
-_POLL_S = 0.005
+_NOT_ON_DISK = Pattern(
+    "guard.not_on_disk",
+    "; not on disk ({error}): a restart of the station may forget it",
+)
+_OBEYED = Pattern("guard.obeyed", "every tick now sends the measured position{doubt}")
+_NOT_OBEYED = Pattern(
+    "guard.not_obeyed",
+    "latched, but control has not obeyed within {ms:.0f} ms: USE THE HARDWARE STOP{doubt}",
+)
+_UNKNOWN = Pattern("guard.unknown", "the guard knows estop and status, not {kind!r}")
 _SHARE = 8  # questions that are answered in one turn, besides all presses
 _REMEMBERED = 10_000  # presses of one e-stop
 
@@ -69,7 +80,7 @@ class Guard:
             self._latch.set(by, why)
         except OSError as error:
             self._unsaid.append((logging.ERROR, f"the e-stop is not on disk: {error}"))
-            return f"; not on disk ({error.strerror or error}): a restart of the station may forget it"
+            return _NOT_ON_DISK(error=error.strerror or error)
         self._latched = (by, why)
         return ""
 
@@ -121,24 +132,14 @@ class Guard:
             version = self._page.control.version
             doubt = self.press(named(command), why_of(command))
             if self.obeyed(version):
-                return Ack(
-                    command.uuid,
-                    "done",
-                    f"every tick now sends the measured position{doubt}",
-                    data=self._said,
-                )
-            return Ack(
-                command.uuid,
-                "failed",
-                f"latched, but control has not obeyed within {self._patience * 1000:.0f} ms: "
-                f"USE THE HARDWARE STOP{doubt}",
-                data=self._said,
-            )
+                return Ack(command.uuid, "done", _OBEYED(doubt=doubt), data=self._said)
+            late = _NOT_OBEYED(ms=self._patience * 1000, doubt=doubt)
+            return Ack(command.uuid, "failed", late, data=self._said)
         if command.kind == "status":
             latched = self._latch.read()
             data = {"latched": latched is not None, "by": latched.by if latched else ""}
             return Ack(command.uuid, "done", data=data)
-        return Ack(command.uuid, "refused", f"the guard knows estop and status, not {command.kind!r}")
+        return Ack(command.uuid, "refused", _UNKNOWN(kind=command.kind))
 
 
 class Desk:
@@ -158,6 +159,11 @@ class Desk:
         self._guard, self._page, self._key = guard, shared, Key(station_dir)
         self._server = CommandServer(context, station_dir, "estop")
         self._turns = Turns(self._server, (), _SHARE, LONGEST_STOP)
+        self._bell = shared.bells.get("guard")
+        self._poller = zmq.Poller()
+        self._poller.register(self._server.socket, zmq.POLLIN)
+        if self._bell is not None:
+            self._poller.register(self._bell.descriptor, zmq.POLLIN)
         self._endpoints = Endpoints(station_dir)
         self._answered: dict[str, Ack] = {}
         self._tell_where()
@@ -166,9 +172,11 @@ class Desk:
         self._endpoints.write("guard", {"estop": self._server.endpoint})
 
     def serve(self, timeout: float) -> None:
-        """Wait up to `timeout` seconds for a message, answer what there is."""
+        """Wait up to `timeout` seconds for a message, or for what the guard watches; answer what there is."""
         if not self._turns.waiting:
-            self._server.socket.poll(int(timeout * 1000))
+            self._poller.poll(int(timeout * 1000))
+        if self._bell is not None:
+            self._bell.hush()
         presses, others = self._turns.take()
         anew = self._page.estop is not EStop.LATCHED
         if anew:
@@ -213,7 +221,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--folder", required=True, type=Path, help="of the station: latch, key, endpoints")
     parser.add_argument("--period", required=True, type=float, help="of control's ticks [s]")
     parser.add_argument("--layout", required=True, help="of the shared state, as JSON")
+    parser.add_argument("--rest", required=True, type=float, help="between two signs of life [s]")
     parser.add_argument("--shared", required=True, type=int)
+    parser.add_argument("--bells", required=True, type=bells)
     parser.add_argument("--boot", required=True)
     return parser.parse_args()
 
@@ -225,14 +235,16 @@ def main() -> None:
     logs.start("guard")
     sizes = json.loads(given.layout)
     layout = SharedStateLayout(**{**sizes, "cameras": tuple(sizes["cameras"])})
-    member = Membership(SharedState.attach(layout, given.shared), given.boot, Lifeline())
+    shared = SharedState.attach(layout, given.shared)
+    shared.hang(given.bells)
+    member = Membership(shared, given.boot, Lifeline())
     clock = MonotonicClock()
     guard = Guard(member.shared, Latch(given.folder), clock, given.period, given.station)
     desk = Desk(guard, member.shared, zmq.Context.instance(), given.folder)
     while member.needed(clock.now()):
         member.shared.beat("guard", clock.now())
         guard.watch()
-        desk.serve(_POLL_S)
+        desk.serve(given.rest)
     desk.close()
 
 

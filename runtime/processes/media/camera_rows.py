@@ -6,9 +6,23 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from runtime.core.sentences import Pattern
 from runtime.core.types import Observation, UInt8
 from runtime.ipc.messages import Event
 from runtime.recording.settings import RecordingSettings
+
+_STOPPED = Pattern(
+    "media.pictures_stopped",
+    "camera {camera} gives no new picture: rows from {row} on repeat its last one",
+)
+_STOPPED_FOR = Pattern(
+    "media.pictures_stopped_for",
+    "camera {camera} has given no new picture for {seconds:.1f} s: rows from {row} on repeat its last one",
+)
+_BACK = Pattern("media.pictures_back", "camera {camera} gives pictures again, from row {row} on")
+_ONCE_MORE = Pattern("media.stopped_once_more", "{what}; it had stopped {more} time more since row {row}")
+_MORE = Pattern("media.stopped_more", "{what}; it had stopped {more} times more since row {row}")
+
 
 QUIET_S = 5.0  # from one pictures_stopped of a camera to its next
 
@@ -37,13 +51,12 @@ class _Camera:
         """How it is; `age` [s] is that of its last picture."""
         data: dict[str, object] = {"camera": name, "row": self.row}
         if self.silent:
-            since = "gives no new picture" if age is None else f"has given no new picture for {age:.1f} s"
-            text = f"camera {name} {since}: rows from {self.row} on repeat its last one"
+            stopped = {"camera": name, "row": self.row}
+            text = _STOPPED(**stopped) if age is None else _STOPPED_FOR(**stopped, seconds=age)
         else:
-            text = f"camera {name} gives pictures again, from row {self.row} on"
+            text = _BACK(camera=name, row=self.row)
         if more := self.unsaid - self.silent:
-            often = "time" if more == 1 else "times"
-            text += f"; it had stopped {more} {often} more since row {self.unsaid_from}"
+            text = (_ONCE_MORE if more == 1 else _MORE)(what=text, more=more, row=self.unsaid_from)
             data |= {"more": more, "since_row": self.unsaid_from}
         if self.unsaid:
             self.spoken = now

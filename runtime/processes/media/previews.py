@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import simplejpeg
@@ -13,7 +15,7 @@ from runtime.station.spec import StationSpec
 
 
 class Previews:
-    """Shows each new picture small, at most `bus.preview_rate` times a second and camera.
+    """Shows each new picture small to who looks, at most `bus.preview_rate` times a second and camera.
 
     One that only stands in further observations is not shown again: who looks sees it grow old.
     """
@@ -26,7 +28,7 @@ class Previews:
         self._height = settings.preview_height
         self._due: dict[str, float] = {}
         self._shown: dict[str, float] = {}  # when each camera's last one was captured
-        self._newest: dict[str, bytes] = {}
+        self._newest: Observation | None = None
         cv2.setNumThreads(1)  # the other cores belong to the rest of the family
         self._endpoints = Endpoints(folder)
         self._tell_where()
@@ -34,10 +36,29 @@ class Previews:
     def _tell_where(self) -> None:
         self._endpoints.write("media", {"cameras": self._publisher.endpoint})
 
-    def __call__(self, observation: Observation) -> None:
+    @property
+    def socket(self) -> zmq.Socket[Any]:
+        """Can be read when somebody begins to look, or no longer does."""
+        socket: zmq.Socket[Any] = self._publisher.socket
+        return socket
+
+    def wanted(self) -> bool:
+        """True if somebody looks; to be asked five times a second: looks whether they can connect."""
         if self._publisher.moved():
             self._tell_where()
+        for topic in self._publisher.hear():  # who begins to look sees what there is
+            self._due = {
+                name: due for name, due in self._due.items() if not f"camera/{name}".startswith(topic)
+            }
+            self._shown.clear()
+        return bool(self._publisher.topics)
+
+    def __call__(self, observation: Observation) -> None:
+        self._newest = observation
+        self.wanted()
         for camera in observation.pictures:
+            if not self._publisher.wanted(f"camera/{camera}"):
+                continue
             captured = observation.captured.get(camera, observation.arrived)
             if observation.arrived < self._due.get(camera, 0.0) or captured == self._shown.get(camera):
                 continue
@@ -48,13 +69,16 @@ class Previews:
             self._shown[camera] = captured
             # A little early counts, so that 15 of 30 pictures a second are shown and not 10.
             self._due[camera] = observation.arrived + 0.9 * self._period
-            self._newest[camera] = simplejpeg.encode_jpeg(self._small(picture), quality=80)
-            self._publisher.publish(f"camera/{camera}", self._newest[camera])
+            self._publisher.publish(
+                f"camera/{camera}", simplejpeg.encode_jpeg(self._small(picture), quality=80)
+            )
 
     def again(self) -> None:
         """Show the newest of each camera once more: time stands still, and who begins to look now sees them too."""
-        for camera, jpeg in self._newest.items():
-            self._publisher.publish(f"camera/{camera}", jpeg)
+        self._due.clear()
+        self._shown.clear()
+        if self._newest is not None:
+            self(self._newest)
 
     def close(self) -> None:
         """Release the socket."""

@@ -12,7 +12,9 @@ from runtime.core import file_limits as descriptors
 from runtime.core import malloc as heap
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RecordingError
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Observation
+from runtime.ipc.membership import rest_s
 from runtime.ipc.messages import (
     BeginEpisode,
     BeginRun,
@@ -49,6 +51,19 @@ from runtime.spaces.end_effectors import EndEffectors
 from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
+_COORDINATOR_SILENT = fixed(
+    "media.coordinator_silent",
+    "the coordinator has given no sign of life since it was restarted",
+)
+_END_NEVER_TOLD = fixed("media.end_never_told", "its end was never told, and another recording begins")
+_STILL_WRITING = fixed(
+    "media.still_writing",
+    "the last episode is still being written: is the disk slow? try again in a moment",
+)
+_SUCCESS = fixed("media.success", "success")
+_NO_SUCCESS = fixed("media.no_success", "no success")
+_TRUTH = Pattern("media.truth", "the simulated bench says: {how}")
+_SUPERVISOR_ENDED = fixed("media.supervisor_ended", "the station's supervisor ended")
 # Of a deployment, what others make: what is wrong with its modules costs no recording.
 _UNREAD = (
     "runtime.policies",
@@ -58,7 +73,7 @@ _UNREAD = (
     "runtime.strategies",
 )
 _REPORT_PERIOD = 0.2
-_PERIOD_S = 0.002  # between two looks at what the family says
+_PERIOD_S = 0.002  # between two looks at what the family says, while there is something to record
 _LAST_S = 8.0  # for the last episode, before the supervisor's patience ends
 _EXPORT_S = 3.0  # of it, for the exports that are under way; the worker, or a person, makes up for them
 _CLOSING_S = 1.0  # how long a new episode waits for the one before it; longer is a disk in trouble
@@ -106,6 +121,12 @@ class Media:
         """True if the last episode is still being closed."""
         return self._closing is not None
 
+    @property
+    def rests(self) -> bool:
+        """True while nothing is recorded, begun or closed: what is observed or asked for wakes media."""
+        going_on = self.recording, self.closing, self._waiting is not None, self._opened is not None
+        return not any(going_on)
+
     def digest(self) -> None:
         """Write down what reception, control and the coordinator have posted."""
         died = self._page.generation("coordinator") != self._generation  # all that it said is in the rings
@@ -130,7 +151,7 @@ class Media:
             self._drain("ticks")
             self._generation = generation
             self._waiting = self._opened = None
-            self.end("interrupted", "the coordinator has given no sign of life since it was restarted")
+            self.end("interrupted", _COORDINATOR_SILENT)
             self._ask_source(EndRun())
 
     def _drain(self, ring: str) -> None:
@@ -177,7 +198,7 @@ class Media:
             if message.generation != self._generation:
                 log.warning("run %d of a coordinator that has died is not recorded", message.run)
                 return
-            self.end("interrupted", "its end was never told, and another recording begins")
+            self.end("interrupted", _END_NEVER_TOLD)
             if self._closing is None:
                 self._begin(message)
             else:
@@ -198,6 +219,7 @@ class Media:
         self._preview(observation)
 
     def _begin(self, message: BeginEpisode) -> None:
+        self._page.set_unrecorded(False)  # before anybody hears that it has begun
         opened = EpisodeOpened(message.run, "", "")
         if message.manifest is not None:
             opened = self._open(message.run, message.manifest)
@@ -209,7 +231,7 @@ class Media:
 
     def _open(self, run: int, manifest: Mapping[str, Any]) -> EpisodeOpened:
         if self._closing is not None:
-            error = "the last episode is still being written: is the disk slow? try again in a moment"
+            error = _STILL_WRITING
             return EpisodeOpened(run, "", "", error)
         try:
             # With its pictures as they are now: those of an earlier one may be overwritten by the time they are read.
@@ -286,9 +308,9 @@ class Media:
         """Report a simulated bench's end state and the times of its milestones: the episode's score."""
         truth = self._truth
         if truth:
-            how = "success" if truth["success"] else "no success"
+            how = _SUCCESS if truth["success"] else _NO_SUCCESS
             data = {**truth, "reached": dict(reached), "episode": self._recorder.recording}
-            self._say(Event("truth", f"the simulated bench says: {how}", self._clock.now(), data=data))
+            self._say(Event("truth", _TRUTH(how=how), self._clock.now(), data=data))
 
     def _say(self, event: Event) -> None:
         """An event of media's own: to the coordinator, and into the episode."""
@@ -326,10 +348,12 @@ def main() -> None:
     spec, shared = member.spec, member.shared
     clock = MonotonicClock()
     shared.beat("media", clock.now())
+    shared.set_unrecorded(False)  # a predecessor may have died with it
     exports = Exports(spec.deployment.data, spec.deployment.recording.export)
     start_repair(spec.deployment.episodes_dir, spec.deployment.station, exports.start)
     previews = LowPriorityWorker(Previews(spec))  # late on a busy machine, rather than what is recorded
     media = Media(shared, make_recorder(spec, clock.now), clock, previews, in_background, exports.start)
+    bell, rest = shared.bells["media"], rest_s(spec.deployment.control.heartbeat_timeout_s)
     try:
         while not member.lifeline.cut:
             now = clock.now()
@@ -342,9 +366,13 @@ def main() -> None:
                     "interrupted",
                     f"the coordinator has given no sign of life {shared.silence('coordinator', now)}",
                 )
-            clock.sleep_until(now + _PERIOD_S)
+            if media.rests:
+                shared.set_unrecorded(True)
+                bell.wait(rest)
+            else:
+                clock.sleep_until(now + _PERIOD_S)
     finally:
-        media.end("interrupted", "the station's supervisor ended")
+        media.end("interrupted", _SUPERVISOR_ENDED)
         ended = clock.now()
         media.finish(_LAST_S)
         exports.finish(min(_EXPORT_S, _LAST_S - (clock.now() - ended)))

@@ -15,14 +15,23 @@ from typing import Any
 import numpy as np
 
 from runtime.core.errors import RecordingError
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Float32, Observation
 from runtime.ipc.messages import ChunkMerged, Event, PolicyAnswer, TickDone, event_row
 from runtime.processes.media.camera_rows import CameraRows
 from runtime.processes.media.chunk_log import RecordedChunks
 from runtime.recording.base import VIDEO_LOST, ExecutedTick, Journal, Outcome, Row, Status
+from runtime.recording.bench_truth import truth_text
 from runtime.recording.files import UnclosedError
 from runtime.recording.schema import Schema
 from runtime.recording.settings import RecordingSettings
+
+_EPISODE_OPEN = Pattern("recording.episode_open", "episode {episode} is still open")
+_NO_OBSERVATION = fixed(
+    "recording.no_observation",
+    "no observation has arrived: nothing is known of the cameras yet",
+)
+_NO_PICTURE = Pattern("recording.no_picture", "no picture has arrived from {cameras}")
 
 _OBSERVATIONS_KEPT = (
     256  # ticks reach us within a few ms, after a stall of ours later; at 200 Hz this is a second
@@ -82,15 +91,15 @@ class Recorder:
     def begin(self, manifest: Mapping[str, Any], run: int) -> tuple[str, Path]:
         """Open an episode; raises RecordingError. `run` 0 takes every tick, else those of that run alone."""
         if self._uuid:
-            raise RecordingError(f"episode {self._uuid} is still open")
+            raise RecordingError(_EPISODE_OPEN(episode=self._uuid))
         if not self._seen:
-            raise RecordingError("no observation has arrived: nothing is known of the cameras yet")
+            raise RecordingError(_NO_OBSERVATION)
         newest = self._seen[-1]
         self._schema = Schema.of(manifest)
         self._cameras = self._schema.kept(self._grid.cameras)
         missing = [camera for camera in self._cameras if camera not in newest.pictures]
         if missing:
-            raise RecordingError(f"no picture has arrived from {', '.join(missing)}")
+            raise RecordingError(_NO_PICTURE(cameras=", ".join(missing)))
         self._schema.check(newest)
         self._shown = CameraRows(self._cameras, self._grid.recording)
         identity = str(manifest.get("uuid") or uuid.uuid4())
@@ -102,6 +111,7 @@ class Recorder:
         self._news: list[Event] = []
         self._applied: Float32 | None = None  # the newest action that the robot reported
         self._lost: list[str] = []  # what was said of cameras whose video has ended
+        self._bench = ""  # what a simulated bench said of itself in the row before
         self._chunks = RecordedChunks(self._journal)
         return identity, self._root / identity
 
@@ -269,9 +279,18 @@ class Recorder:
             intervention=tick.source == "teleop",
             stale=self._shown.stale,
             lost=self._shown.lost,
+            bench=self._bench_changed(seen),
         )
         self._journal.append(row)
         self.rows += 1
+
+    def _bench_changed(self, seen: Observation | None) -> str | None:
+        """What a simulated bench says of itself where that is something new."""
+        said = "" if seen is None or not seen.truth else truth_text(seen.truth)
+        if not said or said == self._bench:
+            return None
+        self._bench = said
+        return said
 
     def _eef(self, told: Float32 | None, joints: Float32) -> Float32:
         """Poses as the robot told them, else by forward kinematics."""

@@ -6,6 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from runtime.core.sentences import Pattern, fixed, series
+
+_ENABLED = fixed("drives.enabled", "drives enabled")
+_DISABLED = fixed("drives.disabled", "drives disabled")
+_FAULT = Pattern("drives.fault", "drive fault: {fault}")
+_FAULT_GONE = Pattern("drives.fault_gone", "drive fault gone: {fault}")
+
 _QUIET_S = 0.2  # between two lines: a node that says something else in every frame floods no log
 
 
@@ -28,10 +35,10 @@ class Drives:
         if said is None or now - self._told < _QUIET_S:
             return ""
         enabled, faults = bool(said["enabled"]), tuple(said["faults"])
-        changes = [] if enabled == self._enabled else ["drives enabled" if enabled else "drives disabled"]
-        changes += [f"drive fault: {fault}" for fault in faults if fault not in self._faults]
-        changes += [f"drive fault gone: {fault}" for fault in self._faults if fault not in faults]
+        changes: list[str] = [] if enabled == self._enabled else [_ENABLED if enabled else _DISABLED]
+        changes += [_FAULT(fault=fault) for fault in faults if fault not in self._faults]
+        changes += [_FAULT_GONE(fault=fault) for fault in self._faults if fault not in faults]
         self._enabled, self._faults = enabled, faults
         if changes:
             self._told = now
-        return "; ".join(changes)
+        return series(changes)

@@ -14,7 +14,9 @@ from runtime.core import realtime
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault
 from runtime.core.plugins import variants
+from runtime.core.sentences import Pattern
 from runtime.core.types import Observation
+from runtime.ipc.membership import rest_s
 from runtime.ipc.messages import BeginRun, EndRun, Event, Message, ReceptionReport, RunBegun, decode, encode
 from runtime.ipc.observation_messages import as_message
 from runtime.ipc.shared_state import SharedState
@@ -24,10 +26,15 @@ from runtime.station.spec import StationSpec, delivered
 from runtime.transports.base import Source
 
 log = logging.getLogger(__name__)
+_CLASS_GIVEN_UP = Pattern(
+    "reception.class_given_up",
+    "receiving took more than a processor core for {seconds:g} s and gives its real-time class up: see "
+    "what the robot's node and the cameras send; the class is back when the station is started anew",
+)
 # Of a deployment, what others make: what is wrong with its modules keeps nobody from seeing the robot.
 _UNREAD = ("runtime.policies", "runtime.teleoperators", "runtime.kinematics", "runtime.strategies")
 _REPORT_PERIOD = 0.2
-_WAIT_S = 0.005  # for an observation, until media is heard again
+_WAIT_S = 0.05  # at most for an observation, until media is heard again
 _RETRY_S = 1.0  # between two tries to connect
 _SHARE_S = 3.0
 
@@ -77,10 +84,7 @@ class Reception:
         """No real-time class any more: what comes in would take the processors from guard and coordinator."""
         realtime.leave_all()
         self._scheduling = "ordinary"
-        text = (
-            f"receiving took more than a processor core for {_SHARE_S:g} s and gives its real-time class up: "
-            "see what the robot's node and the cameras send; the class is back when the station is started anew"
-        )
+        text = _CLASS_GIVEN_UP(seconds=_SHARE_S)
         self._say(Event("scheduling", text, self._clock.now()))
 
     def _report_in_time(self) -> None:
@@ -163,6 +167,7 @@ def main() -> None:
     source = make_source(member.spec, clock)
     reception = Reception(shared, source, clock, scheduling)
     connected, retry_at = False, 0.0
+    wait = min(_WAIT_S, rest_s(member.spec.deployment.control.heartbeat_timeout_s))
     share = Share() if scheduling.startswith("FIFO") else None
     while member.needed(clock.now()):
         now = clock.now()
@@ -173,10 +178,10 @@ def main() -> None:
         if not connected and now >= retry_at:
             connected, retry_at = _connected(source), now + _RETRY_S
         if connected:
-            reception.pump(_WAIT_S)
+            reception.pump(wait)
         else:
             reception.tend()
-            clock.sleep_until(now + 0.1)
+            clock.sleep_until(now + wait)
     source.close()
 
 

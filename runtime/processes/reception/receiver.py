@@ -13,6 +13,8 @@ import numpy as np
 
 from runtime.core.clock import Clock
 from runtime.core.errors import TransportError
+from runtime.core.quantiles import quantiles
+from runtime.core.sentences import Pattern
 from runtime.core.types import Observation
 from runtime.ipc.messages import Event
 from runtime.ipc.shared_state import SharedState
@@ -20,6 +22,8 @@ from runtime.processes.reception.drive_status import Drives
 from runtime.transports.base import Source
 
 log = logging.getLogger(__name__)
+_BECAUSE = Pattern("reception.because", "{what}: {why}")
+_SOURCE_FAULT = Pattern("reception.source_fault", "source: {fault} ({count} so far)")
 _RATE_WINDOW = 40  # arrivals per stream
 _AGES_KEPT = 2000  # over a minute at 30 Hz
 _SILENT_S = 2.0  # after which a stream has no rate any more
@@ -48,7 +52,7 @@ class ObservationReceiver:
         self._say, self._hand_on = say, hand_on
         self._before = int(shared.observation.read()["sequence"])  # observations of predecessors
         self._numbers = {camera: slots.newest for camera, slots in shared.pictures.items()}
-        self._ages: deque[float] = deque(maxlen=_AGES_KEPT)
+        self._ages, self._aged = np.zeros(_AGES_KEPT), 0  # [s], and how many there ever were
         self._captured: dict[str, float] = {}
         self._arrivals: dict[str, deque[float]] = {}
         self._faults: dict[str, int] = {}  # as they were last said
@@ -100,7 +104,8 @@ class ObservationReceiver:
                 self._faults[name], self._said_at[name] = count, now
                 why = self._source.why(name)
                 named = name.replace("_", " ").replace(".", ": ")
-                text = f"source: {named} ({count} so far)" + (f": {why}" if why else "")
+                text = _SOURCE_FAULT(fault=named, count=count)
+                text = _BECAUSE(what=text, why=why) if why else text
                 self._say(Event(f"source_{name}", text, now, data={"count": count}))
         return faults
 
@@ -111,9 +116,10 @@ class ObservationReceiver:
 
     def age_ms(self) -> dict[str, float]:
         """Age of joints when they came into shared state: p50, p99 and max of the newest 2000 [ms]."""
-        if not self._ages:
+        if not self._aged:
             return {}
-        p50, p99, worst = (1000.0 * np.percentile(self._ages, (50, 99, 100))).tolist()
+        ages = self._ages[: min(self._aged, _AGES_KEPT)]
+        p50, p99, worst = (1000.0 * age for age in quantiles(ages, (0.5, 0.99, 1.0)))
         return {"p50": p50, "p99": p99, "max": worst}
 
     def _receive(self, timeout: float) -> Observation | None:
@@ -132,7 +138,7 @@ class ObservationReceiver:
         return observation
 
     def _take(self, given: Observation) -> None:
-        observation = self._that_fits(replace(given, sequence=self._before + given.sequence))
+        observation = self._that_fits(given)
         for camera, picture in observation.pictures.items():
             captured = observation.captured.get(camera, observation.arrived)
             if captured != self._captured.get(camera):
@@ -145,16 +151,19 @@ class ObservationReceiver:
         self._hear_drives(observation)
         self._hand_on(observation, self._numbers)
         self._page.publish_observation(observation, self._numbers)
-        self._ages.append(self._clock.now() - observation.captured.get("joints", observation.arrived))
+        age = self._clock.now() - observation.captured.get("joints", observation.arrived)
+        self._ages[self._aged % _AGES_KEPT] = age
+        self._aged += 1
 
     def _that_fits(self, observation: Observation) -> Observation:
-        """Without pictures of other cameras than the page's, and without those that have no room in it."""
+        """With its number in the page; without pictures of other cameras, or that have no room there."""
         most = self._page.layout.picture_bytes
         ours = {camera: seen for camera, seen in observation.pictures.items() if camera in self._numbers}
         large = {camera for camera, picture in ours.items() if picture.nbytes > most}
         self._too_large.update(f"picture_too_large_{camera}" for camera in large)
         return replace(
             observation,
+            sequence=self._before + observation.sequence,
             pictures={camera: picture for camera, picture in ours.items() if camera not in large},
             captured={name: time for name, time in observation.captured.items() if name not in large},
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -12,13 +13,17 @@ import time
 import uuid
 from collections import deque
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
 from runtime.core.environment import for_programs
+from runtime.ipc.bells import Bell
 from runtime.ipc.bus import Endpoints, Key
 from runtime.ipc.lifeline import Lifeline
-from runtime.ipc.shared_state import PROCESSES, SharedState
+from runtime.ipc.membership import rest_s
+from runtime.ipc.shared_state import PROCESSES, WOKEN, SharedState
+from runtime.link.key_files import known_lab_path
 from runtime.processes.supervisor.optional_child import OptionalChild
 from runtime.station.lock import hold, unwritable
 from runtime.station.spec import CAPABILITIES, StationSpec
@@ -33,10 +38,12 @@ _MODULES = {
     "headless": "runtime.clients.headless",
 }
 _START_ORDER = ("guard", "reception", "media", "control", "coordinator")
+# Beside the family.
+_CHANNEL, _LINK, _PANEL = "runtime.clients.channel", "runtime.link", "runtime.clients.panel"
 MOST_RESTARTS, RESTART_WINDOW_S = 5, 60.0
 _PATIENCE_S = 9.0  # after the lifeline is cut; then what is left is killed
 _DRIVER_PATIENCE_S = 2.0  # for what drives a headless run, after it was told to end
-_POLL_S = 0.05
+_LOOK_S = 0.2  # between two looks at what is beside the family
 
 
 class Supervisor:
@@ -50,7 +57,7 @@ class Supervisor:
         self._environment = for_programs(os.environ)
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._driver: subprocess.Popen[bytes] | None = None
-        self._channel: OptionalChild | None = None
+        self._companions: dict[str, OptionalChild] = {}
         self._restarts: deque[float] = deque()
         self._ending = False
         self.boot = str(uuid.uuid4())
@@ -65,6 +72,7 @@ class Supervisor:
         self._endpoints.begin()
         Key(self._station_dir).secret()  # what is wrong with it is said before anything moves
         self._page, self._page_fd = SharedState.create(self._plan.layout)
+        self._bells, self._signalled = [Bell.made() for _ in WOKEN], Bell.made()
         # Children hold the reading end as their standard input: it ends when this process does, however it does.
         self._lifeline_out, self._lifeline_in = os.pipe()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -75,7 +83,11 @@ class Supervisor:
             for process in _START_ORDER:
                 self._start(process)
             if self._plan.deployment.control_channel.enabled:
-                self._channel = OptionalChild("channel", self._spawn_channel)
+                self._companions["channel"] = OptionalChild(
+                    "channel", partial(self._spawn_companion, _CHANNEL)
+                )
+            if self._plan.deployment.panel is not None:
+                self._companions["panel"] = OptionalChild("panel", partial(self._spawn_companion, _PANEL))
             if headless:
                 self._driver = self._spawn("headless")
             return self._watch()
@@ -99,7 +111,9 @@ class Supervisor:
         self._endpoints.write("supervisor", {"boot": self.boot, **pids})
 
     def _spawn(self, process: str) -> subprocess.Popen[bytes]:
-        shared = () if process == "headless" else ("--shared", str(self._page_fd))
+        inherited = () if process == "headless" else (self._page_fd, *(b.descriptor for b in self._bells))
+        rung = ",".join(map(str, inherited[1:]))
+        shared = ("--shared", str(self._page_fd), "--bells", rung) if inherited else ()
         return subprocess.Popen(
             [
                 *(sys.executable, "-m", _MODULES[process], "--boot", self.boot),
@@ -107,7 +121,7 @@ class Supervisor:
                 *shared,
             ],
             stdin=self._lifeline_out,
-            pass_fds=(self._page_fd,) if shared else (),
+            pass_fds=inherited,
             env=self._environment,
             start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them in order
         )
@@ -126,13 +140,14 @@ class Supervisor:
         return (
             *("--station", spec.deployment.station, "--folder", str(self._station_dir)),
             *("--period", repr(1.0 / spec.rate), "--layout", json.dumps(asdict(spec.layout))),
+            *("--rest", repr(rest_s(spec.deployment.control.heartbeat_timeout_s))),
         )
 
-    def _spawn_channel(self) -> subprocess.Popen[bytes]:
-        """The control channel: a client like any other, without a part in the shared state."""
+    def _spawn_companion(self, module: str) -> subprocess.Popen[bytes]:
+        """Control channel, link to a lab, panel: clients like any other, without a part in the shared state."""
         station, data = self._plan.deployment.station, str(self._plan.deployment.data)
         return subprocess.Popen(
-            [sys.executable, "-m", "runtime.clients.channel", station, "--data-dir", data, "--lifeline"],
+            [sys.executable, "-m", module, station, "--data-dir", data, "--lifeline"],
             stdin=self._lifeline_out,
             env=self._environment,
             start_new_session=True,
@@ -146,12 +161,25 @@ class Supervisor:
                 code = self._children[process].poll()
                 if code is not None and not self._restart(process, code):
                     return 1
-            if self._channel is not None:
-                self._channel.look()
+            if "link" not in self._companions and known_lab_path(self._station_dir).exists():
+                self._companions["link"] = OptionalChild("link", partial(self._spawn_companion, _LINK))
+            for companion in self._companions.values():
+                companion.look()
             if self._endpoints.lost("supervisor"):
                 self._tell_where()
-            time.sleep(_POLL_S)
+            self._sleep()
         return 130
+
+    def _sleep(self) -> None:
+        """Until a process of the family ends, a signal comes, our own parent is gone, or it is time to look around."""
+        children = [*self._children.values(), *([self._driver] if self._driver else [])]
+        ends = [os.pidfd_open(child.pid) for child in children if child.returncode is None]
+        try:
+            lives = [self._lifeline.descriptor] if self._lifeline else []
+            select.select([*ends, *lives, self._signalled.descriptor], [], [], _LOOK_S)
+        finally:
+            for end in ends:
+                os.close(end)
 
     def _restart(self, process: str, code: int) -> bool:
         now = time.monotonic()
@@ -172,6 +200,7 @@ class Supervisor:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._ending = True
+        self._signalled.ring()
 
     def _end(self) -> None:
         """End the driver, which commands the others; cut the lifeline: each child closes its files, control holds
@@ -184,10 +213,12 @@ class Supervisor:
         deadline = time.monotonic() + _PATIENCE_S
         for process, child in self._children.items():
             self._await(process, child, max(0.1, deadline - time.monotonic()))
-        if self._channel is not None:
-            self._await("channel", self._channel.process, _DRIVER_PATIENCE_S)
+        for name, companion in self._companions.items():
+            self._await(name, companion.process, _DRIVER_PATIENCE_S)
         os.close(self._lifeline_out)
         os.close(self._page_fd)
+        for bell in (*self._bells, self._signalled):
+            bell.close()
         self._endpoints.clear()
 
     def _await(self, process: str, child: subprocess.Popen[bytes], seconds: float) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from runtime.core.clock import Clock
 from runtime.core.errors import CodecError, ConfigurationError, TransportError
+from runtime.core.sentences import Pattern, fixed, series
 from runtime.core.types import Observation
 from runtime.ipc.messages import Event
 from runtime.transports.base import Source
@@ -31,7 +32,26 @@ _PICTURES_DEPTH = 32  # of a camera; a second of them at 30 Hz
 _HISTORY_S = 1.0
 _LOOK_S = 0.5  # how often it is looked who is at the other side of silent topics
 _GRACE_S = 1.0  # for publishers and us to find each other
-_JUMPED = "the clock that stamps {} {}: it was set, or its node was started anew"
+_BACK = Pattern(
+    "ros.clock_back",
+    "the clock that stamps {stream} went back: it was set, or its node was started anew",
+)
+_AHEAD = Pattern(
+    "ros.clock_ahead",
+    "the clock that stamps {stream} leapt ahead: it was set, or its node was started anew",
+)
+_FROZEN = Pattern("ros.frozen_picture", "{camera} shows the same picture for over {seconds:g} s")
+_STAMPS_STAND = fixed("ros.stamps_stand", "its stamps do not advance")
+_WAITING = Pattern("ros.waiting", "waiting for {streams}: {why}")
+_SILENT = Pattern("ros.silent", "waiting for {stream} ({topic}): nothing for {seconds:.1f} s")
+_UNUSABLE = Pattern("ros.unusable", "waiting for {stream} ({topic}): nothing usable for {seconds:.1f} s")
+_BECAUSE = Pattern("ros.because", "{what}: {why}")
+_NO_PUBLISHER = fixed("ros.no_publisher", "nobody publishes it")
+_APART = Pattern(
+    "ros.apart",
+    "no message of {apart} is within {skew:g} s of the newest of {slowest}, whose stamps are {behind:.2f} s "
+    "behind the others': have the robot's computers one clock? (transport.max_skew_s)",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +131,7 @@ class RosSource(Source):
             self._blame(error.fault, str(error))
             return None
         for camera in self._assembly.newly_frozen(self._clock.now()):
-            self._blame(f"frozen_{camera}", f"{camera} shows the same picture for over {FROZEN_S:g} s")
+            self._blame(f"frozen_{camera}", _FROZEN(camera=camera, seconds=FROZEN_S))
         self._told.clear()
         return made
 
@@ -208,16 +228,16 @@ class RosSource(Source):
             if self._ros.backwards > before:
                 self.alignment.clear()
                 self._cursor = None
-                self._sentences["clock_backwards"] = _JUMPED.format(part.name, "went back")
+                self._sentences["clock_backwards"] = _BACK(stream=part.name)
             if self._ros.forwards > leaps:
-                self._sentences["clock_forwards"] = _JUMPED.format(part.name, "leapt ahead")
+                self._sentences["clock_forwards"] = _AHEAD(stream=part.name)
             if self.alignment.add(part.name, Sample(stamp, arrived, Received(value, ours))):
                 self._heard_at[part.name] = arrived
                 self._refusals.pop(part.name, None)
                 self._changed.notify_all()
             else:
                 self._faults["not_newer"] += 1
-                text = self._sentences["not_newer"] = "its stamps do not advance"
+                text = self._sentences["not_newer"] = _STAMPS_STAND
                 self._refusals[part.name] = ("not_newer", text)
 
     def _stamp(self, message: Message, arrived: float) -> float:
@@ -265,9 +285,9 @@ class RosSource(Source):
             self._told |= causes[name]
         shared = {match.refused for match in fresh.values()}
         if len(fresh) > 1 and len(shared) == 1 and any(shared) and not fresh.keys() & self._refusals.keys():
-            self._tell(f"waiting for {', '.join(fresh)}: {shared.pop()}")
+            self._tell(_WAITING(streams=", ".join(fresh), why=shared.pop()))
         elif fresh:
-            self._tell("; ".join(self._silence(name, stalled[name], match) for name, match in fresh.items()))
+            self._tell(series([self._silence(name, stalled[name], match) for name, match in fresh.items()]))
 
     def _tell(self, sentence: str) -> None:
         self._last_fault = sentence
@@ -286,22 +306,18 @@ class RosSource(Source):
     def _silence(self, name: str, age: float, match: Match) -> str:
         topic = self._topics[name].name
         refusal = self._refusals.get(name)
-        why = match.refused or ("" if match.peers else "nobody publishes it")
+        why = match.refused or ("" if match.peers else _NO_PUBLISHER)
         if refusal is not None:
             why = refusal[1]
-        since = "nothing" if refusal is None else "nothing usable"
-        return f"waiting for {name} ({topic}): {since} for {age:.1f} s" + (f": {why}" if why else "")
+        what = (_SILENT if refusal is None else _UNUSABLE)(stream=name, topic=topic, seconds=age)
+        return _BECAUSE(what=what, why=why) if why else what
 
     def _distance(self, apart: list[str]) -> str:
         newest = {part.name: self.alignment.newest(part.name) for part in self._parts}
         stamps = {name: sample.stamp for name, sample in newest.items() if sample is not None}
         slowest = min(stamps, key=lambda name: stamps[name])
         behind = max(stamps.values()) - stamps[slowest]
-        return (
-            f"no message of {', '.join(apart)} is within {self._terms.skew:g} s of the newest of {slowest}, whose "
-            f"stamps are {behind:.2f} s behind the others': have the robot's computers one clock? "
-            "(transport.max_skew_s)"
-        )
+        return _APART(apart=", ".join(apart), skew=self._terms.skew, slowest=slowest, behind=behind)
 
     def _blame(self, fault: str, text: str, *streams: str) -> None:
         with self._changed:

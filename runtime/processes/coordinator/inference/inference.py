@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError, RuntimeFault
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Conditioning, Float64
 from runtime.ipc.messages import ChunkMerged, Event, Mode, PolicyAnswer, PostedChunk
 from runtime.ipc.shared_state import SharedState
@@ -24,6 +25,12 @@ from runtime.processes.coordinator.inference.retry import Retry
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
 from runtime.processes.coordinator.inference.worker import telling
 from runtime.strategies.base import Progress, Query, StrategyParameters
+
+_NOT_ANSWERED_YET = Pattern(
+    "policy.not_answered_yet",
+    "the policy was asked {seconds:.1f} s ago and has not answered yet",
+)
+_ANSWER_UNUSABLE = fixed("policy.answer_unusable", "the policy's answer cannot be used")
 
 ON_DEMAND: tuple[Mode, ...] = ("step", "preview")  # modes that ask when a person says so
 
@@ -143,7 +150,7 @@ class Inference:
         """Why there may be no chunk: what the policy last failed of, or for how long it owes an answer; else ""."""
         if self.retry.failure or self._flight is None:
             return self.retry.failure
-        return f"the policy was asked {self._clock.now() - self._asked_at:.1f} s ago and has not answered yet"
+        return _NOT_ANSWERED_YET(seconds=self._clock.now() - self._asked_at)
 
     @property
     def rtc(self) -> dict[str, Any]:
@@ -259,7 +266,7 @@ class Inference:
 
     def pump(self) -> PolicyAnswer | None:
         """Collect an answer, or ask; returns the answer, for the record. Raises PolicyError, and no other error."""
-        with telling("the policy's answer cannot be used"):
+        with telling(_ANSWER_UNUSABLE):
             return self._pump() if self._run else None
 
     def _pump(self) -> PolicyAnswer | None:

@@ -10,8 +10,13 @@ import numpy as np
 
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Float64, Observation
 from runtime.ipc.shared_state import SharedState
+
+_NONE_YET = fixed("observation.none_yet", "no observation has arrived yet")
+_STALE = Pattern("observation.stale", "{stream}: {seconds:.2f} s old, allowed {allowed:g}")
+_NO_PICTURE = Pattern("observation.no_picture", "no picture has arrived from {cameras}")
 
 
 class StaleObservationError(PolicyError):
@@ -61,17 +66,17 @@ class PolicyObservation:
         cameras = self._page.layout.cameras if pictures else ()
         seen = self._page.read_observation(cameras)
         if seen is None:
-            raise PolicyError("no observation has arrived yet")
+            raise PolicyError(_NONE_YET)
         now, bounds = self._clock.now(), self._settings
         for stream, captured in seen.captured.items():
             if not (pictures or stream in ("joints", "eef")):
                 continue
             allowed = bounds.joint_age if stream in ("joints", "eef") else bounds.picture_age
             if not now - captured <= allowed:
-                raise StaleObservationError(f"{stream}: {now - captured:.2f} s old, allowed {allowed:g}")
+                raise StaleObservationError(_STALE(stream=stream, seconds=now - captured, allowed=allowed))
         missing = [camera for camera in cameras if camera not in seen.pictures]
         if missing:
-            raise PolicyError(f"no picture has arrived from {', '.join(missing)}")
+            raise PolicyError(_NO_PICTURE(cameras=", ".join(missing)))
         shown = replace(seen, step=self._step_of(seen), prompt=prompt)
         return self._of_the_simulated_robot(shown) if self.simulated else shown
 

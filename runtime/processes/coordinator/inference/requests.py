@@ -12,6 +12,7 @@ import numpy as np
 
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError, RuntimeFault, SetupError
+from runtime.core.sentences import Pattern
 from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.ipc.messages import Event
 from runtime.kinematics.base import IkFlag, IkResult
@@ -21,6 +22,16 @@ from runtime.processes.coordinator.inference.worker import Runner
 from runtime.spaces.conversion import ActionSpaces, CommandRows, Onset
 
 log = logging.getLogger(__name__)
+_EEF_DISAGREES = Pattern(
+    "policy.eef_disagrees",
+    '{wrong}; allowed: policy.observation_eef = "fk", or a node that measures that link',
+)
+_POSES_NOT_REACHED = Pattern(
+    "policy.poses_not_reached",
+    "{over} of {rows} poses are not reached, the worst by {worst_mm:.1f} mm and {worst_deg:.2f} "
+    "degrees: nearest taken ({limit} at a joint limit, {velocity} as fast as joints may, {singular} "
+    "near singular)",
+)
 _EARLY_S = 1e-6  # moments are sums of floats
 Committed = Callable[[int], Conditioning | None]  # by the step of the observation
 
@@ -183,9 +194,7 @@ class PolicyRequests:
             return
         wrong = self._spaces.disagreement(shown.eef, shown.qpos)
         if wrong and self.policy.sees_poses:
-            raise SetupError(
-                f'{wrong}; allowed: policy.observation_eef = "fk", or a node that measures that link'
-            )
+            raise SetupError(_EEF_DISAGREES(wrong=wrong))
         if wrong:
             self.notes.append(Event("eef_disagrees", wrong, self._clock.now(), shown.step))
 
@@ -193,10 +202,14 @@ class PolicyRequests:
         """Say what could not be done of an answer."""
         ik = answered.ik
         if ik.get("over"):
-            text = (
-                f"{ik['over']} of {ik['rows']} poses are not reached, the worst by {ik['worst_mm']:.1f} mm and "
-                f"{ik['worst_deg']:.2f} degrees: nearest taken ({ik['limit']} at a joint limit, {ik['velocity']} as "
-                f"fast as joints may, {ik['singular']} near singular)"
+            text = _POSES_NOT_REACHED(
+                over=ik["over"],
+                rows=ik["rows"],
+                worst_mm=ik["worst_mm"],
+                worst_deg=ik["worst_deg"],
+                limit=ik["limit"],
+                velocity=ik["velocity"],
+                singular=ik["singular"],
             )
             step = answered.observation.step
             self.notes.append(Event("ik_unreached", text, self._clock.now(), step, ik))

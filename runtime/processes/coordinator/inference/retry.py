@@ -7,6 +7,10 @@ from collections.abc import Callable
 from runtime.core.backoff import BackOff
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError, RuntimeFault
+from runtime.core.sentences import Pattern
+
+_LOST = Pattern("policy.lost", "{error}; trying again for {seconds:g} s")
+_ANSWERS_AGAIN = Pattern("policy.answers_again", "the policy answers again after {seconds:.1f} s")
 
 
 class Retry:
@@ -37,13 +41,13 @@ class Retry:
             return False
         if first:
             kind = "policy_lost" if isinstance(error, PolicyLostError) else "policy_failed"
-            self._say(kind, f"{error}; trying again for {self._patience:g} s")
+            self._say(kind, _LOST(error=error, seconds=self._patience))
         return True
 
     def recovered(self) -> None:
         """It answers."""
         if self._back_off.since is not None:
-            self._say("policy_back", f"the policy answers again after {self.lost_for:.1f} s")
+            self._say("policy_back", _ANSWERS_AGAIN(seconds=self.lost_for))
         self.forget()
 
     def forget(self) -> None:

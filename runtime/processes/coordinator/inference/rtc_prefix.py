@@ -8,10 +8,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import ActionChunk, Conditioning, Float32, Float64
 from runtime.ipc.messages import ChunkMerged
 from runtime.motion.timeline import HELD
 from runtime.processes.coordinator.inference.chunk_mixture import Mixture, Parts
+
+_RELATIVE_ROWS_LOST = fixed(
+    "rtc.relative_rows_lost",
+    "RTC: the policy's rows are relative to an observation that is over and it returned none of its own"
+    " space: they cannot be continued, requests go out without them",
+)
+_DELAY_BEYOND_PLAN = Pattern(
+    "rtc.delay_beyond_plan",
+    "RTC: an answer is expected after {steps:g} steps, but {left} are planned: the robot will stand "
+    "before it arrives; allowed: a delay that fits, so ask more often, or raise "
+    "strategy.execution_horizon, or take a faster policy",
+)
 
 _HAIR = 1e-9  # of a row: what rates divided by rates are off by
 Numbers = Float32 | Float64
@@ -150,10 +163,7 @@ class RtcPrefix:
             return None
         held = self._merged[max(self._merged)]
         if held.rebased:
-            self.warning = (
-                "RTC: the policy's rows are relative to an observation that is over and it returned none of its own "
-                "space: they cannot be continued, requests go out without them"
-            )
+            self.warning = _RELATIVE_ROWS_LOST
             return None
         passed = math.floor((observation_step - held.anchor) * held.pace + 0.5 + _HAIR)
         consumed = max(0, passed)
@@ -259,11 +269,7 @@ class RtcPrefix:
     def _judge(self, delay: float, left: int) -> None:
         """RTC needs steps to go on with until the answer arrives."""
         if delay > left:
-            self.warning = (
-                f"RTC: an answer is expected after {delay:g} steps, but {left} are planned: the robot will stand "
-                "before it arrives; allowed: a delay that fits, so ask more often, or raise "
-                "strategy.execution_horizon, or take a faster policy"
-            )
+            self.warning = _DELAY_BEYOND_PLAN(steps=delay, left=left)
 
 
 def _expected(delays: Sequence[int], quantile: float) -> float:

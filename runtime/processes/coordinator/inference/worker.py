@@ -14,8 +14,10 @@ from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 from runtime.core.errors import PolicyError, RuntimeFault
+from runtime.core.sentences import fixed
 
 log = logging.getLogger(__name__)
+_CODE_FAILED = fixed("policy.code_failed", "the policy's own code failed")
 Result = TypeVar("Result")
 
 
@@ -59,7 +61,7 @@ def telling(what: str) -> Iterator[None]:
 
 def _told(call: Callable[[], Result]) -> Callable[[], Result]:
     def told() -> Result:
-        with telling("the policy's own code failed"):
+        with telling(_CODE_FAILED):
             return call()
 
     return told

@@ -9,10 +9,13 @@ import numpy as np
 
 from robots.robot import Group
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 from runtime.ipc.command_arguments import GripperRequest
 from runtime.spaces.binary_grippers import open_or_closed, switches
 from runtime.station.spec import StationSpec
+
+_NO_SUCH_ARM = Pattern("grippers.no_such_arm", "gripper: arm = {arm!r}; {robot} has grippers on {names}")
 
 _REACHED = 1e-3  # of its travel: a gripper that is so near to its lock is there
 
@@ -78,7 +81,7 @@ class Grippers:
         chosen = [group for group in self._groups if group.name == name]
         if not chosen:
             names = ", ".join(group.name for group in self._groups) or "none"
-            raise RuntimeFault(f"gripper: arm = {name!r}; {self._robot} has grippers on {names}")
+            raise RuntimeFault(_NO_SUCH_ARM(arm=name, robot=self._robot, names=names))
         return chosen
 
     def told(self, commanded: Float64) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 from runtime.ipc.command_arguments import AimRequest, GripperRequest, MoveRequest, read
 from runtime.ipc.shared_state import SharedState
@@ -20,6 +21,7 @@ from runtime.processes.coordinator.setup.sequence import first_action
 from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
+_MOVES_NO_ROBOT = Pattern("manual.moves_no_robot", "{what}: transport {transport!r} moves no robot")
 
 
 class ManualControl:
@@ -46,7 +48,7 @@ class ManualControl:
         """Refuse where the transport moves no robot."""
         if not self._plan.capabilities.moves_robot:
             kind = self._plan.deployment.transport.kind
-            raise RuntimeFault(f"{what}: transport {kind!r} moves no robot")
+            raise RuntimeFault(_MOVES_NO_ROBOT(what=what, transport=kind))
 
     def waits(self, arguments: Mapping[str, Any]) -> bool:
         """True if such an aim needs what is still being loaded; loading begins with the first aim."""

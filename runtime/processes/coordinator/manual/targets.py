@@ -10,6 +10,7 @@ import numpy as np
 
 from robots.rotations import matrix_of_quaternion, matrix_of_rpy, quaternion_of_matrix
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float32, Float64
 from runtime.ipc.command_arguments import AimRequest, Jog, MoveRequest
 from runtime.kinematics.base import Kinematics
@@ -17,6 +18,23 @@ from runtime.motion.trajectories import Trajectory
 from runtime.processes.coordinator.path_check import PathCheck
 from runtime.spaces.conversion import ActionSpaces
 from runtime.station.spec import StationSpec
+
+_NO_TARGET = Pattern("targets.no_target", "move: say joints or a pose; poses of {robot}: {poses}")
+_SPEED_AT_END = Pattern(
+    "targets.speed_at_end",
+    "move: {name} = {value:.4f} is a speed; allowed at the end of a motion: 0",
+)
+_BEYOND_LIMITS = Pattern(
+    "targets.beyond_limits",
+    "{what}: {name} = {value:.4f}; allowed: {lower:g} to {upper:g}",
+)
+_JOINTS_AND_POSE = Pattern(
+    "targets.joints_and_pose",
+    "{what}: joints and the pose {pose!r}; allowed: one of the two",
+)
+_NO_SUCH_POSE = Pattern("targets.no_such_pose", "{what}: pose = {pose!r}; {robot} has {poses}")
+_NUMBER_OF_JOINTS = Pattern("targets.number_of_joints", "{what}: {given} joints; {robot} has {expected}")
+_NO_SUCH_ARM = Pattern("targets.no_such_arm", "aim: jog.arm = {arm!r}; {robot} has {arms}")
 
 _TOLERANCE = 1e-6
 
@@ -59,16 +77,12 @@ class Targets:
     def goal(self, asked: MoveRequest, commanded: Float64) -> Float64:
         """The end of a motion from `commanded`, checked all the way: RuntimeFault says what is wrong with it."""
         if asked.joints is None and asked.pose is None:
-            raise RuntimeFault(
-                f"move: say joints or a pose; poses of {self._plan.robot.name}: {self._poses()}"
-            )
+            raise RuntimeFault(_NO_TARGET(robot=self._plan.robot.name, poses=self._poses()))
         goal = self._wanted("move", asked.joints, asked.pose, commanded)
         for dim in self._plan.limits.speeds:
             if goal[dim]:
                 name = self._plan.limits.names[dim]
-                raise RuntimeFault(
-                    f"move: {name} = {goal[dim]:.4f} is a speed; allowed at the end of a motion: 0"
-                )
+                raise RuntimeFault(_SPEED_AT_END(name=name, value=goal[dim]))
         return self.checked("move", goal, commanded)
 
     def checked(self, what: str, goal: Float64, commanded: Float64) -> Float64:
@@ -82,8 +96,13 @@ class Targets:
         if len(beyond):
             worst = int(beyond[0])
             raise RuntimeFault(
-                f"{what}: {limits.names[worst]} = {goal[worst]:.4f}; allowed: {limits.lower[worst]:g} to "
-                f"{limits.upper[worst]:g}"
+                _BEYOND_LIMITS(
+                    what=what,
+                    name=limits.names[worst],
+                    value=goal[worst],
+                    lower=limits.lower[worst],
+                    upper=limits.upper[worst],
+                )
             )
         self._ways.check(what, commanded, goal)
         return goal
@@ -99,15 +118,17 @@ class Targets:
     ) -> Float64:
         robot = self._plan.robot
         if joints is not None and pose is not None:
-            raise RuntimeFault(f"{what}: joints and the pose {pose!r}; allowed: one of the two")
+            raise RuntimeFault(_JOINTS_AND_POSE(what=what, pose=pose))
         if pose is not None:
             if pose not in robot.poses:
-                raise RuntimeFault(f"{what}: pose = {pose!r}; {robot.name} has {self._poses()}")
+                raise RuntimeFault(_NO_SUCH_POSE(what=what, pose=pose, robot=robot.name, poses=self._poses()))
             return np.array(robot.poses[pose], np.float64)
         if joints is None:
             return commanded.copy()
         if len(joints) != robot.dim:
-            raise RuntimeFault(f"{what}: {len(joints)} joints; {robot.name} has {robot.dim}")
+            raise RuntimeFault(
+                _NUMBER_OF_JOINTS(what=what, given=len(joints), robot=robot.name, expected=robot.dim)
+            )
         return np.array(
             [now if given is None else given for given, now in zip(joints, commanded, strict=True)]
         )
@@ -124,7 +145,7 @@ class Targets:
     def _jogged(self, jog: Jog, start: Float64) -> TargetPreview:
         arms = [arm.name for arm in self._plan.robot.arms]
         if jog.arm not in arms:
-            raise RuntimeFault(f"aim: jog.arm = {jog.arm!r}; {self._plan.robot.name} has {', '.join(arms)}")
+            raise RuntimeFault(_NO_SUCH_ARM(arm=jog.arm, robot=self._plan.robot.name, arms=", ".join(arms)))
         index = arms.index(jog.arm)
         poses = self._kinematics.forward(start)
         poses[index] = _stepped(poses[index], jog)

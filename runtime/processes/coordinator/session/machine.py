@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from runtime.core.errors import RuntimeFault
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.command_arguments import ARGUMENTS, read
-from runtime.ipc.identity import named
+from runtime.ipc.identity import at_the_panel, named
 from runtime.ipc.messages import Ack, AckStatus, Command
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
@@ -28,6 +29,33 @@ from runtime.processes.coordinator.session.transitions import (
 if TYPE_CHECKING:
     from runtime.processes.coordinator.operations import SessionActions
 
+_WAITING_FOR_OBSERVATION = fixed("session.waiting_for_observation", "waiting for the first observation")
+_NO_UUID = fixed("session.no_uuid", "a command needs a uuid of its own")
+_UUID_OF_ANOTHER = Pattern("session.uuid_of_another", "its uuid was given to the command {kind!r} before")
+_UNKNOWN_COMMAND = Pattern("session.unknown_command", "unknown command {kind!r}; known: {known}")
+_STALE_BOOT = fixed("session.stale_boot", "stale: it was decided before the runtime was restarted")
+_STALE_STATE = Pattern(
+    "session.stale_state",
+    "stale: the state has changed since it was decided (now {state}: {reason})",
+)
+_STALE_DEADLINE = fixed("session.stale_deadline", "stale: it arrived after its deadline")
+_NOT_ALLOWED = Pattern(
+    "session.not_allowed",
+    "{command} is not allowed while {state} ({reason}); allowed: {allowed}",
+)
+_NOT_ALLOWED_NOW = Pattern(
+    "session.not_allowed_now",
+    "{command} is not allowed now: {why}; allowed: {allowed}",
+)
+_ESTOP_ELSEWHERE = fixed(
+    "session.estop_elsewhere",
+    "the e-stop has a socket of its own: send it to the guard",
+)
+_HOLDER_HIDDEN = fixed(
+    "session.holder_hidden",
+    "the page of the lease's holder is hidden while the robot moves",
+)
+
 LEASE_COMMANDS = ("lease_claim", "lease_renew", "lease_give_up")
 ANSWERS_KEPT = 5000
 _OF_THE_LINK = (SessionEvent.CONNECTED, SessionEvent.INCOMPLETE, SessionEvent.LINK_LOST)
@@ -42,9 +70,10 @@ class SessionMachine:
         self._boot = boot
         self._now = now
         self.state = SessionState.DISCONNECTED
-        self.reason = "waiting for the first observation"
+        self.reason: str = _WAITING_FOR_OBSERVATION
         self.sequence = 0
         self._connected = False  # complete observations arrive, by what was noticed last
+        self._unattended = False  # a run goes on though its holder is lost
         self._answers: dict[str, Ack] = {}
 
     def remember(self, answers: dict[str, Ack]) -> None:
@@ -92,12 +121,12 @@ class SessionMachine:
         A uuid that was another command's is no repetition: a stop is obeyed all the same, the rest refused.
         """
         if not command.uuid:  # all such commands would be repetitions of each other
-            return self._ack(command, "refused", "a command needs a uuid of its own")
+            return self._ack(command, "refused", _NO_UUID)
         if (repeated := self.answered(command)) is not None:
             return repeated
         first = self._answers.get(command.uuid)
         if first is not None and command.kind not in STOPPING:
-            return self._ack(command, "refused", f"its uuid was given to the command {first.kind!r} before")
+            return self._ack(command, "refused", _UUID_OF_ANOTHER(kind=first.kind))
         refusal, told = self._refusal(command), None
         if not refusal:
             try:
@@ -143,6 +172,7 @@ class SessionMachine:
         elif happening is SessionEvent.RUN_FAILED:
             self._effects.end_run("failed", reason)
         self._enter(after, reason)
+        self._unattended = happening is SessionEvent.HOLDER_LOST
         return True
 
     def _stop_for(self, before: SessionState, reason: str) -> None:
@@ -159,36 +189,41 @@ class SessionMachine:
         if command.kind in LEASE_COMMANDS:
             return ""
         if command.kind not in COMMANDS and command.kind != "estop":
-            return (
-                f"unknown command {command.kind!r}; known: {', '.join([*COMMANDS, 'estop', *LEASE_COMMANDS])}"
-            )
+            return _UNKNOWN_COMMAND(kind=command.kind, known=", ".join([*COMMANDS, "estop", *LEASE_COMMANDS]))
         if command.kind not in STOPPING:
             stale = self._staleness(command)
             if stale:
                 return stale
         if command.kind != "estop":
             refusal = self._lease.check(command.holder, command.epoch, self._now())
-            if refusal:
+            if refusal and not self._stops_without(command):
                 return refusal
         return self._not_now(command.kind)
 
+    def _stops_without(self, command: Command) -> bool:
+        """True if it is a stop that needs no lease: at the station's own panel, or of a run that nobody commands."""
+        if command.kind not in STOPPING:
+            return False
+        return self._unattended or at_the_panel(command)
+
     def _staleness(self, command: Command) -> str:
         if command.boot != self._boot:
-            return "stale: it was decided before the runtime was restarted"
+            return _STALE_BOOT
         if command.sequence < self.sequence:
-            return f"stale: the state has changed since it was decided (now {self.state}: {self.reason})"
+            return _STALE_STATE(state=self.state, reason=self.reason)
         if not self._now() <= command.valid_until:  # NaN included
-            return "stale: it arrived after its deadline"
+            return _STALE_DEADLINE
         return ""
 
     def _not_now(self, kind: str) -> str:
         allowed = self.allowed()
         if kind in allowed:
             return ""
-        why = f"while {self.state} ({self.reason})"
+        possible = ", ".join(allowed)
         if self.state in COMMANDS[kind].allowed:
-            why = f"now: {COMMANDS[kind].guard(self.state, self._effects.situation)}"
-        return f"{kind} is not allowed {why}; allowed: {', '.join(allowed)}"
+            why = COMMANDS[kind].guard(self.state, self._effects.situation)
+            return _NOT_ALLOWED_NOW(command=kind, why=why, allowed=possible)
+        return _NOT_ALLOWED(command=kind, state=self.state, reason=self.reason, allowed=possible)
 
     def _carry_out(self, command: Command) -> Told | None:
         """Do it; raises RuntimeFault where something in it, or who is to do it, refuses."""
@@ -196,7 +231,7 @@ class SessionMachine:
             self._lease_command(command)
             return None
         if command.kind == "estop":
-            raise RuntimeFault("the e-stop has a socket of its own: send it to the guard")
+            raise RuntimeFault(_ESTOP_ELSEWHERE)
         rule = COMMANDS[command.kind]
         if self.state is SessionState.SETTING_UP and command.kind in CANCELLING:
             rule = CANCEL
@@ -218,15 +253,20 @@ class SessionMachine:
             "lease_renew": self._lease.renew,
             "lease_give_up": self._lease.give_up,
         }[command.kind]
+        if command.kind == "lease_renew" and command.args.get("hidden") is True and self.state.meaning.moving:
+            self._lease.hide(command.holder, command.epoch, now)
+            raise RuntimeFault(_HOLDER_HIDDEN)
         refusal = act(command.holder, command.epoch, now, named(command))
         after = self._lease.current(now)
         if (before and before.epoch) != (after and after.epoch):
             self.sequence += 1
+            if after and self._unattended:
+                self._unattended, self.reason = False, ""
         if refusal:
             raise RuntimeFault(refusal)
 
     def _enter(self, state: SessionState, reason: str) -> None:
-        self.state, self.reason = state, reason
+        self.state, self.reason, self._unattended = state, reason, False
         self.sequence += 1
 
     def _ack(self, command: Command, status: AckStatus, reason: str, told: Told | None = None) -> Ack:

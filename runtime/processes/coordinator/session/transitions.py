@@ -7,11 +7,73 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.messages import Mode
 from runtime.ipc.session_state import SessionState
 
 if TYPE_CHECKING:
     from runtime.processes.coordinator.operations import SessionActions
+
+_NO_COLLECTION = fixed(
+    "session.no_collection",
+    "this station collects nothing: its deployment has no [collection]",
+)
+_NOT_ARMED = fixed("session.not_armed", "the station is set up to collect and is not armed: arm first")
+_DEMONSTRATION_NOT_ARMED = fixed(
+    "session.demonstration_not_armed",
+    "a demonstration is open and the station is not armed: arm first, or stop",
+)
+_SET_UP_WITH_POLICY = fixed(
+    "session.set_up_with_policy",
+    "the station is set up with a policy: set up with collect first",
+)
+_ARMED_ALREADY = fixed("session.armed_already", "it is armed already")
+_NOT_ARMED_AT_ALL = fixed("session.not_armed_at_all", "it is not armed")
+_TRIAL_OPEN = fixed(
+    "session.trial_open",
+    "the open run is one of a trial: what is measured may not be changed",
+)
+_OPENING = fixed(
+    "session.opening",
+    "the run has not begun, its recording is being opened: try again in a moment",
+)
+_MODE_WITHOUT_STEP = Pattern(
+    "session.mode_without_step",
+    "the run's mode is {mode}, and step is for step and preview",
+)
+_CHUNK_SHOWN = fixed("session.chunk_shown", "a chunk is shown: commit or cancel it first")
+_POLICY_ASKED = fixed("session.policy_asked", "the policy is being asked")
+_CHUNK_EXECUTING = fixed("session.chunk_executing", "the last chunk is still being executed")
+_MODE_WITHOUT_COMMIT = Pattern(
+    "session.mode_without_commit",
+    "the run's mode is {mode}, and commit is for preview",
+)
+_APPROACHING = fixed(
+    "session.approaching",
+    "the robot is on its way to where the chunk begins: wait, or cancel",
+)
+_NO_CHUNK_SHOWN = fixed("session.no_chunk_shown", "no chunk is shown: step first")
+_MODE_WITHOUT_CANCEL = Pattern(
+    "session.mode_without_cancel",
+    "the run's mode is {mode}, and cancel is for step, preview and manual: stop or halt it",
+)
+_MODE_WITHOUT_MOVE = Pattern("session.mode_without_move", "the run's mode is {mode}, and move is for manual")
+_FIRST_ACTION_UNKNOWN = fixed(
+    "session.first_action_unknown",
+    "the policy's first action is not known: set up again",
+)
+_MODE_WITHOUT_APPROACH = Pattern(
+    "session.mode_without_approach",
+    "the run's mode is {mode}, and approach is for preview",
+)
+STOPPED = fixed("session.stopped", "stopped by the operator")
+_HALTED = fixed("session.halted", "halted by the operator")
+CANCELLED = fixed("session.setup_cancelled", "set-up cancelled by the operator")
+_HALTED_WAITS = fixed("session.halted_waits", "halted by the operator: resume or stop")
+_GOING_HOME = fixed("session.going_home", "going home")
+_SETTING_UP = fixed("session.setting_up", "setting up")
+_APPROACHING_FIRST = fixed("session.approaching_first", "going to the policy's first action")
+DISCARDED = fixed("session.discarded", "discarded by the operator")
 
 Told = Mapping[str, Any]  # for the data of an answer
 
@@ -29,6 +91,7 @@ class SessionEvent(StrEnum):
     RUN_ENDED = "run_ended"  # the run is over by itself: its time, its source
     RUN_FAILED = "run_failed"  # it could not begin
     LEASE_ENDED = "lease_ended"
+    HOLDER_LOST = "holder_lost"  # its holder is silent, and the run is one that goes on without
     ESTOPPED = "estopped"
     RELEASED = "released"
     FAMILY_DIED = "family_died"  # a process of the family was restarted
@@ -86,17 +149,14 @@ class Rule:
         return self.after.get(state) if isinstance(self.after, Mapping) else self.after
 
 
-_NO_COLLECTION = "this station collects nothing: its deployment has no [collection]"
-
-
 def _may_run(state: SessionState, situation: GuardFacts) -> str:
     unarmed = situation.collecting and not situation.armed
-    return "the station is set up to collect and is not armed: arm first" if unarmed else ""
+    return _NOT_ARMED if unarmed else ""
 
 
 def _may_resume(state: SessionState, situation: GuardFacts) -> str:
     unarmed = situation.mode == "collect" and not situation.armed
-    return "a demonstration is open and the station is not armed: arm first, or stop" if unarmed else ""
+    return _DEMONSTRATION_NOT_ARMED if unarmed else ""
 
 
 def _may_collect(state: SessionState, situation: GuardFacts) -> str:
@@ -107,21 +167,18 @@ def _may_arm(state: SessionState, situation: GuardFacts) -> str:
     if not situation.collection:
         return _NO_COLLECTION
     if not situation.collecting:
-        return "the station is set up with a policy: set up with collect first"
-    return "it is armed already" if situation.armed else situation.unled
+        return _SET_UP_WITH_POLICY
+    return _ARMED_ALREADY if situation.armed else situation.unled
 
 
 def _may_disarm(state: SessionState, situation: GuardFacts) -> str:
     if not situation.collection:
         return _NO_COLLECTION
-    return "" if situation.armed else "it is not armed"
+    return "" if situation.armed else _NOT_ARMED_AT_ALL
 
 
 def _untried(state: SessionState, situation: GuardFacts) -> str:
-    return "the open run is one of a trial: what is measured may not be changed" if situation.trial else ""
-
-
-_OPENING = "the run has not begun, its recording is being opened: try again in a moment"
+    return _TRIAL_OPEN if situation.trial else ""
 
 
 def _may_grip(state: SessionState, situation: GuardFacts) -> str:
@@ -132,51 +189,50 @@ def _may_grip(state: SessionState, situation: GuardFacts) -> str:
 
 def _may_step(state: SessionState, situation: GuardFacts) -> str:
     if situation.mode not in ("step", "preview"):
-        return f"the run's mode is {situation.mode}, and step is for step and preview"
+        return _MODE_WITHOUT_STEP(mode=situation.mode)
     if situation.opening:  # what is asked for now would be forgotten when it begins
         return _OPENING
     if situation.proposed:
-        return "a chunk is shown: commit or cancel it first"
+        return _CHUNK_SHOWN
     if situation.asked:
-        return "the policy is being asked"
-    return "the last chunk is still being executed" if situation.executing else ""
+        return _POLICY_ASKED
+    return _CHUNK_EXECUTING if situation.executing else ""
 
 
 def _may_commit(state: SessionState, situation: GuardFacts) -> str:
     if situation.mode != "preview":
-        return f"the run's mode is {situation.mode}, and commit is for preview"
+        return _MODE_WITHOUT_COMMIT(mode=situation.mode)
     if situation.approaching:  # control would not take the chunk, and it would be gone
-        return "the robot is on its way to where the chunk begins: wait, or cancel"
-    return "" if situation.proposed else "no chunk is shown: step first"
+        return _APPROACHING
+    return "" if situation.proposed else _NO_CHUNK_SHOWN
 
 
 def _may_cancel(state: SessionState, situation: GuardFacts) -> str:
     if situation.mode in ("step", "preview", "manual"):
         return _OPENING if situation.opening else ""
-    return f"the run's mode is {situation.mode}, and cancel is for step, preview and manual: stop or halt it"
+    return _MODE_WITHOUT_CANCEL(mode=situation.mode)
 
 
 def _may_move(state: SessionState, situation: GuardFacts) -> str:
     if situation.mode == "manual":
         return _OPENING if situation.opening else ""
-    return f"the run's mode is {situation.mode}, and move is for manual"
+    return _MODE_WITHOUT_MOVE(mode=situation.mode)
 
 
 def _may_approach(state: SessionState, situation: GuardFacts) -> str:
     if state is SessionState.READY:
-        return "" if situation.first_action else "the policy's first action is not known: set up again"
+        return "" if situation.first_action else _FIRST_ACTION_UNKNOWN
     if situation.mode != "preview":
-        return f"the run's mode is {situation.mode}, and approach is for preview"
-    return "" if situation.proposed else "no chunk is shown: step first"
+        return _MODE_WITHOUT_APPROACH(mode=situation.mode)
+    return "" if situation.proposed else _NO_CHUNK_SHOWN
 
 
 S = SessionState
-_STOPPED = "stopped by the operator"
 COMMANDS: dict[str, Rule] = {
     "setup": Rule((S.IDLE, S.READY), S.SETTING_UP, lambda do, asked: do.begin_setup(asked)),
     "run": Rule((S.READY,), S.RUNNING, lambda do, asked: do.begin_run(asked), guard=_placed(_may_run)),
-    "stop": Rule((S.RUNNING, S.HOLDING, S.READY), S.READY, lambda do, _: do.end_run("finished", _STOPPED)),
-    "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda do, _: do.hold("halted by the operator")),
+    "stop": Rule((S.RUNNING, S.HOLDING, S.READY), S.READY, lambda do, _: do.end_run("finished", STOPPED)),
+    "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda do, _: do.hold(_HALTED)),
     "resume": Rule((S.HOLDING,), S.RUNNING, lambda do, _: do.resume_run(), guard=_placed(_may_resume)),
     "home": Rule((S.READY,), S.SETTING_UP, lambda do, _: do.go_home(), guard=_placed()),
     "release": Rule((S.FAULTED,), None, lambda do, _: do.shared.ask_release()),
@@ -236,6 +292,7 @@ EVENT_TRANSITIONS: dict[tuple[SessionEvent, SessionState], SessionState] = {
     (SessionEvent.RUN_FAILED, S.HOLDING): S.READY,
     (SessionEvent.LEASE_ENDED, S.RUNNING): S.HOLDING,
     (SessionEvent.LEASE_ENDED, S.SETTING_UP): S.IDLE,
+    (SessionEvent.HOLDER_LOST, S.RUNNING): S.RUNNING,
     (SessionEvent.RELEASED, S.FAULTED): S.IDLE,
     **{(SessionEvent.ESTOPPED, state): S.FAULTED for state in SessionState if state is not S.FAULTED},
     **{(SessionEvent.FAMILY_DIED, state): S.IDLE for state in (S.READY, S.RUNNING, S.HOLDING, S.SETTING_UP)},
@@ -243,13 +300,13 @@ EVENT_TRANSITIONS: dict[tuple[SessionEvent, SessionState], SessionState] = {
 
 # A gripper may be on its way in these, although no run goes on: the end of the lease stops it, and no more.
 MOVED_BY_HAND = (S.READY, S.HOLDING)
-CANCELLED = "set-up cancelled by the operator"
+
 CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda do, _: do.cancel_setup(CANCELLED))
 REASONS = {
-    "stop": _STOPPED,
-    "halt": "halted by the operator: resume or stop",
-    "home": "going home",
-    "setup": "setting up",
-    "approach": "going to the policy's first action",
-    "discard": "discarded by the operator",
+    "stop": STOPPED,
+    "halt": _HALTED_WAITS,
+    "home": _GOING_HOME,
+    "setup": _SETTING_UP,
+    "approach": _APPROACHING_FIRST,
+    "discard": DISCARDED,
 }

@@ -7,10 +7,17 @@ from dataclasses import replace
 from runtime.config import loader
 from runtime.core.errors import RuntimeFault
 from runtime.core.plugins import variants
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.command_arguments import TuneRequest
 from runtime.policies.base import PolicyInfo
 from runtime.processes.coordinator.inference.inference import Strategy
 from runtime.station.spec import StationSpec
+
+_NOTHING_TO_CHANGE = fixed("tuning.nothing_to_change", "tune: nothing to change; allowed: strategy, task")
+_POLICY_WITHOUT_RTC = Pattern(
+    "tuning.policy_without_rtc",
+    "tune: the policy {policy!r} does not continue a chunk that it is given (RTC)",
+)
 
 
 def strategy_of(spec: StationSpec) -> Strategy:
@@ -25,11 +32,11 @@ def tuned(spec: StationSpec, asked: TuneRequest, info: PolicyInfo | None) -> Sta
     `info` is what the connected policy says of itself, None where none is.
     """
     if asked.strategy is None and asked.task is None:
-        raise RuntimeFault("tune: nothing to change; allowed: strategy, task")
+        raise RuntimeFault(_NOTHING_TO_CHANGE)
     now = spec.deployment
     strategy = {**now.strategy.model_dump(), **(asked.strategy or {})}
     task = now.task if asked.task is None else asked.task
     made = replace(spec, resolved=loader.changed(spec.resolved, {"strategy": strategy, "task": task}, "tune"))
     if info is not None and info.supports_rtc is False and strategy_of(made).query.continues:
-        raise RuntimeFault(f"tune: the policy {info.name!r} does not continue a chunk that it is given (RTC)")
+        raise RuntimeFault(_POLICY_WITHOUT_RTC(policy=info.name))
     return made

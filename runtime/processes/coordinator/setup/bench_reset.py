@@ -8,10 +8,27 @@ from typing import Any
 
 from runtime.core.clock import Clock
 from runtime.core.errors import SetupError
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.command_arguments import BenchRequest
 from runtime.ipc.messages import Event, ReceptionReport
 from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.station.spec import StationSpec
+
+_NOT_SIMULATED = Pattern(
+    "bench.not_simulated",
+    "setup: bench with seed {seed}: the transport is not declared simulated; allowed: no bench, or a "
+    "node that simulates one, with transport.simulated = true in the deployment",
+)
+_RESET_ALREADY = Pattern(
+    "bench.reset_already",
+    "setup: bench.id = {identity!r}: the bench was reset under this id already; allowed: an id of its "
+    "own for each reset, or none",
+)
+_CANNOT_RESET = Pattern("bench.cannot_reset", "the bench cannot be reset: {why}")
+_NOT_RESET = Pattern("bench.not_reset", "the bench was not reset within {seconds:g} s: {why}")
+_NODE_REFUSED = Pattern("bench.node_refused", "the node refused it ({reasons})")
+_NODE_SILENT = fixed("bench.node_silent", "the node does not answer to it")
+_NO_TRUTH = fixed("bench.no_truth", "the node says no truth of a bench; does it simulate one?")
 
 _RESET_S = 3.0  # for a simulated bench to be laid out
 _REPEAT_S = 0.2  # a control word may be lost on its way
@@ -34,15 +51,9 @@ class BenchReset:
         if bench is None:
             return None
         if not self._plan.capabilities.resets_bench:
-            raise SetupError(
-                f"setup: bench with seed {bench.seed}: the transport is not declared simulated; allowed: no "
-                "bench, or a node that simulates one, with transport.simulated = true in the deployment"
-            )
+            raise SetupError(_NOT_SIMULATED(seed=bench.seed))
         if bench.id is not None and bench.id == self._reception().truth.get("reset"):
-            raise SetupError(
-                f"setup: bench.id = {bench.id!r}: the bench was reset under this id already; allowed: an id "
-                "of its own for each reset, or none"
-            )
+            raise SetupError(_RESET_ALREADY(identity=bench.id))
         return bench.model_dump(exclude_none=True) | {"id": bench.id or str(uuid.uuid4())}
 
     def start(self, reset: dict[str, Any]) -> None:
@@ -64,9 +75,9 @@ class BenchReset:
             return True
         now = self._clock.now()
         if self._refused:
-            raise SetupError(f"the bench cannot be reset: {self._refused}")
+            raise SetupError(_CANNOT_RESET(why=self._refused))
         if now - self._since > _RESET_S:
-            raise SetupError(f"the bench was not reset within {_RESET_S:g} s: {self._why_not()}")
+            raise SetupError(_NOT_RESET(seconds=_RESET_S, why=self._why_not()))
         if now - self._asked_at >= _REPEAT_S:
             self._asked_at = now
             self._orders.ask_node("scene_reset", self._reset)
@@ -74,10 +85,10 @@ class BenchReset:
 
     def _why_not(self) -> str:
         if not self._reception().truth:
-            return "the node says no truth of a bench; does it simulate one?"
+            return _NO_TRUTH
         before = self._refused_before
         new = [reason for reason, count in self._refused_by_node().items() if count > before.get(reason, 0)]
-        return f"the node refused it ({', '.join(new)})" if new else "the node does not answer to it"
+        return _NODE_REFUSED(reasons=", ".join(new)) if new else _NODE_SILENT
 
     def _refused_by_node(self) -> dict[str, int]:
         prefix = "node_refused."

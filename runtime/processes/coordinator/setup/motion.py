@@ -6,6 +6,7 @@ import numpy as np
 
 from runtime.core.clock import Clock
 from runtime.core.errors import SetupError
+from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 from runtime.ipc.messages import Event
 from runtime.ipc.shared_state import SharedState
@@ -14,6 +15,14 @@ from runtime.motion.trajectories import Trajectory
 from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.processes.coordinator.path_check import PathCheck
 from runtime.station.spec import StationSpec
+
+_GOING = Pattern("motion.going", "going to {where}")
+_NOT_COME = Pattern("motion.not_come", "control has not come to {where} within {seconds:.1f} s")
+_NOT_ARRIVED = Pattern(
+    "motion.not_arrived",
+    "the arm did not arrive: {joint} is {distance:.2f} rad from {where}; is it blocked, or is another "
+    "program commanding it?",
+)
 
 _SETTLE_S = 2.0  # for the arm to follow the last target of a motion
 _ARRIVED_RAD = 0.1
@@ -31,7 +40,7 @@ class SetupMotion:
 
     def start(self, goal: Float64, where: str) -> None:
         """Have control go to `goal` [D]; RuntimeFault, and nothing moves, where the way there is not free."""
-        self._ways.check(f"going to {where}", self._start(), goal)
+        self._ways.check(_GOING(where=where), self._start(), goal)
         self._goal, self._where = goal, where
         self._allowed = self._motion_time() + _SETTLE_S
         self._since = self._clock.now()
@@ -40,7 +49,7 @@ class SetupMotion:
     def require_progress(self) -> None:
         """SetupError where control should have been there by now."""
         if self._clock.now() - self._since > self._allowed:
-            raise SetupError(f"control has not come to {self._where} within {self._allowed:.1f} s")
+            raise SetupError(_NOT_COME(where=self._where, seconds=self._allowed))
 
     def done(self, event: Event) -> bool:
         """True if `event` says that control has sent the end of this motion: then the arm is waited for."""
@@ -60,8 +69,7 @@ class SetupMotion:
             return True
         if self._clock.now() - self._since > _SETTLE_S:
             raise SetupError(
-                f"the arm did not arrive: {limits.names[worst]} is {error[worst]:.2f} rad from "
-                f"{self._where}; is it blocked, or is another program commanding it?"
+                _NOT_ARRIVED(joint=limits.names[worst], distance=error[worst], where=self._where)
             )
         return False
 

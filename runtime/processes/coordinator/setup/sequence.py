@@ -13,6 +13,7 @@ from runtime.cameras.complaints import complaints
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.plugins import variants
+from runtime.core.sentences import Pattern, Sentence, fixed, series
 from runtime.core.types import Float64
 from runtime.ipc.command_arguments import LeastTimes
 from runtime.ipc.messages import Event, ReceptionReport
@@ -29,6 +30,43 @@ from runtime.processes.coordinator.setup.bench_reset import BenchReset
 from runtime.processes.coordinator.setup.motion import SetupMotion
 from runtime.station.spec import StationSpec
 
+_THE_POSE = Pattern("setup.the_pose", "the pose {pose!r}")
+_THE_FIRST_ACTION = fixed("setup.the_first_action", "the policy's first action")
+_POLICY_UNUSABLE = fixed("setup.policy_unusable", "what the policy says of itself cannot be used")
+_ZERO_JOINTS = Pattern(
+    "setup.zero_joints",
+    "{joints} read exactly 0 rad: look whether the robot stands so, or an encoder is dead",
+)
+_NO_FAULT_NAMED = fixed("setup.no_fault_named", "no fault named")
+_DRIVES_DISABLED = Pattern(
+    "setup.drives_disabled",
+    "the robot says that its drives are disabled ({faults}): enable them",
+)
+_SILENT = Pattern("setup.silent", "the process {process} gives no sign of life")
+_NO_DRIVES = Pattern("setup.no_drives", "no ready drives within {seconds:g} s: {why}")
+_NO_OBSERVATION = Pattern("setup.no_observation", "no complete observation within {seconds:g} s: {why}")
+_VALIDATED = Pattern(
+    "setup.validated",
+    "{rows} rows in {ms:.0f} ms, the first at most {distance:.3f} rad away ({joint})",
+)
+_VALIDATED_FAR = Pattern(
+    "setup.validated_far",
+    "{rows} rows in {ms:.0f} ms, the first at most {distance:.3f} rad away ({joint}): far, approach it or "
+    "start elsewhere",
+)
+_DRIVES_ROBOT = Pattern("setup.drives_robot", "{who} drives the robot")
+_ANSWER_UNUSABLE = fixed("setup.answer_unusable", "the policy's answer cannot be used")
+_POLICY_WITHOUT_RTC = Pattern(
+    "setup.policy_without_rtc",
+    "strategy 'rtc': the policy {policy!r} does not continue a chunk that it is given; allowed: another"
+    " strategy, or a server and policy.rtc that do",
+)
+_HORIZON_TOO_LONG = Pattern(
+    "setup.horizon_too_long",
+    "strategy.execution_horizon = {wanted} control steps, but the policy {policy!r} says that its "
+    "answers have {rows} rows, {steps} control steps; correct the one that is wrong",
+)
+
 
 class Stage(StrEnum):
     """Stage of a set-up."""
@@ -42,7 +80,13 @@ class Stage(StrEnum):
     WARM_UP = "warming up the policy"
     APPROACH = "approaching the policy's first action"
 
+    @property
+    def sentence(self) -> Sentence:
+        """Its name, with an id."""
+        return _STAGES[self]
 
+
+_STAGES = {stage: fixed(f"setup.stage.{stage.name.lower()}", stage.value) for stage in Stage}
 _ALL = (
     Stage.CONNECT,
     Stage.OBSERVE,
@@ -102,7 +146,7 @@ class SetUp:
         """How far it is, how long its stages took [s], what came of it, and how far the policy's first action is."""
         first = self.first_action
         return {
-            "stage": str(self.stage),
+            "stage": self.stage.sentence,
             "stages": [self._stage_status(stage, now) for stage in self._course],
             "setup_took": dict(self.took),
             "first_action": {} if first is None else self.distance_of(first),
@@ -134,7 +178,7 @@ class SetUp:
         if since is not None:
             later = [at for other, at in self.stages.items() if other is not stage and at >= since]
             seconds = min(later, default=now) - since
-        return {"name": str(stage), "state": state, "seconds": seconds}
+        return {"name": stage.sentence, "state": state, "seconds": seconds}
 
     def begin(self, reset: dict[str, Any] | None, least: LeastTimes | None = None) -> None:
         """Start from the first stage; `reset` as by `BenchReset.of`."""
@@ -150,13 +194,13 @@ class SetUp:
     def begin_homing(self) -> None:
         """Only go to the pose; RuntimeFault, and nothing has changed, where the way there is not free."""
         pose = self._plan.deployment.setup.pose
-        where = f"the pose {pose!r}"
+        where = _THE_POSE(pose=pose)
         self._only_go(self._plan.robot.poses[pose], where, Stage.HOME)
 
     def begin_approach(self, first_action: Float64) -> None:
         """Only go to the policy's first action [D], as it is allowed; RuntimeFault where the way there is not free."""
         self.expect(first_action)
-        self._only_go(first_action, "the policy's first action", Stage.APPROACH)
+        self._only_go(first_action, _THE_FIRST_ACTION, Stage.APPROACH)
 
     def expect(self, first_action: Float64 | None) -> None:
         """The first action [D] of what drives the robot is this one from now on; None where it is not known."""
@@ -193,7 +237,7 @@ class SetUp:
         if self.stage is Stage.CONNECT:
             ready = self._inference.runner.ready(self._connection)
             if ready and self._rested("connect_s", self._least.connect_s):
-                with telling("what the policy says of itself cannot be used"):
+                with telling(_POLICY_UNUSABLE):
                     self.info = self._connection.result()
                     check_info(self.info, self._plan, self._inference.continues)
                 self._enter(Stage.OBSERVE)
@@ -230,19 +274,19 @@ class SetUp:
         joints = self._page.observation.read()["qpos"]
         zero = [limits.names[i] for i in np.flatnonzero(limits.places & (joints == 0.0))]
         if zero and self._plan.capabilities.moves_robot:
-            text = f"{', '.join(zero)} read exactly 0 rad: look whether the robot stands so, or an encoder is dead"
+            text = _ZERO_JOINTS(joints=", ".join(zero))
             self._inference.notes.append(Event("zero_joints", text, self._clock.now()))
 
     def _check_drives(self) -> None:
         drives = self._reception().drives
         if self._plan.capabilities.moves_robot and drives.get("enabled") is False:
-            faults = ", ".join(map(str, drives.get("faults", ()))) or "no fault named"
-            raise DrivesDisabledError(f"the robot says that its drives are disabled ({faults}): enable them")
+            faults = ", ".join(map(str, drives.get("faults", ()))) or _NO_FAULT_NAMED
+            raise DrivesDisabledError(_DRIVES_DISABLED(faults=faults))
 
     def _check_cameras(self) -> None:
         found = complaints(self._reception().cameras)
         if found:
-            raise SetupError("; ".join(found))
+            raise SetupError(series(found))
 
     def _waited(self) -> float:
         return self._clock.now() - self._since
@@ -258,9 +302,8 @@ class SetUp:
         except (PolicyError, SetupError) as error:
             if self._waited() <= settings.observation_timeout_s:
                 return False
-            waited = f"within {settings.observation_timeout_s:g} s: {error}"
-            missing = "ready drives" if isinstance(error, DrivesDisabledError) else "complete observation"
-            raise SetupError(f"no {missing} {waited}") from None
+            missing = _NO_DRIVES if isinstance(error, DrivesDisabledError) else _NO_OBSERVATION
+            raise SetupError(missing(seconds=settings.observation_timeout_s, why=str(error))) from None
         self._name_zeros()
         if settings.home and self._plan.capabilities.moves_robot:
             self._go_home()
@@ -272,11 +315,11 @@ class SetUp:
         within = self._plan.deployment.control.heartbeat_timeout_s
         for process in SIBLINGS:
             if not self._page.alive(process, self._clock.now(), within):
-                raise SetupError(f"the process {process} gives no sign of life")
+                raise SetupError(_SILENT(process=process))
 
     def _go_home(self) -> None:
         pose = self._plan.deployment.setup.pose
-        self._going.start(self._plan.robot.poses[pose], f"the pose {pose!r}")
+        self._going.start(self._plan.robot.poses[pose], _THE_POSE(pose=pose))
         self._enter(Stage.HOME)
 
     def _settle(self) -> bool:
@@ -298,7 +341,7 @@ class SetUp:
     def _start_warm_up(self) -> bool:
         """Ask the policy; True where there is nobody to ask, and all is done."""
         if not self._inference.policy.answers:
-            self.validated = f"{self.info.name if self.info else 'the node'} drives the robot"
+            self.validated = _DRIVES_ROBOT(who=self.info.name if self.info else "the node")
             self.stage = Stage.IDLE
             return True
         self._left = self._plan.deployment.setup.warmup_chunks
@@ -322,7 +365,7 @@ class SetUp:
         if not self._inference.runner.ready(self._asked):
             return False
         asked, self._asked = self._asked, None
-        with telling("the policy's answer cannot be used"):
+        with telling(_ANSWER_UNUSABLE):
             self._validate(asked.result())
         self._left -= 1
         return True
@@ -339,10 +382,11 @@ class SetUp:
             self._inference.requests.compare(answered)
         self.first_action = answered.made.meant
         first = first_action(self.first_action, np.asarray(answered.observation.qpos, np.float64), self._plan)
-        far = ": far, approach it or start elsewhere" if first["far"] else ""
-        self.validated = (
-            f"{len(answered.chunk.actions)} rows in {answered.seconds * 1000:.0f} ms, the first at most "
-            f"{first['distance']:.3f} rad away ({first['joint']}){far}"
+        self.validated = (_VALIDATED_FAR if first["far"] else _VALIDATED)(
+            rows=len(answered.chunk.actions),
+            ms=answered.seconds * 1000,
+            distance=first["distance"],
+            joint=first["joint"],
         )
 
 
@@ -353,10 +397,7 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
     """
     # A server that drops the conditioning without a word looks healthy, and does something else.
     if continues and info.supports_rtc is False:
-        raise SetupError(
-            f"strategy 'rtc': the policy {info.name!r} does not continue a chunk that it is given; allowed: "
-            "another strategy, or a server and policy.rtc that do"
-        )
+        raise SetupError(_POLICY_WITHOUT_RTC(policy=info.name))
     # More rows cannot be executed of each answer than it has.
     strategy = spec.deployment.strategy
     wanted, uses = strategy.execution_horizon, variants("runtime.strategies")[strategy.kind].USES
@@ -364,10 +405,7 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
         return
     steps = resampling.length(info.horizon, info.rate or spec.rate, spec.rate)
     if wanted > steps:
-        raise SetupError(
-            f"strategy.execution_horizon = {wanted} control steps, but the policy {info.name!r} says that its "
-            f"answers have {info.horizon} rows, {steps} control steps; correct the one that is wrong"
-        )
+        raise SetupError(_HORIZON_TOO_LONG(wanted=wanted, policy=info.name, rows=info.horizon, steps=steps))
 
 
 def first_action(action: Float64, joints: Float64, spec: StationSpec) -> dict[str, Any]:

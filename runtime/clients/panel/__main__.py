@@ -1,0 +1,120 @@
+"""`python -m runtime.clients.panel STATION [--set-pin]`: the station's own panel, and its PIN.
+
+A family whose deployment has a [panel] starts it by itself; beside a lockstep station it is started by hand.
+"""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import zmq
+
+from robots.broken_pipe import unread_ends
+from runtime.clients.panel.pin import Attempts, PinFile
+from runtime.clients.panel.requests import Panel
+from runtime.clients.panel.server import PanelServer
+from runtime.clients.panel.sessions import Sessions
+from runtime.clients.panel.settings import place_of
+from runtime.clients.panel.stops import Stops
+from runtime.clients.panel.watch import Watch
+from runtime.core import logs
+from runtime.core.errors import RuntimeFault, TransportError
+from runtime.ipc.bus import Endpoints
+from runtime.ipc.lifeline import Lifeline
+
+log = logging.getLogger(__name__)
+_AGAIN_S = 1.0
+
+
+@unread_ends
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve until a signal or the end of standard input; exit code 2 where there is no panel, or no PIN to set."""
+    given = _parser().parse_args(arguments)
+    data = Path(given.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
+    station_dir = data / "stations" / given.station
+    try:
+        if given.set_pin:
+            PinFile(station_dir).set(_asked())
+            print(f"the panel of {given.station} has another PIN: who had given the former one gives it anew")
+            return 0
+        logs.start("panel")
+        ended: list[int] = []
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda number, frame: ended.append(number))
+        lifeline = Lifeline() if given.lifeline else None
+        serve(station_dir, lambda: bool(ended) or (lifeline is not None and lifeline.cut))
+    except RuntimeFault as fault:
+        print(f"error: {fault}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def serve(station_dir: Path, ended: Callable[[], bool]) -> None:
+    """Listen until `ended`; a port that is taken is tried again every second. Raises ConfigurationError."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
+    pin, endpoints = PinFile(station_dir), Endpoints(station_dir)
+    stops, watch = Stops(context, station_dir), Watch(context, station_dir)
+    panel = Panel(station_dir.name, place_of(station_dir), pin, Sessions(pin, Attempts()), stops, watch)
+    try:
+        server = _open(panel, ended)
+        if server is None:
+            return
+        endpoints.write("panel", {"panel": server.url})
+        log.info("the panel of %s is at %s", panel.station, server.url)
+        if pin.version == (0, 0):
+            log.warning(
+                "the panel has no PIN: it shows its e-stop alone, until python -m runtime.clients.panel %s --set-pin",
+                panel.station,
+            )
+        while not ended():
+            server.turn()
+            if endpoints.lost("panel"):
+                endpoints.write("panel", {"panel": server.url})
+        endpoints.withdraw("panel")
+        server.server_close()
+    finally:
+        watch.end()
+
+
+def _open(panel: Panel, ended: Callable[[], bool]) -> PanelServer | None:
+    told = ""
+    while not ended():
+        try:
+            return panel.server()
+        except TransportError as fault:
+            if str(fault) != told:
+                log.error("%s; tried again every second", fault)
+            told = str(fault)
+            time.sleep(_AGAIN_S)
+    return None
+
+
+def _asked() -> str:
+    """The PIN from a terminal, twice; from a pipe, its first line."""
+    if not sys.stdin.isatty():
+        return sys.stdin.readline().rstrip("\n")
+    pin = getpass.getpass("PIN: ")
+    if getpass.getpass("again: ") != pin:
+        raise RuntimeFault("the two differ: nothing was changed")
+    return pin
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m runtime.clients.panel", description=__doc__)
+    parser.add_argument("station", help="name of a station of this computer")
+    parser.add_argument("--data-dir", type=Path, metavar="DIR", help="$EVA_DATA_DIR or ./data if not given")
+    parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")
+    parser.add_argument("--set-pin", action="store_true", help="ask for another PIN, keep its hash, end")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,76 @@
+"""Browsers that have given the PIN: for half a day, until another PIN is set, or the panel is started again."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+
+from runtime.clients.panel.pin import Attempts, PinFile
+from runtime.core.errors import ConfigurationError
+
+LASTS_S = 12 * 3600.0
+_MOST = 32
+
+
+class Refusal(ConfigurationError):
+    """The PIN was not taken; `wait_s` is how long none of this source is looked at."""
+
+    def __init__(self, why: str, wait_s: float = 0.0) -> None:
+        super().__init__(why)
+        self.wait_s = wait_s
+
+
+class Sessions:
+    """Who has given the PIN; for any thread."""
+
+    def __init__(self, pin: PinFile, attempts: Attempts, now: Callable[[], float] = time.monotonic) -> None:
+        self._pin, self._attempts, self._now = pin, attempts, now
+        self._open: OrderedDict[bytes, tuple[float, tuple[int, int]]] = OrderedDict()
+        self._trying, self._lock = threading.Lock(), threading.Lock()
+
+    def begin(self, pin: str, source: str) -> str:
+        """The secret of a new session; raises Refusal.
+
+        One PIN is looked at at a time: who tries many at once gains nothing, and costs little.
+        """
+        if not self._trying.acquire(blocking=False):
+            raise Refusal("another PIN is being looked at: try again", 1.0)
+        try:
+            if (wait := self._attempts.wait(source)) > 0:
+                raise Refusal(f"too many wrong PINs: wait {wait:.0f} s; the E-STOP needs none", wait)
+            version = self._pin.version
+            try:
+                right = self._pin.matches(pin)
+            except ConfigurationError as fault:
+                raise Refusal(str(fault)) from None
+            if not right:
+                self._attempts.failed(source)
+                raise Refusal("wrong PIN", self._attempts.wait(source))
+            self._attempts.passed(source)
+        finally:
+            self._trying.release()
+        secret = secrets.token_urlsafe(32)
+        with self._lock:
+            self._open[_digest(secret)] = (self._now() + LASTS_S, version)
+            if len(self._open) > _MOST:
+                self._open.popitem(last=False)
+        return secret
+
+    def holds(self, secret: str) -> bool:
+        """True if this is the secret of a session that goes on."""
+        with self._lock:
+            until, version = self._open.get(_digest(secret), (0.0, (0, 0)))
+        return self._now() < until and version == self._pin.version != (0, 0)
+
+    def end(self, secret: str) -> None:
+        """End it."""
+        with self._lock:
+            self._open.pop(_digest(secret), None)
+
+
+def _digest(secret: str) -> bytes:
+    return hashlib.sha256(secret.encode("utf-8", "replace")).digest()

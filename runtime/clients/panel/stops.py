@@ -1,0 +1,67 @@
+"""What the panel can do: press the e-stop, and stop a run. Nothing that moves a robot, and no release."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from runtime.core.errors import CodecError, TransportError
+from runtime.ipc.bus import Endpoints
+from runtime.ipc.estop_client import urgent
+from runtime.ipc.estop_requests import kept
+from runtime.ipc.identity import PANEL
+from runtime.ipc.messages import Ack, Command
+
+_GUARD_S, _COORDINATOR_S = 1.0, 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What became of it: whether the station has done it, and the sentence that says so."""
+
+    done: bool
+    text: str
+
+
+class Stops:
+    """Commands of one station's panel; for any thread, each over a connection of its own."""
+
+    def __init__(self, context: zmq.Context[Any], station_dir: Path) -> None:
+        self._context, self._endpoints = context, Endpoints(station_dir)
+
+    def press(self, source: str, uuid: str) -> Told:
+        """Press the e-stop: at the guard, and where that does not answer at the coordinator, which has the flag too."""
+        command = self._command(
+            uuid, "estop", source, {"why": kept(f"at the station's panel, from {source}")}
+        )
+        try:
+            ack = self._ask(command, ("guard", "estop"), _GUARD_S)
+        except (TransportError, CodecError):
+            try:
+                ack = self._ask(command, ("coordinator", "commands"), _COORDINATOR_S)
+            except (TransportError, CodecError) as fault:
+                return Told(False, f"USE THE HARDWARE STOP: {fault}")
+        if ack.status in ("done", "accepted"):
+            return Told(True, ack.reason)
+        text = ack.reason if "HARDWARE STOP" in ack.reason else f"USE THE HARDWARE STOP: {ack.reason}"
+        return Told(False, text)
+
+    def stop(self, source: str, uuid: str) -> Told:
+        """Stop the run, whoever holds the lease."""
+        command = self._command(uuid, "stop", source, {})
+        try:
+            ack = self._ask(command, ("coordinator", "commands"), _COORDINATOR_S)
+        except (TransportError, CodecError) as fault:
+            return Told(False, f"{fault}; the E-STOP goes another way")
+        done = ack.status in ("done", "accepted")
+        return Told(done, "stopped" if done else ack.reason)
+
+    def _command(self, uuid: str, kind: str, source: str, args: dict[str, Any]) -> Command:
+        holder = PANEL + source
+        return Command(uuid, kind, args, user=holder, holder=holder)
+
+    def _ask(self, command: Command, where: tuple[str, str], seconds: float) -> Ack:
+        return urgent(self._context, self._endpoints, where, command, seconds)

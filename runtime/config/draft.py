@@ -1,0 +1,136 @@
+"""A first deployment file from a few choices: what there is to choose from, and the text of the file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from runtime.config.reference import first_line, meaning, own_first
+from runtime.core.errors import ConfigurationError
+from runtime.core.plugins import variants
+
+PACKAGES = {"transport": "runtime.transports", "cameras": "runtime.cameras", "policy": "runtime.policies"}
+_SCALARS = {"string": "text", "integer": "whole", "number": "number", "boolean": "yes"}
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One key of a table that has a single value: `type` is text, whole, number, yes or choice."""
+
+    key: str
+    type: str
+    choices: tuple[str, ...]
+    default: str  # as it is typed, "" for none
+    required: bool
+    meaning: str
+
+    @property
+    def address(self) -> bool:
+        """True of what says where something is, which nobody can guess: it is asked first."""
+        return (
+            self.required
+            or self.key in ("url", "network", "master", "address", "domain", "user")
+            or (self.key.endswith("_endpoint"))
+        )
+
+    def value(self, typed: str) -> Any:
+        """The value of what was typed; ConfigurationError says what is allowed."""
+        if self.type == "yes":
+            return _one_of(self.key, typed, {"yes": True, "no": False})
+        if self.type == "choice":
+            return _one_of(self.key, typed, {word: json.loads(word) for word in self.choices})
+        if self.type == "text":
+            return typed
+        try:
+            return int(typed) if self.type == "whole" else float(typed)
+        except ValueError:
+            what = "a whole number" if self.type == "whole" else "a number"
+            raise ConfigurationError(f"{self.key} = {typed!r:.80}; allowed: {what}") from None
+
+
+def kinds(part: str) -> dict[str, str]:
+    """The kinds of a part, a key of PACKAGES, each with what it is in a sentence, or why it cannot be loaded here."""
+    return {kind: _about(part, kind) for kind in variants(PACKAGES[part])}
+
+
+def entries(part: str, kind: str) -> tuple[Entry, ...]:
+    """What may be said of a part of that kind, its own keys first; ConfigurationError lists the kinds."""
+    known = variants(PACKAGES[part])
+    if kind not in known:
+        raise ConfigurationError(f"{part}.kind = {kind!r:.40}; allowed: {', '.join(known)}")
+    return tuple(_entries(known[kind].Config))
+
+
+def table(part: str, kind: str, typed: Mapping[str, str]) -> dict[str, Any]:
+    """The table of a part from what was typed, without keys that were left empty or have their own default."""
+    found: dict[str, Any] = {"kind": kind}
+    for entry in entries(part, kind):
+        given = typed.get(entry.key, "").strip()
+        if given and given != entry.default:
+            found[entry.key] = entry.value(given)
+    return found
+
+
+def text_of(tree: Mapping[str, Any], comments: Sequence[str]) -> str:
+    """A deployment file as TOML: scalars, lists of them, and tables."""
+    return "\n".join([*(f"# {line}" for line in comments), *_lines(tree, ())]) + "\n"
+
+
+def _about(part: str, kind: str) -> str:
+    try:
+        return first_line(variants(PACKAGES[part])[kind].Config)
+    except ConfigurationError as fault:
+        return str(fault)
+
+
+def _entries(model: type[BaseModel]) -> Iterator[Entry]:
+    properties = model.model_json_schema()["properties"]
+    for name, field in own_first(model):
+        schema = _given(properties[name])
+        choices = tuple(json.dumps(value) for value in schema.get("enum", ()))
+        scalar = "choice" if choices else _SCALARS.get(str(schema.get("type")), "")
+        if name != "kind" and scalar:
+            default = _default(field, choices)
+            yield Entry(name, scalar, choices, default, field.is_required(), meaning(model, name, field))
+
+
+def _given(schema: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The schema of a key where it has a value."""
+    parts = [part for part in schema.get("anyOf", ()) if part.get("type") != "null"]
+    return parts[0] if len(parts) == 1 else schema
+
+
+def _default(field: FieldInfo, choices: tuple[str, ...]) -> str:
+    value = None if field.is_required() else field.get_default(call_default_factory=True)
+    if value is None:
+        return ""
+    if isinstance(value, bool) and not choices:
+        return "yes" if value else "no"
+    return json.dumps(value) if choices else str(value)
+
+
+def _one_of(key: str, typed: str, allowed: Mapping[str, Any]) -> Any:
+    if typed not in allowed:
+        raise ConfigurationError(f"{key} = {typed!r:.80}; allowed: {', '.join(allowed)}")
+    return allowed[typed]
+
+
+def _lines(tree: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
+    if path:
+        yield f"\n[{'.'.join(path)}]"
+    for key, value in tree.items():
+        if not isinstance(value, Mapping):
+            yield f"{_bare(key)} = {json.dumps(value, ensure_ascii=False)}"
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _lines(value, (*path, _bare(key)))
+
+
+def _bare(key: str) -> str:
+    plain = key.replace("_", "").replace("-", "")
+    return key if plain.isascii() and plain.isalnum() else json.dumps(key, ensure_ascii=False)

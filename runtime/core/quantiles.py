@@ -1,0 +1,20 @@
+"""Quantiles of a few thousand figures, for who counts them several times a second."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from runtime.core.types import Float64
+
+
+def quantiles(figures: Float64, fractions: Sequence[float]) -> list[float]:
+    """As `numpy.quantile` of `figures` [N], N > 0, for each of `fractions`, within rounding, and many times as fast."""
+    ordered = np.sort(figures)
+    found, last = [], len(ordered) - 1
+    for fraction in fractions:
+        below = int(fraction * last)
+        low, high = float(ordered[below]), float(ordered[min(below + 1, last)])
+        found.append(low + (fraction * last - below) * (high - low))
+    return found

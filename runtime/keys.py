@@ -1,0 +1,69 @@
+"""`python -m runtime.keys new | enrol ADDRESS CODE | show`: the key of this computer, and the labs of its stations."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from robots.broken_pipe import unread_ends
+from runtime.core.errors import RuntimeFault
+from runtime.link import codes, key_files
+from runtime.link.enrolment import enrol
+
+
+@unread_ends
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit code 0 where it was done, 1 where it was not: the sentence says why."""
+    given = _parser().parse_args(arguments)
+    data = Path(given.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
+    try:
+        if given.what == "new":
+            key = key_files.make_station_key(data, given.replace)
+            print(f"the key of this computer is made: {codes.fingerprint(key.public)}")
+        elif given.what == "enrol":
+            _enrol(data, given.address, given.code)
+        else:
+            _show(data)
+    except RuntimeFault as fault:
+        print(f"error: {fault}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m runtime.keys", description=__doc__)
+    parser.add_argument("--data-dir", type=Path, metavar="DIR", help="$EVA_DATA_DIR or ./data if not given")
+    what = parser.add_subparsers(dest="what", required=True)
+    new = what.add_parser("new", help="make the key of this computer")
+    new.add_argument("--replace", action="store_true", help="in place of the one that it has")
+    asking = what.add_parser("enrol", help="make a station of this computer one of a lab")
+    asking.add_argument("address", metavar="ADDRESS", help="HOST:PORT, as the lab's administration shows it")
+    asking.add_argument("code", metavar="CODE", nargs="+", help="the one-time code that it shows")
+    what.add_parser("show", help="the key of this computer, and the labs of its stations")
+    return parser
+
+
+def _enrol(data: Path, address: str, words: Sequence[str]) -> None:
+    code = codes.read(" ".join(words))
+    key = key_files.station_key(data)
+    print(f"the lab's key   {codes.fingerprint(code.lab)}")
+    print(f"this computer's {codes.fingerprint(key.public)}")
+    lab = enrol(data, address, code, key)
+    print(f"{lab.station} is a station of {lab.lab} now: start it, or python -m runtime.link {lab.station}")
+
+
+def _show(data: Path) -> None:
+    print(f"this computer's key {codes.fingerprint(key_files.station_key(data).public)}")
+    for path in sorted((data / "stations").glob("*/lab.json")):
+        lab = key_files.known_lab(path.parent)
+        ports = f"ports {lab.port} and {lab.second_port}"
+        print(
+            f"{lab.station}: {lab.lab} at {lab.host}, {ports}, its key {codes.fingerprint(bytes.fromhex(lab.key))}"
+        )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,68 @@
+"""The one-time code with which a computer is enrolled: the lab's key, which it connects to, and a secret.
+
+With the whole key in it nothing has to be fetched from an address that nobody has verified: who answers there without
+that key cannot read what the station sends.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import secrets
+from dataclasses import dataclass
+
+from runtime.core.errors import ConfigurationError
+
+_KEY_BYTES, SECRET_BYTES, _SUM_BYTES = 32, 10, 3
+_WHOLE = _KEY_BYTES + SECRET_BYTES + _SUM_BYTES
+_GROUP = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """The public key of the lab's gate, and the secret that is good once."""
+
+    lab: bytes
+    secret: bytes
+
+    def shown(self) -> str:
+        """As people copy it: nine groups of letters and digits."""
+        whole = self.lab + self.secret
+        letters = base64.b32encode(whole + _sum(whole)).decode()
+        return "-".join(letters[at : at + _GROUP] for at in range(0, len(letters), _GROUP))
+
+
+def fresh(lab: bytes) -> Code:
+    """A new code of the lab with that public key."""
+    return Code(lab, secrets.token_bytes(SECRET_BYTES))
+
+
+def read(shown: str) -> Code:
+    """The code that was copied; ConfigurationError where something of it is missing or mistyped."""
+    letters = "".join(shown.split()).replace("-", "").upper()
+    try:
+        whole = base64.b32decode(letters)
+    except ValueError:
+        whole = b""
+    body, end = whole[:-_SUM_BYTES], whole[-_SUM_BYTES:]
+    if len(whole) != _WHOLE or not secrets.compare_digest(_sum(body), end):
+        raise ConfigurationError(
+            f"the code of {len(letters)} letters and digits is not whole, or mistyped; it has 72, in groups of 8: "
+            "copy all of it from the administration"
+        )
+    return Code(body[:_KEY_BYTES], body[_KEY_BYTES:])
+
+
+def fingerprint(key: bytes) -> str:
+    """A public key as two people compare it: four groups of five of the SHA-256's hexadecimal digits."""
+    digest = hashlib.sha256(key).hexdigest()
+    return " ".join(digest[at : at + 5] for at in range(0, 20, 5))
+
+
+def digest(secret: bytes) -> str:
+    """What the lab keeps of the secret of a code."""
+    return hashlib.sha256(b"eva-web enrolment 1\0" + secret).hexdigest()
+
+
+def _sum(whole: bytes) -> bytes:
+    return hashlib.sha256(b"eva-web code 1\0" + whole).digest()[:_SUM_BYTES]

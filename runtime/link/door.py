@@ -1,0 +1,358 @@
+"""A port of a lab: who has connected there, what they say, and how they are cut off.
+
+Everything that a connection may use up is bounded here: messages of one turn, bytes of a second, the time that it may
+take to say who it is, and how many there are. What breaks a bound is cut off, its key refused for a while, and nothing
+else notices.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import socket as sockets
+import struct
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from runtime.core.errors import CodecError, TransportError
+from runtime.link.admission import AllowList, Seldom
+from runtime.link.key_files import KeyPair, z85
+from runtime.link.wire import MOST_PARTS, Beat, Bye, Message, read, write
+
+log = logging.getLogger(__name__)
+_EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED
+_TURN = 200  # messages that are taken up in one turn
+_TURN_BYTES = 16 << 20
+_TURN_PARTS = 20_000  # some 20 ms, where a message is made of nothing but parts
+_QUEUED = 64  # messages of one connection, in each direction
+_HANDSHAKE_MS = 2000
+_NAMED_S = 5.0  # from connecting to the first word
+_SILENT_S = 5.0  # without a word from who was greeted
+_LAST_WORD_S = 0.3  # for a Bye to go out, before the connection is cut
+_LOOK_S, _WATCH_S = 1.0, 0.05
+_UNNAMED_BYTES = 16 << 10  # handshake and first message
+_MOST_MESSAGES = 2000  # of one connection in a second: some hundred are usual at the most
+_MOST_CONNECTIONS = 1024
+_BACKLOG = 256
+_BYTES_RECEIVED = 128  # where struct tcp_info has tcpi_bytes_received
+_TCP_INFO_BYTES = 192
+Address = tuple[Any, ...]
+
+
+@dataclass(slots=True)
+class Peer:
+    """A connection: its descriptor in this process, the other end's address, and what is known of it."""
+
+    descriptor: int
+    address: Address
+    since: float
+    route: bytes = b""
+    key: str = ""
+    heard_at: float = 0.0
+    received: int = 0
+    read: int = 0  # bytes that it had sent when it was last seen to have said something whole
+    messages: int = 0  # since somebody last looked
+    cut_at: float = float("inf")
+
+    def __str__(self) -> str:
+        return f"{str(self.address[0]).removeprefix('::ffff:')}:{self.address[1]}"
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A message as it came: over which connection, with whose key."""
+
+    route: bytes
+    key: str
+    message: Message
+    parts: list[bytes]
+
+
+@dataclass(slots=True)
+class _Known:
+    by_descriptor: dict[int, Peer] = field(default_factory=dict)
+    by_route: dict[bytes, Peer] = field(default_factory=dict)
+
+
+class Door:
+    """One port. All of it belongs to one thread, which calls `arrivals` and `look`.
+
+    `rate` is how many bytes a second one connection may send, over any second.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[Any],
+        host: str,
+        port: int,
+        key: KeyPair,
+        largest: int,
+        rate: float,
+        allowed: AllowList,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock, self._rate, self._allowed = clock, rate, allowed
+        self._known = _Known()
+        self._seldom = Seldom(clock)
+        self._looked = self._watched = clock()
+        self._parts: list[zmq.Frame] = []  # of a message that is not read to its end
+        self.gone: list[bytes] = []  # connections that have ended since somebody last looked
+        self.socket = context.socket(zmq.ROUTER)
+        self.socket.linger = 0
+        self.socket.set(zmq.ROUTER_MANDATORY, 1)
+        self.socket.set(zmq.RCVHWM, _QUEUED)
+        self.socket.set(zmq.SNDHWM, _QUEUED)
+        self.socket.set(zmq.MAXMSGSIZE, largest)
+        self.socket.set(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
+        # No heartbeats of ZMQ's own: its library (4.3.5) aborts where one is due on a connection that broke while it
+        # was not read, as that of a flood does. Signs of life are ours, and `look` ends who gives none.
+        self.socket.set(zmq.BACKLOG, _BACKLOG)
+        self.socket.set(zmq.IPV6, 1)
+        self.socket.zap_domain = b"stations"
+        self.socket.curve_server = True
+        self.socket.curve_secretkey, self.socket.curve_publickey = z85(key.secret), z85(key.public)
+        self._monitor = self.socket.get_monitor_socket(_EVENTS)
+        self.port = self._bind(host, port)
+
+    def _bind(self, host: str, port: int) -> int:
+        shown = f"[{host}]" if ":" in host else host
+        try:
+            self.socket.bind(f"tcp://{shown}:{port or '*'}")
+        except zmq.ZMQError as error:
+            self.close()
+            raise TransportError(f"cannot listen for stations at {shown}:{port}: {error.strerror}") from None
+        bound = self.socket.last_endpoint.decode()
+        return int(bound.rpartition(":")[2])
+
+    def arrivals(self) -> list[Arrival]:
+        """What has come, as much as a turn has time for; what cannot be read costs its sender the connection."""
+        self._hear_of_connections()
+        found: list[Arrival] = []
+        room, self._room = _TURN_BYTES, _TURN_PARTS
+        for _ in range(_TURN):
+            if room <= 0 or not (frames := self._message()):
+                break
+            room -= sum(len(frame) for frame in frames)
+            if (arrival := self._arrival(frames)) is not None:
+                found.append(arrival)
+        return found
+
+    def _message(self) -> list[zmq.Frame]:
+        """The next one, [] where none is there to its end; of too many parts it has as many as show that."""
+        with suppress(zmq.Again):
+            while self._room:
+                self._room -= 1
+                frame = self.socket.recv(zmq.NOBLOCK, copy=False)
+                if len(self._parts) <= MOST_PARTS + 2:
+                    self._parts.append(frame)
+                if not frame.more:
+                    frames, self._parts = self._parts, []
+                    return frames
+        return []
+
+    def send(self, route: bytes, message: Message, *parts: bytes) -> bool:
+        """Send it, without waiting; False where the connection has gone, or takes no more."""
+        try:
+            self.socket.send_multipart([route, *write(message, *parts)], zmq.NOBLOCK)
+        except zmq.ZMQError:  # EHOSTUNREACH, EAGAIN
+            return False
+        return True
+
+    def key_of(self, route: bytes) -> str:
+        """The key, in hexadecimal, with which that connection was made; "" where it has ended."""
+        peer = self._known.by_route.get(route)
+        return peer.key if peer is not None else ""
+
+    def address_of(self, route: bytes) -> str:
+        """The address, without its port, from which that connection came; "" where it has ended."""
+        peer = self._known.by_route.get(route)
+        return str(peer.address[0]) if peer is not None else ""
+
+    def cut(self, route: bytes, why: str, again_s: float = 30.0) -> None:
+        """Say why, and end the connection a moment later; nothing of it is heard any more."""
+        peer = self._known.by_route.pop(route, None)
+        if peer is None:
+            return
+        self.send(route, Bye(why, again_s))
+        peer.cut_at = min(peer.cut_at, self._clock() + _LAST_WORD_S)
+        self.gone.append(route)
+        if self._seldom.due(peer.key or str(peer)):
+            log.warning("%s is cut off: %s", peer, why)
+
+    def look(self) -> None:
+        """Cut off who floods, says nothing, or is one too many; time and again."""
+        now = self._clock()
+        for peer in [one for one in self._known.by_descriptor.values() if now >= one.cut_at]:
+            self._shut(peer)
+        if now - self._watched >= _WATCH_S:
+            self._watch()
+            self._watched = now
+        if now - self._looked < _LOOK_S:
+            return
+        seconds, self._looked = now - self._looked, now
+        for peer in list(self._known.by_descriptor.values()):
+            received = _received(peer)
+            more, peer.received = received - peer.received, received
+            messages, peer.messages = peer.messages, 0
+            if more > self._rate * seconds:
+                self._flood(
+                    peer, f"it sends {more / seconds / 1e6:.0f} MB a second; allowed: {self._rate / 1e6:.0f}"
+                )
+            elif messages > _MOST_MESSAGES * seconds:
+                self._flood(
+                    peer, f"it sends {messages / seconds:.0f} messages a second; allowed: {_MOST_MESSAGES}"
+                )
+            elif now - (peer.heard_at or peer.since) > (_SILENT_S if peer.route else _NAMED_S):
+                self._end(peer, "it says nothing")
+
+    def _watch(self) -> None:
+        """Cut off who sends what has no end, and who is one too many: thousands come in a moment."""
+        unnamed = [peer for peer in self._known.by_descriptor.values() if not peer.route]
+        for peer in unnamed[: max(0, len(self._known.by_descriptor) - _MOST_CONNECTIONS)]:
+            self._end(peer, f"there are more than {_MOST_CONNECTIONS} connections")
+        for peer in list(self._known.by_descriptor.values()):
+            received = _received(peer)
+            if peer.heard_at >= self._watched:
+                peer.read = received
+            elif received - peer.read > (self._rate if peer.route else _UNNAMED_BYTES):
+                self._flood(peer, f"it has sent {received - peer.read} bytes without a whole message")
+
+    def close(self) -> None:
+        """Release the port."""
+        self.socket.disable_monitor()
+        self._monitor.close(linger=0)
+        self.socket.close(linger=0)
+
+    # --- who there is ------------------------------------------------------------------------------------------
+
+    def _hear_of_connections(self) -> None:
+        with suppress(zmq.Again):
+            while True:
+                event = recv_monitor_message(self._monitor, zmq.NOBLOCK)
+                self._forget(int(event["value"]))
+                if event["event"] == zmq.EVENT_ACCEPTED:
+                    self._remember(int(event["value"]))
+
+    def _remember(self, descriptor: int) -> None:
+        address = _address(descriptor)
+        if address is not None:
+            now = self._clock()
+            self._known.by_descriptor[descriptor] = Peer(descriptor, address, now)
+
+    def _forget(self, descriptor: int) -> None:
+        peer = self._known.by_descriptor.pop(descriptor, None)
+        if peer is not None and self._known.by_route.pop(peer.route, None) is not None:
+            self.gone.append(peer.route)
+
+    def _arrival(self, frames: list[zmq.Frame]) -> Arrival | None:
+        route = frames[0].bytes
+        peer = self._known.by_route.get(route) or self._named(route, frames[-1])
+        if peer is None:
+            return None
+        peer.heard_at = self._clock()
+        peer.messages += 1
+        try:
+            message, parts = read([frame.bytes for frame in frames[1:]])
+        except CodecError as error:
+            self._flood(peer, f"it said what cannot be read: {error}")
+            return None
+        return Arrival(route, peer.key, message, parts)
+
+    def _named(self, route: bytes, frame: zmq.Frame) -> Peer | None:
+        """Whose connection that is of which this is the first message; None where it has ended, or is cut off."""
+        try:
+            descriptor, key = int(frame.get(zmq.SRCFD)), str(frame["User-Id"])
+        except (zmq.ZMQError, KeyError, TypeError, ValueError):
+            return None
+        peer = self._known.by_descriptor.get(descriptor)
+        if (
+            peer is None or peer.route
+        ):  # it came while this turn was reading, and may have the descriptor of another
+            self._hear_of_connections()
+            peer = self._known.by_descriptor.get(descriptor)
+        if peer is None or peer.route == route or (peer.route and self._is_there(peer.route)):
+            return None  # cut off already, or ended, and what it had still sent
+        if self._known.by_route.pop(peer.route, None) is not None:
+            self.gone.append(peer.route)
+        peer.route, peer.key = route, key
+        self._known.by_route[route] = peer
+        return peer
+
+    def _is_there(self, route: bytes) -> bool:
+        """False for one that has ended: what it had sent was read after another connection had its descriptor."""
+        self.socket.get(zmq.EVENTS)  # so that ZMQ takes up what has ended
+        return self.send(route, Beat())
+
+    def _flood(self, peer: Peer, why: str) -> None:
+        """Cut it off, and let its key in no more for a while; which key that is its first message tells."""
+        if peer.route in self._known.by_route:
+            known = peer.key in self._allowed.now.stations
+            self._allowed.refuse(peer.key if known else str(peer.address[0]), self._clock())
+        self._end(peer, why)
+
+    def _end(self, peer: Peer, why: str) -> None:
+        if peer.route in self._known.by_route:
+            self.cut(peer.route, why)
+        elif peer.cut_at == float("inf"):
+            self._shut(peer)
+            if self._seldom.due(str(peer.address[0])):
+                log.warning("%s is cut off: %s", peer, why)
+
+    def _shut(self, peer: Peer) -> None:
+        """Break the connection, which ZMQ then notices; never another one that has its descriptor by now."""
+        self._known.by_descriptor.pop(peer.descriptor, None)
+        with suppress(OSError), _same(peer.descriptor) as connection:
+            if connection.getpeername() == peer.address:
+                _break(connection)
+
+
+def _address(descriptor: int) -> Address | None:
+    """The other end of a connection; None where it has ended."""
+    try:
+        with _same(descriptor) as connection:
+            address = connection.getpeername()
+    except OSError:
+        return None
+    return address if isinstance(address, tuple) and len(address) > 1 else None
+
+
+def _received(peer: Peer) -> int:
+    """Bytes that a connection has sent so far; what they were known to be where it has ended."""
+    try:
+        with _same(peer.descriptor) as connection:
+            if connection.getpeername() != peer.address:
+                return peer.received
+            told = connection.getsockopt(sockets.IPPROTO_TCP, sockets.TCP_INFO, _TCP_INFO_BYTES)
+    except OSError:
+        return peer.received
+    if len(told) < _BYTES_RECEIVED + 8:
+        return peer.received
+    count: int = struct.unpack_from("=Q", told, _BYTES_RECEIVED)[0]
+    return count
+
+
+def _break(connection: sockets.socket) -> None:
+    """Reset it: to shut it down would leave what a flood has under way, and goes on to send, to be read.
+
+    That is a connect to no address, which Python does not offer (connect(2), AF_UNSPEC).
+    """
+    nowhere = struct.pack("=H14x", sockets.AF_UNSPEC)
+    if ctypes.CDLL(None).connect(connection.fileno(), nowhere, len(nowhere)) != 0:
+        connection.shutdown(sockets.SHUT_RDWR)
+
+
+def _same(descriptor: int) -> sockets.socket:
+    """A second descriptor of what that one is now; OSError where it is no socket."""
+    copy = os.dup(descriptor)
+    try:
+        return sockets.socket(fileno=copy)
+    except OSError:
+        os.close(copy)
+        raise

@@ -1,0 +1,72 @@
+"""Computers that want to be stations, at the lab's end: the database is asked in a thread, a few times in a minute.
+
+So many for each address: who guesses keeps nobody elsewhere from enrolling.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from queue import Empty, Full, Queue, SimpleQueue
+
+from runtime.link.codes import digest
+from runtime.link.wire import Enrol, Enrolled
+
+log = logging.getLogger(__name__)
+_EACH, _ALL, _WITHIN_S = 10, 100, 60.0  # tries of one address and of all, in so many seconds
+_STALE_S = 5.0  # after which the computer that asked is not waiting any more: its code stays good
+Enroller = Callable[[str, str, str], Enrolled | str]
+"""Asked with the digest of a code, a key in hexadecimal and the computer's name; says who it is now, or why not."""
+
+
+class Enrolling:
+    """Tries to enrol, and what became of them; `ask` and `answers` belong to one thread, and never wait."""
+
+    def __init__(self, enrol: Enroller, clock: Callable[[], float] = time.monotonic) -> None:
+        self._enrol, self._clock = enrol, clock
+        self._tries: list[tuple[float, str]] = []
+        self._asked: Queue[tuple[float, bytes, str, Enrol] | None] = Queue(_EACH)
+        self._answered: SimpleQueue[tuple[bytes, Enrolled | str]] = SimpleQueue()
+        self._ended = False
+        threading.Thread(target=self._work, name="enrolment", daemon=True).start()
+
+    def ask(self, route: bytes, address: str, key: str, enrol: Enrol) -> str:
+        """Have it looked at; or why it is not."""
+        now = self._clock()
+        self._tries = [one for one in self._tries if now - one[0] < _WITHIN_S]
+        if len(self._tries) >= _ALL or sum(one[1] == address for one in self._tries) >= _EACH:
+            return f"more than {_EACH} tries to enrol within a minute: wait for a minute"
+        self._tries.append((now, address))
+        try:
+            self._asked.put_nowait((now, route, key, enrol))
+        except Full:
+            return "too many computers enrol at once: try again in a minute"
+        return ""
+
+    def answers(self) -> list[tuple[bytes, Enrolled | str]]:
+        """What was found since."""
+        found = []
+        with suppress(Empty):
+            while True:
+                found.append(self._answered.get_nowait())
+        return found
+
+    def end(self) -> None:
+        """Look at nothing more; a database that hangs keeps nobody waiting."""
+        self._ended = True
+        with suppress(Full):
+            self._asked.put_nowait(None)
+
+    def _work(self) -> None:
+        while (asked := self._asked.get()) is not None and not self._ended:
+            at, route, key, enrol = asked
+            answer: Enrolled | str = "the lab cannot look the code up now: try again"
+            try:
+                if self._clock() - at < _STALE_S:
+                    answer = self._enrol(digest(enrol.code), key, enrol.computer[:120])
+            except Exception:
+                log.exception("a computer cannot be enrolled")
+            self._answered.put((route, answer))

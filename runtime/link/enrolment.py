@@ -1,0 +1,90 @@
+"""A robot's computer becomes a station of a lab: with its own key, and the code that the lab has shown."""
+
+from __future__ import annotations
+
+import re
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from runtime.core.errors import CodecError, ConfigurationError, TransportError
+from runtime.link.codes import Code
+from runtime.link.key_files import KeyPair, KnownLab, keep_lab
+from runtime.link.line import dialled, ended
+from runtime.link.release import version
+from runtime.link.wire import RELEASE, Bye, Enrol, Enrolled, read, write
+
+_POLL_MS = 100
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")  # of a station, which is a folder here
+_HEARD_S, _AGAIN_S = (
+    2.0,
+    0.3,
+)  # for which a lab may not have heard of a code that it has just shown; between two tries
+_NOT_OPEN = Bye("no code is open there: have the administration show a new one")
+
+
+def address_of(given: str) -> tuple[str, int]:
+    """Host and port of the lab; ConfigurationError."""
+    host, _, port = given.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ConfigurationError(
+            f"the address {given!r:.80}; allowed: HOST:PORT, as the administration shows it"
+        )
+    return host.strip("[]"), int(port)
+
+
+def enrol(data: Path, address: str, code: Code, key: KeyPair, timeout: float = 10.0) -> KnownLab:
+    """Ask the lab, and write down what it says; ConfigurationError for its refusal, TransportError where it is mute."""
+    host, port = address_of(address)
+    shown = f"[{host}]" if ":" in host else host
+    context: zmq.Context[Any] = zmq.Context()
+    heard_by = time.monotonic() + _HEARD_S
+    try:
+        answer = _asked(context, f"tcp://{shown}:{port}", code, key, timeout)
+        while answer == _NOT_OPEN and time.monotonic() < heard_by:
+            time.sleep(_AGAIN_S)
+            answer = _asked(context, f"tcp://{shown}:{port}", code, key, timeout)
+    finally:
+        context.destroy(linger=0)
+    if isinstance(answer, Bye):
+        raise ConfigurationError(f"the lab at {address} does not enrol this computer: {answer.why}")
+    if not _NAME.fullmatch(answer.station):
+        raise ConfigurationError(
+            f"the lab at {address} names it {answer.station!r:.80}; allowed: letters, digits, '.', '_' and '-'"
+        )
+    lab = KnownLab(
+        answer.station, answer.lab, host, port, answer.second_port, code.lab.hex(), answer.tokens.hex()
+    )
+    keep_lab(data / "stations" / answer.station, lab)
+    return lab
+
+
+def _asked(
+    context: zmq.Context[Any], endpoint: str, code: Code, key: KeyPair, timeout: float
+) -> Enrolled | Bye:
+    dealer, monitor = dialled(context, endpoint, code.lab, key)
+    dealer.send_multipart(write(Enrol(RELEASE, version(), code.secret, socket.gethostname())))
+    deadline = time.monotonic() + timeout
+    try:
+        while time.monotonic() < deadline:
+            over = bool(monitor.poll(0))  # looked at first: what was said before that can still be read
+            if dealer.poll(0 if over else _POLL_MS):
+                message, _ = read(dealer.recv_multipart())
+                if isinstance(message, Enrolled | Bye):
+                    return message
+            elif over and recv_monitor_message(monitor)["event"] == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+                return _NOT_OPEN
+            elif over:
+                break
+    except CodecError as error:
+        raise TransportError(f"{endpoint} answers what cannot be read: {error}") from None
+    finally:
+        ended(dealer, monitor)
+    raise TransportError(
+        f"no answer from a lab with the key in this code at {endpoint}: is the address right, "
+        "and does its gate run?"
+    )

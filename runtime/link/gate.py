@@ -1,0 +1,492 @@
+"""The lab's end of the link: to the programs of this computer every linked station looks like one that runs here.
+
+One thread passes stops and commands: stops first, those of every station, then a few messages of each. Nothing in it
+waits for a database or for a station.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zmq
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from runtime.core.errors import TransportError
+from runtime.ipc.bus import Call, CommandServer
+from runtime.ipc.fair_queue import Asked
+from runtime.ipc.messages import Ack, Command, encode
+from runtime.link.admission import Admission, AllowList, Seldom
+from runtime.link.door import Arrival, Door
+from runtime.link.enrolling import Enroller, Enrolling
+from runtime.link.incoming import Incoming
+from runtime.link.key_files import KeyPair
+from runtime.link.lab_streams import LabStreams
+from runtime.link.mirror import STOPPING, Mirror, MirrorTaken
+from runtime.link.release import version
+from runtime.link.remote import Held, Line, Pending, Remote
+from runtime.link.tokens import Signer
+from runtime.link.wire import (
+    COMMANDS,
+    COORDINATOR,
+    GUARD,
+    LARGEST_ANSWER,
+    MEDIA,
+    RELEASE,
+    STOPS,
+    Answer,
+    Ask,
+    Beat,
+    Enrol,
+    Enrolled,
+    Hello,
+    Welcome,
+    apart,
+)
+
+log = logging.getLogger(__name__)
+RATE = 8e6  # bytes a second that one connection may send
+_POLL_MS = 50
+_LOOK_S = 0.05
+_TRY_S = 2.0  # between two tries to have the folder of a station
+_MOST_PENDING = 64  # commands of one station that wait for their answers
+_PENDING_S = 30.0
+_HOPE_S = 0.8  # for which a press waits for a link that has just been lost, before its sender is told
+_HELD_S = 5.0  # after which a press that could not be passed on is none any more
+_MOST_HELD = 64
+_LOST = "the link to its computer is lost: it goes on by its own rules"
+_NOT_RUNNING = "its computer is linked, and the station does not run there: start it"
+
+
+class Gate:
+    """The first port of a lab; all but `end` belongs to one thread, which calls `turn`."""
+
+    def __init__(
+        self,
+        data: Path,
+        key: KeyPair,
+        tokens: bytes,
+        allowed: AllowList,
+        enrol: Enroller,
+        where: tuple[str, int, int],
+        clock: Callable[[], float] = time.monotonic,
+        incoming: Incoming | None = None,
+    ) -> None:
+        """`where`: the address to listen at, and its two ports; 0 takes a free one. Raises TransportError.
+
+        Without `incoming` the lab takes no episodes of stations elsewhere.
+        """
+        host, port, second_port = where
+        self._stations = data / "stations"
+        self._allowed, self._clock = allowed, clock
+        self._signer = Signer(Ed25519PrivateKey.from_private_bytes(tokens))
+        self._remotes: dict[str, Remote] = {}
+        self._by_route: dict[bytes, tuple[str, str]] = {}  # station and role
+        self._number = 0
+        self._seldom = Seldom(clock)
+        self._looked = -float("inf")
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._enrolling = Enrolling(enrol, clock)
+        self._streams = LabStreams(host, second_port, key, allowed, clock, incoming)
+        self._admission = Admission([self._context, self._streams.context], allowed, clock)
+        self._admission.start()
+        self._door = Door(self._context, host, port, key, LARGEST_ANSWER, RATE, allowed, clock)
+        self.port, self.second_port = self._door.port, self._streams.open()
+        self._streams.start()
+
+    def turn(self, wait_ms: int = _POLL_MS) -> None:
+        """Wait for somebody, and pass on what there is: stops before all else."""
+        self._wait(wait_ms)
+        if self._streams.failed:
+            raise TransportError("streams of stations elsewhere have ended: see the log above")
+        for remote in self._remotes.values():
+            self._press(remote)
+        heard = {self._heard(arrival) for arrival in self._door.arrivals()}
+        for remote in [
+            self._remotes[name] for name in heard if name
+        ]:  # once all is heard that has come meanwhile
+            self._adjust(remote)
+        for remote in self._remotes.values():
+            self._command(remote)
+        for route, answer in self._enrolling.answers():
+            self._enrolled(route, answer)
+        self._lose(self._door.gone)
+        if (now := self._clock()) - self._looked >= _LOOK_S:
+            self._looked = now
+            self._look(now)
+
+    def close(self) -> None:
+        """End it: no station is linked any more."""
+        for remote in self._remotes.values():
+            self._close(remote, "the lab's gate was ended")
+        self._enrolling.end()
+        self._streams.end()
+        self._door.close()
+        self._admission.end()
+        self._context.destroy(linger=0)
+        self._streams.context.destroy(linger=0)
+
+    def linked(self) -> set[str]:
+        """The stations that can be commanded now; from any thread."""
+        return {remote.name for remote in list(self._remotes.values()) if remote.up}
+
+    def _wait(self, wait_ms: int) -> None:
+        poller = zmq.Poller()
+        poller.register(self._door.socket, zmq.POLLIN)
+        for remote in self._remotes.values():
+            if remote.mirror is None:
+                continue
+            if remote.mirror.waiting:
+                wait_ms = 0
+            poller.register(remote.mirror.estops.socket, zmq.POLLIN)
+            if remote.mirror.commands is not None:
+                poller.register(remote.mirror.commands.socket, zmq.POLLIN)
+        poller.poll(wait_ms)
+
+    # --- what the lab's programs say ---------------------------------------------------------------------------
+
+    def _press(self, remote: Remote) -> None:
+        """Everything that has come at the socket for the e-stop."""
+        if (mirror := remote.mirror) is None:
+            return
+        presses, others = mirror.estop_turns.take()
+        for call, command in presses:
+            payload, verified = _payload(mirror, call, command)
+            held = Held(call, command, payload, verified, self._clock())
+            if not self._pass_press(remote, held):
+                remote.held.append(held)
+                if len(remote.held) > _MOST_HELD:
+                    self._give_up(remote, remote.held.pop(0))
+        for call, command in others:
+            self._pass_command(remote, (call, command), (GUARD, "estop"), mirror.estops)
+
+    def _command(self, remote: Remote) -> None:
+        """Stops that have come at the socket for commands, and a few of the rest."""
+        if remote.mirror is None or remote.mirror.command_turns is None or remote.mirror.commands is None:
+            return
+        server = remote.mirror.commands
+        urgent, others = remote.mirror.command_turns.take()
+        for asked in (*urgent, *others):
+            self._pass_command(remote, asked, (COORDINATOR, "commands"), server)
+
+    def _pass_press(self, remote: Remote, held: Held) -> bool:
+        """Send a press over whichever connection lives; False where none does."""
+        now = self._clock()
+        line = remote.line(STOPS, now) or remote.line(COMMANDS, now)
+        if line is None or remote.mirror is None:
+            return False
+        token = held.payload, held.verified
+        number = self._send(remote, line, (GUARD, "estop"), token, stops=True)
+        if number and not held.told:
+            server, until = remote.mirror.estops, now + _PENDING_S
+            remote.pending[number] = Pending(server, held.call, held.command, until, held)
+        return bool(number)
+
+    def _pass_command(
+        self, remote: Remote, asked: Asked, place: tuple[str, str], server: CommandServer
+    ) -> None:
+        assert remote.mirror is not None
+        (call, command), now = asked, self._clock()
+        stops = command.kind in STOPPING
+        payload, verified = _payload(remote.mirror, call, command)
+        line = (remote.line(STOPS, now) if stops or place[0] == GUARD else None) or remote.line(COMMANDS, now)
+        if not verified and not stops:
+            server.answer(call, Ack(command.uuid, "refused", _unsigned(command)))
+        elif line is None:
+            server.answer(call, _not_sent(remote, command))
+        elif not stops and len(remote.pending) >= _MOST_PENDING:
+            reason = (
+                f"{_MOST_PENDING} commands wait for {remote.name} already: wait for answers; stops are obeyed"
+            )
+            server.answer(call, Ack(command.uuid, "refused", reason))
+        elif number := self._send(remote, line, place, (payload, verified), stops):
+            remote.pending[number] = Pending(server, call, command, now + _PENDING_S)
+        else:
+            server.answer(call, _not_sent(remote, command))
+
+    def _send(
+        self, remote: Remote, line: Line, place: tuple[str, str], said: tuple[bytes, bool], stops: bool
+    ) -> int:
+        """Send what was `said`, with a token where its user is known; its number, 0 where it could not be sent."""
+        self._number += 1
+        payload, verified = said
+        ask = Ask(self._number, *place, stops=stops)
+        if verified:
+            serial, signature = self._signer.token(remote.name, line.challenge, "/".join(place), payload)
+            ask = Ask(self._number, *place, stops, line.challenge, serial, signature)
+        return self._number if self._door.send(line.route, ask, payload) else 0
+
+    # --- what stations say -------------------------------------------------------------------------------------
+
+    def _heard(self, arrival: Arrival) -> str:
+        """As `_hear`; what nobody foresaw costs its sender the connection, and no other station its link."""
+        try:
+            return self._hear(arrival)
+        except Exception:
+            log.exception("what a station's computer says cannot be taken up")
+            self._door.cut(arrival.route, "the lab cannot take up what it said: see the log of its gate")
+            return ""
+
+    def _hear(self, arrival: Arrival) -> str:
+        """Take up what came; the name of the station that lives, "" where none is known by it."""
+        message = arrival.message
+        known = self._by_route.get(arrival.route)
+        if known is None:
+            if isinstance(message, Hello):
+                self._greet(arrival, message)
+            elif isinstance(message, Enrol):
+                self._enrol(arrival, message)
+            else:
+                self._door.cut(arrival.route, "it did not say who it is")
+            return ""
+        remote, line = self._remotes[known[0]], self._remotes[known[0]].lines[known[1]]
+        line.heard_at = self._clock()
+        if isinstance(message, Beat):
+            line.challenge = message.challenge
+            if known[1] == COMMANDS:
+                remote.listening = message.listening
+            self._door.send(arrival.route, Beat())
+        elif isinstance(message, Answer):
+            self._answer(remote, message, arrival.parts)
+        return remote.name
+
+    def _answer(self, remote: Remote, answer: Answer, parts: list[bytes]) -> None:
+        pending = remote.pending.pop(answer.number, None)
+        if pending is None:
+            return
+        if not answer.failure and len(parts) == 1:
+            pending.server.pass_on(pending.call, parts[0])
+            return
+        reason = answer.failure[:500] or "the station answered with what cannot be read"
+        pending.server.answer(pending.call, _failed(remote, pending.command, reason))
+
+    def _greet(self, arrival: Arrival, hello: Hello) -> None:
+        remote = self._known(hello.station)
+        if remote is None or not self._allowed.now.may_be(arrival.key, hello.station):
+            self._door.cut(arrival.route, f"{hello.station!r:.80} is not known here with this key")
+            return
+        if hello.role not in (STOPS, COMMANDS):
+            self._door.cut(arrival.route, f"{hello.role!r:.40} is for the other port")
+            return
+        if remote.mirror is None and not self._mirrored(remote):
+            self._door.cut(arrival.route, remote.refusal, _TRY_S)
+            return
+        if why := apart(hello.release, hello.version, hello.station, lab_side=True):
+            if not remote.up:  # of a station that is linked another program says so
+                self._lower(remote, why)
+            self._door.cut(arrival.route, why)
+            return
+        if hello.session != remote.session:
+            self._leave_lines(remote, "another program has linked this station with the same key", 5.0)
+            remote.session = hello.session
+        elif (line := remote.lines.pop(hello.role, None)) is not None:
+            self._drop_line(line, "another connection of this station has taken its place", 1.0)
+        self._adjust(remote)  # what was asked over a connection that went is not answered by the next
+        remote.lines[hello.role] = Line(arrival.route, self._clock())
+        self._by_route[arrival.route] = (hello.station, hello.role)
+        self._door.send(arrival.route, Welcome(RELEASE, version()))
+
+    def _enrol(self, arrival: Arrival, enrol: Enrol) -> None:
+        refusal = apart(enrol.release, enrol.version, "the station", lab_side=True)
+        refusal = refusal or self._enrolling.ask(
+            arrival.route, self._door.address_of(arrival.route), arrival.key, enrol
+        )
+        if refusal:
+            self._door.cut(arrival.route, refusal)
+
+    def _enrolled(self, route: bytes, answer: Enrolled | str) -> None:
+        if isinstance(answer, str):
+            self._door.cut(route, answer)
+            return
+        told = Enrolled(answer.station, answer.lab, answer.tokens, self.second_port)
+        self._door.send(route, told)
+        log.info("%s is enrolled", answer.station)
+
+    # --- what changes ------------------------------------------------------------------------------------------
+
+    def _look(self, now: float) -> None:
+        """Who is allowed, who lives, what waits too long."""
+        self._door.look()
+        names = self._allowed.now.names()
+        for name in names:
+            self._known(name)
+        for name in self._remotes.keys() - names:
+            self._forget(self._remotes.pop(name))
+        for remote in self._remotes.values():
+            self._leave_withdrawn(remote)
+            if now - remote.tried_at >= _TRY_S:
+                self._try(remote)
+            self._adjust(remote)
+            self._hold_on(remote, now)
+            for number in [one for one, pending in remote.pending.items() if now >= pending.until]:
+                del remote.pending[number]
+            if remote.mirror is not None:
+                remote.mirror.look()
+                if (streams := self._streams.places.get(remote.name)) is not None:
+                    remote.mirror.moved_streams(streams)
+
+    def _known(self, name: str) -> Remote | None:
+        """What is known of a station that is enrolled; None where it is not."""
+        if name not in self._remotes and name in self._allowed.now.names():
+            self._remotes[name] = Remote(name)
+        return self._remotes.get(name)
+
+    def _try(self, remote: Remote) -> None:
+        """Have what is still missing of the station here."""
+        if remote.mirror is None:
+            self._mirrored(remote)
+        elif remote.name not in self._streams.places:
+            remote.tried_at = self._clock()
+            self._streams.serve(remote.name, remote.mirror.station_dir)
+
+    def _mirrored(self, remote: Remote) -> bool:
+        """Have the folder of the station; False where another process has it."""
+        remote.tried_at = self._clock()
+        try:
+            remote.mirror = Mirror(self._context, self._stations / remote.name)
+        except (MirrorTaken, TransportError) as error:
+            remote.refusal = str(error)
+            self._say_once(remote, f"{remote.name} cannot be linked: {error}")
+            return False
+        remote.mirror.lower("its computer has not connected yet")
+        self._streams.serve(remote.name, remote.mirror.station_dir)
+        return True
+
+    def _adjust(self, remote: Remote) -> None:
+        """Show the station as linked, or as lost, where that has changed."""
+        now = self._clock()
+        lives = remote.line(STOPS, now) is not None and remote.line(COMMANDS, now) is not None
+        streams = self._streams.places.get(remote.name)
+        up = lives and COORDINATOR in remote.listening and streams is not None
+        if remote.mirror is None:
+            return
+        if remote.lives and not lives:
+            remote.lost_at = now
+            self._hold(remote)
+        remote.lives = lives
+        if up and not remote.up and streams is not None:
+            try:
+                remote.mirror.raise_up(streams)
+            except (TransportError, zmq.ZMQError) as error:
+                self._say_once(remote, f"{remote.name} cannot be linked: {error}")
+                return
+            remote.up = True
+            self._say_once(remote, f"{remote.name} is linked")
+        elif not up and remote.up:
+            self._hold(remote)
+            self._lower(remote, _NOT_RUNNING if lives else _LOST)
+            remote.up = False
+        elif not up and lives and streams is not None:
+            self._lower(remote, _NOT_RUNNING)
+        if remote.up:
+            remote.mirror.pictures(MEDIA in remote.listening)
+        if remote.held:
+            remote.held = [held for held in remote.held if not self._pass_press(remote, held)]
+
+    def _hold(self, remote: Remote) -> None:
+        """Nobody knows of what was sent and not answered; a press is sent again where the link comes back in time."""
+        for pending in remote.pending.values():
+            if pending.press is not None:
+                pending.press.sent = True
+                remote.held.append(pending.press)
+        remote.pending.clear()
+
+    def _lower(self, remote: Remote, why: str) -> None:
+        """Let the lab's programs know why the station cannot be commanded."""
+        if remote.told != why and remote.mirror is not None:
+            remote.mirror.lower(why)
+            self._say_once(remote, why)
+
+    def _hold_on(self, remote: Remote, now: float) -> None:
+        """Tell who presses that the link is lost; what is too old is not pressed any more."""
+        for held in list(remote.held):
+            known = now - remote.lost_at > _HOPE_S  # it was lost before the press
+            if not held.told and (known or now - held.at > _HOPE_S):
+                self._give_up(remote, held)
+            if now - held.at > _HELD_S:
+                remote.held.remove(held)
+
+    def _give_up(self, remote: Remote, held: Held) -> None:
+        held.told = True
+        if remote.mirror is not None:
+            remote.mirror.estops.answer(held.call, _not_sent(remote, held.command, held.sent))
+
+    def _lose(self, routes: list[bytes]) -> None:
+        """Connections have ended."""
+        for route in routes:
+            known = self._by_route.pop(route, None)
+            remote = self._remotes.get(known[0]) if known is not None else None
+            if remote is None or known is None:
+                continue
+            line = remote.lines.get(known[1])
+            if line is not None and line.route == route:
+                del remote.lines[known[1]]
+                self._adjust(remote)
+        routes.clear()
+
+    def _leave_withdrawn(self, remote: Remote) -> None:
+        """Cut off connections whose key is not the station's any more."""
+        for role, line in list(remote.lines.items()):
+            if not self._allowed.now.may_be(self._door.key_of(line.route), remote.name):
+                del remote.lines[role]
+                self._drop_line(line, "the lab has withdrawn or replaced this station's key", 30.0)
+
+    def _forget(self, remote: Remote) -> None:
+        """The station is not enrolled here any more."""
+        self._leave_lines(remote, "the lab has withdrawn this station's key", 30.0)
+        self._streams.leave(remote.name)
+        self._close(remote, "the key of its computer was withdrawn")
+
+    def _close(self, remote: Remote, why: str) -> None:
+        self._hold(remote)
+        for held in remote.held:
+            if not held.told:
+                self._give_up(remote, held)
+        if remote.mirror is not None:
+            remote.mirror.close(why)
+
+    def _leave_lines(self, remote: Remote, why: str, again_s: float) -> None:
+        for line in remote.lines.values():
+            self._drop_line(line, why, again_s)
+        remote.lines.clear()
+
+    def _drop_line(self, line: Line, why: str, again_s: float) -> None:
+        self._by_route.pop(line.route, None)
+        self._door.cut(line.route, why, again_s)
+
+    def _say_once(self, remote: Remote, what: str) -> None:
+        if remote.told != what:
+            remote.told = what
+            if self._seldom.due(
+                f"{remote.name}: {what}"
+            ):  # a computer may say the one and the other all the time
+                log.warning("%s: %s", remote.name, what)
+
+
+def _payload(mirror: Mirror, call: Call, command: Command) -> tuple[bytes, bool]:
+    """The command as it is passed on, and whether the web has signed it: else only what was understood of it."""
+    if call.signature and mirror.key.verifies(call.payload, call.signature):
+        return call.payload, True
+    return encode(command), False
+
+
+def _unsigned(command: Command) -> str:
+    return (
+        f"{command.kind} is not signed by this lab's web: a program of the lab's computer cannot command a station "
+        "elsewhere; allowed: stops, and python -m runtime.ctl on the station's own computer"
+    )
+
+
+def _not_sent(remote: Remote, command: Command, sent: bool = False) -> Ack:
+    what = "sent and not answered" if sent else "not sent"
+    return _failed(remote, command, f"{what}, the link to {remote.name} is lost")
+
+
+def _failed(remote: Remote, command: Command, reason: str) -> Ack:
+    """The answer in the station's place: a press that failed says what is left to do."""
+    if command.kind == "estop":
+        return Ack(command.uuid, "failed", f"USE THE HARDWARE STOP: {reason}", data={"station": remote.name})
+    return Ack(command.uuid, "failed" if command.kind in STOPPING else "refused", reason, kind=command.kind)

@@ -1,0 +1,472 @@
+"""Episodes of stations elsewhere on their way to the lab's disk: asked for bit by bit, compared, then there at once.
+
+DATA/episodes/.arriving/STATION/UUID/   what is here of one; beside it UUID.json, its list, and UUID.declined, why not
+DATA/episodes/UUID/                     all of it, once every file is what the list says: by one rename
+DATA/arrivals/UUID                      arrived, or its labels have, and the worker has not made rows of it yet
+
+Each station has a thread of its own, which gives way to all others: what one sends, or is compared of one, delays no
+other, and no picture. Of a cut or a kill, at whichever byte, the files here are as long as they got.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import logging
+import os
+import shutil
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from queue import Empty, SimpleQueue
+
+from runtime.core.errors import CodecError, RecordingError
+from runtime.link.contents import MANIFEST, Contents, File, contents_of, is_episode, unpacked
+from runtime.link.wire import PIECE, Arrived, Declined, Labels, Message, Offer, Piece, Want
+from runtime.link.yielding import give_way
+from runtime.recording.files import disk_fault, read_document, sync_folder, write_whole
+from runtime.recording.labels import FOLDER as LABELS
+
+log = logging.getLogger(__name__)
+RESERVE = 5 << 30  # bytes of the disk that stay free for everything else
+LARGEST_LABELS = 1 << 20  # bytes
+ARRIVING, ARRIVALS = ".arriving", "arrivals"
+_WINDOW = 8  # pieces under way
+_MOST_BEGUN = 3  # episodes of one station that are here in part
+_MOST_DECLINED = 64  # of one station that pages say something of
+_MOST_TRIES = 3  # of a file that is not what the list says
+_SOON_S, _LATER_S, _NEVER_S = 60.0, 600.0, 86400.0  # until the station may offer it again
+Owner = Callable[[str], str]
+"""Asked with an episode's uuid; the name of the station that it is known to be of, "" for none. OSError: not now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What is here of an episode that is on its way [bytes]; why it is not, where the lab has declined it."""
+
+    here: int
+    size: int
+    why: str = ""
+
+
+def progress_of(data: Path, station: str, uuid: str) -> Progress | None:
+    """How far an episode of that station has come; None where it was never offered, or has arrived."""
+    begun = data / "episodes" / ARRIVING / station
+    try:
+        why = _beside(begun, uuid, "declined").read_text("utf-8")
+    except OSError:
+        why = ""
+    try:
+        contents = unpacked(_beside(begun, uuid, "json").read_bytes())
+    except (OSError, CodecError):
+        return Progress(0, 0, why) if why else None
+    here = sum(min(_size(begun / uuid / file.name), file.size) for file in contents.files)
+    return Progress(here, contents.size, why)
+
+
+def arrivals(data: Path) -> list[tuple[str, Path]]:
+    """Episodes that have arrived, or their labels, since somebody last took them in: uuid, and what to remove then."""
+    folder = data / ARRIVALS
+    try:
+        return [(path.name, path) for path in sorted(folder.iterdir()) if is_episode(path.name)]
+    except FileNotFoundError:
+        return []
+
+
+class Incoming:
+    """All stations' desks. `hear` and `left` are for one thread, which `wake` tells to ask for `answers`."""
+
+    def __init__(self, data: Path, owner: Owner, reserve: int = RESERVE) -> None:
+        self._data, self._owner, self._reserve = data, owner, reserve
+        self._desks: dict[str, _Desk] = {}
+        self._answers: SimpleQueue[tuple[bytes, Message]] = SimpleQueue()
+        self.wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+
+    def hear(self, station: str, route: bytes, message: Message, part: bytes) -> None:
+        """A message about an episode has come from the station."""
+        if station not in self._desks:
+            self._desks[station] = _Desk(Shelf(self._data, station, self._owner, self._reserve), self._say)
+        self._desks[station].put(route, message, part)
+
+    def left(self, station: str, route: bytes) -> None:
+        """That connection of the station has ended: what it was asked for does not come any more."""
+        if station in self._desks:
+            self._desks[station].put(route, None, b"")
+
+    def answers(self) -> list[tuple[bytes, Message]]:
+        """What is to be sent since the last time, each over its connection."""
+        with suppress(BlockingIOError):
+            os.eventfd_read(self.wake)
+        found = []
+        with suppress(Empty):
+            while True:
+                found.append(self._answers.get_nowait())
+        return found
+
+    def end(self) -> None:
+        """End all desks after what they are at."""
+        for desk in self._desks.values():
+            desk.end()
+        os.close(self.wake)
+
+    def _say(self, route: bytes, message: Message) -> None:
+        self._answers.put((route, message))
+        os.eventfd_write(self.wake, 1)
+
+
+class _Desk:
+    """The thread of one station."""
+
+    def __init__(self, shelf: Shelf, say: Callable[[bytes, Message], None]) -> None:
+        self._shelf, self._say = shelf, say
+        self._asked: SimpleQueue[tuple[bytes, Message | None, bytes] | None] = SimpleQueue()
+        self._route = b""
+        self._thread = threading.Thread(target=self._work, name=f"{shelf.station} episodes", daemon=True)
+        self._thread.start()
+
+    def put(self, route: bytes, message: Message | None, part: bytes) -> None:
+        self._asked.put((route, message, part))
+
+    def end(self) -> None:
+        self._asked.put(None)
+        self._thread.join()
+
+    def _work(self) -> None:
+        give_way()
+        while (asked := self._asked.get()) is not None:
+            route, message, part = asked
+            if route != self._route or message is None:
+                self._shelf.drop()
+                self._route = route
+            if message is None:
+                continue
+            for answer in self._answers(message, part):
+                self._say(route, answer)
+        self._shelf.drop()
+
+    def _answers(self, message: Message, part: bytes) -> list[Message]:
+        try:
+            return list(self._shelf.take(message, part))
+        except Exception:
+            log.exception("%s: an episode cannot be taken in", self._shelf.station)
+            self._shelf.drop()
+            episode = getattr(message, "episode", "")
+            return [Declined(episode, "the lab cannot take it in: its log says why", _LATER_S)]
+
+
+@dataclass(slots=True)
+class _Begun:
+    """The episode that is on its way, which file of it, and what was asked for of that."""
+
+    episode: str
+    contents: Contents
+    folder: Path
+    number: int = 0
+    descriptor: int = -1
+    next: int = 0  # the first byte of the file that was not asked for
+    asked: deque[Want] = field(default_factory=deque)
+    tries: int = 0
+
+    @property
+    def file(self) -> File:
+        return self.contents.files[self.number]
+
+    @property
+    def path(self) -> Path:
+        return self.folder / self.file.name
+
+    def close(self) -> None:
+        if self.descriptor >= 0:
+            os.close(self.descriptor)
+        self.descriptor = -1
+
+
+class _Unwanted(Exception):
+    """The episode is not taken: why, and after how long it may be offered again."""
+
+    def __init__(self, why: str, again_s: float) -> None:
+        super().__init__(why)
+        self.again_s = again_s
+
+
+class Shelf:
+    """What one station has sent, on the disk; all of it belongs to one thread."""
+
+    def __init__(self, data: Path, station: str, owner: Owner, reserve: int = RESERVE) -> None:
+        self.station = station
+        self._data, self._owner, self._reserve = data, owner, reserve
+        self._episodes = data / "episodes"
+        self._root = self._episodes / ARRIVING / station
+        self._begun: _Begun | None = None
+
+    def take(self, message: Message, part: bytes) -> Iterator[Message]:
+        """The answers to a message of the station."""
+        episode = getattr(message, "episode", "")
+        try:
+            if isinstance(message, Offer):
+                yield from self._offered(episode, part)
+            elif isinstance(message, Piece):
+                yield from self._piece(message, part)
+            elif isinstance(message, Labels):
+                yield self._labelled(episode, part)
+        except _Unwanted as unwanted:
+            yield self._declined(episode, str(unwanted), unwanted.again_s)
+        except CodecError as error:
+            yield self._declined(episode, f"the list of its files cannot be used: {error}", _NEVER_S)
+        except RecordingError as error:
+            yield self._declined(episode, str(error), _LATER_S)
+        except OSError as error:
+            yield self._declined(episode, str(disk_fault("writing", self._root, error)), _SOON_S)
+
+    def drop(self) -> None:
+        """What is under way does not come any more; what is here of it stays, to go on from."""
+        if self._begun is not None:
+            self._begun.close()
+        self._begun = None
+
+    # --- an episode ----------------------------------------------------------------------------------------------
+
+    def _offered(self, episode: str, sent: bytes) -> Iterator[Message]:
+        self.drop()
+        if not is_episode(episode):
+            raise _Unwanted(f"{episode!r:.80} is no episode: expected its uuid", _NEVER_S)
+        contents = unpacked(sent)
+        self._require_own(episode)
+        if (self._episodes / episode).exists():
+            yield self._known(episode, contents)
+            return
+        folder = self._staging(episode, contents)
+        missing = contents.size - sum(_size(folder / file.name) for file in contents.files)
+        self._require_room(missing)
+        self._begun = _Begun(episode, contents, folder)
+        _beside(self._root, episode, "declined").unlink(missing_ok=True)
+        yield from self._go_on(self._begun)
+
+    def _piece(self, piece: Piece, data: bytes) -> Iterator[Message]:
+        begun = self._begun
+        if begun is None or begun.episode != piece.episode:
+            return  # it was under way when the episode was declined
+        want = begun.asked.popleft() if begun.asked else None
+        if want is None or (piece.file, piece.offset) != (want.file, want.offset):
+            self.drop()
+            raise _Unwanted("what came is not what was asked for", _SOON_S)
+        if len(data) != want.count:
+            self.drop()
+            raise _Unwanted(
+                f"{want.file} had {want.count} bytes at {want.offset} when it was offered, and has {len(data)} now",
+                _SOON_S,
+            )
+        try:
+            self._require_room(len(data))
+            _write_at(begun.descriptor, data, piece.offset)
+        except (_Unwanted, OSError):
+            self.drop()
+            raise
+        yield from self._go_on(begun)
+
+    def _go_on(self, begun: _Begun) -> Iterator[Message]:
+        """Ask for what is missing of the file; where nothing is, compare it and go on with the next."""
+        while begun.number < len(begun.contents.files):
+            file = begun.file
+            if begun.descriptor < 0:
+                begun.descriptor, begun.next = _opened(begun.path, file.size)
+            while begun.next < file.size and len(begun.asked) < _WINDOW:
+                count = min(PIECE, file.size - begun.next)
+                want = Want(begun.episode, file.name, begun.next, count)
+                begun.asked.append(want)
+                begun.next += count
+                yield want
+            if begun.asked:
+                return
+            self._compare(begun, file)
+        yield self._finish(begun)
+
+    def _compare(self, begun: _Begun, file: File) -> None:
+        """Read back what is on the disk; a file that is another one is sent anew, three times at the most."""
+        os.fsync(begun.descriptor)
+        begun.close()
+        if _sha256(begun.path) == file.sha256:
+            begun.number, begun.tries = begun.number + 1, 0
+            return
+        begun.path.unlink()
+        begun.tries += 1
+        log.warning("%s: %s of episode %s is not what its list says", self.station, file.name, begun.episode)
+        if begun.tries >= _MOST_TRIES:
+            self.drop()
+            raise _Unwanted(
+                f"{file.name} was sent {_MOST_TRIES} times, and is not what its SHA-256 says", _LATER_S
+            )
+
+    def _finish(self, begun: _Begun) -> Message:
+        self._begun = None
+        folder, target = begun.folder, self._episodes / begun.episode
+        self._require_named(begun)
+        self._require_own(begun.episode)
+        sync_folder(folder)
+        try:
+            os.rename(folder, target)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+            return self._known(begun.episode, begun.contents)
+        sync_folder(self._episodes)
+        return self._arrived(begun.episode, begun.contents)
+
+    def _known(self, episode: str, contents: Contents) -> Message:
+        """An episode that is here: the same, or another one, which stays as it is."""
+        here = contents_of(self._episodes / episode)
+        if here != contents:
+            other = [file.name for file in contents.files if file not in here.files]
+            raise _Unwanted(
+                f"the lab has an episode {episode} already, with other content ({', '.join(other) or 'more files'}): "
+                "nothing is overwritten",
+                _NEVER_S,
+            )
+        return self._arrived(episode, contents)
+
+    def _arrived(self, episode: str, contents: Contents) -> Message:
+        self._tell(episode)
+        self._forget(episode)
+        log.info("%s: episode %s has arrived, %d bytes", self.station, episode, contents.size)
+        return Arrived(episode, contents.digest)
+
+    # --- what is required ----------------------------------------------------------------------------------------
+
+    def _require_own(self, episode: str) -> None:
+        try:
+            owner = self._owner(episode)
+        except OSError as error:
+            raise _Unwanted(f"the lab cannot say now whose episode that is: {error}", _SOON_S) from None
+        if owner not in ("", self.station):
+            raise _Unwanted(f"episode {episode} is of another station of this lab", _NEVER_S)
+
+    def _require_named(self, begun: _Begun) -> None:
+        """The episode's own manifest says what it was offered as: one that does not is thrown away."""
+        try:
+            manifest = read_document(begun.folder / MANIFEST)
+        except RecordingError as error:
+            manifest, why = {}, str(error)
+        else:
+            why = f"it is of episode {manifest.get('uuid')!r:.80} and station {manifest.get('station')!r:.80}"
+        if (manifest.get("uuid"), manifest.get("station")) != (begun.episode, self.station):
+            self._forget(begun.episode)
+            raise _Unwanted(f"its {MANIFEST} does not say that it is this station's: {why}", _NEVER_S)
+
+    def _require_room(self, wanted: int) -> None:
+        free = shutil.disk_usage(self._episodes).free
+        if free - wanted < self._reserve:
+            raise _Unwanted(
+                f"the lab's disk has too little room for it: {free / 1e9:.1f} GB free, {wanted / 1e9:.1f} wanted, "
+                f"{self._reserve / 1e9:.1f} are kept free",
+                _SOON_S,
+            )
+
+    # --- what lies there -----------------------------------------------------------------------------------------
+
+    def _staging(self, episode: str, contents: Contents) -> Path:
+        """The folder of what is here of it, without anything that is of no use; others make room for it."""
+        folder, known = self._root / episode, _beside(self._root, episode, "json")
+        sent = contents.packed()
+        if (
+            not known.exists() or known.read_bytes() != sent
+        ):  # another one of the same name was offered before
+            self._forget(episode)
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in folder.iterdir():
+            if path.name not in {file.name for file in contents.files}:
+                path.unlink()
+        write_whole(known, sent)
+        begun = sorted((path for path in self._root.iterdir() if path.is_dir()), key=_changed)
+        for path in [path for path in begun if path != folder][: max(0, len(begun) - _MOST_BEGUN)]:
+            self._forget(path.name)
+        return folder
+
+    def _forget(self, episode: str) -> None:
+        """Remove what is here of it in part, and what is said of it."""
+        shutil.rmtree(self._root / episode, ignore_errors=True)
+        for kind in ("json", "declined"):
+            _beside(self._root, episode, kind).unlink(missing_ok=True)
+
+    def _declined(self, episode: str, why: str, again_s: float) -> Declined:
+        log.warning("%s: episode %.40r is not taken: %s", self.station, episode, why)
+        if is_episode(episode):
+            with suppress(OSError, RecordingError):  # a disk that is full: the station is told all the same
+                self._root.mkdir(parents=True, exist_ok=True)
+                write_whole(_beside(self._root, episode, "declined"), why.encode())
+                for path in sorted(self._root.glob("*.declined"), key=_changed)[:-_MOST_DECLINED]:
+                    path.unlink()
+        return Declined(episode, why[:500], again_s)
+
+    def _tell(self, episode: str) -> None:
+        """Have the worker make rows of it."""
+        folder = self._data / ARRIVALS
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / episode, self.station.encode())
+
+    # --- labels --------------------------------------------------------------------------------------------------
+
+    def _labelled(self, episode: str, lines: bytes) -> Message:
+        """Keep the lines: all that are here are their beginning, or nothing is changed."""
+        if not is_episode(episode) or len(lines) > LARGEST_LABELS:
+            raise _Unwanted(
+                f"{len(lines)} bytes of labels; allowed: {LARGEST_LABELS}, of an episode", _NEVER_S
+            )
+        manifest = read_document(self._episodes / episode / MANIFEST)
+        if manifest.get("station") != self.station:
+            raise _Unwanted(f"episode {episode} is of another station of this lab", _NEVER_S)
+        path = self._data / LABELS / f"{episode}.jsonl"
+        here = path.read_bytes() if path.exists() else b""
+        if not lines.startswith(here):
+            raise _Unwanted("the lab has other labels of it: nothing is overwritten", _NEVER_S)
+        if lines != here:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, lines)
+            self._tell(episode)
+        return Arrived(episode, _digest(lines))
+
+
+def _digest(data: bytes) -> str:
+
+    return hashlib.sha256(data).hexdigest()
+
+
+def _sha256(path: Path) -> str:
+
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _opened(path: Path, size: int) -> tuple[int, int]:
+    """A descriptor to write with, and how many bytes are there; a file that is longer than it may be begins anew."""
+    if path.is_symlink() or _size(path) > size:
+        path.unlink()
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+    return descriptor, os.fstat(descriptor).st_size
+
+
+def _write_at(descriptor: int, data: bytes, offset: int) -> None:
+    view = memoryview(data)
+    while view:
+        written = os.pwrite(descriptor, view, offset)
+        view, offset = view[written:], offset + written
+
+
+def _beside(root: Path, episode: str, kind: str) -> Path:
+    return root / f"{episode}.{kind}"
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _changed(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0

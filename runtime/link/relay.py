@@ -1,0 +1,181 @@
+"""What the lab asks, carried to the sockets of the station on this computer, and the answers back.
+
+Each question has a connection of its own while it waits, as that of any program here: none is refused because others
+wait, and an answer that comes late is never taken for another's.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from runtime.core.errors import TransportError
+from runtime.ipc.bus import CommandClient, Endpoints
+from runtime.ipc.endpoints import LOOK_S
+from runtime.link.wire import COORDINATOR, GUARD
+
+log = logging.getLogger(__name__)
+ALLOWED = ((GUARD, "estop"), (COORDINATOR, "commands"))
+_MOST = 64  # questions that wait at once; beyond, the oldest is given up
+_PATIENCE_S = 30.0  # for an answer: nobody at the lab waits longer
+_FIND_S, _TELL_S = 5.0, 0.8  # for which the socket of a stop is looked for; after which its sender is told
+
+
+@dataclass(slots=True)
+class _Asked:
+    process: str
+    socket: str
+    payload: bytes
+    signature: bytes
+    stops: bool
+    since: float
+    looked: float
+    told: bool = False
+    endpoint: str = ""
+    client: CommandClient | None = None
+
+
+@dataclass(slots=True)
+class _Free:
+    """Connections to a socket over which nothing is under way."""
+
+    endpoint: str
+    clients: list[CommandClient] = field(default_factory=list)
+
+    def close(self) -> None:
+        for client in self.clients:
+            client.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """The answer to the question of that number: as the station packed it, or why there is none."""
+
+    number: int
+    packed: bytes = b""
+    failure: str = ""
+
+
+class Relay:
+    """Questions that wait for the station; belongs to one thread."""
+
+    def __init__(
+        self, context: zmq.Context[Any], station_dir: Path, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._context, self._clock = context, clock
+        self._endpoints = Endpoints(station_dir)
+        self._asked: dict[int, _Asked] = {}
+        self._free: dict[tuple[str, str], _Free] = {}
+
+    def ask(self, number: int, place: tuple[str, str], payload: bytes, signature: bytes, stops: bool) -> None:
+        """Send it to the socket; a stop goes after its socket wherever that goes meanwhile."""
+        if len(self._asked) >= _MOST:
+            self._end(next(iter(self._asked)))
+        now = self._clock()
+        asked = self._asked[number] = _Asked(*place, payload, signature, stops, now, now)
+        self._send(asked)
+
+    @property
+    def asked(self) -> bool:
+        """True while a question waits for the station."""
+        return bool(self._asked)
+
+    def sockets(self) -> list[zmq.Socket[Any]]:
+        """What can be read where an answer has come."""
+        return [asked.client.socket for asked in self._asked.values() if asked.client is not None]
+
+    def answers(self) -> list[Answered]:
+        """All that have come, and what is given up."""
+        now, found = self._clock(), []
+        for number, asked in list(self._asked.items()):
+            packed = asked.client.packed_answer() if asked.client is not None else None
+            if packed is not None:
+                found.append(Answered(number, packed))
+                self._keep(asked)
+                del self._asked[number]
+            elif asked.client is None and not asked.told and (not asked.stops or now - asked.since > _TELL_S):
+                found.append(
+                    Answered(number, failure="the station does not run on its computer: start it there")
+                )
+                asked.told = True
+            elif asked.client is None and (not asked.stops or now - asked.since > _FIND_S):
+                del self._asked[number]
+            elif now - asked.since > _PATIENCE_S:
+                self._end(number)
+            elif asked.stops and now - asked.looked > LOOK_S / 4:
+                asked.looked = now
+                self._send(asked)
+        return found
+
+    def forget(self) -> None:
+        """Nobody waits for what was asked; what was sent is carried out all the same."""
+        for number in list(self._asked):
+            self._end(number)
+
+    def listening(self) -> list[str]:
+        """The processes of the station whose sockets are there."""
+        return [process for process in (GUARD, COORDINATOR, "media") if self._is_there(process)]
+
+    def close(self) -> None:
+        """Release all sockets."""
+        self.forget()
+        for free in self._free.values():
+            free.close()
+        self._free.clear()
+
+    def _send(self, asked: _Asked) -> None:
+        """To the socket where it is now, unless it was sent there."""
+        try:
+            endpoint = str(self._endpoints.read(asked.process)[asked.socket])
+        except (TransportError, KeyError):
+            return
+        if endpoint == asked.endpoint:
+            return
+        if asked.client is not None:
+            self._taken(asked).close()
+        asked.endpoint, asked.client = endpoint, self._client((asked.process, asked.socket), endpoint)
+        try:
+            asked.client.forward(asked.payload, asked.signature)
+        except zmq.ZMQError as error:  # its queue is full: nobody reads there
+            log.warning("%s takes no more: %s", endpoint, error.strerror)
+
+    def _client(self, place: tuple[str, str], endpoint: str) -> CommandClient:
+        free = self._free.get(place)
+        if free is None or free.endpoint != endpoint:  # the station was started anew, or listens elsewhere
+            if free is not None:
+                free.close()
+            free = self._free[place] = _Free(endpoint)
+        if free.clients:
+            return free.clients.pop()
+        return CommandClient(self._context, endpoint, owner=self._endpoints.owner)
+
+    def _keep(self, asked: _Asked) -> None:
+        free, client = self._free[asked.process, asked.socket], self._taken(asked)
+        if free.endpoint == asked.endpoint:
+            free.clients.append(client)
+        else:
+            client.close()
+
+    def _taken(self, asked: _Asked) -> CommandClient:
+        client, asked.client = asked.client, None
+        assert client is not None
+        return client
+
+    def _end(self, number: int) -> None:
+        asked = self._asked.pop(number)
+        if asked.client is not None:
+            asked.client.close()
+
+    def _is_there(self, process: str) -> bool:
+        try:
+            found = self._endpoints.read(process)
+        except TransportError:
+            return False
+        places = [str(place) for place in found.values() if str(place).startswith("ipc://")]
+        return bool(places) and all(Path(place.removeprefix("ipc://")).exists() for place in places)

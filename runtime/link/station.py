@@ -1,0 +1,250 @@
+"""The station's end of the link: threads that pass commands, stops and streams between the lab and this computer.
+
+Stops have a connection, a thread and connections to the station of their own: they wait behind nothing else.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import zmq
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+from runtime.core.errors import ConfigurationError
+from runtime.ipc.bus import Key
+from runtime.link.key_files import KeyPair, KnownLab
+from runtime.link.line import Dial, Line
+from runtime.link.relay import ALLOWED, Relay
+from runtime.link.station_streams import Flow, source_of
+from runtime.link.tokens import Challenges
+from runtime.link.uploads import Uploads, UploadSettings
+from runtime.link.wire import COMMANDS, EPISODES, PICTURES, STATE, STOPS, Answer, Ask, Beat, Credit
+from runtime.link.yielding import give_way
+
+log = logging.getLogger(__name__)
+_POLL_MS = 50
+_IDLE_MS = 100  # of turns in which nothing that was asked waits for the station
+_LOOK_S = 0.2  # between two looks which processes of the station listen
+# In place of a signature, of what no user of the lab is known to have given: the station obeys it in nothing but stops.
+NOBODY = b"nobody known to the lab"
+_UPLOAD_AGAIN_S = 30.0  # after what nobody foresaw
+_MOST_STREAMS_S = 1 / 40  # between two bundles
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A station of this computer, its lab, and the key with which it is known there."""
+
+    station_dir: Path
+    lab: KnownLab
+    key: KeyPair
+    session: bytes
+
+    def dial(self, role: str) -> Dial:
+        """What a connection of that role needs."""
+        return Dial(self.lab, self.key, role, self.session)
+
+
+class Commands:
+    """Questions of the lab over the connection of one role; all of it belongs to one thread."""
+
+    def __init__(self, place: Place, role: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._place, self._role, self._clock = place, role, clock
+        self._context: zmq.Context[Any] = zmq.Context()  # what is slow in another one's delays nothing here
+        self._relay = Relay(self._context, place.station_dir, clock)
+        tokens = Ed25519PublicKey.from_public_bytes(bytes.fromhex(place.lab.tokens))
+        self._challenges = Challenges(place.lab.station, tokens, clock)
+        self._bus_key = Key(place.station_dir)
+        self._listening: list[str] = []
+        self._looked = -float("inf")
+        self._line = Line(self._context, place.dial(role), self._beat, clock)
+        self._connection = 0
+
+    def turn(self) -> None:
+        """Wait for the lab or the station, and pass on what either says."""
+        wait_ms = _POLL_MS if self._relay.asked else _IDLE_MS
+        poller = zmq.Poller()
+        for socket in (self._line.socket, *self._relay.sockets()):
+            if socket is not None:
+                poller.register(socket, zmq.POLLIN)
+        poller.poll(wait_ms)
+        for message, parts in self._line.turn():
+            if isinstance(message, Ask) and len(parts) == 1:
+                self._ask(message, parts[0])
+        if self._line.connections != self._connection:
+            self._connection = self._line.connections
+            self._relay.forget()
+        for answered in self._relay.answers():
+            self._line.send(Answer(answered.number, answered.failure), answered.packed)
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no connection to the lab, "" where there is; any thread may ask."""
+        return "" if self._line.up else self._line.why
+
+    def close(self) -> None:
+        """Release every socket."""
+        self._line.close()
+        self._relay.close()
+        self._context.destroy(linger=0)
+
+    def _beat(self) -> Beat:
+        now = self._clock()
+        if (
+            self._role == COMMANDS and now - self._looked >= _LOOK_S
+        ):  # one of both: two would contradict each other
+            self._looked, self._listening = now, self._relay.listening()
+        return Beat(self._challenges.newest(), self._listening)
+
+    def _ask(self, ask: Ask, payload: bytes) -> None:
+        if (ask.process, ask.socket) not in ALLOWED:
+            refusal = f"{ask.process}/{ask.socket} is no socket that a lab may use"
+            self._line.send(Answer(ask.number, refusal), b"")
+            return
+        wrong = self._challenges.wrong(ask, payload)
+        if wrong and not ask.stops:
+            log.warning("a command of the lab is not passed on: %s", wrong)
+            self._line.send(Answer(ask.number, f"the station did not take it: {wrong}"), b"")
+            return
+        if wrong:
+            log.warning("a stop of the lab is passed on, of a user who is not verified: %s", wrong)
+        signature = NOBODY if wrong else self._signature(payload)
+        self._relay.ask(ask.number, (ask.process, ask.socket), payload, signature, ask.stops)
+
+    def _signature(self, payload: bytes) -> bytes:
+        try:
+            return self._bus_key.sign(payload)
+        except ConfigurationError as error:
+            log.error("a command of the lab is passed on without a signature: %s", error)
+            return NOBODY
+
+
+class Streams:
+    """State and pictures, newest of each as often as the lab takes them; all of it belongs to one thread."""
+
+    def __init__(self, place: Place, clock: Callable[[], float] = time.monotonic) -> None:
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._clock = clock
+        self._flows = [self._flow(place, role) for role in (STATE, PICTURES)]
+        self._connections = [0] * len(self._flows)
+        self._sent_at = [-float("inf")] * len(self._flows)
+
+    def _flow(self, place: Place, role: str) -> tuple[Line, Flow]:
+        line = Line(self._context, place.dial(role), Beat, self._clock)
+        return line, Flow(self._context, source_of(place.station_dir, role))
+
+    def turn(self, wait_ms: int = _IDLE_MS) -> None:
+        """Wait for the lab or the station, and send what is new where the lab takes it."""
+        now = self._clock()
+        poller = zmq.Poller()
+        for (line, flow), sent_at in zip(self._flows, self._sent_at, strict=True):
+            if line.socket is not None:
+                poller.register(line.socket, zmq.POLLIN)
+            if flow.socket is not None and now - sent_at >= _MOST_STREAMS_S:
+                poller.register(flow.socket, zmq.POLLIN)
+            elif flow.socket is not None:
+                wait_ms = min(wait_ms, int(1000 * (sent_at + _MOST_STREAMS_S - now)) + 1)
+        poller.poll(wait_ms)
+        for at, (line, flow) in enumerate(self._flows):
+            self._pass(at, line, flow)
+
+    def _pass(self, at: int, line: Line, flow: Flow) -> None:
+        heard = line.turn()
+        if (
+            line.connections != self._connections[at] or not line.up
+        ):  # what was asked for is of another connection
+            flow.stop()
+            self._connections[at] = line.connections
+        for message, _ in heard:
+            if isinstance(message, Credit):
+                flow.allow(message)
+        now = self._clock()
+        if now - self._sent_at[at] < _MOST_STREAMS_S:
+            return
+        if (bundle := flow.bundle()) is not None and line.send(bundle[0], *bundle[1]):
+            self._sent_at[at] = now
+
+    def close(self) -> None:
+        """Release every socket."""
+        for line, flow in self._flows:
+            line.close()
+            flow.close()
+        self._context.destroy(linger=0)
+
+
+class StationLink:
+    """The threads of one station's link; without `uploads` its episodes stay where they are."""
+
+    def __init__(
+        self, station_dir: Path, lab: KnownLab, key: KeyPair, uploads: UploadSettings | None = None
+    ) -> None:
+        self._place = Place(station_dir, lab, key, secrets.token_bytes(16))
+        self._ended = threading.Event()
+        self.failed = threading.Event()
+        self._stops: Commands | None = None
+        self._threads = [
+            threading.Thread(target=self._work, args=(name, make), name=name, daemon=True)
+            for name, make in (
+                (STOPS, partial(Commands, self._place, STOPS)),
+                (COMMANDS, partial(Commands, self._place, COMMANDS)),
+                ("streams", partial(Streams, self._place)),
+            )
+        ]
+        if uploads is not None:
+            make = partial(Uploads, self._place.dial(EPISODES), station_dir, uploads)
+            self._threads.append(
+                threading.Thread(target=self._upload, args=(make,), name=EPISODES, daemon=True)
+            )
+
+    def start(self) -> None:
+        """Begin; returns at once."""
+        for thread in self._threads:
+            thread.start()
+
+    def end(self) -> None:
+        """End all of it."""
+        self._ended.set()
+        for thread in self._threads:
+            thread.join()
+
+    @property
+    def trouble(self) -> str:
+        """Why the lab cannot stop the station just now, "" where it can."""
+        return "not connected yet" if self._stops is None else self._stops.trouble
+
+    def _work(self, name: str, make: Callable[[], Commands | Streams]) -> None:
+        """One thread; what nobody foresaw ends the process, which is started again, rather than a part of it."""
+        part = None
+        try:
+            part = make()
+            if name == STOPS and isinstance(part, Commands):
+                self._stops = part
+            while not self._ended.is_set():
+                part.turn()
+        except Exception:
+            log.exception("the link's thread %s ends", name)
+            self.failed.set()
+        finally:
+            if part is not None:
+                part.close()
+
+    def _upload(self, make: Callable[[], Uploads]) -> None:
+        """The thread of episodes: whatever befalls it, stops and commands go on, and it begins anew."""
+        give_way()
+        while not self._ended.is_set():
+            try:
+                with closing(make()) as part:
+                    while not self._ended.is_set():
+                        part.turn()
+            except Exception:
+                log.exception("episodes are sent to the lab again in %g s", _UPLOAD_AGAIN_S)
+                self._ended.wait(_UPLOAD_AGAIN_S)

@@ -1,0 +1,56 @@
+"""What a station's own computer knows of its link: in the station's folder, for its panel."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from runtime.core.errors import TransportError
+from runtime.ipc.bus import Endpoints
+
+UPLINK = "uplink"
+_NOT_RUNNING = "the process of the link does not run"
+
+
+@dataclass(frozen=True, slots=True)
+class Uplink:
+    """A lab by its name, and since when [Unix time, s] and why there is no link to it; since 0 where there is."""
+
+    lab: str
+    since: float = 0.0
+    why: str = ""
+
+
+class Telling:
+    """Says it in the station's folder whenever it is another."""
+
+    def __init__(self, endpoints: Endpoints, lab: str, clock: Callable[[], float] = time.time) -> None:
+        self._endpoints, self._clock = endpoints, clock
+        self._said: Uplink | None = None
+        self._lab = lab
+
+    def look(self, trouble: str) -> None:
+        """`trouble` says why there is no link just now, "" where there is one."""
+        before = self._said
+        lost = before is not None and before.why
+        since = 0.0 if not trouble else before.since if lost and before else self._clock()
+        now = Uplink(self._lab, since, trouble)
+        if now != before or self._endpoints.lost(UPLINK):
+            self._said = now
+            self._endpoints.write(UPLINK, {"lab": now.lab, "since": repr(now.since), "why": now.why})
+
+    def end(self) -> None:
+        """Nobody knows any more."""
+        self._endpoints.withdraw(UPLINK)
+
+
+def read_uplink(endpoints: Endpoints) -> dict[str, Any] | None:
+    """lab, since, why, for JSON; None where the station is not linked to a lab."""
+    try:
+        found = endpoints.read(UPLINK)
+        told = {"lab": str(found["lab"]), "since": float(found["since"]), "why": str(found["why"])}
+    except (TransportError, KeyError, ValueError, TypeError):
+        return None
+    return told if endpoints.served(UPLINK) else told | {"why": _NOT_RUNNING}
