@@ -13,15 +13,17 @@ http = get_asgi_application()  # before anything that imports models
 from channels.routing import ProtocolTypeRouter, URLRouter
 from channels.security.websocket import AllowedHostsOriginValidator
 from channels.sessions import CookieMiddleware
+from django.conf import settings
 
 from evaweb.api.door import StopDoor
 from evaweb.console.origins import SameOrigin
 from evaweb.console.routing import websocket_urlpatterns
 from evaweb.slots import Slots
+from evaweb.static_files import StaticFiles
 
 application = ProtocolTypeRouter(
     {
-        "http": StopDoor(Slots(http)),
+        "http": StopDoor(StaticFiles(Slots(http), settings.STATIC_DIGEST)),
         "websocket": SameOrigin(
             AllowedHostsOriginValidator(CookieMiddleware(URLRouter(websocket_urlpatterns)))
         ),

@@ -15,8 +15,9 @@ from typing import Any
 from django.core.exceptions import ImproperlyConfigured
 
 from evaweb.errors import NotAllowed
+from runtime.core.sentences import fixed, identity, plain, shows
 
-HIDDEN = "hidden until the reveal"
+HIDDEN = fixed("blinding.hidden", "hidden until the reveal")
 
 # Sentences that no checkpoint has a part in. All others may name a server, a time or a number of rows.
 _HARMLESS = re.compile(
@@ -30,6 +31,7 @@ _HARMLESS = re.compile(
     | (abandoned|chosen\ again)(\ \([\w.@+-]+\))?
     | the\ e-stop\ was\ (pressed|released)[\w .,:@+-]*
     | lease\ [\w .,]*
+    | nobody\ commands\ the\ station:\ [\w .,;+]*
     | too\ little\ room\ to\ record\ in\ [^\n:]*:\ [\w ,]*\ wanted\ [\w .;()]*
     | disk\ (full|error)\ while\ creating\ [^\n:]*:\ [\w ;]*\ free\ in\ [^\n:]*
     """,
@@ -42,8 +44,7 @@ class Sight:
     """Data hidden from one user: checkpoints by id and by name, in trials, episodes and at stations.
 
     `stations` are those, by name, at which a trial of such a plan was handed out; `at_work` those at which one is not
-    finished; `plans` says of which, in words, `keys` by their ids. `revealed`: evaluations of plans that were, whose
-    trials are told whatever other plan has their checkpoints too.
+    finished; `plans` says of which, in words, `keys` by their ids.
     """
 
     checkpoints: frozenset[int] = frozenset()
@@ -51,7 +52,6 @@ class Sight:
     stations: frozenset[str] = frozenset()
     at_work: frozenset[str] = frozenset()
     keys: frozenset[int] = frozenset()
-    revealed: frozenset[int] = frozenset()
     plans: str = ""
 
     @property
@@ -60,14 +60,17 @@ class Sight:
         return not self.checkpoints
 
     def hides_plan(self, plan: Any) -> bool:
-        """True if what the plan says of its checkpoints is hidden: question, digest, what was amended."""
-        return plan.pk in self.keys
+        """True if what the plan says of its checkpoints is hidden: question, digest, what was amended.
+
+        The draft of an amendment says the same as the plan that it amends.
+        """
+        return plan.pk in self.keys or (plan.state == "draft" and plan.amends_id in self.keys)
 
     # --- trials and checkpoints ------------------------------------------------------------------------------
 
     def hides(self, trial: Any) -> bool:
         """True if the checkpoint of this trial is hidden."""
-        return trial.checkpoint_id in self.checkpoints and trial.evaluation_id not in self.revealed
+        return trial.checkpoint_id in self.checkpoints
 
     def label(self, trial: Any) -> str:
         """Shown name of a trial's checkpoint: its own; of a hidden one the code of the trial."""
@@ -82,8 +85,10 @@ class Sight:
         return self.told(trial.reason)
 
     def told(self, text: str) -> str:
-        """A station's sentence as a user may read it from whom something is hidden."""
-        return text if not text or _HARMLESS.fullmatch(text) else HIDDEN
+        """A station's sentence as a user may read it from whom something is hidden; with its id if it is all shown."""
+        if text and not _HARMLESS.fullmatch(text):
+            return HIDDEN
+        return text if shows(text, identity(text)["arguments"]) else plain(text)
 
     def open(self, rows: Any, checkpoint: str = "checkpoint") -> Any:
         """The rows of a query that are of no hidden checkpoint; `checkpoint` leads to it."""
@@ -104,6 +109,16 @@ class Sight:
         if not self.hides_episode(episode):
             return str(trial.checkpoint.name if trial is not None else episode.checkpoint)
         return self.label(trial) if trial is not None else HIDDEN
+
+    def tags_of(self, episode: Any) -> list[str]:
+        """Tags of a recording as far as they name no hidden checkpoint: people write what they like."""
+        return [tag.words for tag in episode.tags.all() if not self.named_in(tag.words)]
+
+    def named_in(self, words: str) -> bool:
+        """True if words of somebody name a hidden checkpoint, in whatever letters."""
+        return any(
+            re.search(rf"(?<!\w){re.escape(name.casefold())}(?!\w)", words.casefold()) for name in self.names
+        )
 
     def require_episode(self, episode: Any) -> None:
         """NotAllowed for the parts of a recording that tell which policy made it."""

@@ -30,6 +30,12 @@ def reason_of(context: Any, trial: Any) -> str:
 
 
 @register.simple_tag(takes_context=True)
+def tags_of(context: Any, episode: Any) -> list[str]:
+    """The tags of a recording that may be shown."""
+    return sight_for(context["request"]).tags_of(episode)
+
+
+@register.simple_tag(takes_context=True)
 def hidden(context: Any, trial: Any) -> bool:
     """True if the trial's checkpoint is hidden."""
     return sight_for(context["request"]).hides(trial)

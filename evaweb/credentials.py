@@ -30,6 +30,7 @@ from django.db import connection
 from evaweb.lock_wait import hurried
 from evaweb.lookups import Crowded, Lookups
 from evaweb.roles import Role, role_of
+from runtime.core.sentences import Pattern
 
 log = logging.getLogger(__name__)
 SESSION, TOKEN = "session", "token"
@@ -48,6 +49,11 @@ _RECHECK_S = 0.25  # for which a stop of somebody who is remembered waits for it
 RETRY_AFTER_S = 1
 Credential = tuple[str, str]  # its kind, and the secret
 _Key = tuple[str, str]  # a kind, and the digest of a secret
+
+
+_AWAY = Pattern("credentials.database_away", "the database does not answer: {why}")
+_LATE = Pattern("credentials.database_late", "the database did not answer within {seconds:g} s")
+_NO_TURN = Pattern("credentials.no_turn", "the database has not come to this login within {seconds:g} s")
 
 
 class Unverifiable(Exception):
@@ -231,7 +237,7 @@ class Credentials:
         failed = asked.exception()
         if isinstance(failed, Crowded):
             return Busy(str(failed))
-        return asked.result() if failed is None else Unverifiable(f"the database does not answer: {failed}")
+        return asked.result() if failed is None else Unverifiable(_AWAY(why=failed))
 
     def _is_known_as_nobodys(self, key: _Key) -> bool:
         with self._lock:
@@ -279,9 +285,9 @@ def patience(came: float, answered: float, now: float) -> float:
     """
     silent = max(came, answered) + _PATIENCE_S - now
     if silent <= 0:
-        raise Unverifiable(f"the database did not answer within {_PATIENCE_S:g} s")
+        raise Unverifiable(_LATE(seconds=_PATIENCE_S))
     if came + _TURN_S <= now:
-        raise Busy(f"the database has not come to this login within {_TURN_S:g} s")
+        raise Busy(_NO_TURN(seconds=_TURN_S))
     return min(silent, came + _TURN_S - now)
 
 

@@ -2,21 +2,45 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import secrets
+import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
+from urllib.parse import urlsplit
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from django.core.exceptions import ImproperlyConfigured
 
 _TRUE, _FALSE = ("1", "true", "yes", "on"), ("0", "false", "no", "off", "")
 _LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
+
+
+@dataclass(frozen=True, slots=True)
+class Bucket:
+    """A bucket of an S3-compatible store: `endpoint` of a server that is not Amazon's, else "", and the key."""
+
+    name: str
+    prefix: str
+    endpoint: str
+    region: str
+    key: str
+    secret: str = field(repr=False)
+
+    @property
+    def origin(self) -> str:
+        """From where browsers get signed addresses, for the policy of pages."""
+        return self.endpoint or f"https://s3.{self.region}.amazonaws.com"
+
+    def __str__(self) -> str:
+        return f"s3://{self.name}/{self.prefix}".rstrip("/")
 
 
 def flag(name: str, default: bool) -> bool:
@@ -36,18 +60,37 @@ def words(name: str, default: tuple[str, ...] = ()) -> list[str]:
     return list(default) if given is None else [word.strip() for word in given.split(",") if word.strip()]
 
 
-def seconds(name: str, default: float) -> float:
-    """A time above zero [s]."""
+def _number(name: str, default: float, least: float, most: float, allowed: str) -> float:
     given = os.environ.get(name)
     if given is None:
         return default
     try:
         value = float(given)
     except ValueError:
-        value = 0.0
-    if not 0 < value < float("inf"):
-        raise ImproperlyConfigured(f"{name} = {given!r}; allowed: seconds above zero")
+        value = math.nan
+    if not least <= value <= most:
+        raise ImproperlyConfigured(f"{name} = {given!r}; allowed: {allowed}")
     return value
+
+
+def seconds(name: str, default: float) -> float:
+    """A time above zero [s]."""
+    return _number(name, default, sys.float_info.min, sys.float_info.max, "seconds above zero")
+
+
+def gigabytes(name: str, default: float) -> float:
+    """A size from zero [GB]."""
+    return _number(name, default, 0.0, 1e6, "gigabytes from 0 to 1000000")
+
+
+def niceness(name: str, default: int) -> int:
+    """How much a process gives way to others, from 0 (not at all) to 19."""
+    given = os.environ.get(name)
+    if given is None:
+        return default
+    if not (given.isascii() and given.isdecimal() and int(given) <= 19):
+        raise ImproperlyConfigured(f"{name} = {given!r}; allowed: 0 to 19")
+    return int(given)
 
 
 def networks(name: str) -> list[IPv4Network | IPv6Network]:
@@ -59,6 +102,19 @@ def networks(name: str) -> list[IPv4Network | IPv6Network]:
         raise ImproperlyConfigured(
             f"{name} = {given!r}: {error}; allowed: addresses and networks such as 127.0.0.1, 10.0.0.0/24"
         ) from None
+
+
+def address(name: str) -> tuple[str, int] | None:
+    """A host and a port, HOST:PORT; None where it is not given."""
+    given = os.environ.get(name, "").strip()
+    if not given:
+        return None
+    host, _, port = given.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65535:
+        raise ImproperlyConfigured(
+            f"{name} = {given!r}; allowed: HOST:PORT such as 0.0.0.0:8470, the port below 65535"
+        )
+    return host.strip("[]"), int(port)
 
 
 def log_level(name: str, default: str) -> str:
@@ -80,6 +136,46 @@ def time_zone(name: str, default: str) -> str:
         raise ImproperlyConfigured(
             f"{name} = {given!r}; allowed: names such as UTC, Europe/Berlin, Asia/Shanghai"
         ) from None
+
+
+def store() -> Path | Bucket | None:
+    """Where large files lie that never change: a folder or a bucket of EVA_STORE; None where it is not given."""
+    given = os.environ.get("EVA_STORE", "").strip()
+    if not given:
+        return None
+    if not given.startswith("s3://"):
+        folder = Path(given).expanduser()
+        if not folder.is_absolute() or not folder.is_dir():
+            raise ImproperlyConfigured(
+                f"EVA_STORE = {given!r}; allowed: the path of a folder that is there, or s3://BUCKET/PREFIX"
+            )
+        return folder
+    name, _, prefix = given.removeprefix("s3://").partition("/")
+    if not re.fullmatch("[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]", name):
+        raise ImproperlyConfigured(f"EVA_STORE = {given!r}; allowed: s3://BUCKET or s3://BUCKET/PREFIX")
+    if find_spec("obstore") is None:
+        raise ImproperlyConfigured(
+            "EVA_STORE names a bucket, and obstore is absent: .venv/bin/python -m pip install -e '.[s3]'"
+        )
+    key, secret = os.environ.get("EVA_STORE_KEY", ""), os.environ.get("EVA_STORE_SECRET", "")
+    if not key or not secret:
+        raise ImproperlyConfigured(
+            "EVA_STORE names a bucket: give its key in EVA_STORE_KEY and EVA_STORE_SECRET"
+        )
+    region = os.environ.get("EVA_STORE_REGION") or "us-east-1"
+    return Bucket(name, prefix.strip("/"), _endpoint("EVA_STORE_ENDPOINT"), region, key, secret)
+
+
+def _endpoint(name: str) -> str:
+    """An origin, which goes into the policy of pages as it is; "" where it is not given."""
+    given = os.environ.get(name, "").strip().rstrip("/")
+    parts = urlsplit(given)
+    whole = f"{parts.scheme}://{parts.netloc}"
+    if given and (given != whole or not re.fullmatch(r"https?://[A-Za-z0-9.\[\]:-]+", given)):
+        raise ImproperlyConfigured(
+            f"{name} = {given!r}; allowed: an origin such as https://s3.example.org:9000"
+        )
+    return given
 
 
 def require_driver(name: str, engine: str) -> None:

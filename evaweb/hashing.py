@@ -12,6 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 from django.contrib.auth.hashers import PBKDF2PasswordHasher
 
 from evaweb.errors import EvaError
+from runtime.core.sentences import fixed
+
+_TOO_MANY_PASSWORDS_BEING_CHECKED = fixed(
+    "web.hashing.too_many_passwords_being_checked",
+    "too many passwords are being checked: try again in a few seconds",
+)
 
 _MOST_WAITING = 16
 _NICE = 10
@@ -37,7 +43,7 @@ class QueuedHasher(PBKDF2PasswordHasher):
     def encode(self, password: str, salt: str, iterations: int | None = None) -> str:
         """The hash; raises Busy."""
         if not _places.acquire(blocking=False):
-            raise Busy("too many passwords are being checked: try again in a few seconds")
+            raise Busy(_TOO_MANY_PASSWORDS_BEING_CHECKED)
         try:
             made: str = _thread.submit(super().encode, password, salt, iterations).result()
             return made

@@ -29,14 +29,14 @@ BARE = [  # the headers of such an answer
     (b"cross-origin-opener-policy", b"same-origin"),
 ]
 
-CONTENT_SECURITY_POLICY: dict[str, Any] = {
+_POLICY: dict[str, Any] = {
     "DIRECTIVES": {
         "default-src": [SELF],
         "script-src": [SELF],
         "style-src": [SELF, NONCE, *_VIEWER_STYLES],
         "img-src": [SELF, "data:"],
         "connect-src": [SELF],  # its websockets as well
-        "worker-src": [NONE],
+        "worker-src": [SELF],  # static/console/commands/beat.js
         "frame-src": [NONE],
         "object-src": [NONE],
         "base-uri": [NONE],
@@ -44,6 +44,12 @@ CONTENT_SECURITY_POLICY: dict[str, Any] = {
         "frame-ancestors": [NONE],
     }
 }
+
+
+def content_security_policy(videos: str = "") -> dict[str, Any]:
+    """The policy of pages; `videos` is an origin from which they may play some, "" for none but ours."""
+    directives = dict(_POLICY["DIRECTIVES"])
+    return {"DIRECTIVES": directives | ({"media-src": [SELF, videos]} if videos else {})}
 
 
 class HeadersMiddleware(MiddlewareMixin):

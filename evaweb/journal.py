@@ -34,9 +34,20 @@ from pydantic import (
 
 from evaweb.errors import EvaError
 from evaweb.roles import known_person
+from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
 
 log = logging.getLogger(__name__)
+_CONTAINS_CHARACTER_U_0000_WHICH = Pattern(
+    "web.journal.contains_character_u_0000_which",
+    "{name} contains the character U+0000, which no database keeps: remove it",
+)
+_HAS_CHARACTERS_ALLOWED_AT_MOST = Pattern(
+    "web.journal.has_characters_allowed_at_most",
+    "{name} has {count} characters; allowed: at most {longest}",
+)
+_ITS_IS_OF = Pattern("web.journal.its_is_of", "its {verbose_name} {uuid} is of {belongs} {other}")
+_NOT_KEPT = Pattern("web.journal.not_kept", "not kept: {strerror} ({path}); {done}")
 
 
 class NotKept(EvaError):
@@ -48,10 +59,10 @@ class NotKept(EvaError):
 def text(name: str, given: str, longest: int) -> str:
     """A text as it was typed, without blanks at its ends; EvaError where it cannot be stored."""
     if "\x00" in given:
-        raise EvaError(f"{name} contains the character U+0000, which no database keeps: remove it")
+        raise EvaError(_CONTAINS_CHARACTER_U_0000_WHICH(name=name))
     stripped = given.strip()
     if len(stripped) > longest:
-        raise EvaError(f"{name} has {len(stripped)} characters; allowed: at most {longest}")
+        raise EvaError(_HAS_CHARACTERS_ALLOWED_AT_MOST(name=name, count=len(stripped), longest=longest))
     return stripped
 
 
@@ -168,7 +179,9 @@ def absent(model: type[Model], lines: Sequence[AnyLine], **owner: Model) -> list
     rows = dict(model._default_manager.filter(uuid__in=last).values_list("uuid", belongs))
     for uuid, other in rows.items():
         if other != whose.pk:
-            raise EvaError(f"its {model._meta.verbose_name} {uuid} is of {belongs} {other}")
+            raise EvaError(
+                _ITS_IS_OF(verbose_name=model._meta.verbose_name, uuid=uuid, belongs=belongs, other=other)
+            )
     return [line for uuid, line in last.items() if uuid not in rows]
 
 
@@ -253,7 +266,7 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
                 done = _taken_back(file, before)
                 raise
     except OSError as error:
-        raise NotKept(f"not kept: {error.strerror} ({path}); {done}") from error
+        raise NotKept(_NOT_KEPT(strerror=error.strerror, path=path, done=done)) from error
 
 
 def _written(file: FileIO, payload: bytes) -> None:

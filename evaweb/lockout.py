@@ -13,18 +13,27 @@ from django.utils import timezone
 
 from evaweb.callers import address_of
 from evaweb.refusals import told
+from runtime.core.sentences import Pattern
+
+_LOCKED = Pattern(
+    "login.locked",
+    "The password was wrong {times} times for this name from this computer. Try again in {minutes} minutes; "
+    "an administrator can unlock it earlier. Anyone who is already logged in stays logged in.",
+)
+_LOCKED_FOR_A_MINUTE = Pattern(
+    "login.locked_for_a_minute",
+    "The password was wrong {times} times for this name from this computer. Try again in {minutes} minute; "
+    "an administrator can unlock it earlier. Anyone who is already logged in stays logged in.",
+)
 
 
 def answer(request: HttpRequest, *given: Any) -> HttpResponse:
     """429 with how long it lasts."""
     seconds = _left(request)
     minutes = ceil(seconds / 60)
-    sentence = (
-        f"The password was wrong {settings.AXES_FAILURE_LIMIT} times for this name from this computer. "
-        f"It can be tried again in {minutes} minute{'s' if minutes > 1 else ''}; "
-        "an administrator can unlock it before. Who is logged in already stays so."
-    )
-    response = told(request, sentence, 429, "registration/locked.html")
+    sentence = _LOCKED if minutes > 1 else _LOCKED_FOR_A_MINUTE
+    said = sentence(times=settings.AXES_FAILURE_LIMIT, minutes=minutes)
+    response = told(request, said, 429, "registration/locked.html")
     response["Retry-After"] = str(seconds)
     return response
 

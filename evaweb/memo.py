@@ -34,6 +34,12 @@ class Kept(Generic[T]):
                 self._rows.popitem(last=False)
         return made
 
+    def renew(self, key: Hashable, make: Callable[[T | None], T]) -> T:
+        """What `make` makes of the value of before, None where there is none; two who ask at once both make theirs."""
+        with self._lock:
+            found = self._rows.get(key)
+        return self.get(key, object(), lambda: make(found[1] if found else None))
+
     def clear(self) -> None:
         """Forget all of it."""
         with self._lock:

@@ -1,4 +1,4 @@
-"""Modes of the files with passwords and sessions, their user's alone: looked at when a process starts."""
+"""Whether the data folder is its user's alone, and all there: looked at when a process starts."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from django.conf import settings
-from django.core.checks import CheckMessage, Tags, Warning, register
+from django.core.checks import CheckMessage, Error, Tags, Warning, register
 
 from evaweb.environment import beside, readable_by_others
+
+RESTORING = ".restoring"  # of the data folder: what a restore has copied and not put in its place yet
 
 
 @register(Tags.security)
@@ -22,6 +24,21 @@ def data_is_private(**options: Any) -> list[CheckMessage]:
         )
         for path in _private()
         if path.exists() and readable_by_others(path)
+    ]
+
+
+@register()
+def data_is_whole(**options: Any) -> list[CheckMessage]:
+    """No restore of a backup was cut off, which leaves the database without its files."""
+    draft = Path(settings.DATA_DIR) / RESTORING
+    if not draft.exists():
+        return []
+    return [
+        Error(
+            f"{draft} is there: a backup is being put back, or that was cut off",
+            hint="if no restore is running, empty the data folder and the database, and restore again",
+            id="evaweb.E001",
+        )
     ]
 
 

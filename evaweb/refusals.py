@@ -18,11 +18,22 @@ from django.shortcuts import render
 from django.utils.deprecation import MiddlewareMixin
 from django.views import defaults
 
-from evaweb.errors import EvaError
+from evaweb.errors import EvaError, refusal
+from evaweb.races import TAKEN, was_taken
 from evaweb.storage import refusal_of
+from runtime.core.sentences import Pattern, fixed
 
 log = logging.getLogger(__name__)
 _NO_TEXT = re.compile("[\x00\ud800-\udfff]")
+_NUL_IN_ADDRESS = fixed("web.nul_in_address", "there is a NUL in the address")
+_NUL_IN_WHAT_WAS_SENT = fixed("web.nul_in_what_was_sent", "there is a NUL in what was sent; allowed: text")
+_NOWHERE = Pattern(
+    "web.nowhere",
+    "{path} does not exist; docs/openapi.json and /api/v1/openapi.json list the addresses",
+)
+_NO_METHOD = Pattern("web.no_method", "{method:.20} is not possible at this address; allowed: {allowed}")
+_DATABASE_AWAY = fixed("web.database_away", "the database is busy or gone: try again")
+_FAILED = fixed("web.failed", "this failed; the log of the web says why")
 
 
 class LoginMiddleware(LoginRequiredMiddleware):
@@ -36,16 +47,16 @@ class LoginMiddleware(LoginRequiredMiddleware):
 
 
 class RefusalMiddleware(MiddlewareMixin):
-    """A page with the sentence for a browser that navigates, {"error": sentence} for everything else."""
+    """A page with the sentence for a browser that navigates, JSON as by `errors.refusal` for everything else."""
 
     def process_view(self, request: HttpRequest, *given: Any) -> HttpResponse | None:
         # REST reads its body itself, and looks at it in evaweb.api.questions.
         fields = [request.GET] if _of_programs(request) else [request.GET, request.POST]
         texts = (text for one in fields for name, values in one.lists() for text in (name, *values))
         if not is_text(request.path):
-            return told(request, "there is a NUL in the address", 404, "refused.html")
+            return told(request, _NUL_IN_ADDRESS, 404, "refused.html")
         if not all(map(is_text, texts)):
-            return told(request, "there is a NUL in what was sent; allowed: text", 400, "refused.html")
+            return told(request, _NUL_IN_WHAT_WAS_SENT, 400, "refused.html")
         return None
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
@@ -63,6 +74,9 @@ class RefusalMiddleware(MiddlewareMixin):
         if _is_no_number(exception):
             log.warning("%a was refused", request.path, exc_info=exception)
             return told(request, f"{exception!s:.120}", 400, "refused.html")
+        if was_taken(exception):
+            log.warning("%a was refused: %s", request.path, exception)
+            return told(request, TAKEN, 409, "refused.html")
         if not isinstance(exception, EvaError):
             return None
         return told(request, str(exception), exception.status, "refused.html")
@@ -70,7 +84,7 @@ class RefusalMiddleware(MiddlewareMixin):
 
 def nowhere(path: str) -> str:
     """Sentence on an unknown address of REST."""
-    return f"{path} does not exist; docs/openapi.json and /api/v1/openapi.json list the addresses"
+    return _NOWHERE(path=path)
 
 
 def _sentence_of(request: HttpRequest, response: HttpResponseBase) -> str:
@@ -78,13 +92,15 @@ def _sentence_of(request: HttpRequest, response: HttpResponseBase) -> str:
         return nowhere(request.path)
     if response.status_code == 405:
         allowed = response.headers.get("Allow") or "nothing"
-        return f"{request.method:.20} is not possible at this address; allowed: {allowed}"
+        return _NO_METHOD(method=request.method, allowed=allowed)
     return response.reason_phrase
 
 
 def _is_no_number(exception: Exception) -> bool:
-    """True if forms have let through what is no number of the database's."""
-    return isinstance(exception, OverflowError) or "expected a number but got" in str(exception)
+    """True if forms have let through what is no number of the database's, or of Python's."""
+    said = str(exception)
+    none = "expected a number but got" in said or said.startswith("Exceeds the limit")
+    return isinstance(exception, OverflowError) or none
 
 
 def is_text(given: str) -> bool:
@@ -93,10 +109,10 @@ def is_text(given: str) -> bool:
 
 
 def told(request: HttpRequest, sentence: str, status: int, template: str) -> HttpResponse:
-    """`template` with the sentence for a browser that navigates, {"error": sentence} for everything else."""
+    """`template` with the sentence for a browser that navigates, JSON as by `errors.refusal` for everything else."""
     if "text/html" in request.headers.get("Accept", "") and not _of_programs(request):
         return render(request, template, {"sentence": sentence, "status": status}, status=status)
-    return JsonResponse({"error": sentence}, status=status)
+    return JsonResponse(refusal(sentence), status=status)
 
 
 def bad_request(request: HttpRequest, exception: Exception) -> HttpResponse:
@@ -113,8 +129,8 @@ def server_error(request: HttpRequest) -> HttpResponse:
     if not _of_programs(request):
         return defaults.server_error(request)
     if isinstance(fault, Error):
-        return JsonResponse({"error": "the database is busy or gone: try again"}, status=503)
-    return JsonResponse({"error": "this failed; the log of the web has why"}, status=500)
+        return JsonResponse(refusal(_DATABASE_AWAY), status=503)
+    return JsonResponse(refusal(_FAILED), status=500)
 
 
 def _of_programs(request: HttpRequest) -> bool:

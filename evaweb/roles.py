@@ -9,8 +9,13 @@ from typing import Any
 from django.db import transaction
 
 from evaweb.errors import NotAllowed
+from runtime.core.sentences import Pattern
 
 log = logging.getLogger(__name__)
+_NEEDS_ROLE = Pattern(
+    "web.roles.needs_role",
+    "{user} is {role}; this needs {needed}: ask an administrator",
+)
 
 
 class Role(StrEnum):
@@ -19,6 +24,10 @@ class Role(StrEnum):
     VIEWER = "viewer"
     OPERATOR = "operator"
     ADMIN = "admin"
+
+    def includes(self, other: Role) -> bool:
+        """True if this role has all rights of the other."""
+        return _RANK[self] >= _RANK[other]
 
     @property
     def a(self) -> str:
@@ -40,8 +49,8 @@ def role_of(user: Any) -> Role:
 def require(user: Any, role: Role) -> Role:
     """The role of the user; NotAllowed unless it is at least `role`."""
     has = role_of(user)
-    if _RANK[has] < _RANK[role]:
-        raise NotAllowed(f"{user.get_username()} is {has.a}; this needs {role.a}: ask an administrator")
+    if not has.includes(role):
+        raise NotAllowed(_NEEDS_ROLE(user=user.get_username(), role=has.a, needed=role.a))
     return has
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from datetime import timedelta
-from importlib.metadata import PackageNotFoundError, files
+from importlib.metadata import PackageNotFoundError, files, version
 from pathlib import Path
 
 import dj_database_url
 from django.core.exceptions import ImproperlyConfigured
 
 from evaweb import environment, headers
+from evaweb.static_files import digest_of
 
 BASE_DIR = environment.checkout(Path(__file__).parents[1])
 DATA_DIR = environment.data_dir(BASE_DIR / "data")
@@ -41,6 +42,7 @@ INSTALLED_APPS = [
     "evaweb.datasets",
     "evaweb.results",
     "evaweb.preflights",
+    "evaweb.setup",
     "evaweb.console",
     "evaweb.api",
     "evaweb.lab",
@@ -50,7 +52,6 @@ MIDDLEWARE = [
     "evaweb.headers.HeadersMiddleware",
     "django.middleware.security.SecurityMiddleware",
     "csp.middleware.CSPMiddleware",
-    "whitenoise.middleware.WhiteNoiseMiddleware",
     "evaweb.cookies.AnySessionMiddleware",
     "django.middleware.common.CommonMiddleware",
     "django.middleware.csrf.CsrfViewMiddleware",
@@ -80,7 +81,11 @@ TEMPLATES = [
                 "django.contrib.auth.context_processors.auth",
                 "django.contrib.messages.context_processors.messages",
             ],
-            "builtins": ["evaweb.blinding_tags"],  # no template names a checkpoint in another way
+            "builtins": [
+                "evaweb.blinding_tags",  # no template names a checkpoint in another way
+                "evaweb.language_tags",
+                "evaweb.time_tags",
+            ],
         },
     }
 ]
@@ -109,7 +114,7 @@ def _database() -> dict[str, object]:
     if not url:
         # Whoever can read it can be everybody who is logged in.
         name = environment.private_file(DATA_DIR / "eva.sqlite3")
-        return {"ENGINE": "django.db.backends.sqlite3", "NAME": name, "OPTIONS": _SQLITE}
+        return {"ENGINE": "evaweb.sqlite3", "NAME": name, "OPTIONS": _SQLITE}
     try:
         # Each request has a thread of its own: a connection that outlived its request would never be used again.
         found = dj_database_url.parse(url, conn_max_age=0)
@@ -119,7 +124,7 @@ def _database() -> dict[str, object]:
         ) from None
     environment.require_driver("DATABASE_URL", found["ENGINE"])
     if found["ENGINE"].endswith("sqlite3"):
-        found["OPTIONS"] = _SQLITE
+        found |= {"ENGINE": "evaweb.sqlite3", "OPTIONS": _SQLITE}
     if found["ENGINE"].endswith("postgresql"):
         found["OPTIONS"] = {**_POSTGRESQL, **found.get("OPTIONS", {})}
     return dict(found)
@@ -145,16 +150,15 @@ def _viewer() -> Path | None:
     return Path(str(scripts[0].locate())).parent if scripts else None
 
 
-STATIC_URL = "static/"
-STATIC_ROOT = DATA_DIR / "static"  # for a web server in front; our own processes serve from the sources
-STATIC_ROOT.mkdir(exist_ok=True)
-STATICFILES_DIRS: list[object] = [BASE_DIR / "static"]
+LANGUAGES_DIR = BASE_DIR / "static" / "languages"  # of the sentences that are shown: evaweb.languages
+STATICFILES_DIRS: list[Path | tuple[str, Path]] = [BASE_DIR / "static"]
 # `make setup` brings both; the system check of evaweb.console says so where one is absent.
 for _name, _folder in (("meshcat", _viewer()), ("uplot", BASE_DIR / "node_modules" / "uplot" / "dist")):
     if _folder is not None and _folder.is_dir():
         STATICFILES_DIRS.append((_name, _folder))
-WHITENOISE_USE_FINDERS = True
-WHITENOISE_MAX_AGE = 0  # names carry no hash: a browser asks each time, and is told that nothing changed
+_FOLDERS = [Path(entry[1] if isinstance(entry, tuple) else entry) for entry in STATICFILES_DIRS]
+STATIC_DIGEST = "" if DEBUG else digest_of(_FOLDERS, *map(version, ("django", "django-htmx")))
+STATIC_URL = f"static/{STATIC_DIGEST}/" if STATIC_DIGEST else "static/"
 
 # --- language, security, log -------------------------------------------------------------------------------
 
@@ -162,8 +166,8 @@ LANGUAGE_CODE = "en-gb"
 TIME_ZONE = environment.time_zone("EVA_TIME_ZONE", "UTC")
 USE_TZ = True
 # Cookies know no ports: another lab of this host, or another program of Django's, has cookies of other names.
-_LAB = environment.lab_id(DATA_DIR)
-SESSION_COOKIE_NAME, CSRF_COOKIE_NAME = f"eva_session_{_LAB}", f"eva_csrf_{_LAB}"
+EVA_LAB_ID = environment.lab_id(DATA_DIR)
+SESSION_COOKIE_NAME, CSRF_COOKIE_NAME = f"eva_session_{EVA_LAB_ID}", f"eva_csrf_{EVA_LAB_ID}"
 MESSAGE_STORAGE = (
     "django.contrib.messages.storage.session.SessionStorage"  # not in a cookie of its usual name
 )
@@ -173,7 +177,9 @@ SESSION_COOKIE_SECURE = CSRF_COOKIE_SECURE = _HTTPS
 SECURE_PROXY_SSL_HEADER = ("HTTP_X_FORWARDED_PROTO", "https") if _HTTPS else None
 # Browsers remember for so long that this name is reached over HTTPS alone; a month, so that it can be taken back.
 SECURE_HSTS_SECONDS = int(environment.seconds("EVA_HSTS_S", 30 * 24 * 3600)) if _HTTPS else 0
-CONTENT_SECURITY_POLICY = headers.CONTENT_SECURITY_POLICY
+# Where large files lie that never change: None, they stay in the data folder; another folder, or a bucket.
+EVA_STORE = environment.store()
+CONTENT_SECURITY_POLICY = headers.content_security_policy(getattr(EVA_STORE, "origin", ""))
 SECURE_REFERRER_POLICY = "same-origin"
 X_FRAME_OPTIONS = "DENY"
 AUTHENTICATION_BACKENDS = [
@@ -212,9 +218,19 @@ LOGGING = {
 
 # The proxies in front, whose X-Forwarded-For is believed.
 EVA_PROXIES = environment.networks("EVA_PROXIES")
+# Where stations on other computers connect; None: there are none. The port after it takes their pictures.
+EVA_GATE = environment.address("EVA_GATE")
+# By which name those computers reach this one.
+EVA_GATE_NAME = os.environ.get("EVA_GATE_NAME", "")
+# How much of the disk stays free of what stations on other computers send [GB].
+EVA_RESERVE_BYTES = int(1e9 * environment.gigabytes("EVA_RESERVE_GB", 5.0))
+# How many of a bucket's objects are kept here as files [GB].
+EVA_CACHE_BYTES = int(1e9 * environment.gigabytes("EVA_CACHE_GB", 10.0))
 # How long a request waits for a station's answer [s]; after it the outcome is unknown.
 EVA_COMMAND_TIMEOUT_S = environment.seconds("EVA_COMMAND_TIMEOUT_S", 2.0)
 # Without a sign of life for so long a worker's job is taken from it [s].
 EVA_JOB_STALE_S = environment.seconds("EVA_JOB_STALE_S", 60.0)
 # How long a worker that is told to end may finish its job [s]; then it puts it back.
 EVA_WORKER_GRACE_S = environment.seconds("EVA_WORKER_GRACE_S", 12.0)
+# How much a worker gives way to whatever else runs on its machine.
+EVA_WORKER_NICE = environment.niceness("EVA_WORKER_NICE", 19)

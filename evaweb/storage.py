@@ -6,8 +6,22 @@ import errno
 
 from django.db import DatabaseError, Error, InterfaceError, InternalError, OperationalError
 
+from runtime.core.sentences import Pattern, fixed
+
 _FULL = ("disk is full", "disk full", "no space left")
 _READ_ONLY = ("readonly", "read-only")
+_DISK_FULL = fixed(
+    "storage.disk_full",
+    "the disk of the lab is full: the database was not changed. Make room there, and try again",
+)
+_CANNOT_WRITE = Pattern(
+    "storage.cannot_write",
+    "the lab's data cannot be written ({fault}): the database was not changed. Ask an administrator",
+)
+_DATABASE_AWAY = fixed(
+    "storage.database_away",
+    "the database is busy or gone: it was not changed, try again",
+)
 
 
 def refusal_of(fault: BaseException | None) -> tuple[str, int] | None:
@@ -16,18 +30,9 @@ def refusal_of(fault: BaseException | None) -> tuple[str, int] | None:
         return None
     text = str(fault).lower()
     if getattr(fault, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or any(word in text for word in _FULL):
-        return (
-            "the disk of the lab is full: the database was not changed. Make room there, and try again",
-            507,
-        )
+        return _DISK_FULL, 507
     if getattr(fault, "errno", None) == errno.EROFS or any(word in text for word in _READ_ONLY):
-        return (
-            f"the lab's data cannot be written ({fault}): the database was not changed. Ask an administrator",
-            503,
-        )
+        return _CANNOT_WRITE(fault=fault), 503
     if isinstance(fault, OperationalError | InterfaceError | InternalError) or type(fault) is DatabaseError:
-        return (
-            "the database is busy or gone: it was not changed, try again",
-            503,
-        )  # where it is, the log says
+        return _DATABASE_AWAY, 503  # where it is, the log says
     return None

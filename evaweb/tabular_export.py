@@ -11,7 +11,7 @@ from enum import Enum
 from itertools import islice
 from typing import Any, Union, get_args, get_origin
 
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # wide ones too
 Pages = Iterable[Iterable[Mapping[str, Any]]]
 
 

@@ -9,6 +9,7 @@ from django.http import HttpRequest, HttpResponse
 from django.urls import include, path
 
 from evaweb.api.urls import urls as rest
+from evaweb.lab import first_account
 from evaweb.passwords import OwnPasswordView
 
 
@@ -21,7 +22,14 @@ async def healthz(request: HttpRequest) -> HttpResponse:
 handler400, handler500 = "evaweb.refusals.bad_request", "evaweb.refusals.server_error"
 urlpatterns = [
     path("healthz", healthz),
-    path("login/", auth_views.LoginView.as_view(redirect_authenticated_user=True), name="login"),
+    path(
+        "login/",
+        auth_views.LoginView.as_view(
+            redirect_authenticated_user=True,
+            extra_context={"missing": first_account.is_missing, "offered": first_account.is_offered},
+        ),
+        name="login",
+    ),
     path("logout/", auth_views.LogoutView.as_view(), name="logout"),
     path("password/", OwnPasswordView.as_view(), name="password"),
     path("admin/", admin.site.urls),
@@ -34,4 +42,6 @@ urlpatterns = [
     path("", include("evaweb.results.urls")),
     path("", include("evaweb.plans.urls")),
     path("", include("evaweb.preflights.urls")),
+    path("", include("evaweb.setup.urls")),
+    path("", include("evaweb.lab.urls")),
 ]

@@ -15,9 +15,14 @@ _MOST_SAID = 10  # faults of one question
 
 
 class Failure(Schema):
-    """Why it was not done: a sentence for a person."""
+    """Why it was not done: a sentence for a person, and for a page in another language its id and arguments.
+
+    Sentences that were written by others, such as an operating system, have neither.
+    """
 
     error: str
+    id: str | None = None
+    arguments: dict[str, Any] | None = None
 
 
 class Page(Schema, Generic[Row]):

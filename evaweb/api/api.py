@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from django.db import InterfaceError, InternalError, OperationalError
+from django.db import IntegrityError, InterfaceError, InternalError, OperationalError
 from django.http import Http404, HttpRequest, HttpResponse
 from ninja import NinjaAPI
 from ninja.errors import AuthenticationError, HttpError, ValidationError, ValidationErrorContext
@@ -17,6 +17,7 @@ from evaweb.api import (
     datasets,
     episodes,
     failures,
+    find,
     jobs,
     plans,
     preflights,
@@ -28,9 +29,10 @@ from evaweb.api import (
     trials,
 )
 from evaweb.api.answers import said_of
-from evaweb.api.auth import Bearer, Session
+from evaweb.api.auth import NOT_LOGGED_IN, Bearer, Session
 from evaweb.api.questions import Bounded, only_known
-from evaweb.errors import EvaError
+from evaweb.errors import EvaError, refusal
+from evaweb.races import TAKEN, was_taken
 from evaweb.storage import refusal_of
 from runtime.core import bounded_documents as bounded
 
@@ -79,6 +81,7 @@ api.add_router("/preflights", preflights.router)
 api.add_router("", collecting.router)
 api.add_router("", results.router)
 api.add_router("/jobs", jobs.router)
+api.add_router("/find", find.router)
 
 
 @api.get("/openapi.json", include_in_schema=False, url_name="openapi")
@@ -94,7 +97,7 @@ def _refused(request: HttpRequest, fault: EvaError) -> HttpResponse:
 
 @api.exception_handler(AuthenticationError)
 def _not_logged_in(request: HttpRequest, fault: AuthenticationError) -> HttpResponse:
-    return _failure(request, "not logged in: log in, or send Authorization: Bearer TOKEN", 401)
+    return _failure(request, NOT_LOGGED_IN, 401)
 
 
 @api.exception_handler(ValidationError)
@@ -127,5 +130,13 @@ def _storage(request: HttpRequest, fault: Exception) -> HttpResponse:
     return _failure(request, *refused)
 
 
+@api.exception_handler(IntegrityError)
+def _taken(request: HttpRequest, fault: IntegrityError) -> HttpResponse:
+    if not was_taken(fault):
+        raise fault
+    log.warning("%s %s was refused: %s", request.method, request.path, fault)
+    return _failure(request, TAKEN, 409)
+
+
 def _failure(request: HttpRequest, sentence: str, status: int) -> HttpResponse:
-    return api.create_response(request, {"error": sentence}, status=status)
+    return api.create_response(request, refusal(sentence), status=status)

@@ -12,6 +12,18 @@ from evaweb.api.tokens import UNKNOWN
 from evaweb.callers import address_of
 from evaweb.credentials import SESSION, TOKEN, credentials
 from evaweb.errors import EvaError
+from runtime.core.sentences import Pattern, fixed
+
+_UNKNOWN_TOKEN = Pattern(
+    "api.auth.unknown_token",
+    "the token {unknown}: make one with manage.py api_token USER NAME",
+)
+
+
+NOT_LOGGED_IN = fixed(
+    "api.auth.not_logged_in",
+    "not logged in: log in, or send Authorization: Bearer TOKEN",
+)
 
 
 class NotLoggedIn(EvaError):
@@ -28,7 +40,7 @@ class Bearer(HttpBearer):
         user = credentials.look(TOKEN, token)
         if user is None:
             audit.token_refused(address_of(request), UNKNOWN)
-            raise NotLoggedIn(f"the token {UNKNOWN}: make one with manage.py api_token USER NAME")
+            raise NotLoggedIn(_UNKNOWN_TOKEN(unknown=UNKNOWN))
         return user
 
 

@@ -61,12 +61,13 @@ class DatasetEpisodeOut(Schema):
     task: str
     uuid: UUID | None
     success: bool | None
+    result: str
     verdict: str
 
     @staticmethod
     def of(row: listing.Row) -> dict[str, Any]:
         """As the dataset lists it, with the newest verdict of the lab."""
-        plain = ("index", "seconds", "task", "success", "verdict")
+        plain = ("index", "seconds", "task", "success", "result", "verdict")
         return {**{name: getattr(row, name) for name in plain}, "rows": row.length, "uuid": row.uuid or None}
 
 
@@ -88,10 +89,14 @@ def dataset(request: HttpRequest, name: str) -> Any:
     summary="Episodes of a dataset",
     url_name="dataset-episodes",
 )
-def episodes(request: HttpRequest, name: str, words: str = "", success: str = "", verdict: str = "") -> Any:
-    """In the order of their indices; `success` is yes, no or unknown, `verdict` pass, fail or unreviewed."""
+def episodes(
+    request: HttpRequest, name: str, words: str = "", success: str = "", result: str = "", verdict: str = ""
+) -> Any:
+    """In the order of their indices; `success` is yes, no or unknown, `result` success, partial, fail or unknown,
+    `verdict` pass, fail or unreviewed."""
+    only = {"words": words, "success": success, "result": result, "verdict": verdict}
     try:
-        found = listing.rows(orders.full_name(name), words=words, success=success, verdict=verdict)
+        found = listing.rows(orders.full_name(name), **only)
     except RecordingError as error:
         raise Conflict(str(error)) from None
     return [DatasetEpisodeOut.of(row) for row in found]

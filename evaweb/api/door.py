@@ -24,6 +24,7 @@ from pydantic import ValidationError
 
 from evaweb import audit
 from evaweb.api.answers import said_of
+from evaweb.api.auth import NOT_LOGGED_IN
 from evaweb.api.stations import HTTP_OF, CommandIn, EStopIn
 from evaweb.api.tokens import UNKNOWN
 from evaweb.callers import address_of, share_of
@@ -39,16 +40,22 @@ from evaweb.credentials import (
     Unverifiable,
     credentials,
 )
-from evaweb.errors import EvaError, NotAllowed
+from evaweb.errors import EvaError, NotAllowed, refusal
 from evaweb.headers import BARE
 from evaweb.origins import is_ours
 from evaweb.roles import Role
 from evaweb.stations import commands, stops
 from evaweb.stations import redaction as veil
 from evaweb.stations.models import Station
+from runtime.core.sentences import Pattern, fixed, identity
 from runtime.ipc import estop_requests as pressing
 
 log = logging.getLogger(__name__)
+_UNKNOWN_TOKEN = Pattern(
+    "api.door.unknown_token",
+    "the token {unknown}: make one with manage.py api_token USER NAME",
+)
+_CSRF_CHECK_FAILED = fixed("api.door.csrf_check_failed", "CSRF check Failed")
 _PATH = re.compile(r"/api/v1/stations/([^/]+)/(estop|commands)")
 _LARGEST = 64 * 1024  # bytes of a stop; what is longer is another command, but for a press
 _ASKED = {
@@ -65,7 +72,11 @@ _PREFLIGHT = [  # what a browser may send from the web's port to another one, an
 ]
 _BUSY = (b"retry-after", b"%d" % RETRY_AFTER_S)
 _MOST_TOKENS = 4  # of one request
-_NOT_LOGGED_IN = "not logged in: log in, or send Authorization: Bearer TOKEN"
+_STOP_AGAIN = Pattern("api.door.stop_again", "{why}: stop again; the e-stop works")
+_STOPS_ALONE = Pattern(
+    "api.door.stops_alone",
+    "this process answers stop, halt and e-stop alone; the web is at port {port}",
+)
 _Receive = Callable[[], Awaitable[Any]]
 _Headers = Sequence[tuple[bytes, bytes]]
 Answered = tuple[int, dict[str, Any]]
@@ -100,13 +111,13 @@ class StopDoor:
         try:
             answered = await self._answered(scope, asked, body)
         except EvaError as fault:
-            answered = (fault.status, {"error": str(fault)})
+            answered = (fault.status, refusal(str(fault)))
         except Busy as fault:
-            answered = (503, {"error": f"{fault}: stop again; the e-stop works"})
+            answered = (503, refusal(_STOP_AGAIN(why=fault)))
             told.append(_BUSY)
         except Exception as fault:  # whatever it is: who stops must be told
             log.exception("a stop at %s was not answered", scope["path"][:200])
-            answered = (500, {"error": f"{stops.HARDWARE_STOP}: {fault.__class__.__name__}"})
+            answered = (500, refusal(f"{stops.HARDWARE_STOP}: {fault.__class__.__name__}"))
         if answered is None:
             await self._application(scope, _again(body, receive), send)
         else:
@@ -148,10 +159,10 @@ class StopDoor:
 
 def stops_alone(web_port: int) -> StopDoor:
     """The application of the process for stops, for pages of the web at that port."""
-    said = f"this process answers stop, halt and e-stop alone; the web is at port {web_port}"
+    said = refusal(_STOPS_ALONE(port=web_port))
 
     async def nothing_else(scope: dict[str, Any], receive: _Receive, send: Any) -> None:
-        await _send(send, 404, {"error": said})
+        await _send(send, 404, said)
 
     return StopDoor(nothing_else, web_port)
 
@@ -206,8 +217,8 @@ async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], bo
 
 
 def _told(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> dict[str, Any]:
-    said = {"status": answer.status.value, "reason": answer.reason, "allowed": answer.allowed}
-    return {"uuid": uuid, **said, "data": data}
+    said = {"status": answer.status.value, "reason": answer.reason, **identity(answer.reason)}
+    return {"uuid": uuid, **said, "allowed": answer.allowed, "data": data}
 
 
 async def _presser(scope: dict[str, Any]) -> Login:
@@ -225,7 +236,7 @@ async def _stopper(scope: dict[str, Any]) -> tuple[str, Login]:
     try:
         known = await credentials.stopper(found, share_of(scope))
     except Unverifiable as fault:
-        raise Refused(f"{fault}: who may stop is not known; the e-stop works", 503) from None
+        raise Refused(stops.UNKNOWN_STOPPER(why=fault), 503) from None
     if known is None:
         raise _nobodys(found, scope)
     return known
@@ -233,9 +244,9 @@ async def _stopper(scope: dict[str, Any]) -> tuple[str, Login]:
 
 def _nobodys(found: list[Credential], scope: dict[str, Any]) -> Refused:
     if all(kind != TOKEN for kind, _ in found):
-        return Refused(_NOT_LOGGED_IN, 401)
+        return Refused(NOT_LOGGED_IN, 401)
     audit.token_refused(address_of(ASGIRequest(scope, BytesIO())), UNKNOWN)
-    return Refused(f"the token {UNKNOWN}: make one with manage.py api_token USER NAME", 401)
+    return Refused(_UNKNOWN_TOKEN(unknown=UNKNOWN), 401)
 
 
 def _credentials(scope: dict[str, Any]) -> list[Credential]:
@@ -246,7 +257,7 @@ def _credentials(scope: dict[str, Any]) -> list[Credential]:
         found.append((TOKEN, secret.strip() if scheme.lower() == "bearer" else header))
     found += [(SESSION, key) for key in sessions_of(_headers(scope, b"cookie"))]
     if not found:
-        raise Refused(_NOT_LOGGED_IN, 401)
+        raise Refused(NOT_LOGGED_IN, 401)
     return found
 
 
@@ -261,7 +272,7 @@ def _require_csrf(scope: dict[str, Any], body: bytes) -> None:
                 return
     except DisallowedHost as fault:
         raise Refused(str(fault), 400) from None
-    raise Refused("CSRF check Failed", 403)
+    raise Refused(_CSRF_CHECK_FAILED, 403)
 
 
 def _said(body: bytes) -> dict[str, Any]:

@@ -13,16 +13,34 @@ from ninja import Field, Query, Router, Schema, Status
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.jobs import JobOut
 from evaweb.blinding import Sight, sight_for
+from evaweb.collect.selectors import PUBLISHED_RESULTS, accepted
 from evaweb.episodes import services
 from evaweb.episodes.exporting import CONTENT_TYPE, table_file
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.streaming import file_answer
-from evaweb.errors import NotFound
+from evaweb.errors import Conflict, NotFound
 from evaweb.roles import Role, require
 from evaweb.stations.selectors import station_get
+from evaweb.trials.models import TrialStatus
+from runtime.core.sentences import Pattern
+
+_EPISODE_STILL_BEING_RECORDED_PUBLISHED = Pattern(
+    "api.episodes.episode_still_being_recorded_published",
+    "episode {uuid} is still being recorded: it is published when it is closed",
+)
+_EPISODE_NOT_ACCEPTED_HAS_LABELLED = Pattern(
+    "api.episodes.episode_not_accepted_has_labelled",
+    "episode {uuid} is not accepted: it has to be labelled {published_results}, not discarded, and "
+    "failed by no review",
+)
+_EPISODE_SIMULATED_ROBOT_NO_DATASET = Pattern(
+    "api.episodes.episode_simulated_robot_no_dataset",
+    "episode {uuid} is of a simulated robot: no dataset ever holds it",
+)
+_EPISODE_DOES_NOT_EXIST = Pattern("api.episodes.episode_does_not_exist", "episode {uuid} does not exist")
 
 router = Router(tags=["episodes"])
-_WITH = ("station", "trial__checkpoint", "trial__handout")
+_WITH = ("station", "trial__checkpoint", "trial__handout", "trial__verdict", "demonstration")
 
 
 class DamageOut(Schema):
@@ -38,6 +56,9 @@ class DamageOut(Schema):
 class EpisodeOut(Schema):
     """One recorded run or demonstration; `trial` is the id of the trial that it was recorded for.
 
+    `result` is success, partial (of demonstrations) or fail; "" where nobody has said. `away_since` is since when it is
+    closed on its station's computer and not here yet; null where it is here.
+
     While it is hidden from the caller which checkpoint made it, the trial's code stands for the checkpoint, and what
     else would tell is empty.
     """
@@ -45,6 +66,7 @@ class EpisodeOut(Schema):
     uuid: UUID
     station: str
     trial: int | None
+    result: str
     status: EpisodeStatus
     reason: str
     kind: str
@@ -65,20 +87,32 @@ class EpisodeOut(Schema):
     published_at: datetime | None
     damage: list[DamageOut]
     verified_at: datetime | None
+    away_since: datetime | None
+    tags: list[str]
 
     @staticmethod
     def of(episode: Episode, sight: Sight) -> dict[str, Any]:
         """With the names of its station and its trial."""
-        own = [name for name in EpisodeOut.model_fields if name not in ("station", "trial")]
+        own = [name for name in EpisodeOut.model_fields if name not in ("station", "trial", "result", "tags")]
         trial, hidden = getattr(episode, "trial", None), sight.hides_episode(episode)
         return {
             **{name: getattr(episode, name) for name in own},
             "station": episode.station.name,
             "trial": trial.pk if trial else None,
+            "result": _result(episode, trial),
+            "tags": sight.tags_of(episode),
             "checkpoint": sight.policy_of(episode) if hidden else episode.checkpoint,
             "strategy": "" if hidden else episode.strategy,
             "reason": sight.told(episode.reason) if hidden else episode.reason,
         }
+
+
+def _result(episode: Episode, trial: Any) -> str:
+    demonstration = getattr(episode, "demonstration", None)
+    if demonstration is not None:
+        return str(demonstration.result)
+    counts = trial is not None and trial.status == TrialStatus.SCORED and trial.verdict is not None
+    return ("success" if trial.verdict.success else "fail") if counts else ""
 
 
 class EpisodeDetail(EpisodeOut):
@@ -114,16 +148,21 @@ class Filters(Schema):
     status: EpisodeStatus | None = None
     dataset: Annotated[str, Field(description="Relative to the data folder")] = ""
     damaged: bool | None = None
+    tag: str = ""
 
 
 @router.get("", response={200: Page[EpisodeOut], **FAILURES}, summary="Episodes", url_name="episodes")
 def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging]) -> Any:
     """The newest first."""
-    rows = Episode.objects.select_related(*_WITH).order_by("-started_at", "-created_at", "pk")
+    sight = sight_for(request)
+    rows = Episode.objects.select_related(*_WITH).prefetch_related("tags")
+    rows = rows.order_by("-started_at", "-created_at", "pk")
     if filters.station:
         rows = rows.filter(station=station_get(name=filters.station))
     if filters.damaged is not None:
         rows = rows.exclude(damage=[]) if filters.damaged else rows.filter(damage=[])
+    if filters.tag:
+        rows = rows.filter(tags__words=filters.tag) if not sight.named_in(filters.tag) else rows.none()
     wanted = {
         "mode": filters.mode and filters.mode.value,
         "status": filters.status and filters.status.value,
@@ -132,7 +171,7 @@ def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging
     return paging.of(
         rows.filter(**{name: value for name, value in wanted.items() if value}),
         EpisodeOut,
-        sight_for(request),
+        sight,
     )
 
 
@@ -174,8 +213,39 @@ def episode_export_asked(request: HttpRequest, uuid: UUID) -> Any:
     return Status(202, JobOut.of(services.export_asked(episode=_found(uuid)), sight_for(request)))
 
 
+@router.post(
+    "/{uuid:uuid}/publish",
+    response={202: JobOut, **FAILURES},
+    summary="Have it published",
+    url_name="episode-publish-asked",
+)
+def episode_publish_asked(request: HttpRequest, uuid: UUID) -> Any:
+    """Write it into its dataset, or anew with the score that counts now; operators.
+
+    A demonstration as its session would: labelled a success or partial, neither discarded nor failed by a review.
+    """
+    require(request.auth, Role.OPERATOR)
+    found = _found(uuid)
+    if found.status == EpisodeStatus.RECORDING:
+        raise Conflict(_EPISODE_STILL_BEING_RECORDED_PUBLISHED(uuid=uuid))
+    demonstration = getattr(found, "demonstration", None)
+    if demonstration is not None and not _accepted(demonstration):
+        raise Conflict(
+            _EPISODE_NOT_ACCEPTED_HAS_LABELLED(uuid=uuid, published_results=" or ".join(PUBLISHED_RESULTS))
+        )
+    job = services.publish_asked(episode=found)
+    if job is None:
+        raise Conflict(_EPISODE_SIMULATED_ROBOT_NO_DATASET(uuid=uuid))
+    return Status(202, JobOut.of(job, sight_for(request)))
+
+
+def _accepted(demonstration: Any) -> bool:
+    fits = accepted(session=demonstration.session, results=PUBLISHED_RESULTS)
+    return fits.filter(pk=demonstration.pk).exists()
+
+
 def _found(uuid: UUID) -> Episode:
     found = Episode.objects.select_related(*_WITH).filter(pk=uuid).first()
     if found is None:
-        raise NotFound(f"episode {uuid} does not exist")
+        raise NotFound(_EPISODE_DOES_NOT_EXIST(uuid=uuid))
     return found

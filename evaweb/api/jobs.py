@@ -13,7 +13,6 @@ from evaweb.blinding import HIDDEN, Sight, sight_for
 from evaweb.jobs import services
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_get
-from evaweb.roles import Role, require
 
 router = Router(tags=["jobs"])
 
@@ -68,6 +67,12 @@ def jobs(
 
 @router.post("/{id}/retry", response={202: JobOut, **FAILURES}, summary="Try again", url_name="job-retry")
 def retry(request: HttpRequest, id: int) -> Any:
-    """Ask anew for what a failed job was about; operators."""
-    require(request.auth, Role.OPERATOR)
-    return Status(202, JobOut.of(services.try_again(job=job_get(id=id)), sight_for(request)))
+    """Ask anew for what a failed job was about; whoever may ask for that."""
+    job = services.try_again(user=request.auth, job=job_get(id=id))
+    return Status(202, JobOut.of(job, sight_for(request)))
+
+
+@router.post("/{id}/cancel", response={200: JobOut, **FAILURES}, summary="Cancel", url_name="job-cancel")
+def cancel(request: HttpRequest, id: int) -> Any:
+    """End a job for good: at once where it waits, else at its next step; operators."""
+    return JobOut.of(services.cancel(user=request.auth, job=job_get(id=id)), sight_for(request))

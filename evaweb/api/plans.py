@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema, Status
+from pydantic import StrictBool
 
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.trials import TrialDetail
@@ -56,6 +57,7 @@ class PlanOut(Schema):
     def of(plan: Plan, user: Any) -> dict[str, Any]:
         """As this user may see it."""
         sealed = sealed_for(plan, user)
+        before = plan.amends if plan.state == PlanState.DRAFT else None  # it says what its draft says
         done = progress(plan)
         plain = ("name", "version", "title", "state", "blind", "commitment")
         times = ("frozen_at", "closed_at", "revealed_at")
@@ -68,7 +70,7 @@ class PlanOut(Schema):
             "total": done.total,
             "counted": done.counted,
             "attempts": done.attempts,
-            "question": "" if sealed else plan.question,
+            "question": "" if sealed or (before and sealed_for(before, user)) else plan.question,
             "digest": "" if sealed else plan.digest,
             "document": None if sealed else plan.document,
             "key": bytes(plan.key or b"").hex() if plan.state == PlanState.REVEALED else "",
@@ -179,7 +181,7 @@ class CamerasOut(Schema):
 class CamerasIn(Schema):
     """`first`: what a camera without a reference shows becomes its reference."""
 
-    first: bool = False
+    first: StrictBool = False
 
 
 class ReferenceIn(Schema):

@@ -19,7 +19,21 @@ from evaweb.refusals import is_text
 from evaweb.roles import require
 from evaweb.stations.commands import STOPPING
 from runtime.core import bounded_documents as bounded
+from runtime.core.sentences import Pattern
 from runtime.ipc import estop_requests as pressing
+
+_UNKNOWN_PARAMETER = Pattern(
+    "api.questions.unknown_parameter",
+    "{unknown:.200}: unknown parameter; allowed: {known}",
+)
+_BODY_TOO_LONG = Pattern(
+    "api.questions.body_too_long",
+    "the body has {count} bytes; allowed here: at most {largest}",
+)
+_NO_TEXT = Pattern(
+    "api.questions.no_text",
+    "{place} = {text!r:.80}: allowed: text without NUL and half characters",
+)
 
 View = Callable[..., Any]
 
@@ -51,7 +65,7 @@ def _parameters(view: Any) -> list[str]:
 def _check(given: set[str], known: list[str]) -> None:
     unknown = ", ".join(sorted(given - set(known)))
     if unknown:
-        raise UnknownParameter(f"{unknown:.200}: unknown parameter; allowed: {', '.join(known) or 'none'}")
+        raise UnknownParameter(_UNKNOWN_PARAMETER(unknown=unknown, known=", ".join(known) or "none"))
 
 
 class TooLong(EvaError):
@@ -79,14 +93,12 @@ class Bounded(Parser):
 def _read(request: HttpRequest) -> Any:
     post = post_at(request.path)
     if len(request.body) > post.largest:
-        raise TooLong(f"the body has {len(request.body)} bytes; allowed here: at most {post.largest}")
+        raise TooLong(_BODY_TOO_LONG(count=len(request.body), largest=post.largest))
     given = bounded.from_json(request.body, "the body", most=post.values)
     if b"\\u" in request.body and not (isinstance(given, dict) and given.get("kind") in STOPPING):
         for place, text in _texts(given):
             if not is_text(text):
-                raise EvaError(
-                    f"{place or 'body'} = {text!r:.80}: allowed: text without NUL and half characters"
-                )
+                raise EvaError(_NO_TEXT(place=place or "body", text=text))
     return given
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 from uuid import UUID
 
 from django.http import HttpRequest
@@ -22,8 +22,8 @@ from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import Chosen, chosen
 from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.models import Judgement, Preference, Rating
-from evaweb.results.presentation.addresses import frozen_address
 from evaweb.results.presentation.citing import citation
+from evaweb.results.presentation.headline import with_planned_letters
 from evaweb.results.presentation.integrity import integrity_document
 from evaweb.results.ratings.unblinding import require_seen
 from evaweb.results.reports.document import analysis_document, arm_document, comparison_document
@@ -32,6 +32,16 @@ from evaweb.results.selectors import plan_at_reveal, plan_get
 from evaweb.tabular_export import in_pages
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import Score
+from runtime.core.sentences import Pattern
+
+_NO_TRIAL_COUNTS_THERE_TRIALS = Pattern(
+    "api.results.no_trial_counts_there_trials",
+    "no trial of {checkpoint!r:.80} counts; there are trials of: {names}",
+)
+_NO_COMPARISON_THERE_TRIALS = Pattern(
+    "api.results.no_comparison_there_trials",
+    "no comparison of {first!r:.80} and {second!r:.80}; there are trials of: {names}",
+)
 
 router = Router(tags=["results"])
 _USUAL = Question()
@@ -169,6 +179,7 @@ class Planned(Schema):
     power: Annotated[float, Field(ge=0.5, le=0.999)] = _USUAL.power
     cycle_s: Annotated[float, Field(ge=1, le=36_000)] = _USUAL.cycle_s
     checkpoints: Annotated[int, Field(ge=2, le=50)] = _USUAL.checkpoints
+    comparing: Literal["all", "control", "pair"] = "all"
     stations: Annotated[int, Field(ge=1, le=100)] = _USUAL.stations
     hours: Annotated[float, Field(ge=0.1, le=10_000)] = _USUAL.hours
 
@@ -182,7 +193,7 @@ class Planned(Schema):
 def results(request: HttpRequest, name: str, version: int, only: Query[Only]) -> Any:
     """Of each checkpoint, of each pair, of raters, automatic judges and preferences; intervals are at 95 %."""
     plan, which = _seen(request, name, version, only)
-    analysis = caching.analysis_of(plan, which)
+    analysis = with_planned_letters(plan, caching.analysis_of(plan, which))
     return {
         "plan": plan.name,
         "version": plan.version,
@@ -219,7 +230,7 @@ def frozen(request: HttpRequest, digest: str) -> Any:
     plan = plan_at_reveal(digest)
     require_seen(plan, request.auth)
     later = reverse("api:plan-integrity", args=[plan.name, plan.version])
-    return {**citation(plan, frozen_address(request, digest)).document, "later": later}
+    return {**citation(plan).document, "later": later}
 
 
 @router.get(
@@ -234,7 +245,7 @@ def checkpoint(request: HttpRequest, name: str, version: int, checkpoint: str, o
     analysis = caching.analysis_of(plan, which)
     found = next((arm for arm in analysis.arms if arm.checkpoint == checkpoint), None)
     if found is None:
-        raise NotFound(f"no trial of {checkpoint!r:.80} counts; there are trials of: {_names(analysis)}")
+        raise NotFound(_NO_TRIAL_COUNTS_THERE_TRIALS(checkpoint=checkpoint, names=_names(analysis)))
     return arm_document(found)
 
 
@@ -252,9 +263,7 @@ def comparison(
     analysis = caching.analysis_of(plan, which)
     found = analysis.compared(first, second)
     if found is None:
-        raise NotFound(
-            f"no comparison of {first!r:.80} and {second!r:.80}; there are trials of: {_names(analysis)}"
-        )
+        raise NotFound(_NO_COMPARISON_THERE_TRIALS(first=first, second=second, names=_names(analysis)))
     return comparison_document(found)
 
 

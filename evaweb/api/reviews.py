@@ -12,9 +12,9 @@ from ninja import Field, Router, Schema, Status
 from evaweb.api.answers import FAILURES
 from evaweb.api.jobs import JobOut
 from evaweb.blinding import sight_for
-from evaweb.episodes.selectors import episode_get
+from evaweb.episodes.selectors import episode_get, tag_counts
 from evaweb.reviews import selectors, services
-from evaweb.reviews.models import Review, Segment
+from evaweb.reviews.models import Review, Segment, SegmentLabel
 from evaweb.roles import Role, require
 
 router = Router(tags=["reviews"])
@@ -93,6 +93,14 @@ class SegmentOut(Schema):
         }
 
 
+class LabelOut(Schema):
+    """A word for parts of episodes; `key` begins and ends such a part in Replay."""
+
+    words: str
+    colour: SegmentLabel.Colour
+    key: str
+
+
 class SaidOut(Schema):
     """All that is said of an episode: reviews newest first, segments in order, the report where there is one."""
 
@@ -120,6 +128,28 @@ class SegmentIn(Schema):
     segment: UUID | None = None
 
 
+class TagsIn(Schema):
+    """Tags to put on it and to take off; each is kept in small letters."""
+
+    add: Annotated[list[str], Field(default_factory=list, max_length=30)]
+    remove: Annotated[list[str], Field(default_factory=list, max_length=30)]
+
+
+class TagsOut(Schema):
+    """Its tags now, and what of that was changed."""
+
+    tags: list[str]
+    added: list[str]
+    removed: list[str]
+
+
+class TagOut(Schema):
+    """A tag of the lab, and how many episodes have it."""
+
+    words: str
+    episodes: int
+
+
 class NextOut(Schema):
     """An episode without a pass or fail, None where there is no other; `waiting` counts all."""
 
@@ -134,6 +164,17 @@ def following(request: HttpRequest, after: UUID | None = None) -> Any:
     """The one after the episode `after` in the list, newest first; from the top where there is none below."""
     found, waiting = selectors.unreviewed_next(after=after)
     return {"episode": found.uuid if found else None, "waiting": waiting}
+
+
+@router.get(
+    "/reviews/labels",
+    response={200: list[LabelOut], **FAILURES},
+    summary="Vocabulary of parts",
+    url_name="segment-labels",
+)
+def labels(request: HttpRequest) -> Any:
+    """In the lab's order, without what is retired; segments may have other labels."""
+    return selectors.labels_offered()
 
 
 @router.get(
@@ -181,6 +222,26 @@ def segment_removed(request: HttpRequest, uuid: UUID, segment: UUID) -> Any:
     """One of one's own; administrators any."""
     services.segment_remove(user=request.auth, episode=episode_get(uuid=uuid), segment=segment)
     return _said(uuid)
+
+
+@router.get("/reviews/tags", response={200: list[TagOut], **FAILURES}, summary="Tags", url_name="tags")
+def tags(request: HttpRequest) -> Any:
+    """All that episodes have, in the order of the alphabet."""
+    found = tag_counts(sight=sight_for(request))
+    return [{"words": words, "episodes": episodes} for words, episodes in found.items()]
+
+
+@router.post(
+    "/episodes/{uuid:uuid}/tags",
+    response={200: TagsOut, **FAILURES},
+    summary="Tag it",
+    url_name="episode-tags",
+)
+def tags_changed(request: HttpRequest, uuid: UUID, given: TagsIn) -> Any:
+    """Put tags on it and take others off; operators. Once it is closed."""
+    changed = services.tags_change(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
+    left = sight_for(request).tags_of(episode_get(uuid=uuid))
+    return {"tags": left, "added": changed.added, "removed": changed.removed}
 
 
 @router.get(

@@ -18,7 +18,7 @@ from evaweb.blinding import Sight, sight_for
 from evaweb.collect.selectors import session_get
 from evaweb.collect.station_commands import session_command
 from evaweb.datasets.on_robot import replay_command
-from evaweb.errors import EvaError, StationGone
+from evaweb.errors import EvaError, StationGone, reasoned
 from evaweb.stations import commands, leases, selectors, stops
 from evaweb.stations import redaction as veil
 from evaweb.stations.holders import who
@@ -27,6 +27,23 @@ from evaweb.stations.runtime_client import wire_to
 from evaweb.trials import selectors as trial_selectors
 from evaweb.trials import services
 from evaweb.trials.station_commands import checkpoint_command, trial_command
+from runtime.core.sentences import Pattern
+
+_SEVERAL_NAMED = Pattern(
+    "api.stations.several_named",
+    "{named}: each has its own arguments, name one of them",
+)
+_SESSION_OF_ANOTHER = Pattern(
+    "api.stations.session_of_another",
+    "session {session} is one of {station}, not of {other}",
+)
+_TRIAL_OF_ANOTHER = Pattern(
+    "api.stations.trial_of_another", "trial {trial} is one of {station}, not of {other}"
+)
+_REQUEST_MISSING = Pattern(
+    "api.stations.request_missing",
+    "request is missing: {action} answers somebody's request, name its id",
+)
 
 router = Router(tags=["stations"])
 PageId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$", description="Made by the page at random")]
@@ -161,6 +178,8 @@ class CommandOut(Schema):
     uuid: UUID
     status: CommandStatus
     reason: str
+    id: Annotated[str, Field(description="Of the reason; empty where it has none, or was said before")] = ""
+    arguments: Annotated[dict[str, Any], Field(default_factory=dict, description="Of the reason")]
     allowed: list[str]
     data: dict[str, Any]
 
@@ -255,11 +274,13 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     order = given.model_dump(exclude=set(_NAMED))
     named = [name for name in _NAMED if getattr(given, name) is not None]
     if len(named) > 1:
-        raise EvaError(f"{' and '.join(named)}: each has its own arguments, name one of them")
+        raise EvaError(_SEVERAL_NAMED(named=" and ".join(named)))
     if given.session is not None:
         session = session_get(uuid=given.session)
         if session.station_id != found.pk:
-            raise EvaError(f"session {session} is one of {session.station.name}, not of {found.name}")
+            raise EvaError(
+                _SESSION_OF_ANOTHER(session=session, station=session.station.name, other=found.name)
+            )
         row = session_command(user=request.auth, session=session, **order)
     elif given.checkpoint is not None:
         checkpoint = trial_selectors.checkpoint_get(name=given.checkpoint, sight=seen)
@@ -271,7 +292,7 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     else:
         trial = trial_selectors.trial_get(id=given.trial)
         if trial.station_id != found.pk:
-            raise EvaError(f"trial {trial.pk} is one of {trial.station.name}, not of {found.name}")
+            raise EvaError(_TRIAL_OF_ANOTHER(trial=trial.pk, station=trial.station.name, other=found.name))
         row = trial_command(user=request.auth, trial=trial, **order)
     return Status(HTTP_OF[CommandStatus(row.status)], _command_out(row, seen))
 
@@ -287,8 +308,8 @@ def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
     answer = stops.press(station=name, username=user.get_username(), why=given.why, uuid=identity).result()
     place = Station(name=name)
     commands.estop_noted(user=user, station=place, why=given.why, uuid=identity, answer=answer, at=at)
-    said = {name: getattr(answer, name) for name in ("status", "reason", "allowed", "data")}
-    return Status(HTTP_OF[answer.status], {"uuid": identity, **said})
+    said = {name: getattr(answer, name) for name in ("status", "allowed", "data")}
+    return Status(HTTP_OF[answer.status], {"uuid": identity, **said, **reasoned(answer.reason)})
 
 
 @router.post(
@@ -310,15 +331,13 @@ def prepare(request: HttpRequest, name: str, given: TrialIn) -> Any:
 
 def _request_of(given: LeaseIn) -> int:
     if given.request is None:
-        raise EvaError(f"request is missing: {given.action} answers somebody's request, name its id")
+        raise EvaError(_REQUEST_MISSING(action=given.action))
     return given.request
 
 
 def _command_out(row: Command, sight: Sight) -> dict[str, Any]:
-    answer = {
-        "uuid": row.pk,
-        **{name: getattr(row, name) for name in ("status", "reason", "allowed", "data")},
-    }
+    reason, data = row.reason, row.data
     if sight.veils_events(row.station.name) or sight.veils(row.station.name, row.args):
-        answer |= {"reason": sight.told(row.reason), "data": veil.answer(row.data)}
-    return answer
+        reason, data = sight.told(row.reason), veil.answer(row.data)
+    known = {"uuid": row.pk, "status": row.status, "allowed": row.allowed}
+    return {**known, **reasoned(reason), "data": data}

@@ -17,8 +17,18 @@ from evaweb.api.models import Token
 from evaweb.credentials import OF_ANY_AGE, TOKEN, credentials, digest
 from evaweb.errors import Conflict, EvaError
 from evaweb.lock_wait import lock_wait
+from runtime.core.sentences import Pattern
 
 log = logging.getLogger(__name__)
+_NAME_ALLOWED_1_80_CHARACTERS = Pattern(
+    "api.tokens.name_allowed_1_80_characters",
+    "name = {name!r:.100}; allowed: 1 to 80 characters that say what uses the token",
+)
+_DAYS_ALLOWED_1 = Pattern("api.tokens.days_allowed_1", "days = {days}; allowed: 1 to {most_days}")
+_HAS_TOKEN_NAMED_REVOKE_CHOOSE = Pattern(
+    "api.tokens.has_token_named_revoke_choose",
+    "{user} has a token named {name!r}: revoke it, or choose another name",
+)
 UNKNOWN = "is not known, or its time is over"
 PREFIX = "eva_"  # so that a scanner of secrets knows one when it sees it
 DAYS, MOST_DAYS = 90, 366
@@ -30,17 +40,15 @@ def token_create(*, user: User, name: str, days: int = DAYS) -> str:
     """A new token of 256 random bits that ends after `days`; the only time that it can be seen."""
     name = name.strip()
     if not 0 < len(name) <= 80 or not name.isprintable():
-        raise EvaError(f"name = {name!r:.100}; allowed: 1 to 80 characters that say what uses the token")
+        raise EvaError(_NAME_ALLOWED_1_80_CHARACTERS(name=name))
     if not 1 <= days <= MOST_DAYS:
-        raise EvaError(f"days = {days}; allowed: 1 to {MOST_DAYS}")
+        raise EvaError(_DAYS_ALLOWED_1(days=days, most_days=MOST_DAYS))
     secret, end = PREFIX + secrets.token_urlsafe(32), timezone.now() + timedelta(days=days)
     try:
         with transaction.atomic():
             Token.objects.create(user=user, name=name, digest=digest(secret), ends_at=end)
     except IntegrityError:
-        raise Conflict(
-            f"{user.get_username()} has a token named {name!r}: revoke it, or choose another name"
-        ) from None
+        raise Conflict(_HAS_TOKEN_NAMED_REVOKE_CHOOSE(user=user.get_username(), name=name)) from None
     log.info("token %a of %a is made, until %s", name, user.get_username(), f"{end:%Y-%m-%d}")
     return secret
 

@@ -9,12 +9,12 @@ from uuid import UUID
 
 from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema
-from pydantic import create_model
+from pydantic import StrictBool, create_model
 
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.tables import Format, table_answer
 from evaweb.blinding import Sight, sight_for
-from evaweb.trials import selectors, services, voids
+from evaweb.trials import corrections, selectors, services, voids
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import Score, Trial, TrialStatus, VoidRequest
 from evaweb.trials.record import api_columns, shown
@@ -144,12 +144,15 @@ class ScoreIn(Schema):
     same again: with its `uuid`, or word by word, it is the first score once more.
     """
 
-    milestones: Annotated[dict[str, bool], Field(default_factory=dict)]
+    milestones: Annotated[dict[str, StrictBool], Field(default_factory=dict)]
     times: Annotated[
-        dict[str, float | None],
-        Field(default_factory=dict, description="When each was reached, s after the start of the run"),
-    ]
-    success: bool | None = None
+        dict[str, float | None] | None,
+        Field(
+            description="When each was reached, s after the start of the run; "
+            "a correction without them keeps those of what is still ticked"
+        ),
+    ] = None
+    success: StrictBool | None = None
     note: str = ""
     failure: Annotated[
         str, Field(description="Why it failed, best one of the lab's causes: see /failures")
@@ -162,6 +165,17 @@ class ScoreIn(Schema):
     uuid: Annotated[UUID | None, Field(description="Of your own; another one for each score")] = None
 
 
+class FailureIn(Schema):
+    """Why a scored trial failed; null leaves that level as it is, "" takes it away."""
+
+    failure: str | None = None
+    failure_phase: str | None = None
+    score: Annotated[
+        UUID | None, Field(description="The score that you saw: 409 where another counts by now")
+    ] = None
+    reason: Annotated[str, Field(description='Without one: "failure was ..., now ..."')] = ""
+
+
 class Reason(Schema):
     """Reason, for later readers."""
 
@@ -171,7 +185,7 @@ class Reason(Schema):
 class VoidAnswer(Reason):
     """Whether the trial is to be voided; a refusal with its reason."""
 
-    agree: bool
+    agree: StrictBool
 
 
 COLUMNS: dict[str, Any] = {**_LIST, "milestones_reached": str, "milestones_missed": str}
@@ -200,6 +214,19 @@ def score(request: HttpRequest, id: int, given: ScoreIn) -> Any:
     """Add a score, or a correction; operators."""
     found = selectors.trial_get(id=id)
     services.trial_score(user=request.auth, trial=found, **given.model_dump())
+    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
+
+
+@router.post(
+    "/{int:id}/failure",
+    response={200: TrialDetail, **FAILURES},
+    summary="Correct its failure",
+    url_name="failure",
+)
+def failure(request: HttpRequest, id: int, given: FailureIn) -> Any:
+    """Correct phase and cause and nothing else of its score, which stays in the record; operators."""
+    found = selectors.trial_get(id=id)
+    corrections.trial_failure(user=request.auth, trial=found, **given.model_dump())
     return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
 
 

@@ -21,7 +21,14 @@ from evaweb.episodes.services import station_known
 from evaweb.errors import EvaError
 from evaweb.roles import known_person
 from evaweb.stations.models import Station
+from runtime.core.sentences import Pattern
 from runtime.recording.files import read_document
+
+_SESSION_NO_UUID = Pattern("collect.restoring.session_no_uuid", "its session {named!r:.60} is no uuid")
+_MANIFEST_DOES_NOT_SAY_HOW = Pattern(
+    "collect.restoring.manifest_does_not_say_how",
+    "its manifest does not say how its session was set up: {error!r}",
+)
 
 
 @restores
@@ -36,7 +43,7 @@ def restore(kept: Kept) -> int:
     try:
         uuid = UUID(str(named))
     except ValueError:
-        raise EvaError(f"its session {named!r:.60} is no uuid") from None
+        raise EvaError(_SESSION_NO_UUID(named=named)) from None
     with transaction.atomic():
         session, made = CollectSession.objects.filter(pk=uuid).first(), 0
         if session is None:
@@ -84,7 +91,7 @@ def _from_manifest(uuid: UUID, episode: Episode) -> CollectSession:
     try:
         setup, dataset = setup_in(manifest), str(manifest["session"]["dataset"])
     except (KeyError, TypeError, AttributeError) as error:
-        raise EvaError(f"its manifest does not say how its session was set up: {error!r}") from None
+        raise EvaError(_MANIFEST_DOES_NOT_SAY_HOW(error=error)) from None
     opened = episode.started_at or timezone.now()
     return _made(
         uuid,

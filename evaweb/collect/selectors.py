@@ -13,9 +13,15 @@ from evaweb.episodes.models import EpisodeStatus
 from evaweb.episodes.publishing import session_dataset
 from evaweb.errors import NotFound
 from evaweb.stations.models import Station
+from runtime.core.sentences import Pattern
 from runtime.datasets.catalog import Catalog
 from runtime.datasets.layout import DEFAULT_VERSION, WRITABLE_VERSIONS
 from runtime.recording.files import RecordingError
+
+_SESSION_DOES_NOT_EXIST_THIS = Pattern(
+    "collect.selectors.session_does_not_exist_this",
+    "session {uuid} does not exist in this lab",
+)
 
 EARLIER = 12  # sessions offered to be resumed, tasks to be picked
 PUBLISHED_RESULTS = (Result.SUCCESS.value, Result.PARTIAL.value)
@@ -66,7 +72,7 @@ def session_get(*, uuid: UUID) -> CollectSession:
     """The session; NotFound where there is none."""
     found = session_list().filter(pk=uuid).first()
     if found is None:
-        raise NotFound(f"session {uuid} does not exist in this lab")
+        raise NotFound(_SESSION_DOES_NOT_EXIST_THIS(uuid=uuid))
     return found
 
 

@@ -21,6 +21,61 @@ from evaweb.roles import Role, require
 from evaweb.stations.holders import who
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import wire_to
+from runtime.core.sentences import Pattern, fixed
+
+_TASK_EMPTY_SAY_WHAT_DEMONSTRATED = fixed(
+    "collect.services.task_empty_say_what_demonstrated",
+    "task is empty: say what is to be demonstrated",
+)
+_STATION_SWITCHED_OFF_CHOOSE_ANOTHER = Pattern(
+    "collect.services.station_switched_off_choose_another",
+    "station {name} is switched off: choose another, or ask an administrator",
+)
+_SOMEONE_ELSE_OPENED_SESSION_AT = Pattern(
+    "collect.services.someone_else_opened_session_at",
+    "someone else opened a session at {name} at the same moment: look at it",
+)
+_EPISODE_BEING_RECORDED_STOP_FIRST = fixed(
+    "collect.services.episode_being_recorded_stop_first",
+    "an episode of it is being recorded: stop it first",
+)
+_SESSION_CLOSED_ALREADY = Pattern(
+    "collect.services.session_closed_already", "session {session} is closed already"
+)
+_RESULTS_ALLOWED_SOME = Pattern(
+    "collect.services.results_allowed_some",
+    "results = {results}; allowed: some of {allowed}",
+)
+_VERSION_ALLOWED = Pattern(
+    "collect.services.version_allowed",
+    "version = {version!r:.20}; allowed: {versions}{why}",
+)
+_NOTHING_PUBLISH_EPISODES_WHOLE_NOT = Pattern(
+    "collect.services.nothing_publish_episodes_whole_not",
+    "nothing to publish: episodes that are whole, not discarded, failed by no review, labelled "
+    "{results} and in no dataset yet",
+)
+_SESSION_OPEN_AT_CLOSE_FIRST = Pattern(
+    "collect.services.session_open_at_close_first",
+    "a session is open at {name} ({other}): close it first",
+)
+_COMMANDS_ASK_FOR_FIRST = Pattern(
+    "collect.services.commands_ask_for_first",
+    "{holder} commands {name}: ask for it first",
+)
+_DATASET_ALLOWED_1_100_LETTERS = Pattern(
+    "collect.services.dataset_allowed_1_100_letters",
+    "dataset = {name!r:.110}; allowed: 1 to 100 letters, digits, '.', '_' and '-', the first a letter "
+    "or digit",
+)
+_DATASET_NAMES_WITH_THOSE_POLICIES = Pattern(
+    "collect.services.dataset_names_with_those_policies",
+    "dataset = {name!r}: names with {rollouts} are those of policies' runs; choose another",
+)
+_TARGET_ALLOWED_1_NONE = Pattern(
+    "collect.services.target_allowed_1_none",
+    "target = {target}; allowed: 1 to {highest_target}, or none",
+)
 
 LONGEST_TASK = 2000  # characters; as a station takes it
 HIGHEST_TARGET = 100_000
@@ -38,10 +93,10 @@ def session_begin(
     require(user, Role.OPERATOR)
     task = text("task", task, LONGEST_TASK)
     if not task:
-        raise EvaError("task is empty: say what is to be demonstrated")
+        raise EvaError(_TASK_EMPTY_SAY_WHAT_DEMONSTRATED)
     _check_target(target)
     if not station.active:
-        raise Conflict(f"station {station.name} is switched off: choose another, or ask an administrator")
+        raise Conflict(_STATION_SWITCHED_OFF_CHOOSE_ANOTHER(name=station.name))
     snapshot = _commanded(user, station)
     setup = setup_of(snapshot, station.name)
     dataset = _dataset(dataset or snapshot["collect"]["dataset"])
@@ -57,9 +112,7 @@ def session_begin(
             session.save(force_insert=True)
             _note(session, user, SessionEventKind.OPENED)
     except IntegrityError:
-        raise Conflict(
-            f"somebody else opened a session at {station.name} at the same moment: look at it"
-        ) from None
+        raise Conflict(_SOMEONE_ELSE_OPENED_SESSION_AT(name=station.name)) from None
     return session
 
 
@@ -69,11 +122,11 @@ def session_close(*, user: Any, session: CollectSession) -> CollectSession:
     snapshot = _commanded(user, session.station, needed=False)
     running = (snapshot.get("collect") or {}).get("episode")
     if running and session.demonstrations.filter(pk=running).exists():
-        raise Conflict("an episode of it is being recorded: stop it first")
+        raise Conflict(_EPISODE_BEING_RECORDED_STOP_FIRST)
     with transaction.atomic():
         held = _held(session)
         if held.closed_at is not None:
-            raise Conflict(f"session {held.pk} is closed already")
+            raise Conflict(_SESSION_CLOSED_ALREADY(session=held.pk))
         held.closed_at = timezone.now()
         _note(held, user, SessionEventKind.CLOSED)
         held.save(update_fields=["closed_at"])
@@ -93,9 +146,7 @@ def session_resume(*, user: Any, session: CollectSession) -> CollectSession:
             held.save(update_fields=["closed_at"])
             _note(held, user, SessionEventKind.RESUMED)
     except IntegrityError:
-        raise Conflict(
-            f"somebody else opened a session at {station.name} at the same moment: look at it"
-        ) from None
+        raise Conflict(_SOMEONE_ELSE_OPENED_SESSION_AT(name=station.name)) from None
     return held
 
 
@@ -126,19 +177,18 @@ def session_publish(
     require(user, Role.OPERATOR)
     allowed = [result.value for result in Result if result.value]
     if not results or set(results) - set(allowed):
-        raise EvaError(f"results = {', '.join(results) or 'none'}; allowed: some of {', '.join(allowed)}")
+        raise EvaError(
+            _RESULTS_ALLOWED_SOME(results=", ".join(results) or "none", allowed=", ".join(allowed))
+        )
     dataset = selectors.dataset_of(session=session)
     if dataset.problem:
         raise Conflict(dataset.problem)
     if version and version not in dataset.versions:
         why = f": {dataset.name} is of that version already, convert it" if dataset.version else ""
-        raise Conflict(f"version = {version!r:.20}; allowed: {', '.join(dataset.versions)}{why}")
+        raise Conflict(_VERSION_ALLOWED(version=version, versions=", ".join(dataset.versions), why=why))
     waiting = list(selectors.to_publish(session=session, results=tuple(results)))
     if not waiting:
-        raise Conflict(
-            "nothing to publish: episodes that are whole, not discarded, failed by no review, labelled "
-            f"{' or '.join(results)} and in no dataset yet"
-        )
+        raise Conflict(_NOTHING_PUBLISH_EPISODES_WHOLE_NOT(results=" or ".join(results)))
     chosen = version or dataset.versions[0]
     with transaction.atomic():
         _note(
@@ -163,7 +213,7 @@ def _held(session: CollectSession) -> CollectSession:
 def _require_none_open(station: Station) -> None:
     other = selectors.session_open(station=station)
     if other is not None:
-        raise Conflict(f"a session is open at {station.name} ({other}): close it first")
+        raise Conflict(_SESSION_OPEN_AT_CLOSE_FIRST(name=station.name, other=other))
 
 
 def _commanded(user: Any, station: Station, *, needed: bool = True) -> dict[str, Any]:
@@ -176,22 +226,18 @@ def _commanded(user: Any, station: Station, *, needed: bool = True) -> dict[str,
         return {}
     holder = who((snapshot.get("lease") or {}).get("holder") or "")
     if holder and holder != user.get_username():
-        raise Conflict(f"{holder} commands {station.name}: ask for it first")
+        raise Conflict(_COMMANDS_ASK_FOR_FIRST(holder=holder, name=station.name))
     return dict(snapshot)
 
 
 def _dataset(name: str) -> str:
     if not DATASET_NAME.fullmatch(name):
-        raise EvaError(
-            f"dataset = {name!r:.110}; allowed: 1 to 100 letters, digits, '.', '_' and '-', the first a letter or digit"
-        )
+        raise EvaError(_DATASET_ALLOWED_1_100_LETTERS(name=name))
     if name.lower().startswith(_ROLLOUTS):
-        raise EvaError(
-            f"dataset = {name!r}: names with {_ROLLOUTS} are those of policies' runs; choose another"
-        )
+        raise EvaError(_DATASET_NAMES_WITH_THOSE_POLICIES(name=name, rollouts=_ROLLOUTS))
     return name
 
 
 def _check_target(target: int | None) -> None:
     if target is not None and not 1 <= target <= HIGHEST_TARGET:
-        raise EvaError(f"target = {target}; allowed: 1 to {HIGHEST_TARGET}, or none")
+        raise EvaError(_TARGET_ALLOWED_1_NONE(target=target, highest_target=HIGHEST_TARGET))

@@ -6,6 +6,20 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from evaweb.errors import Conflict
+from runtime.core.sentences import Pattern
+
+_COLLECTS_NOTHING_DEPLOYMENT_HAS_NO = Pattern(
+    "collect.setups.collects_nothing_deployment_has_no",
+    "{station} collects nothing: its deployment has no [collection]",
+)
+_HAS_NOT_SEEN_PICTURE_EVERY = Pattern(
+    "collect.setups.has_not_seen_picture_every",
+    "{station} has not seen a picture of every camera ({cameras}): look at those that are grey",
+)
+_SET_UP_DIFFERS_FROM = Pattern(
+    "collect.setups.set_up_differs_from",
+    "the set-up differs from that of {whose}: {found}",
+)
 
 Setup = Mapping[str, Any]
 _PLAIN = ("robot", "groups", "joints", "fps")
@@ -19,12 +33,9 @@ def setup_of(snapshot: Mapping[str, Any], station: str) -> dict[str, Any]:
     """The set-up that a station's snapshot shows; Conflict where it collects nothing or a camera is not seen yet."""
     collect = snapshot.get("collect")
     if collect is None:
-        raise Conflict(f"{station} collects nothing: its deployment has no [collection]")
+        raise Conflict(_COLLECTS_NOTHING_DEPLOYMENT_HAS_NO(station=station))
     if collect.get("setup") is None:
-        raise Conflict(
-            f"{station} has not seen a picture of every camera ({', '.join(collect['cameras'])}): "
-            "look at those that are grey"
-        )
+        raise Conflict(_HAS_NOT_SEEN_PICTURE_EVERY(station=station, cameras=", ".join(collect["cameras"])))
     return dict(collect["setup"])
 
 
@@ -54,7 +65,7 @@ def require_same(given: Setup, allowed: Setup, whose: str) -> None:
     """SetupChanged with every difference; `whose` is what `allowed` belongs to."""
     found = differences(given, allowed)
     if found:
-        raise SetupChanged(f"the set-up is not that of {whose}: {'; '.join(found)}")
+        raise SetupChanged(_SET_UP_DIFFERS_FROM(whose=whose, found="; ".join(found)))
 
 
 def _plain(given: Setup, allowed: Setup) -> Iterator[str]:

@@ -18,6 +18,20 @@ from evaweb.roles import Role, require
 from evaweb.stations.commands import identity_of, issue
 from evaweb.stations.models import CARRIED_OUT, Command
 from evaweb.stations.runtime_client import wire_to
+from runtime.core.sentences import Pattern
+
+_ARGS_SAY_BESIDE_SESSION_WHICH = Pattern(
+    "collect.station_commands.args_say_beside_session_which",
+    "args say {doubled} beside the session, which has its own: leave it out",
+)
+_TAKES_NO_SESSION_ALLOWED_SETUP = Pattern(
+    "collect.station_commands.takes_no_session_allowed_setup",
+    "{kind} takes no session; allowed: setup, run",
+)
+_SESSION_CLOSED_RESUME_FIRST = Pattern(
+    "collect.station_commands.session_closed_resume_first",
+    "session {session} is closed: resume it first",
+)
 
 
 def session_command(
@@ -40,7 +54,7 @@ def session_command(
     beside = dict(args or {})
     doubled = sorted(own.keys() & beside.keys())
     if doubled:
-        raise EvaError(f"args say {', '.join(doubled)} beside the session, which has its own: leave it out")
+        raise EvaError(_ARGS_SAY_BESIDE_SESSION_WHICH(doubled=", ".join(doubled)))
     if not Command.objects.filter(pk=identity).exists():  # else it is asked again what became of it
         _require_fit(session, kind)
     row = issue(user=user, station=session.station, kind=kind, args={**beside, **own}, uuid=identity, **given)
@@ -75,13 +89,13 @@ def _own(session: CollectSession, kind: str, user: Any) -> dict[str, Any]:
             "operator": user.get_username(),
             "session": {"uuid": str(session.pk), "dataset": session.dataset},
         }
-    raise EvaError(f"{kind} takes no session; allowed: setup, run")
+    raise EvaError(_TAKES_NO_SESSION_ALLOWED_SETUP(kind=kind))
 
 
 def _require_fit(session: CollectSession, kind: str) -> None:
     """Whatever the page thinks: the session is open, and before a run the station is as it was."""
     if session_get(uuid=session.pk).closed_at is not None:
-        raise Conflict(f"session {session} is closed: resume it first")
+        raise Conflict(_SESSION_CLOSED_RESUME_FIRST(session=session))
     if kind == "run":
         station = session.station.name
         require_same(setup_of(wire_to(station).status(), station), session.setup, f"session {session}")

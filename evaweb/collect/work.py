@@ -12,6 +12,7 @@ from django.utils import timezone
 from evaweb.collect.models import CollectSession
 from evaweb.episodes.models import Episode
 from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.workers import Served, served
 
 KINDS = ("preview", "quality", "export", "publish", "sides")
 _MEASURED = 20  # jobs of a kind that its speed is taken from
@@ -27,6 +28,7 @@ class Item:
     number: int
     left_s: float | None
     expected_s: float | None
+    lacks: str = ""  # why no running worker can take it
 
     @property
     def fraction(self) -> float | None:
@@ -70,7 +72,8 @@ def queue_of(*, session: CollectSession) -> Queue:
     newest = _newest([f"{kind}:{uuid}" for uuid in frames for kind in KINDS])
     open_jobs = [job for job in newest if job.status != JobStatus.DONE]
     speeds = {kind: _seconds_per_frame(kind) for kind in {job.kind for job in open_jobs}}
-    items = sorted((_item(job, frames, speeds) for job in open_jobs), key=_turn)
+    having = served()
+    items = sorted((_item(job, frames, speeds, having) for job in open_jobs), key=_turn)
     waiting = [item.left_s for item in items if item.job.status != JobStatus.FAILED]
     known = [left for left in waiting if left is not None]
     return Queue(tuple(items), len(newest) - len(items), sum(known) if len(known) == len(waiting) else None)
@@ -90,14 +93,18 @@ def _parts(keys: Sequence[str]) -> Iterator[list[str]]:
         yield part
 
 
-def _item(job: Job, frames: Mapping[UUID, tuple[int, int]], speeds: Mapping[str, float | None]) -> Item:
+def _item(
+    job: Job, frames: Mapping[UUID, tuple[int, int]], speeds: Mapping[str, float | None], having: Served
+) -> Item:
     uuid = UUID(job.key.partition(":")[2])
     number, count = frames[uuid]
     speed = speeds[job.kind]
     expected = left = None if speed is None else speed * max(count, 1)
     if left is not None and job.status == JobStatus.RUNNING and job.claimed_at is not None:
         left = max(0.0, left - (timezone.now() - job.claimed_at).total_seconds())
-    return Item(job, uuid, number, None if job.status == JobStatus.FAILED else left, expected)
+    return Item(
+        job, uuid, number, None if job.status == JobStatus.FAILED else left, expected, having.lacks(job)
+    )
 
 
 def _turn(item: Item) -> tuple[int, object]:

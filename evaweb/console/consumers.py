@@ -32,13 +32,14 @@ from evaweb.console.requests import Aim, BadRequest, Credit, EStop, Events, Rene
 from evaweb.console.stopping import Stopping
 from evaweb.cookies import sessions_of
 from evaweb.credentials import COUNTS_S, SESSION, Login, credentials
-from evaweb.errors import NotFound, StationGone
+from evaweb.errors import NotFound, StationGone, reasoned
 from evaweb.roles import Role, role_of
 from evaweb.stations import leases
 from evaweb.stations.flights import Flights, TooMany
 from evaweb.stations.models import Station
 from evaweb.stations.robot_geometry import facts_of
 from evaweb.stations.selectors import station_get
+from runtime.core.sentences import Pattern, identity
 from runtime.ipc.messages import Ack
 
 log = logging.getLogger(__name__)
@@ -49,7 +50,11 @@ _MOST_EARLY = 50  # messages that wait until the database has said who is there
 _LOGIN_S = 5.0  # how often the login is looked at
 _AGAIN_S = 1.0  # after which a database that did not answer is asked again
 _renewals: Flights[Ack] = Flights("renew", most=32)  # of one station, which may hang
-_NOT_SAID = f"the database has not said for {COUNTS_S:.0f} s whose login this is; stopping works"
+_LOGIN_UNKNOWN = Pattern(
+    "console.login_unknown",
+    "the database has not said for {seconds:.0f} s whose login this is; stopping works",
+)
+_NOT_SAID = _LOGIN_UNKNOWN(seconds=COUNTS_S)
 _under_way: set[asyncio.Task[None]] = set()  # they go on when the page is closed
 
 
@@ -224,7 +229,8 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._mailbox.want_events(request.after, request.boot)
             self._room.ring()
         elif isinstance(request, Aim) and self._counted is None:
-            self._say({"type": "aimed", "id": request.id, "ok": False, "reason": _NOT_SAID})
+            said = {"ok": False, "reason": _NOT_SAID, "sentence": identity(_NOT_SAID)}
+            self._say({"type": "aimed", "id": request.id, **said})
         elif isinstance(request, Aim) and self._aims.ask(request):
             _go_on(self._aims.answer())
 
@@ -232,7 +238,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         """Renew the lease if the database has named the user within the last minute; it may be away since."""
         login = self._counted
         if login is None:
-            self._say({"type": "renewed", "ok": False, "lost": False, "reason": _NOT_SAID})
+            self._say({"type": "renewed", "ok": False, "lost": False, **reasoned(_NOT_SAID)})
         elif not self._renewing:  # else the one before has no answer yet
             self._renewing = True
             _go_on(self._renew(request, login.username))
@@ -245,24 +251,23 @@ class StationConsumer(AsyncWebsocketConsumer):
             page=self._page,
             station=self._station,
             epoch=request.epoch,
+            hidden=request.hidden,
         )
         try:
-            key = (username, self._page)
-            ack = await asyncio.wrap_future(
-                _renewals.ask(self._station, renew, key=key, identity=request.epoch)
-            )
+            key, identity = (username, self._page), (request.epoch, request.hidden)
+            ack = await asyncio.wrap_future(_renewals.ask(self._station, renew, key=key, identity=identity))
             refused = ack.status == "refused"
             self._say(
                 {
                     "type": "renewed",
                     "ok": not refused,
                     "lost": refused,
-                    "reason": ack.reason,
+                    **reasoned(ack.reason),
                     "epoch": request.epoch,
                 }
             )
         except (StationGone, TooMany) as gone:
-            self._say({"type": "renewed", "ok": False, "lost": False, "reason": str(gone)})
+            self._say({"type": "renewed", "ok": False, "lost": False, **reasoned(str(gone))})
         finally:
             self._renewing = False
 

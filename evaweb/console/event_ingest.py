@@ -173,7 +173,7 @@ def _hand_on(station: Station, boot: str, event: Mapping[str, Any]) -> None:
             commands.run_unopened(station=station, uuid=unbegun["command"], reason=event["text"])
         trials.run_changed(station=station, event=event, boot=boot)
         if unbegun.get("unopened"):
-            episodes.episode_unopened(uuid=unbegun["episode"])
+            episodes.episode_unopened(station=station, uuid=unbegun["episode"])
         if event["kind"] in collect.TOLD:
             collect.demonstration_told(event=event)
     except Error:

@@ -19,8 +19,12 @@ import zmq
 from evaweb.binary_frames import plain
 from evaweb.errors import StationGone
 from evaweb.stations.runtime_client import StationWire, wire_to
+from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CodecError, Subscriber
 from runtime.ipc.session_state import with_meaning
+
+_UNHEARD = Pattern("console.feed.unheard", "{station} has not been heard yet")
+
 
 log = logging.getLogger(__name__)
 EVENTS_KEPT = 2000
@@ -112,7 +116,7 @@ class _Reader(ABC):
                     self.lost(
                         f"no sign of life from {self._wire.name}: was its runtime ended, or does it hang?"
                     )
-                if now - looked > 2 * _TURN_S:
+                if now - looked >= _TURN_S:
                     looked = now
                     if self._wire.address(self._process, self._key) != endpoint:
                         return
@@ -126,19 +130,16 @@ class _Reader(ABC):
 
 
 class _Numbers(_Reader):
-    """State, joints, chunks and events, from the coordinator."""
+    """State and events, from the coordinator."""
 
     def __init__(self, feed: Feed, wire: StationWire) -> None:
-        super().__init__(wire, "coordinator", "state", ("state", "joints", "chunk", "event"))
+        super().__init__(wire, "coordinator", "state", ("state", "event"))
         self._feed = feed
 
     def heard(self, found: Mapping[str, Any]) -> None:
         feed = self._feed
         if feed.link != Link(True):
             feed.tell("link", Link(True))
-        for stream in ("joints", "chunk"):
-            if stream in found:
-                feed.tell(stream, found[stream])
         if "state" in found:
             feed.tell("state", _whole(found["state"]))
         if "event" in found or self._behind():
@@ -175,16 +176,26 @@ def _whole(state: Any) -> dict[str, Any]:
     return with_meaning(plain(state))
 
 
-class _Pictures(_Reader):
-    """Previews of the cameras, from media."""
+class _Shown(_Reader):
+    """What is for pages alone, and passed on as it comes."""
 
-    def __init__(self, feed: Feed, wire: StationWire) -> None:
-        super().__init__(wire, "media", "cameras", ("camera/",))
+    def __init__(self, feed: Feed, wire: StationWire, process: str, key: str, *streams: str) -> None:
+        super().__init__(wire, process, key, streams)
         self._feed = feed
 
     def heard(self, found: Mapping[str, Any]) -> None:
-        for stream, jpeg in found.items():
-            self._feed.tell(stream, jpeg)
+        for stream, content in found.items():
+            self._feed.tell(stream, content)
+
+
+def _motion(feed: Feed, wire: StationWire) -> _Reader:
+    """Joints and chunks, from the coordinator."""
+    return _Shown(feed, wire, "coordinator", "state", "joints", "chunk")
+
+
+def _pictures(feed: Feed, wire: StationWire) -> _Reader:
+    """Previews of the cameras, from media."""
+    return _Shown(feed, wire, "media", "cameras", "camera/")
 
 
 class Feed:
@@ -196,13 +207,17 @@ class Feed:
         self.state: dict[str, Any] = {}
         self.history = History()
         self._wire = wire_to(station)
-        self._listeners: dict[Listener, bool] = {}  # and whether it wants pictures
+        self._listeners: dict[Listener, bool] = {}  # and whether it wants pictures and motion
         self._lock = threading.Lock()
         self._numbers: _Reader | None = None
+        self._motion: _Reader | None = None
         self._pictures: _Reader | None = None
 
     def join(self, listener: Listener, *, pictures: bool) -> None:
-        """Tell `listener` what is known, then all that comes; the first one starts the threads."""
+        """Tell `listener` what is known, then all that comes; the first one starts the threads.
+
+        Pictures, joints and chunks come while anybody wants `pictures`.
+        """
         with self._lock:
             self._listeners[listener] = pictures
             listener("link", self.link)
@@ -220,7 +235,7 @@ class Feed:
         self._adjust()
 
     def _unheard(self) -> Link:
-        return Link(False, f"{self.station} has not been heard yet")
+        return Link(False, _UNHEARD(station=self.station))
 
     def tell(self, stream: str, content: Any) -> None:
         """Pass on what a reader has heard."""
@@ -238,7 +253,8 @@ class Feed:
         with self._lock:
             wanted, pictures = bool(self._listeners), any(self._listeners.values())
             self._numbers = self._switched(self._numbers, wanted, _Numbers)
-            self._pictures = self._switched(self._pictures, pictures, _Pictures)
+            self._motion = self._switched(self._motion, pictures, _motion)
+            self._pictures = self._switched(self._pictures, pictures, _pictures)
 
     def _switched(
         self, reader: _Reader | None, wanted: bool, kind: Callable[[Feed, StationWire], _Reader]

@@ -19,6 +19,7 @@ from evaweb.stations import redaction as veil
 from evaweb.stations.robot_geometry import Looks
 
 _FLUSH_S = 1 / 40  # frames leave at most so often
+_STATE_S = 1 / 200  # but for the station's state, which comes seldom and waits for no curve
 _CHANGES_S = 1.0
 
 
@@ -106,10 +107,14 @@ class Room:
         said = veil.state(content, EVERYTHING) if stream == "state" else content
         return self._covering.encode(stream, said)
 
-    def ring(self) -> None:
-        """Something is waiting: send it soon, together with what comes until then."""
-        if self._timer is None:
-            self._timer = self._loop.call_at(self._flushed + _FLUSH_S, self._flush)
+    def ring(self, after: float = _FLUSH_S) -> None:
+        """Something is waiting: send it `after` the last frame [s], together with what comes until then."""
+        at = self._flushed + after
+        if self._timer is not None and self._timer.when() <= at:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop.call_at(at, self._flush)
 
     def _take(self, stream: str, content: Any, encoded: list[Part], covered: list[Part]) -> None:
         if stream == "link":
@@ -129,7 +134,7 @@ class Room:
             for part in covered if viewer.veiled else encoded:
                 viewer.put(part)
         if self._viewers:
-            self.ring()
+            self.ring(_STATE_S if stream in ("state", "link") else _FLUSH_S)
 
     # --- who may see what ------------------------------------------------------------------------------------
 

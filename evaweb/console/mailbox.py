@@ -13,6 +13,7 @@ from typing import Any
 from evaweb.blinding import EVERYTHING, Sight
 from evaweb.console.feed import History, Link
 from evaweb.console.parts import Part
+from evaweb.errors import reasoned
 from evaweb.stations import redaction as veil
 
 CREDITS = 2
@@ -77,9 +78,8 @@ class Mailbox:
 
     def flush(self, history: History, make_frame: MakeFrame) -> None:
         """Send what may be sent now."""
-        if self._link is not None and self._say(
-            {"type": "link", "ok": self._link.ok, "reason": self._link.reason}
-        ):
+        link = self._link
+        if link is not None and self._say({"type": "link", "ok": link.ok, **reasoned(link.reason)}):
             self._link = None
         if self._changed and self._say({"type": "changed", "what": sorted(self._changed)}):
             self._changed.clear()

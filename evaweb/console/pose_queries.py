@@ -23,8 +23,16 @@ from evaweb.stations.holders import readable
 from evaweb.stations.models import Station
 from evaweb.stations.robot_geometry import Looks
 from evaweb.stations.runtime_client import StationWire
+from runtime.core.sentences import Pattern, Sentence, identity
 from runtime.ipc import messages
 from runtime.ipc.bus import CodecError
+
+_VIEWER = Pattern(
+    "console.aim.viewer",
+    "{user} is a viewer; aiming needs an operator: ask an administrator",
+)
+_NOT_SENDABLE = Pattern("console.aim.not_sendable", "the target cannot be sent: {error}")
+
 
 _TIMEOUT_S = 3.0  # the first one may have to wait until the station's kinematics are loaded
 _DIGITS = 5  # of a matrix in the answer: a hundredth of a millimetre
@@ -45,8 +53,7 @@ class Aims:
     def ask(self, request: Aim) -> bool:
         """Take the question in place of the one that waits; True where `answer` has to be started."""
         if self._role is Role.VIEWER:
-            reason = f"{self._username} is a viewer; aiming needs an operator: ask an administrator"
-            self._say({"type": "aimed", "id": request.id, "ok": False, "reason": reason})
+            self._say({"type": "aimed", "id": request.id, **_refused(_VIEWER(user=self._username))})
             return False
         self._waiting = request
         first, self._under_way = not self._under_way, True
@@ -68,7 +75,13 @@ class Aims:
             asked = _under_way.ask(self._station.name, work, key=id(self), identity=identity)
             return await asyncio.wrap_future(asked)
         except TooMany as fault:
-            return {"ok": False, "reason": str(fault)}
+            return _refused(str(fault))
+
+
+def _refused(reason: str) -> dict[str, Any]:
+    """`sentence` has the id and the arguments of the reason: "id" is that of the question."""
+    known = {"sentence": identity(reason)} if isinstance(reason, Sentence) else {}
+    return {"ok": False, "reason": reason, **known}
 
 
 def aimed(station: str, username: str, args: Mapping[str, Any], looks: Looks | None) -> dict[str, Any]:
@@ -78,12 +91,13 @@ def aimed(station: str, username: str, args: Mapping[str, Any], looks: Looks | N
         messages.encode(command)  # what cannot be sent is no fault of the station
         ack = _wire_to(station).request(command, timeout=_TIMEOUT_S)
     except CodecError as error:
-        return {"ok": False, "reason": f"the target cannot be sent: {error}"}
+        return _refused(_NOT_SENDABLE(error=error))
     except EvaError as gone:
-        return {"ok": False, "reason": str(gone)}
+        return _refused(str(gone))
     data = plain(dict(ack.data))
     links = _links(looks, data.get("joints")) if ack.status == "done" else []
-    return {**data, "ok": ack.status == "done", "reason": readable(ack.reason), "links": links}
+    said = {**_refused(readable(ack.reason)), "ok": ack.status == "done"}
+    return {**data, **said, "links": links}
 
 
 def _links(looks: Looks | None, joints: Any) -> list[float]:

@@ -10,7 +10,23 @@ from uuid import UUID, uuid4
 
 from evaweb.errors import EvaError
 from runtime.core import bounded_documents as bounded
+from runtime.core.sentences import Pattern
 from runtime.ipc import estop_requests as pressing
+
+_TYPE_UNKNOWN_ALLOWED_WATCH_ESTOP = Pattern(
+    "console.requests.type_unknown_allowed_watch_estop",
+    "type {kind!r:.40} is unknown; allowed: watch, estop, {read}",
+)
+_STREAMS_ALLOWED_LIST = Pattern(
+    "console.requests.streams_allowed_list",
+    "streams = {streams!r:.200}; allowed: a list of {allowed}",
+)
+_ALLOWED_WHOLE_NUMBER_FROM_0 = Pattern(
+    "console.requests.allowed_whole_number_from_0",
+    "{key} = {value!r:.40}; allowed: a whole number from 0 on",
+)
+_ALLOWED_MAP = Pattern("console.requests.allowed_map", "{key} = {value!r:.40}; allowed: a map")
+_ALLOWED_TEXT = Pattern("console.requests.allowed_text", "{key} = {value!r:.40}; allowed: a text")
 
 _LARGEST = 64 * 1024  # characters of what is no press; a page says little
 STREAMS = ("state", "joints", "recent", "poses", "chunk")
@@ -37,9 +53,10 @@ class Credit:
 
 @dataclass(frozen=True, slots=True)
 class Renew:
-    """The page is there and visible, and holds the lease of this epoch."""
+    """The page is there, visible or not, and holds the lease of this epoch."""
 
     epoch: int
+    hidden: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +116,7 @@ def parse(text: str, cameras: Collection[str]) -> Request:
         return Watch(_streams(said, cameras))
     read = _READ.get(kind) if isinstance(kind, str) else None
     if read is None:
-        raise BadRequest(f"type {kind!r:.40} is unknown; allowed: watch, estop, {', '.join(_READ)}")
+        raise BadRequest(_TYPE_UNKNOWN_ALLOWED_WATCH_ESTOP(kind=kind, read=", ".join(_READ)))
     return read(said)
 
 
@@ -107,28 +124,28 @@ def _streams(said: Mapping[str, Any], cameras: Collection[str]) -> tuple[str, ..
     allowed = (*STREAMS, *(f"camera/{camera}" for camera in cameras))
     streams = said.get("streams")
     if not isinstance(streams, list) or any(stream not in allowed for stream in streams):
-        raise BadRequest(f"streams = {streams!r:.200}; allowed: a list of {', '.join(allowed)}")
+        raise BadRequest(_STREAMS_ALLOWED_LIST(streams=streams, allowed=", ".join(allowed)))
     return tuple(streams)
 
 
 def _whole(said: Mapping[str, Any], key: str) -> int:
     value = said.get(key)
     if type(value) is not int or not 0 <= value <= 2**53:
-        raise BadRequest(f"{key} = {value!r:.40}; allowed: a whole number from 0 on")
+        raise BadRequest(_ALLOWED_WHOLE_NUMBER_FROM_0(key=key, value=value))
     return value
 
 
 def _map(said: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     value = said.get(key)
     if not isinstance(value, dict):
-        raise BadRequest(f"{key} = {value!r:.40}; allowed: a map")
+        raise BadRequest(_ALLOWED_MAP(key=key, value=value))
     return value
 
 
 def _text(said: Mapping[str, Any], key: str, default: str) -> str:
     value = said.get(key) or default
     if not isinstance(value, str):
-        raise BadRequest(f"{key} = {value!r:.40}; allowed: a text")
+        raise BadRequest(_ALLOWED_TEXT(key=key, value=value))
     return value
 
 
@@ -146,7 +163,7 @@ def _uuid(said: Mapping[str, Any]) -> UUID:
 
 _READ: dict[str, Callable[[Mapping[str, Any]], Request]] = {
     "credit": lambda said: Credit(),
-    "renew": lambda said: Renew(_whole(said, "epoch")),
+    "renew": lambda said: Renew(_whole(said, "epoch"), said.get("hidden") is True),
     "stop": _stop("stop"),
     "halt": _stop("halt"),
     "events": lambda said: Events(_whole(said, "after"), _text(said, "boot", "")),

@@ -18,6 +18,7 @@ from django.utils import timezone
 
 from evaweb.console.requests import EStop, Stop
 from evaweb.credentials import UNVERIFIED, Busy, Credential, Login, Unverifiable, credentials
+from evaweb.errors import reasoned
 from evaweb.roles import Role
 from evaweb.stations import commands, stops
 from evaweb.stations.models import CommandStatus, Station
@@ -68,8 +69,8 @@ class Stopping:
         try:
             known = await credentials.stopper(self._found, self._share)
         except (Unverifiable, Busy) as fault:
-            reason = f"{fault}: who may stop is not known; the e-stop works"
-            self._acknowledge(request.kind, request.uuid, stops.Answer(CommandStatus.FAILED, reason))
+            unknown = stops.Answer(CommandStatus.FAILED, stops.UNKNOWN_STOPPER(why=fault))
+            self._acknowledge(request.kind, request.uuid, unknown)
         else:
             if known is not None:
                 self._stop(request, known[1], at)
@@ -115,5 +116,5 @@ class Stopping:
         note(station=Station(name=self._station), answer=found)
 
     def _acknowledge(self, kind: str, uuid: UUID, answer: stops.Answer) -> None:
-        said = {"kind": kind, "uuid": str(uuid), "status": answer.status.value, "reason": answer.reason}
-        self._say({"type": "ack", **said})
+        said = {"kind": kind, "uuid": str(uuid), "status": answer.status.value}
+        self._say({"type": "ack", **said, **reasoned(answer.reason)})

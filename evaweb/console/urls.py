@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from django.urls import path
 
-from evaweb.console import views
+from evaweb.console import views, views_jobs, views_languages
 
 urlpatterns = [
     path("", views.home, name="home"),
+    path("languages/<str:code>.json", views_languages.catalogue, name="language"),
+    path("jobs/", views_jobs.jobs, name="jobs"),
+    path("jobs/cancel", views_jobs.job_act, {"what": "cancel"}, name="job-cancel"),
+    path("jobs/repeat", views_jobs.job_act, {"what": "repeat"}, name="job-repeat"),
     path("stations/<str:name>/", views.station, name="station"),
+    path("stations/<str:name>/still", views.still, name="station-still"),
     path("stations/<str:name>/debug/", views.debug, name="station-debug"),
     path("stations/<str:name>/eval/", views.evaluate, name="station-eval"),
     path("stations/<str:name>/eval/panel", views.panel, name="station-panel"),

@@ -10,10 +10,13 @@ from django.http import Http404, HttpRequest, HttpResponse
 from django.shortcuts import redirect, render
 from django.templatetags.static import static
 from django.urls import reverse
+from django.views.decorators.http import require_safe
 
 from evaweb.blinding import sight_for
 from evaweb.collect import panel as collecting
 from evaweb.console import selectors
+from evaweb.console.home import now
+from evaweb.console.stills import still_of
 from evaweb.datasets.on_robot import offer, recorded_at
 from evaweb.errors import EvaError, NotFound
 from evaweb.lock_wait import lock_wait
@@ -28,9 +31,25 @@ _REMEMBER_S = 0.5
 
 
 def home(request: HttpRequest) -> HttpResponse:
-    """The stations of the lab."""
-    template = "console/stations.html" if request.htmx else "console/home.html"  # type: ignore[attr-defined]
-    return render(request, template, {"rows": selectors.station_rows()})
+    """What matters now; with htmx one of its two parts, the stations or all else."""
+    htmx: Any = request.htmx  # type: ignore[attr-defined]
+    part = "now" if htmx and htmx.target == "now" else "stations" if htmx else ""
+    context: dict[str, Any] = {}
+    if part != "now":
+        context["rows"] = selectors.station_rows()
+    if part != "stations":
+        context["now"] = now(user=request.user, sight=sight_for(request))
+    return render(request, f"console/{part or 'home'}.html", context)
+
+
+@require_safe
+def still(request: HttpRequest, name: str) -> HttpResponse:
+    """The newest picture of a station's first camera; an empty answer where there is none, which is no fault."""
+    found = _station(name)
+    try:
+        return HttpResponse(still_of(found), content_type="image/jpeg")
+    except NotFound:
+        return HttpResponse(status=204)
 
 
 def station(request: HttpRequest, name: str) -> HttpResponse:
@@ -163,6 +182,7 @@ def _config(request: HttpRequest, station: Station, page: str, robot: dict[str, 
             "newest": reverse("preflight-newest"),
         },
         "uplot": static("uplot/uPlot.esm.js"),
+        "beat": static("console/commands/beat.js"),
     }
 
 

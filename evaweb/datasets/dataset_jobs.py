@@ -12,6 +12,7 @@ from django.db.models import Q
 from evaweb.datasets.finding import dataset_found
 from evaweb.datasets.orders import KIND, key_of
 from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.workers import waiting_for
 from runtime.datasets import layout
 
 SHOWN = 8  # newest jobs of a page
@@ -76,9 +77,8 @@ def told(job: Job) -> Told:
         return Told(job, title, "failed", job.error)
     if job.status == JobStatus.RUNNING:
         return Told(job, title, "running", job.progress or "it has begun")
-    return Told(
-        job, title, "waiting", f"tried again in a moment: {job.error}" if job.error else "for the worker"
-    )
+    words = f"tried again in a moment: {job.error}" if job.error else "for the worker"
+    return Told(job, title, "waiting", waiting_for(job) or words)
 
 
 def _about(args: Mapping[str, Any]) -> str:

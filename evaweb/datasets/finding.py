@@ -11,9 +11,21 @@ from typing import Any
 
 from evaweb.episodes.folders import data_dir
 from evaweb.errors import EvaError, NotFound
+from evaweb.names import is_name
+from runtime.core.sentences import Pattern
 from runtime.datasets import layout
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.recording.files import RecordingError
+
+_NAMES_NO_DATASET_ALLOWED_FOLDER = Pattern(
+    "datasets.finding.names_no_dataset_allowed_folder",
+    "{name!r:.120} names no dataset; allowed: a folder below the data folder such as datasets/cups, in one "
+    "line, without leading dots, and none that is called -",
+)
+_THERE_NO_DATASET_THERE = Pattern(
+    "datasets.finding.there_no_dataset_there",
+    "there is no dataset {name!r:.120}; there are: {there}{more}",
+)
 
 _LONGEST_PART = 255  # bytes; no file system takes more
 DEPTH = 3  # folders below the data folder at which datasets are looked for
@@ -23,6 +35,9 @@ _OWN = frozenset(
         *(
             "episodes",
             "previews",
+            "arrivals",
+            "cache",
+            "uploads",
             "reveals",
             "exports",
             "labels",
@@ -33,6 +48,7 @@ _OWN = frozenset(
             "sessions",
         ),
         *("stations", "jobs", "broker", "unwritten", "pictures", "logs", "static", "media"),
+        *("deployments", "diagnosis", "link"),
     )
 )
 
@@ -53,9 +69,14 @@ class Overview:
     problem: str = ""
 
     @property
+    def seconds(self) -> float:
+        """Duration of all of it."""
+        return self.frames / self.fps if self.fps else 0.0
+
+    @property
     def lasts(self) -> str:
-        """Duration of all of it, in words."""
-        seconds = self.frames / self.fps if self.fps else 0.0
+        """The same in words."""
+        seconds = self.seconds
         if seconds < 120:
             return f"{seconds:.1f} s"
         return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
@@ -73,13 +94,16 @@ def dataset_names() -> list[str]:
 
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:
-    """Datasets below `folder`; hidden ones are on their way, or were left by a crash."""
+    """Datasets below `folder`; hidden ones are on their way, or were left by a crash.
+
+    Folders that no address can name are none: one of them would take the lists of all others with it.
+    """
     try:
         below = [Path(entry.path) for entry in os.scandir(folder) if entry.is_dir()]
     except OSError:
         return  # it went away meanwhile, or is somebody else's
     for path in below:
-        if path.name.startswith(".") or (folder == data_dir() and path.name in _OWN):
+        if not _is_part(path.name) or (folder == data_dir() and path.name in _OWN):
             continue
         if (path / layout.INFO).is_file():
             yield path
@@ -90,17 +114,17 @@ def _walk(folder: Path, depth: int) -> Iterator[Path]:
 def folder_named(name: str) -> Path:
     """The folder of a new dataset or of one that is there: below the data folder, never hidden; EvaError."""
     parts = PurePosixPath(name).parts
-    wrong = (
-        not parts or len(parts) > DEPTH or any(part in (".", "..") or part.startswith(".") for part in parts)
-    )
+    wrong = not parts or len(parts) > DEPTH or not all(map(_is_part, parts))
     long = any(len(part.encode("utf-8", "surrogatepass")) > _LONGEST_PART for part in parts)
     own = parts == ("datasets",) or any(part in _OWN for part in parts[:1])
-    if wrong or long or own or PurePosixPath(name).is_absolute() or "\x00" in name:
-        raise EvaError(
-            f"{name!r:.120} names no dataset; allowed: a folder below the data folder such as datasets/cups, without "
-            "leading dots"
-        )
+    if wrong or long or own or PurePosixPath(name).is_absolute():
+        raise EvaError(_NAMES_NO_DATASET_ALLOWED_FOLDER(name=name))
     return data_dir().joinpath(*parts)
+
+
+def _is_part(name: str) -> bool:
+    """True if a folder on the way to a dataset may have this name; "-" ends a dataset's in addresses."""
+    return is_name(name) and name != "-" and not name.startswith(".")
 
 
 def dataset_found(name: str) -> Path:
@@ -109,9 +133,7 @@ def dataset_found(name: str) -> Path:
     if not (folder / layout.INFO).is_file():
         there = dataset_names()
         more = f", and {len(there) - 8} more" if len(there) > 8 else ""
-        raise NotFound(
-            f"there is no dataset {name!r:.120}; there are: {', '.join(there[:8]) or 'none'}{more}"
-        )
+        raise NotFound(_THERE_NO_DATASET_THERE(name=name, there=", ".join(there[:8]) or "none", more=more))
     return folder
 
 

@@ -13,9 +13,15 @@ from evaweb.episodes import services
 from evaweb.episodes.dataset_membership import places_read
 from evaweb.episodes.folders import data_dir, datasets_dir, episodes_dir
 from evaweb.errors import EvaError
+from runtime.core.sentences import Pattern
 from runtime.datasets.identities import named_copy
 from runtime.datasets.importing import bring, whose
 from runtime.datasets.reader import open_dataset
+
+_ALLOWED_NAME_DATASETS_NAME_WHAT = Pattern(
+    "datasets.importing.allowed_name_datasets_name_what",
+    "to = {to!r:.120}; allowed: a name, or datasets/NAME: what is reviewed lies there",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,5 +73,5 @@ def _target(dataset: Path, to: str) -> Path:
         return datasets_dir() / here.name
     folder = folder_named(full_name(to) if to else f"datasets/{here.name}")
     if folder.parent != datasets_dir():
-        raise EvaError(f"to = {to!r:.120}; allowed: a name, or datasets/NAME: what is reviewed lies there")
+        raise EvaError(_ALLOWED_NAME_DATASETS_NAME_WHAT(to=to))
     return folder

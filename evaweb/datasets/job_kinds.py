@@ -3,33 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from evaweb.datasets.finding import dataset_found, folder_named
-from evaweb.datasets.orders import KIND
+from evaweb.datasets.orders import KIND, least_for
 from evaweb.episodes.dataset_membership import places_read
 from evaweb.errors import EvaError
-from evaweb.jobs.kinds import Work, job_kind
+from evaweb.jobs.kinds import Cancelled, Work, job_kind
 from runtime.recording.files import RecordingError
 
 Found = dict[str, Any]
+_READ = ("check", "push")  # they change no dataset here
 
 
-@job_kind(KIND)
+@job_kind(KIND, least=lambda args: least_for(args["what"]))
 def dataset(work: Work) -> Mapping[str, Any]:
     """Do an order; args: those of evaweb.datasets.orders, checked.
 
     What is refused is a result (`done` false, `why`): to try it again would change nothing.
     """
     try:
+        work.hold(_names(work.args))
         found = _KINDS[work.args["what"]](work)
     except (RecordingError, EvaError) as fault:
         return {"done": False, "why": str(fault)}
-    if work.args["what"] not in ("check", "push"):
-        work.tell("the database is brought up to it")
+    except Cancelled:  # it may have been changed by then
+        if work.args["what"] not in _READ:
+            places_read()
+        raise
+    if work.args["what"] not in _READ:
         found["problems"] = [*found.get("problems", ()), *places_read()]
     return {"done": True, **found}
+
+
+def _names(args: Mapping[str, Any]) -> list[str]:
+    """All datasets that an order reads or writes."""
+    names = [*args.get("datasets", ()), *filter(None, (args.get("dataset"), args.get("to")))]
+    if args["what"] == "split":
+        names += [f"{args['to']}/{part}" for part in args["parts"]]
+    if args["what"] == "import":  # which lies below datasets/ from then on
+        names.append(f"datasets/{PurePosixPath(args['dataset']).name}")
+    return names
 
 
 def _check(work: Work) -> Found:

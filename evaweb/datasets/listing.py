@@ -14,6 +14,7 @@ from runtime.datasets.reader import Dataset
 from runtime.recording.files import RecordingError
 
 SUCCESSES = ("yes", "no", "unknown")
+RESULTS = ("success", "partial", "fail", "unknown")
 VERDICTS = ("pass", "fail", "unreviewed")
 
 
@@ -27,6 +28,7 @@ class Row:
     task: str
     uuid: str = ""
     success: bool | None = None
+    result: str = ""  # as its operator said it: of what is no success some is partial
     outcome: str = ""
     station: str = ""
     recording: Episode | None = None
@@ -38,16 +40,16 @@ class Row:
         return str(review.verdict) if review else ""
 
 
-def rows(name: str, *, words: str = "", success: str = "", verdict: str = "") -> list[Row]:
+def rows(name: str, *, words: str = "", success: str = "", result: str = "", verdict: str = "") -> list[Row]:
     """The episodes of a dataset, narrowed to those whose task or uuid has all `words`, and so on; RecordingError.
 
-    `success` is one of SUCCESSES, `verdict` one of VERDICTS; others choose nothing.
+    `success` is one of SUCCESSES, `result` one of RESULTS, `verdict` one of VERDICTS; others choose nothing.
     """
     dataset = opened(name)
     told = told_of(dataset)
     known = _known([str(line.get("uuid")) for line in told.values()])
     found = [_row(dataset, listed, told.get(listed.index, {}), known) for listed in dataset.episodes]
-    return [row for row in found if _fits(row, words.lower().split(), success, verdict)]
+    return [row for row in found if _fits(row, words.lower().split(), success, result, verdict)]
 
 
 def told_of(dataset: Dataset) -> dict[int, Mapping[str, Any]]:
@@ -85,17 +87,26 @@ def _row(dataset: Dataset, listed: Any, told: Mapping[str, Any], known: Mapping[
         task=", ".join(listed.tasks),
         uuid=uuid,
         success=success if isinstance(success, bool) else None,
+        result=result_of(told),
         outcome=str(outcome.get("status", "")) if isinstance(outcome, Mapping) else "",
         station=str(told.get("station", "")),
         recording=known.get(uuid),
     )
 
 
-def _fits(row: Row, words: Sequence[str], success: str, verdict: str) -> bool:
+def result_of(told: Mapping[str, Any]) -> str:
+    """ "success", "partial", "fail", or "" by our own line about an episode; lines of before have no `result`."""
+    if told.get("result") in RESULTS[:3]:
+        return str(told["result"])
+    return {True: "success", False: "fail"}.get(told.get("success"), "")  # type: ignore[call-overload,no-any-return]
+
+
+def _fits(row: Row, words: Sequence[str], success: str, result: str, verdict: str) -> bool:
     text = f"{row.task} {row.uuid} {row.station}".lower()
     wanted = {"yes": True, "no": False, "unknown": None}
     return (
         all(word in text for word in words)
         and (success not in wanted or row.success is wanted[success])
+        and (result not in RESULTS or (row.result or "unknown") == result)
         and (verdict not in VERDICTS or (row.verdict or "unreviewed") == verdict)
     )

@@ -23,11 +23,31 @@ from evaweb.stations.commands import issue
 from evaweb.stations.models import Command, Station
 from evaweb.stations.robot_geometry import facts_of
 from evaweb.stations.runtime_client import wire_to
+from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
 from runtime.recording.reader import open_episode
 
-SPACES = {"joint": "joints", "eef": "poses of the end effectors"}
+_TAKES_NO_REPLAY_SETUP_DOES = Pattern(
+    "datasets.on_robot.takes_no_replay_setup_does",
+    "{kind} takes no replay: setup does",
+)
+_ARGS_SAY_BESIDE_REPLAY_WHICH = Pattern(
+    "datasets.on_robot.args_say_beside_replay_which",
+    "args say {doubled} beside the replay, which has its own: leave it out",
+)
+_NO_EPISODE_ALLOWED_UUID_DATASET = Pattern(
+    "datasets.on_robot.no_episode_allowed_uuid_dataset",
+    "{source!r:.120} is no episode; allowed: a uuid, or DATASET:INDEX",
+)
+_EPISODE_STILL_BEING_RECORDED = Pattern(
+    "datasets.on_robot.episode_still_being_recorded",
+    "episode {uuid} is still being recorded",
+)
+_EPISODE_DAMAGED = Pattern("datasets.on_robot.episode_damaged", "episode {uuid} is damaged: {damage}")
+_SPACE_ALLOWED = Pattern("datasets.on_robot.space_allowed", "space = {space!r:.40}; allowed: {spaces}")
+
+SPACES = {"joint": "joints", "eef": "end-effector poses"}
 AFTER_S = 1.0  # for which the last row is held before the run ends by itself
 RATE = 5.0  # answers per second; each reaches a second ahead
 
@@ -144,14 +164,14 @@ def replay_command(
     """
     require(user, Role.OPERATOR)
     if kind != "setup":
-        raise EvaError(f"{kind} takes no replay: setup does")
+        raise EvaError(_TAKES_NO_REPLAY_SETUP_DOES(kind=kind))
     found = offer(recorded_at(episode, robot), station, space)
     if found.differences:
         raise Conflict("; ".join(found.differences))
     beside = dict(args or {})
     doubled = sorted(found.set_up.keys() & beside.keys() - {"task"})
     if doubled:
-        raise EvaError(f"args say {', '.join(doubled)} beside the replay, which has its own: leave it out")
+        raise EvaError(_ARGS_SAY_BESIDE_REPLAY_WHICH(doubled=", ".join(doubled)))
     args = {**found.set_up, **beside}
     return issue(user=user, station=station, kind=kind, args=args, vouched=("policy",), **given)
 
@@ -163,7 +183,7 @@ def recorded_at(source: str, robot: str = "") -> Recorded:
     except ValueError:
         name, _, index = source.rpartition(":")
         if not (name and index.isascii() and index.isdecimal() and len(index) < 10):
-            raise NotFound(f"{source!r:.120} is no episode; allowed: a uuid, or DATASET:INDEX") from None
+            raise NotFound(_NO_EPISODE_ALLOWED_UUID_DATASET(source=source)) from None
         try:
             return _of_dataset(played(full_name(name), int(index), robot))
         except RecordingError as error:
@@ -174,9 +194,9 @@ def recorded_at(source: str, robot: str = "") -> Recorded:
 def _recording(uuid: UUID) -> Recorded:
     row = episode_get(uuid=uuid)
     if row.status == EpisodeStatus.RECORDING:
-        raise Conflict(f"episode {uuid} is still being recorded")
+        raise Conflict(_EPISODE_STILL_BEING_RECORDED(uuid=uuid))
     if row.damage:
-        raise Conflict(f"episode {uuid} is damaged: {'; '.join(one['text'] for one in row.damage)}")
+        raise Conflict(_EPISODE_DAMAGED(uuid=uuid, damage="; ".join(one["text"] for one in row.damage)))
     try:
         episode = open_episode(journal_folder(uuid))
     except RecordingError as error:
@@ -227,7 +247,7 @@ def _of_dataset(shown: Played) -> Recorded:
 def offer(recorded: Recorded, station: Station, space: str) -> Offer:
     """Offer of the station for the episode; EvaError for an unknown space."""
     if space not in SPACES:
-        raise EvaError(f"space = {space!r:.40}; allowed: {', '.join(SPACES)}")
+        raise EvaError(_SPACE_ALLOWED(space=space, spaces=", ".join(SPACES)))
     facts, running = _facts(station)
     return Offer(recorded, station, space, tuple(_differences(recorded, facts, space)), running)
 
@@ -246,7 +266,7 @@ def _differences(recorded: Recorded, facts: Mapping[str, Any], space: str) -> li
     own = str(facts.get("robot", ""))
     if recorded.robot not in robots.names():
         called = f"calls its robot {recorded.robot!r}" if recorded.robot else "names no robot"
-        return [f"the episode {called}: say on its page in Replay whose numbers it has, then come back"]
+        return [f"the episode {called}: choose its robot on its page in Replay, then come back"]
     if recorded.robot != own:
         found.append(f"the episode is of the robot {recorded.robot}, the station has {own}")
     theirs, ours = list(recorded.joints), [str(name) for name in facts.get("joint_names", ())]
@@ -262,7 +282,7 @@ def _differences(recorded: Recorded, facts: Mapping[str, Any], space: str) -> li
     if space == "eef" and not recorded.poses:
         found.append("the episode has no poses of its actions: send joints")
     elif space == "eef" and not recorded.ours:
-        found.append("nobody knows in which frames its poses are, for it is of somebody else: send joints")
+        found.append("the frames of its poses are not known, because it was not recorded here: send joints")
     elif space == "eef" and list(facts.get("eef_names", recorded.poses)) != list(recorded.poses):
         found.append(f"the episode has the poses {', '.join(recorded.poses)}, the station others")
     return found

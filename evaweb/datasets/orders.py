@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, TypeAdapter, ValidationError
 
 import robots
 from evaweb.datasets.finding import dataset_found, dataset_names, folder_named
@@ -15,9 +15,27 @@ from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
 from evaweb.roles import Role, require
+from runtime.core.sentences import Pattern
 from runtime.datasets.layout import INFO
 from runtime.datasets.operations import fingerprint
 from runtime.recording.files import RecordingError
+
+_ROBOT_ALLOWED_NONE = Pattern(
+    "datasets.orders.robot_allowed_none",
+    "robot = {robot!r}; allowed: {names}, or none",
+)
+_WOULD_LIE_WITHIN_DATASET_CHOOSE = Pattern(
+    "datasets.orders.would_lie_within_dataset_choose",
+    "{wanted} would lie within the dataset {name}: choose another name",
+)
+_THERE_ALREADY_NOT_EMPTY_CHOOSE = Pattern(
+    "datasets.orders.there_already_not_empty_choose",
+    "{wanted} is there already and not empty: choose another name",
+)
+_EPISODES_BEING_DELETED_WAIT_UNTIL = Pattern(
+    "datasets.orders.episodes_being_deleted_wait_until",
+    "episodes of {dataset} are being deleted: wait until that is done",
+)
 
 KIND = "dataset"
 Name = Annotated[str, Field(min_length=1, max_length=200)]
@@ -51,7 +69,7 @@ class Convert(_Order):
     to: Name
     version: Version
     rename: dict[Name, Name] = Field(default_factory=dict, max_length=100)
-    reencode: bool = False
+    reencode: StrictBool = False
 
 
 class Import(_Order):
@@ -70,7 +88,7 @@ class Merge(_Order):
     datasets: Annotated[list[Name], Field(min_length=2, max_length=100)]
     to: Name
     version: Version | None = None
-    reencode: bool = False
+    reencode: StrictBool = False
 
 
 class Split(_Order):
@@ -81,7 +99,7 @@ class Split(_Order):
     to: Name
     parts: Annotated[dict[Name, list[Index]], Field(min_length=1, max_length=100)]
     version: Version | None = None
-    reencode: bool = False
+    reencode: StrictBool = False
 
 
 class Delete(_Order):
@@ -90,7 +108,7 @@ class Delete(_Order):
     what: Literal["delete"]
     dataset: Name
     episodes: Annotated[list[Index], Field(min_length=1)]
-    reencode: bool = False
+    reencode: StrictBool = False
 
 
 class Push(_Order):
@@ -99,14 +117,19 @@ class Push(_Order):
     what: Literal["push"]
     dataset: Name
     repository: Name
-    private: bool = True
+    private: StrictBool = True
 
 
 Order = Annotated[
     Check | Repair | Convert | Import | Merge | Split | Delete | Push, Field(discriminator="what")
 ]
 _ADAPTER: TypeAdapter[Check | Repair | Convert | Import | Merge | Split | Delete | Push] = TypeAdapter(Order)
-_ADMIN = (Delete, Push)
+_OF_ADMINS = ("delete", "push")
+
+
+def least_for(what: str) -> Role:
+    """The role that may order this."""
+    return Role.ADMIN if what in _OF_ADMINS else Role.OPERATOR
 
 
 def order_of(given: Mapping[str, Any]) -> Any:
@@ -132,7 +155,7 @@ def asked(*, user: Any, given: Mapping[str, Any]) -> Job:
     Raises EvaError where a dataset is not there, a new one is already, or a name leads out of the data folder.
     """
     order = order_of(given)
-    require(user, Role.ADMIN if isinstance(order, _ADMIN) else Role.OPERATOR)
+    require(user, least_for(order.what))
     sources = list(order.datasets) if isinstance(order, Merge) else [order.dataset]
     names = [full_name(name) for name in sources]
     for name in names:
@@ -147,7 +170,7 @@ def asked(*, user: Any, given: Mapping[str, Any]) -> Job:
     if isinstance(order, Delete):
         args |= {"episodes": sorted(set(order.episodes)), "known": _known(names[0])}
     if isinstance(order, Import) and order.robot and order.robot not in robots.names():
-        raise EvaError(f"robot = {order.robot!r}; allowed: {', '.join(robots.names())}, or none")
+        raise EvaError(_ROBOT_ALLOWED_NONE(robot=order.robot, names=", ".join(robots.names())))
     _require_quiet(names)
     return enqueue(kind=KIND, key=key_of(order.what, names[0], args), args=args)
 
@@ -171,9 +194,9 @@ def _new(to: str, parts: Sequence[str] | Mapping[str, Any]) -> str:
         folder = folder_named(wanted)
         around = next((above for above in folder.parents if (above / INFO).is_file()), None)
         if around is not None:
-            raise Conflict(f"{wanted} would lie within the dataset {around.name}: choose another name")
+            raise Conflict(_WOULD_LIE_WITHIN_DATASET_CHOOSE(wanted=wanted, name=around.name))
         if folder.exists() and any(folder.iterdir()):
-            raise Conflict(f"{wanted} is there already and not empty: choose another name")
+            raise Conflict(_THERE_ALREADY_NOT_EMPTY_CHOOSE(wanted=wanted))
     return name
 
 
@@ -190,4 +213,4 @@ def _require_quiet(names: Sequence[str]) -> None:
         kind=KIND, status__in=(JobStatus.QUEUED, JobStatus.RUNNING), args__what="delete"
     ):
         if job.args.get("dataset") in names:
-            raise Conflict(f"episodes of {job.args['dataset']} are being deleted: wait until that is done")
+            raise Conflict(_EPISODES_BEING_DELETED_WAIT_UNTIL(dataset=job.args["dataset"]))

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 import robots
 from evaweb.datasets.finding import camera_keys, opened
-from evaweb.datasets.listing import told_of
+from evaweb.datasets.listing import result_of, told_of
 from evaweb.errors import NotFound
 from evaweb.stations.robot_geometry import looks_of
+from runtime.core.sentences import Pattern
 from runtime.datasets import layout
 from runtime.datasets.entries import EpisodeEntry, Span
 from runtime.datasets.reader import Dataset
@@ -27,6 +28,23 @@ from runtime.recording.files import RecordingError
 from runtime.recording.layout import Layout
 from runtime.recording.reader import Episode
 from runtime.recording.tables import SCHEMAS
+
+_HAS_NO_CAMERA_HAS = Pattern(
+    "datasets.playing.has_no_camera_has",
+    "{name} has no camera {camera!r:.80}; it has {cameras}",
+)
+_HAS_NO_EPISODE_THERE = Pattern(
+    "datasets.playing.has_no_episode_there",
+    "{name} has no episode {index}, there are {count}",
+)
+_ROBOT_DOES_NOT_EXIST_THERE = Pattern(
+    "datasets.playing.robot_does_not_exist_there",
+    "robot {robot!r:.80} does not exist; there are: {names}",
+)
+_EPISODE_HAS_JOINTS_HAS_CHOOSE = Pattern(
+    "datasets.playing.episode_has_joints_has_choose",
+    "the episode has {count} joints, {robot} has {count_2}: choose another robot",
+)
 
 STATES = ("observation.state", "observation.qpos")  # measured joints, the first that there is
 _SOURCE = "control_source"
@@ -47,6 +65,11 @@ class Played:
     told: Mapping[str, Any]  # our own line about it; {} for one of others
     robot: str
     assumed: bool
+
+    @property
+    def result(self) -> str:
+        """As its operator said it, "" where nobody has."""
+        return result_of(self.told)
 
     @property
     def uuid(self) -> str:
@@ -78,7 +101,7 @@ class Played:
         key = self.cameras.get(camera)
         if key is None:
             raise NotFound(
-                f"{self.name} has no camera {camera!r:.80}; it has {', '.join(self.cameras) or 'none'}"
+                _HAS_NO_CAMERA_HAS(name=self.name, camera=camera, cameras=", ".join(self.cameras) or "none")
             )
         return self.entry.videos.get(key)
 
@@ -118,9 +141,9 @@ def played(name: str, index: int, robot: str = "") -> Played:
     dataset = opened(name)
     listed = next((one for one in dataset.episodes if one.index == index), None)
     if listed is None:
-        raise NotFound(f"{name} has no episode {index}, there are {len(dataset.episodes)}")
+        raise NotFound(_HAS_NO_EPISODE_THERE(name=name, index=index, count=len(dataset.episodes)))
     if robot and robot not in robots.names():
-        raise NotFound(f"robot {robot!r:.80} does not exist; there are: {', '.join(robots.names())}")
+        raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.names())))
     own = str(dataset.info.get("robot_type") or "")
     return Played(name, index, dataset, listed, told_of(dataset).get(index, {}), robot or own, bool(robot))
 
@@ -227,7 +250,7 @@ def _called(shown: Played, joints: list[str]) -> list[str]:
     known = list(looks_of(shown.robot).robot.joint_names)
     if len(known) != len(joints):
         raise NotFound(
-            f"the episode has {len(joints)} joints, {shown.robot} has {len(known)}: choose another robot"
+            _EPISODE_HAS_JOINTS_HAS_CHOOSE(count=len(joints), robot=shown.robot, count_2=len(known))
         )
     return known
 

@@ -28,7 +28,25 @@ from evaweb.episodes.views import player
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.stations.geometry import geometry
 from evaweb.stations.models import Station
+from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
+
+_EPISODES_BESIDE_EACH_OTHER_ALLOWED = Pattern(
+    "datasets.replaying.episodes_beside_each_other_allowed",
+    "{count} episodes beside each other; allowed: at most {most}",
+)
+_PICTURES_COLUMN_THERE_NO_VIDEO = Pattern(
+    "datasets.replaying.pictures_column_there_no_video",
+    "the pictures of {camera} are in a column: there is no video of them",
+)
+_ROW_EPISODE_HAS_ROWS_0 = Pattern(
+    "datasets.replaying.row_episode_has_rows_0",
+    "row {row}: the episode has rows 0 to {frames}",
+)
+_ALLOWED_WHOLE_NUMBER_FROM_0 = Pattern(
+    "datasets.replaying.allowed_whole_number_from_0",
+    "{name} = {given!r:.40}; allowed: a whole number from 0",
+)
 
 Result = TypeVar("Result")
 MOST = 6  # episodes beside each other
@@ -59,7 +77,7 @@ def side_by_side(request: HttpRequest) -> HttpResponse:
     """Several episodes on one clock; ?show= names each, see evaweb.datasets.sources."""
     names = list(dict.fromkeys(name.strip() for name in request.GET.getlist("show") if name.strip()))
     if len(names) > MOST:
-        raise EvaError(f"{len(names)} episodes beside each other; allowed: at most {MOST}")
+        raise EvaError(_EPISODES_BESIDE_EACH_OTHER_ALLOWED(count=len(names), most=MOST))
     found, problems = [], []
     for name in names:
         try:
@@ -96,7 +114,7 @@ async def video(request: HttpRequest, name: str, index: int, camera: str) -> Htt
     episode = await sync_to_async(_episode)(request, name, index)
     span = episode.video(camera)
     if span is None:
-        raise NotFound(f"the pictures of {camera} are in a column: there is no video of them")
+        raise NotFound(_PICTURES_COLUMN_THERE_NO_VIDEO(camera=camera))
     kind = _TYPES.get(span.path.suffix.lower(), "application/octet-stream")
     return await file_answer(request, span.path, kind)
 
@@ -107,7 +125,7 @@ def picture(request: HttpRequest, name: str, index: int, camera: str) -> HttpRes
     episode = _episode(request, name, index)
     row = _number(request, "row")
     if row >= episode.frames:
-        raise NotFound(f"row {row}: the episode has rows 0 to {episode.frames - 1}")
+        raise NotFound(_ROW_EPISODE_HAS_ROWS_0(row=row, frames=episode.frames - 1))
     content, kind = _readable(lambda: still(episode, camera, row))
     return HttpResponse(content, content_type=kind)
 
@@ -160,7 +178,7 @@ def _recording(episode: Played) -> Episode | None:
 def _number(request: HttpRequest, name: str) -> int:
     given = request.GET.get(name, "0")
     if not (given.isascii() and given.isdecimal()) or len(given) > 9:
-        raise EvaError(f"{name} = {given!r:.40}; allowed: a whole number from 0")
+        raise EvaError(_ALLOWED_WHOLE_NUMBER_FROM_0(name=name, given=given))
     return int(given)
 
 

@@ -17,7 +17,17 @@ from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import episode_get, stage_of
 from evaweb.episodes.views import replay_config
 from evaweb.errors import Conflict, NotFound
+from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
+
+_EPISODE_CANNOT_PLAYED_YET = Pattern(
+    "datasets.sources.episode_cannot_played_yet",
+    "episode {uuid} cannot be played yet. {sentence}",
+)
+_NO_EPISODE_ALLOWED_UUID_RECORDING = Pattern(
+    "datasets.sources.no_episode_allowed_uuid_recording",
+    "{name!r:.120} is no episode; allowed: the uuid of a recording, or DATASET:INDEX",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +54,7 @@ def shown(request: Any, name: str) -> Shown:
 def _recording(request: Any, episode: Episode) -> Shown:
     stage = stage_of(episode=episode)
     if stage.name != "ready":
-        raise Conflict(f"episode {episode.uuid} cannot be played yet. {stage.sentence}")
+        raise Conflict(_EPISODE_CANNOT_PLAYED_YET(uuid=episode.uuid, sentence=stage.sentence))
     made_by = sight_for(request).policy_of(episode)
     started = f"{episode.started_at:%Y-%m-%d %H:%M:%S}" if episode.started_at else "time unknown"
     return Shown(
@@ -60,7 +70,7 @@ def _recording(request: Any, episode: Episode) -> Shown:
 def _of_dataset(name: str) -> Shown:
     dataset, colon, index = name.rpartition(":")
     if not (colon and index.isascii() and index.isdecimal() and len(index) < 10):
-        raise NotFound(f"{name!r:.120} is no episode; allowed: the uuid of a recording, or DATASET:INDEX")
+        raise NotFound(_NO_EPISODE_ALLOWED_UUID_RECORDING(name=name))
     episode = episode_of(full_name(dataset), int(index))
     return Shown(
         name=f"{episode.name}:{episode.index}",
@@ -106,7 +116,7 @@ def dataset_config(episode: Played) -> dict[str, Any]:
         "geometry": dataset_address("dataset-geometry", episode) if known else "",
         "why": ""
         if known
-        else f"the dataset calls its robot {episode.robot or 'nothing'}: choose the one to be drawn",
+        else f"the dataset calls its robot {episode.robot or 'nothing'}: choose the one to be drawn under Details",
         "poses": dataset_address("dataset-poses", episode),
         "segments": dataset_address("dataset-segments", episode),
         "videos": videos,

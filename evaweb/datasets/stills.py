@@ -13,7 +13,10 @@ from PIL import Image, UnidentifiedImageError
 
 from evaweb.datasets.playing import Played
 from evaweb.errors import NotFound
+from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
+
+_PICTURES_VIDEO = Pattern("datasets.stills.pictures_video", "the pictures of {camera} are in a video")
 
 QUALITY = 85
 _SHOWN = {"JPEG": "image/jpeg", "PNG": "image/png"}  # as they are coded
@@ -22,7 +25,7 @@ _SHOWN = {"JPEG": "image/jpeg", "PNG": "image/png"}  # as they are coded
 def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
     """Picture `row` of a camera and its type; coded again only where no browser shows it. RecordingError, NotFound."""
     if episode.video(camera) is not None:
-        raise NotFound(f"the pictures of {camera} are in a video")
+        raise NotFound(_PICTURES_VIDEO(camera=camera))
     key = episode.cameras[camera]
     content = _stored(episode, key, row)
     try:
@@ -31,7 +34,7 @@ def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
             if kind:
                 return content, kind
             pixels = np.ascontiguousarray(picture.convert("RGB"))
-    except (OSError, UnidentifiedImageError) as error:
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise RecordingError(f"picture {row} of {key!r} cannot be decoded: {error}") from error
     jpeg: bytes = simplejpeg.encode_jpeg(pixels, quality=QUALITY)
     return jpeg, "image/jpeg"

@@ -2,63 +2,92 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from pathlib import PurePosixPath
 from typing import Any
 
 from django.contrib import messages
 from django.core.paginator import Paginator
 from django.http import HttpRequest, HttpResponse, QueryDict
+from django.http.response import HttpResponseBase
 from django.shortcuts import redirect, render
 from django.views.decorators.http import require_GET, require_POST
 
 import robots
-from evaweb.datasets import dataset_jobs, listing, orders
+from evaweb.datasets import dataset_jobs, listed, listing, orders
 from evaweb.datasets.finding import overview, overviews
 from evaweb.errors import Conflict, EvaError
+from evaweb.lists import Listing
+from evaweb.names import is_name
 from evaweb.roles import Role, role_of
+from runtime.core.sentences import Pattern
+from runtime.datasets.__main__ import MOST, is_index
 from runtime.datasets.__main__ import episodes as indices_of
 from runtime.recording.files import RecordingError
 
+_EXPECTED_NAME_VALUE_EACH_NAME = Pattern(
+    "datasets.views.expected_name_value_each_name",
+    "{name}: {wrong!r}; expected NAME=VALUE, each name once",
+)
+_NOTHING_DELETED_TYPE_NAME_DATASET = Pattern(
+    "datasets.views.nothing_deleted_type_name_dataset",
+    "nothing was deleted: type the name of the dataset, {name}, to confirm it",
+)
+
 PER_PAGE = 100
-FILTERS = ("words", "success", "verdict")
+_INDICES = re.compile(r"[0-9]{1,9}(,[0-9]{1,9}){0,199}")
 
 
 @require_GET
-def dataset_list(request: HttpRequest) -> HttpResponse:
+def dataset_list(request: HttpRequest) -> HttpResponseBase:
     """All datasets of the data folder."""
-    rows = [(one, None if one.problem else dataset_jobs.checked(one.name)) for one in overviews()]
-    context = {"rows": rows, "name": "", **_work(""), **_rights(request)}
+    found = overviews()
+    shown = Listing(request.GET, listed.COLUMNS, listed.filters(found))
+    fits = shown.sorted([one for one in found if listed.fits(one, **shown.chosen)])
+    if shown.wants_file:
+        return shown.file(request, "datasets", fits)
+    page = Paginator(fits, PER_PAGE).get_page(shown.number)
+    rows = [(one, None if one.problem else dataset_jobs.checked(one.name)) for one in page]
+    context = {"listing": shown, "page": page, "rows": rows, "name": "", **_work(""), **_rights(request)}
     return render(request, "datasets/list.html", context)
 
 
 @require_GET
-def dataset(request: HttpRequest, name: str) -> HttpResponse:
+def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
     """One dataset: its figures, its episodes, what can be done with it."""
     name = orders.full_name(name)
-    chosen = {key: request.GET.get(key, "").strip() for key in FILTERS}
+    shown = Listing(request.GET, listed.EPISODE_COLUMNS, listed.EPISODE_FILTERS)
     found = overview(name)
     rows: list[listing.Row] = []
     problem = found.problem
     if not problem:
         try:
-            rows = listing.rows(name, **chosen)
+            rows = shown.sorted(listing.rows(name, **shown.chosen))
         except RecordingError as error:
             problem = str(error)
+    if shown.wants_file and not problem:
+        return shown.file(request, PurePosixPath(name).name, rows)
     context = {
         "dataset": found,
         "problem": problem,
         "checked": None if problem else dataset_jobs.checked(name),
-        "page": Paginator(rows, PER_PAGE).get_page(request.GET.get("page")),
-        "chosen": chosen,
-        "narrowed": any(chosen.values()),
-        "successes": listing.SUCCESSES,
-        "verdicts": listing.VERDICTS,
+        "page": Paginator(rows, PER_PAGE).get_page(shown.number),
+        "listing": shown,
         "robots": robots.names(),
         "name": name,
+        "chosen": _chosen(request.GET.get("chosen", "")),
         **_work(name),
         **_rights(request),
     }
     return render(request, "datasets/dataset.html", context)
+
+
+def _chosen(given: str) -> str:
+    """Indices of episodes that another page has handed over; EvaError."""
+    if given and not _INDICES.fullmatch(given):
+        raise EvaError(f"chosen = {given!r:.80}; allowed: indices of episodes, separated by commas")
+    return given
 
 
 @require_GET
@@ -83,7 +112,7 @@ def dataset_ask(request: HttpRequest) -> HttpResponse:
     else:
         messages.success(request, f"{dataset_jobs.told(job).title}: asked for")
     name = request.POST.get("dataset", "")
-    return redirect("dataset", name=name) if name else redirect("dataset-list")
+    return redirect("dataset", name=name) if name and is_name(name) else redirect("dataset-list")
 
 
 def _order(form: QueryDict) -> Mapping[str, Any]:
@@ -100,12 +129,10 @@ def _order(form: QueryDict) -> Mapping[str, Any]:
     if what == "convert":
         order["rename"] = _pairs("rename", form.get("rename", ""))
     if what == "split":
-        order["parts"] = {
-            part: _indices(which) for part, which in _pairs("parts", form.get("parts", "")).items()
-        }
+        order["parts"] = _parts(form.get("parts", ""))
     if what == "delete":
         _require_confirmed(form)
-        order["episodes"] = [int(index) for index in form.getlist("episodes") if index.isdecimal()]
+        order["episodes"] = [int(index) for index in form.getlist("episodes") if is_index(index)]
     if what in ("convert", "merge", "split", "delete"):
         order["reencode"] = form.get("reencode") == "on"
     if what == "push":
@@ -118,22 +145,26 @@ def _pairs(name: str, text: str) -> dict[str, str]:
     pairs = [part.partition("=") for part in text.split()]
     wrong = [f"{key}{sign}{value}" for key, sign, value in pairs if not (key and sign and value)]
     if wrong or len({key for key, _, _ in pairs}) < len(pairs):
-        raise EvaError(f"{name}: {' '.join(wrong) or text!r}; expected NAME=VALUE, each name once")
+        raise EvaError(_EXPECTED_NAME_VALUE_EACH_NAME(name=name, wrong=" ".join(wrong) or text))
     return {key: value for key, _, value in pairs}
 
 
-def _indices(text: str) -> list[int]:
-    try:
-        return indices_of(text)
-    except RecordingError as fault:
-        raise EvaError(str(fault)) from None
+def _parts(text: str) -> dict[str, list[int]]:
+    """Episodes of each part; together as many as one order may name."""
+    parts: dict[str, list[int]] = {}
+    for part, which in _pairs("parts", text).items():
+        try:
+            parts[part] = indices_of(which, MOST - sum(map(len, parts.values())))
+        except RecordingError as fault:
+            raise EvaError(str(fault)) from None
+    return parts
 
 
 def _require_confirmed(form: QueryDict) -> None:
     """Refuse to delete episodes unless the form names their dataset."""
     name = form.get("dataset", "").removeprefix("datasets/")
     if form.get("confirm", "").strip() != name:
-        raise Conflict(f"nothing was deleted: write the name of the dataset, {name}, to confirm it")
+        raise Conflict(_NOTHING_DELETED_TYPE_NAME_DATASET(name=name))
 
 
 def _work(name: str) -> dict[str, Any]:

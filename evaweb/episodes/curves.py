@@ -12,6 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from evaweb.binary_frames import Stream, encode
+from evaweb.episodes.bench import milestones_reached
 from evaweb.episodes.chunks import chunks
 from evaweb.episodes.robot import looks_in, robot_in
 from evaweb.errors import NotFound
@@ -23,9 +24,16 @@ Array = NDArray[Any]
 
 # Events that say nothing of the policy, for those who are not to know which it was.
 _OPEN_MARKS = ("command", "estopped", "released", "truth")
+_JUDGED = ("truth",)  # people score before they hear it
 
 
-def curves(folder: Path, *, covered: bool = False) -> bytes:
+def curves(
+    folder: Path,
+    *,
+    covered: bool = False,
+    unscored: bool = False,
+    milestones: Sequence[tuple[float, str]] = (),
+) -> bytes:
     """One message of evaweb.binary_frames; RecordingError names the file that is absent or damaged.
 
     Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (a row per joint):
@@ -35,12 +43,20 @@ def curves(folder: Path, *, covered: bool = False) -> bytes:
     makers. makers: chunk i4 [W], weight f4 [W]. raw, where the policy speaks in joints: time f8 [R], values
     f4 [D, R], chunk i4 [R]. chunks: see evaweb.episodes.chunks.
 
-    `covered`: without what tells which policy it was, as of an episode of which no policy's answers were recorded.
+    `covered`: without what tells which policy it was, as of an episode of which no policy's answers were recorded;
+    `unscored`: without what a simulated bench says of how it went. `milestones` are (time of the run [s], words) as
+    they were scored; without any the bench's own are marked.
     """
-    return curves_of(open_episode(folder), covered=covered)
+    return curves_of(open_episode(folder), covered=covered, unscored=unscored, milestones=milestones)
 
 
-def curves_of(episode: Episode, *, covered: bool = False) -> bytes:
+def curves_of(
+    episode: Episode,
+    *,
+    covered: bool = False,
+    unscored: bool = False,
+    milestones: Sequence[tuple[float, str]] = (),
+) -> bytes:
     """The same of an episode that is open already."""
     start = _start(episode)
     if covered:
@@ -53,6 +69,7 @@ def curves_of(episode: Episode, *, covered: bool = False) -> bytes:
         "chunks": chunks(episode, lambda steps: _times_of(episode, steps) - start),
     }
     names = robot_in(episode.manifest).get("joint_names")
+    held = held_spans(episode.rows.column("control_source").to_pylist(), episode.layout.fps)
     return encode(
         streams,
         joints=names if isinstance(names, list) else [f"joint {k}" for k in range(episode.layout.dim)],
@@ -60,8 +77,11 @@ def curves_of(episode: Episode, *, covered: bool = False) -> bytes:
         frames=episode.frames,
         fps=episode.layout.fps,
         period=_period(episode),
-        held=held_spans(episode.rows.column("control_source").to_pylist(), episode.layout.fps),
-        marks=_marks(episode, start),
+        held=held,
+        marks=[
+            *_marks(episode, start, _JUDGED if unscored else ()),
+            *_milestones(episode, unscored, [(_played(at, held), words) for at, words in milestones]),
+        ],
     )
 
 
@@ -201,12 +221,33 @@ def held_spans(sources: Sequence[str], fps: float) -> list[list[float]]:
     ]
 
 
-def _marks(episode: Episode, start: float) -> list[dict[str, Any]]:
-    """The events of the episode; one without a time has no place on the axis."""
+def _marks(episode: Episode, start: float, without: Sequence[str]) -> list[dict[str, Any]]:
+    """The events of the episode but for kinds `without`; one without a time has no place on the axis."""
     marks = []
     for event in episode.events:
         time = event.get("time")
+        if event.get("kind") in without:
+            continue
         if isinstance(time, int | float) and not isinstance(time, bool):
             at = max(0.0, float(time) - episode.layout.started - start)
             marks.append({"time": at, "kind": str(event.get("kind", "")), "text": str(event.get("text", ""))})
     return marks
+
+
+def _played(at: float, held: Sequence[Sequence[float]]) -> float:
+    """When on the clock of the videos a run was `at` seconds old: its time stands still while it is held."""
+    for begin, end in held:
+        if begin <= at:
+            at += end - begin
+    return at
+
+
+def _milestones(
+    episode: Episode, unscored: bool, scored: Sequence[tuple[float, str]]
+) -> list[dict[str, Any]]:
+    """Marks of the milestones as they were scored, else as the bench says them where that may be told."""
+    found = list(scored)
+    if not found and not unscored:
+        fps = episode.layout.fps
+        found = [(row / fps, name.replace("_", " ")) for name, row in milestones_reached(episode)]
+    return [{"time": time, "kind": "milestone", "text": f"reached: {words}"} for time, words in found]

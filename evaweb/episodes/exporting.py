@@ -11,8 +11,19 @@ from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.errors import NotFound
 from evaweb.jobs.models import JobStatus
 from evaweb.jobs.selectors import job_newest
+from evaweb.jobs.workers import waiting_for
+from runtime.core.sentences import Pattern
 from runtime.recording.export import is_exported, place
 from runtime.recording.files import RecordingError, read_document
+
+_TABLE_EPISODE_CANNOT_HAD = Pattern(
+    "episodes.exporting.table_episode_cannot_had",
+    "the table of episode {uuid} cannot be had: {error}",
+)
+_TABLE_EPISODE_NOT_MADE_YET = Pattern(
+    "episodes.exporting.table_episode_not_made_yet",
+    "the table of episode {uuid} is not made yet: POST to this address has it made",
+)
 
 CONTENT_TYPE = "application/vnd.apache.parquet"
 
@@ -43,15 +54,15 @@ def table_file(uuid: UUID) -> Path:
     try:
         path = exported(uuid)
     except RecordingError as error:
-        raise NotFound(f"the table of episode {uuid} cannot be had: {error}") from None
+        raise NotFound(_TABLE_EPISODE_CANNOT_HAD(uuid=uuid, error=error)) from None
     if path is None:
-        raise NotFound(f"the table of episode {uuid} is not made yet: POST to this address has it made")
+        raise NotFound(_TABLE_EPISODE_NOT_MADE_YET(uuid=uuid))
     return path
 
 
 def table_of(*, episode: Episode) -> Table:
     """State of the table, from the disk and its newest job; none of what is still being written."""
-    if episode.status in (EpisodeStatus.RECORDING, EpisodeStatus.MISSING):
+    if episode.away_since or episode.status in (EpisodeStatus.RECORDING, EpisodeStatus.MISSING):
         return Table("none")
     try:
         path = exported(episode.uuid)
@@ -64,4 +75,4 @@ def table_of(*, episode: Episode) -> Table:
         return Table("absent")
     if job.status == JobStatus.FAILED:
         return Table("failed", job.error)
-    return Table("preparing", job.error)
+    return Table("preparing", job.error or waiting_for(job))

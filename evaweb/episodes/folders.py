@@ -35,6 +35,16 @@ def preview_video(uuid: UUID, camera: str) -> Path:
     return preview_folder(uuid) / f"{camera}.mp4"
 
 
+def preview_sheet(uuid: UUID, camera: str) -> Path:
+    """Small pictures of one of the episode's cameras on one sheet."""
+    return preview_folder(uuid) / sheet_name(camera)
+
+
+def sheet_name(camera: str) -> str:
+    """File of a camera's sheet in the folder of a preview."""
+    return f"{camera}.sheet.jpg"
+
+
 def datasets_dir() -> Path:
     """All datasets that are published here."""
     return data_dir() / "datasets"

@@ -12,6 +12,7 @@ from django.db.models.functions import Now
 from django.utils import timezone
 
 from evaweb.episodes import services, verifying
+from evaweb.episodes.arriving import take_in_arrived, whereabouts
 from evaweb.episodes.dataset_sidecars import sides_of
 from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
 from evaweb.episodes.manifest import recorded_in
@@ -20,8 +21,10 @@ from evaweb.episodes.preview import make_preview
 from evaweb.episodes.publishing import dataset_name, success_of
 from evaweb.episodes.reconcile import reconcile
 from evaweb.episodes.smoothness import Smoothness, smoothness_in
+from evaweb.episodes.videos import put_videos, unstored
 from evaweb.jobs.kinds import Work, at_start, chore, job_kind
 from evaweb.jobs.services import enqueue
+from evaweb.object_stores import the_store
 from runtime.datasets.published import never_published, publish
 from runtime.recording.export import export
 from runtime.recording.files import RecordingError
@@ -38,7 +41,22 @@ def preview(work: Work) -> Mapping[str, Any]:
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
     frames = make_preview(journal_folder(episode.uuid), preview_folder(episode.uuid), work.tell)
     Episode.objects.filter(uuid=episode.uuid).update(previewed_at=timezone.now())
+    if the_store() is not None:
+        services.storing_asked(uuid=episode.uuid)
     return {"frames": frames}
+
+
+@job_kind("store")
+def store_videos(work: Work) -> Mapping[str, Any]:
+    """Put the videos of a preview into the lab's store, where they are played from then on; args: uuid."""
+    return {"videos": put_videos(UUID(work.args["uuid"]))}
+
+
+@at_start("videos to be stored")
+def store_at_start() -> None:
+    """Those that were made when there was no store, or when it was away."""
+    for uuid in unstored():
+        services.storing_asked(uuid=uuid)
 
 
 @job_kind("export")
@@ -61,6 +79,7 @@ def measure_smoothness(work: Work) -> Mapping[str, Any]:
         smoothness_commanded=found.commanded,
         smoothness_detail={"arms": {name: dict(arm) for name, arm in found.arms.items()}, "why": found.why},
     )
+    services.trial_changed(uuid=uuid)
     return {"smoothness": found.measured, "why": found.why}
 
 
@@ -73,7 +92,10 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
     folder = journal_folder(episode.uuid)
     if not folder.exists():
-        return {"published": False, "why": "there is no folder of it: nothing of its run is on this disk"}
+        why = "there is no folder of it: nothing of its run is on this disk"
+        if episode.away_since is not None:
+            why = f"{whereabouts(episode)} It is published when it is."
+        return {"published": False, "why": why}
     try:
         return _published(work, episode, folder)
     except RecordingError:
@@ -102,10 +124,12 @@ def _published(work: Work, episode: Episode, folder: Path) -> Mapping[str, Any]:
     simulated = recorded.simulated or episode.station.simulated
     name = dataset_name(recorded, scored=success is not None, simulated=simulated)
     work.tell(f"into {name}")
+    dataset_folder = datasets_dir() / name
+    work.hold([dataset_folder.relative_to(data_dir()).as_posix()])
     with TemporaryDirectory() as beside:
         placed = publish(
             folder,
-            datasets_dir() / name,
+            dataset_folder,
             success=success,
             include_interrupted=success is not None,
             version=work.args.get("version"),
@@ -156,6 +180,12 @@ def reconcile_at_start() -> None:
 def look_for_closed() -> int:
     """Episodes that a station has repaired, or closed while the web was away."""
     return services.catch_up()
+
+
+@chore("arrived recordings")
+def look_for_arrived() -> int:
+    """Episodes of stations on other computers that have come here."""
+    return take_in_arrived()
 
 
 @chore("recordings to be verified")

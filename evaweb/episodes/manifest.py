@@ -10,7 +10,7 @@ from typing import Any
 
 from evaweb.episodes.models import EpisodeStatus
 from runtime.recording.files import RecordingError, read_document
-from runtime.recording.layout import Layout
+from runtime.recording.layout import Layout, simulated
 from runtime.recording.scrub import require_sound
 from runtime.recording.sealing import MANIFEST, OUTCOME, SEAL, read_outcome
 
@@ -63,7 +63,7 @@ def recorded_in(folder: Path) -> Recorded:
     return Recorded(
         uuid=layout.uuid,
         station=_text(manifest, "station", 63),
-        simulated=_table(_table(manifest, "configuration"), "transport").get("simulated") is True,
+        simulated=simulated(manifest),
         trial=_table(manifest, "trial"),
         ended_at=_time(outcome.get("ended_wall")),
         facts=facts | _end(path, outcome),

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import uuid
 
+from django.conf import settings
 from django.db import models
+from django.utils import timezone
 
 from evaweb.stations.models import Station
+
+LONGEST_TAG = 60  # characters
 
 
 class EpisodeStatus(models.TextChoices):
@@ -77,6 +81,11 @@ class Episode(models.Model):
     verified_at = models.DateTimeField(
         null=True, blank=True, help_text="When all of its files were last compared with their digests."
     )
+    away_since = models.DateTimeField(
+        null=True,
+        blank=True,
+        help_text="Since when it is closed on its station's computer and not here yet; none: it is not on its way.",
+    )
     created_at = models.DateTimeField(auto_now_add=True)
 
     class Meta:
@@ -93,3 +102,20 @@ class Episode(models.Model):
 
     def __str__(self) -> str:
         return f"{self.uuid} ({self.get_status_display()})"
+
+
+class Tag(models.Model):
+    """A free word of the lab on an episode, by which lists are narrowed; in small letters, so that it is one word."""
+
+    uuid = models.UUIDField(primary_key=True, default=uuid.uuid4, editable=False)
+    episode = models.ForeignKey(Episode, on_delete=models.PROTECT, related_name="tags")
+    words = models.CharField(max_length=LONGEST_TAG, db_index=True)
+    by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="tags")
+    at = models.DateTimeField(default=timezone.now)
+
+    class Meta:
+        ordering = ("words",)
+        constraints = [models.UniqueConstraint(fields=("episode", "words"), name="tag_once_per_episode")]
+
+    def __str__(self) -> str:
+        return self.words

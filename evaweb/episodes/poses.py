@@ -10,7 +10,13 @@ from evaweb.binary_frames import Stream, encode
 from evaweb.episodes.curves import vectors
 from evaweb.episodes.robot import looks_in
 from evaweb.errors import NotFound
+from runtime.core.sentences import Pattern
 from runtime.recording.reader import Episode, open_episode
+
+_ROW_EPISODE_HAS_ROWS_0 = Pattern(
+    "episodes.poses.row_episode_has_rows_0",
+    "row {first}: the episode has rows 0 to {frames}",
+)
 
 MOST_ROWS = 900  # of one answer: half a minute at 30 Hz
 
@@ -28,7 +34,7 @@ def poses_of(episode: Episode, first: int) -> bytes:
     """The same of an episode that is open already."""
     looks = looks_in(episode.manifest)
     if not 0 <= first < max(1, episode.frames):
-        raise NotFound(f"row {first}: the episode has rows 0 to {episode.frames - 1}")
+        raise NotFound(_ROW_EPISODE_HAS_ROWS_0(first=first, frames=episode.frames - 1))
     joints = vectors(episode.rows.slice(first, MOST_ROWS), "qpos", episode.layout.dim).T
     found = looks.poses(np.nan_to_num(joints))
     return encode({"poses": Stream(body=found)}, first=first, rows=episode.frames, fps=episode.layout.fps)

@@ -1,4 +1,4 @@
-"""Makes what a browser can play of an episode: the same coded pictures with the index at the front, a thumbnail."""
+"""Makes what a browser can play of an episode: the same coded pictures with the index at the front, small pictures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import simplejpeg
 from numpy.typing import NDArray
 from PIL import Image
 
-from evaweb.episodes.folders import THUMBNAIL
+from evaweb.episodes.folders import THUMBNAIL, sheet_name
+from evaweb.episodes.sheets import sheet
 from runtime.datasets.pictures import Pictures
 from runtime.datasets.remux import remux
 from runtime.recording.files import RecordingError, disk_fault, sync_folder, write_whole
@@ -24,7 +25,8 @@ QUALITY = 82
 
 
 def make_preview(journal: Path, target: Path, tell: Callable[[str], None]) -> int:
-    """Put <camera>.mp4 of every camera, as far as it has pictures, and thumbnail.jpg into `target`; the number of rows.
+    """Put <camera>.mp4 and <camera>.sheet.jpg of every camera, as far as it has pictures, and thumbnail.jpg into
+    `target`; the number of rows.
 
     The folder appears whole or not at all, in the place of an older one. RecordingError names the file that
     is absent, damaged or cannot be written.
@@ -68,6 +70,8 @@ def _fill(episode: Episode, draft: Path, tell: Callable[[str], None]) -> None:
         video = draft / f"{camera}.mp4"
         remux(source, video, episode.shown(camera), episode.layout.fps)
         _sync(video)
+        small = sheet(source, episode.frames, episode.shown(camera))
+        write_whole(draft / sheet_name(camera), small)
     shown = [camera for camera in episode.videos if episode.shown(camera)]
     if shown:
         middle = min(episode.frames // 2, episode.shown(shown[0]) - 1)

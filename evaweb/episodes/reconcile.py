@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -110,10 +110,22 @@ def reconcile() -> Report:
     )
 
 
+def taken_in(uuid: UUID | str) -> list[str]:
+    """Read one episode that has come to the disk, or what was said of it, into the database; what is wrong with it."""
+    uuid, problems = UUID(str(uuid)), list[str]()
+    if problem := services.problem_of(uuid):
+        return [problem]
+    services.exports_asked(uuids=[uuid])
+    _give([uuid], {uuid}, problems)
+    return problems
+
+
 def _folders() -> tuple[list[UUID], list[str]]:
     """The episodes that there are, and what else lies there."""
     root, problems = episodes_dir(), list[str]()
-    there = (path for path in root.iterdir() if path.is_dir()) if root.is_dir() else ()
+    # Folders with a dot are of what is on its way from other computers, or on its way out.
+    named = (path for path in root.iterdir() if not path.name.startswith(".")) if root.is_dir() else ()
+    there = (path for path in named if path.is_dir())
     return sorted(_named(there, "", "no episode", problems)), problems
 
 
@@ -140,8 +152,13 @@ def _restored(read: Sequence[UUID], problems: list[str]) -> int:
     }
     recorded, scored = set(read), files.get(_SCORES.folder, set())
     in_order = Episode.objects.order_by("started_at").values_list("uuid", flat=True)
+    uuids = (*(uuid for uuid in in_order if uuid in recorded), *sorted(scored - recorded))
+    return _give(uuids, recorded, problems)
+
+
+def _give(uuids: Iterable[UUID], recorded: Collection[UUID], problems: list[str]) -> int:
     runs = []
-    for uuid in (*(uuid for uuid in in_order if uuid in recorded), *sorted(scored - recorded)):
+    for uuid in uuids:
         try:
             lines = _SCORES.read(uuid, problems.append)
             runs.append(Kept(uuid, uuid in recorded, lines, problems.append))

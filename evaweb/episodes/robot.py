@@ -8,6 +8,20 @@ from typing import Any
 import robots
 from evaweb.errors import NotFound
 from evaweb.stations.robot_geometry import Looks, groups_of, looks_of
+from runtime.core.sentences import Pattern
+
+_ROBOT_DOES_NOT_EXIST_THERE = Pattern(
+    "episodes.robot.robot_does_not_exist_there",
+    "robot {name!r:.80} does not exist; there are: {names}",
+)
+_EPISODE_HAS_JOINTS_HAS_TODAY = Pattern(
+    "episodes.robot.episode_has_joints_has_today",
+    "the episode has {get} joints, {name} has {dim} today",
+)
+_JOINTS_HAVE_OTHER_NAMES_ANOTHER = Pattern(
+    "episodes.robot.joints_have_other_names_another",
+    "the joints of {name} have other names, or another order, today",
+)
 
 
 def robot_in(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -33,7 +47,7 @@ def described_in(manifest: Mapping[str, Any]) -> robots.Robot:
     """The same without its looks, where nothing is drawn."""
     name, groups = str(robot_in(manifest).get("name", "")), groups_in(manifest)
     if name not in robots.names():
-        raise NotFound(f"robot {name!r:.80} does not exist; there are: {', '.join(robots.names())}")
+        raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(name=name, names=", ".join(robots.names())))
     try:
         robot = robots.load(name, groups)
     except robots.RobotError as error:
@@ -45,6 +59,6 @@ def described_in(manifest: Mapping[str, Any]) -> robots.Robot:
 def _require_same(robot: robots.Robot, manifest: Mapping[str, Any]) -> None:
     recorded = robot_in(manifest)
     if robot.dim != recorded.get("dim"):
-        raise NotFound(f"the episode has {recorded.get('dim')} joints, {robot.name} has {robot.dim} today")
+        raise NotFound(_EPISODE_HAS_JOINTS_HAS_TODAY(get=recorded.get("dim"), name=robot.name, dim=robot.dim))
     if groups_in(manifest) is not None and list(robot.joint_names) != recorded["joint_names"]:
-        raise NotFound(f"the joints of {robot.name} have other names, or another order, today")
+        raise NotFound(_JOINTS_HAVE_OTHER_NAMES_ANOTHER(name=robot.name))

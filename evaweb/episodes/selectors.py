@@ -7,20 +7,29 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID
 
-from django.db.models import F, Q, QuerySet
+from django.db.models import Count, F, Q, QuerySet
 
 from evaweb.blinding import EVERYTHING, Sight
+from evaweb.episodes.arriving import whereabouts
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.manifest import CLOSED
-from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.models import Episode, EpisodeStatus, Tag
+from evaweb.episodes.services import station_elsewhere
 from evaweb.errors import NotFound
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_newest
+from evaweb.jobs.workers import waiting_for
+from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError, read_document
 from runtime.recording.layout import Layout
 from runtime.recording.tables import read_table, rows_schema
 
-# What a page says of an episode beside its own facts; trial and standing are bound to it from above.
+_EPISODE_DOES_NOT_EXIST_THIS = Pattern(
+    "episodes.selectors.episode_does_not_exist_this",
+    "episode {uuid} does not exist in this lab",
+)
+
+# What a page says of an episode beside its own facts; trial, standing and demonstration are bound to it from above.
 _WITH = (
     "station",
     "trial__scene",
@@ -29,6 +38,7 @@ _WITH = (
     "trial__verdict",
     "trial__handout",
     "standing__review",
+    "demonstration",
 )
 
 # What the list can be narrowed to, each with its words.
@@ -48,7 +58,7 @@ REVIEW = {
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Stage of an episode on its way to be played: recording, preparing, ready, failed, empty or missing."""
+    """Stage of an episode on its way to be played: recording, elsewhere, preparing, ready, failed, empty or missing."""
 
     name: str
     sentence: str = ""
@@ -56,14 +66,14 @@ class Stage:
     @property
     def passing(self) -> bool:
         """True if it changes by itself, so that a page looks again."""
-        return self.name in ("recording", "preparing")
+        return self.name in ("recording", "elsewhere", "preparing")
 
 
 def episode_get(*, uuid: UUID) -> Episode:
     """The episode with what a page says of it; NotFound where it is not in the database."""
     found = Episode.objects.select_related(*_WITH).filter(uuid=uuid).first()
     if found is None:
-        raise NotFound(f"episode {uuid} does not exist in this lab")
+        raise NotFound(_EPISODE_DOES_NOT_EXIST_THIS(uuid=uuid))
     return found
 
 
@@ -74,6 +84,7 @@ def episode_list(
     status: str = "",
     quality: str = "",
     review: str = "",
+    tag: str = "",
     words: str = "",
     sight: Sight = EVERYTHING,
 ) -> QuerySet[Episode]:
@@ -84,13 +95,15 @@ def episode_list(
     `quality` is a key of QUALITY, `review` one of REVIEW; others choose nothing.
     """
     newest = (F("started_at").desc(nulls_last=True), "-created_at")
-    found = Episode.objects.select_related(*_WITH).order_by(*newest)
+    found = Episode.objects.select_related(*_WITH).prefetch_related("tags").order_by(*newest)
     if station:
         found = found.filter(station__name=station)
     if mode:
         found = found.filter(mode=mode)
     if status:
         found = found.filter(status=status)
+    if tag:
+        found = found.filter(tags__words=tag)
     found = found.filter(QUALITY.get(quality, _ALL)[1], REVIEW.get(review, _ALL)[1])
     seen = ~Q(checkpoint__in=sight.names) & ~Q(trial__checkpoint__in=sight.checkpoints)
     for word in words.split():
@@ -105,6 +118,12 @@ def episode_list(
     return found
 
 
+def tag_counts(*, sight: Sight = EVERYTHING) -> dict[str, int]:
+    """The lab's tags in the order of the alphabet, and how many episodes have each."""
+    rows = Tag.objects.order_by("words").values_list("words")
+    return {words: n for words, n in rows.annotate(n=Count("pk")) if not sight.named_in(words)}
+
+
 def stage_of(*, episode: Episode) -> Stage:
     """Stage of the episode, from its row, the disk and its newest job."""
     if preview_folder(episode.uuid).is_dir() and episode.status != EpisodeStatus.RECORDING:
@@ -117,6 +136,8 @@ def stage_of(*, episode: Episode) -> Stage:
             "episode when it starts again.",
         )
     if episode.status == EpisodeStatus.MISSING or not journal_folder(episode.uuid).is_dir():
+        if episode.away_since is not None:
+            return Stage("elsewhere", whereabouts(episode))
         return Stage(
             "missing",
             "Its folder is not on this machine: it was moved, or recorded elsewhere. Bring it back, then run "
@@ -135,10 +156,12 @@ def unrecorded_because(*, episode: Episode | None) -> str:
         return ""
     if episode.status in CLOSED:
         return f"episode {episode.uuid} of its run has no rows"
-    folder = journal_folder(episode.uuid)
+    folder, later = journal_folder(episode.uuid), "look again once it is closed"
+    if not folder.is_dir() and station_elsewhere(episode.station):
+        where = f"the computer of {episode.station}"
+        return f"{where} has not told yet what is in episode {episode.uuid} of its run: {later}"
     if not folder.is_dir():
         return f"episode {episode.uuid} of its run has no folder: nothing of it is on this disk"
-    later = "look again once it is closed"
     return "" if _rows_written(folder) else f"no row of episode {episode.uuid} is on the disk yet: {later}"
 
 
@@ -153,7 +176,7 @@ def _rows_written(folder: Path) -> int:
 
 def _preparing(job: Job | None) -> Stage:
     if job is None or job.status == JobStatus.DONE:
-        return Stage("failed", "There is no preview of it yet, and nobody is making one.")
+        return Stage("failed", "There is no preview yet, and none is being made.")
     if job.status == JobStatus.FAILED:
         return Stage("failed", job.error)
     if job.status == JobStatus.RUNNING:
@@ -161,8 +184,20 @@ def _preparing(job: Job | None) -> Stage:
             "preparing", f"The videos are being prepared{': ' if job.progress else ''}{job.progress}."
         )
     if job.error:
-        return Stage("preparing", f"It is tried again in a moment: {job.error}")
-    return Stage("preparing", "The videos wait for the worker to prepare them.")
+        return Stage("preparing", f"Another attempt follows in a moment: {job.error}")
+    return Stage("preparing", waiting_for(job) or "The videos wait for the worker to prepare them.")
+
+
+def unscored_for(*, episode: Episode, sight: Sight) -> bool:
+    """True if the user is to score the trial in this recording before hearing how it went."""
+    return sight.hides_episode(episode) and not getattr(trial_of(episode=episode), "verdict_id", None)
+
+
+def milestones_of(*, episode: Episode) -> list[tuple[float, str]]:
+    """When each milestone was reached [s after the start of the run], by the score that counts; [] without one."""
+    verdict = getattr(trial_of(episode=episode), "verdict", None)
+    outcomes = verdict.outcomes.exclude(at_s=None) if verdict is not None else ()
+    return [(outcome.at_s, outcome.text) for outcome in outcomes if outcome.reached]
 
 
 def trial_of(*, episode: Episode) -> Any:

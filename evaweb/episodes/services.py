@@ -17,16 +17,25 @@ from evaweb.episodes.exporting import exported, job_key
 from evaweb.episodes.folders import data_dir, journal_folder, preview_folder
 from evaweb.episodes.manifest import CLOSED, Recorded, recorded_in
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
-from evaweb.errors import EvaError
+from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
-from evaweb.stations.models import Station
+from evaweb.stations.models import Station, StationKey
+from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
 from runtime.recording.quarantine import marked
 from runtime.recording.sealing import OUTCOME
 
 log = logging.getLogger(__name__)
+_NO_EPISODE_EXPECTED_UUID = Pattern(
+    "episodes.services.no_episode_expected_uuid",
+    "{given!r} is no episode: expected its uuid",
+)
+_ANOTHERS = Pattern(
+    "episodes.services.anothers",
+    "episode {uuid} is of {owner}: {station} says nothing of it",
+)
 
 APPEARS_WITHIN = timedelta(seconds=60)  # the folder of an episode that was announced
 
@@ -56,16 +65,25 @@ def episode_opened(
             "started_at": timezone.now(),
         },
     )
+    _require_own(station, episode.pk)
     return episode
+
+
+def _require_own(station: Station, uuid: UUID) -> None:
+    """A station on another computer is believed of its own episodes alone, whatever its key or computer came to."""
+    other = Episode.objects.exclude(station=station).select_related("station").filter(uuid=uuid).first()
+    if other is not None:
+        raise Conflict(_ANOTHERS(uuid=uuid, owner=other.station.name, station=station.name))
 
 
 def episode_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
     """The station says that an episode is on disk: read it there, and ask for its preview.
 
     `data` is that of the runtime's event: uuid, status, reason, rows, error, waits. Where the folder is not on this
-    machine, or damaged, the event's own words are kept. EvaError where it names no episode.
+    machine, or damaged, the event's own words are kept. EvaError where it names no episode, or another station's.
     """
     uuid = _uuid(data.get("uuid"))
+    _require_own(station, uuid)
     try:
         episode = episode_read(uuid=uuid, station=station)
         if data.get("waits") and episode.status == EpisodeStatus.RECORDING:
@@ -80,6 +98,8 @@ def episode_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
             "reason": f"{data.get('reason') or 'no reason was given'} ({error})",
             "frames": rows if isinstance(rows, int) and rows > 0 else 0,
         }
+        if station_elsewhere(station) and not journal_folder(uuid).exists():
+            facts |= {"reason": str(data.get("reason") or ""), "away_since": timezone.now()}
     with transaction.atomic():
         episode, _ = Episode.objects.update_or_create(
             uuid=uuid, defaults=facts, create_defaults={"station": station, "robot": station.robot, **facts}
@@ -88,9 +108,9 @@ def episode_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
 
 
 @transaction.atomic
-def episode_unopened(*, uuid: UUID | str) -> None:
+def episode_unopened(*, station: Station, uuid: UUID | str) -> None:
     """Forget an episode that was announced and could not be opened; one that has a folder, or a trial, stays."""
-    announced = Episode.objects.filter(uuid=_uuid(uuid), status=EpisodeStatus.RECORDING, trial=None)
+    announced = station.episodes.filter(uuid=_uuid(uuid), status=EpisodeStatus.RECORDING, trial=None)
     if not journal_folder(_uuid(uuid)).exists():
         announced.delete()
 
@@ -120,6 +140,7 @@ def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
     facts = dict(recorded.facts) | {
         "previewed_at": _previewed_at(uuid),
         "damage": marked(data_dir(), str(uuid)),
+        "away_since": None,
     }
     episode, _ = Episode.objects.update_or_create(
         uuid=uuid,
@@ -146,9 +167,20 @@ def another_than(row: Episode, seal: str | None) -> str:
     return ""
 
 
+def trial_changed(*, uuid: UUID) -> None:
+    """Mark the episode's trial as changed, where it has one: what is shown of it has."""
+    trials: Any = Episode._meta.get_field("trial").related_model
+    trials._default_manager.filter(episode=uuid).update(changed_at=Now())
+
+
 def preview_asked(*, episode: Episode) -> Job:
     """Have the worker make what a browser can play."""
     return enqueue(kind="preview", key=f"preview:{episode.uuid}", args={"uuid": str(episode.uuid)})
+
+
+def storing_asked(*, uuid: UUID) -> Job:
+    """Have the worker put the videos of its preview into the lab's store."""
+    return enqueue(kind="store", key=f"store:{uuid}", args={"uuid": str(uuid)})
 
 
 def export_asked(*, episode: Episode) -> Job:
@@ -161,7 +193,7 @@ def smoothness_asked(*, most: int) -> int:
     rows = Episode.objects.filter(
         status__in=CLOSED, kind="rollout", frames__gt=0, smoothness_detail__isnull=True
     )
-    found = list(rows.order_by("created_at")[:most])
+    found = list(rows.filter(away_since=None).order_by("created_at")[:most])
     for episode in found:
         with transaction.atomic():
             # Asked for once, however it ends: a job that failed is there to be seen and to be tried again.
@@ -194,7 +226,10 @@ def catch_up() -> int:
 def missing_marked() -> int:
     """Say of every row whose folder is gone that it is missing; how many there are now."""
     fresh = Q(status=EpisodeStatus.RECORDING, created_at__gt=Now() - APPEARS_WITHIN)
-    known = Episode.objects.exclude(fresh).exclude(status=EpisodeStatus.MISSING)
+    known = Episode.objects.exclude(fresh).exclude(status=EpisodeStatus.MISSING).filter(away_since=None)
+    # One that is recorded elsewhere is on that computer until it is closed, and on its way then.
+    elsewhere = StationKey.objects.filter(withdrawn_at=None).values("station")
+    known = known.exclude(status=EpisodeStatus.RECORDING, station__in=elsewhere)
     for uuid in known.values_list("uuid", flat=True):
         if not journal_folder(uuid).is_dir():
             Episode.objects.filter(uuid=uuid).update(status=EpisodeStatus.MISSING)
@@ -254,8 +289,13 @@ def station_known(*, name: str, robot: str, simulated: bool, source: str, active
     return station
 
 
+def station_elsewhere(station: Station) -> bool:
+    """True if it runs on a computer of its own, from where its episodes have to come."""
+    return StationKey.objects.filter(station=station, withdrawn_at=None).exists()
+
+
 def _uuid(given: object) -> UUID:
     try:
         return given if isinstance(given, UUID) else UUID(str(given))
     except ValueError:
-        raise EvaError(f"{given!r} is no episode: expected its uuid") from None
+        raise EvaError(_NO_EPISODE_EXPECTED_UUID(given=given)) from None

@@ -16,6 +16,12 @@ from django.http.response import HttpResponseBase
 
 from evaweb.episodes.ranges import Span, Unsatisfiable, Validators, not_modified, range_holds, span_asked
 from evaweb.errors import NotFound
+from runtime.core.sentences import Pattern
+
+_THIS_EPISODE_NOT_ON_THIS = Pattern(
+    "episodes.streaming.this_episode_not_on_this",
+    "{name} of this episode is not on this machine: {strerror}",
+)
 
 PIECE = 256 * 1024
 # Daphne takes all that we have, however slow the client; a browser asks for the rest of a video by itself
@@ -47,7 +53,7 @@ def _open(path: Path) -> BinaryIO:
     try:
         return path.open("rb")
     except OSError as error:
-        raise NotFound(f"{path.name} of this episode is not on this machine: {error.strerror}") from None
+        raise NotFound(_THIS_EPISODE_NOT_ON_THIS(name=path.name, strerror=error.strerror)) from None
 
 
 def _answer(

@@ -12,10 +12,12 @@ urlpatterns = [
     path("replay/<uuid:uuid>/stage", views.stage, name="replay-stage"),
     path("replay/<uuid:uuid>/preview", views.preview, name="replay-preview"),
     path("episodes/<uuid:uuid>/video/<str:camera>", views.video, name="episode-video"),
+    path("episodes/<uuid:uuid>/sheet/<str:camera>", views.sheet, name="episode-sheet"),
     path("episodes/<uuid:uuid>/thumbnail", views.thumbnail, name="episode-thumbnail"),
     path("episodes/<uuid:uuid>/export", views.export, name="episode-export"),
     path("episodes/<uuid:uuid>/table", views.table, name="episode-table"),
     path("episodes/<uuid:uuid>/curves", views.episode_curves, name="episode-curves"),
     path("episodes/<uuid:uuid>/geometry", views.episode_geometry, name="episode-geometry"),
+    path("episodes/<uuid:uuid>/bench", views.episode_bench, name="episode-bench"),
     path("episodes/<uuid:uuid>/poses", views.episode_poses, name="episode-poses"),
 ]

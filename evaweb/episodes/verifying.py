@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 AGAIN_AFTER = timedelta(days=30)
 OLD_AFTER = timedelta(hours=1)  # what was just recorded is verified when it is published
+LATE_AFTER = timedelta(days=1)
 MOST_EPISODES, MOST_BYTES = 100, 1 << 30  # of one job: whatever is asked for meanwhile waits for its end
 
 
@@ -93,11 +94,22 @@ def _looked_at(folder: Path) -> Verdict:
     return verify(folder)
 
 
+def unverified() -> tuple[int, int]:
+    """Recordings that are damaged, and closed ones that were due to be verified more than a day ago."""
+    late = timezone.now() - LATE_AFTER
+    never = Q(verified_at=None, created_at__lt=late - OLD_AFTER)
+    closed = Episode.objects.filter(status__in=CLOSED, away_since=None)
+    return (
+        closed.exclude(damage=[]).count(),
+        closed.filter(never | Q(verified_at__lt=late - AGAIN_AFTER)).count(),
+    )
+
+
 def _due() -> QuerySet[Episode]:
     now = timezone.now()
     fresh = Q(verified_at=None) & Q(created_at__gte=now - OLD_AFTER)
     return Episode.objects.filter(
-        Q(verified_at=None) | Q(verified_at__lt=now - AGAIN_AFTER), status__in=CLOSED
+        Q(verified_at=None) | Q(verified_at__lt=now - AGAIN_AFTER), status__in=CLOSED, away_since=None
     ).exclude(fresh)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
-from typing import Any
+from dataclasses import asdict
+from typing import Any, TypeVar
 from uuid import UUID
 
 from asgiref.sync import sync_to_async
-from django.core.paginator import Paginator
-from django.http import HttpRequest, HttpResponse, JsonResponse
+from django.http import HttpRequest, HttpResponse, HttpResponseRedirect, JsonResponse
 from django.http.response import HttpResponseBase
 from django.shortcuts import redirect, render
 from django.templatetags.static import static
@@ -17,49 +18,67 @@ from django.views.decorators.http import require_GET, require_POST
 
 import robots
 from evaweb.blinding import sight_for
-from evaweb.episodes import selectors, services
+from evaweb.episodes import listed, selectors, services
+from evaweb.episodes.bench import bench_course
 from evaweb.episodes.curves import curves
 from evaweb.episodes.exporting import CONTENT_TYPE, table_file, table_of
-from evaweb.episodes.folders import THUMBNAIL, journal_folder, preview_folder, preview_video
-from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
+from evaweb.episodes.folders import THUMBNAIL, journal_folder, preview_folder, preview_sheet
+from evaweb.episodes.models import Episode
 from evaweb.episodes.poses import poses
 from evaweb.episodes.robot import looks_in
 from evaweb.episodes.selectors import episode_get, stage_of
+from evaweb.episodes.sheets import Grid
 from evaweb.episodes.streaming import file_answer
+from evaweb.episodes.videos import TYPE, video_address, video_file
 from evaweb.errors import Conflict, EvaError, NotFound
-from evaweb.roles import Role, require
+from evaweb.lists import Listing
+from evaweb.roles import Role, require, role_of
 from evaweb.stations.geometry import geometry
-from evaweb.stations.models import Station
+from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError, read_document
+from runtime.recording.layout import simulated
 
+_EPISODE_DOES_NOT_EXIST_THIS = Pattern(
+    "episodes.views.episode_does_not_exist_this",
+    "episode {uuid} does not exist in this lab",
+)
+_EPISODE_HAS_NO_CAMERA_HAS = Pattern(
+    "episodes.views.episode_has_no_camera_has",
+    "episode {uuid} has no camera {camera!r:.80}; it has {cameras}",
+)
+_FIRST_ALLOWED_WHOLE_NUMBER_FROM = Pattern(
+    "episodes.views.first_allowed_whole_number_from",
+    "first = {first!r:.40}; allowed: a whole number from 0",
+)
+
+Result = TypeVar("Result")
 PER_PAGE = 50
-FILTERS = ("station", "mode", "status", "quality", "review", "words")
 
 
 # --- pages ---------------------------------------------------------------------------------------------------
 
 
 @require_GET
-def replay_list(request: HttpRequest) -> HttpResponse:
-    """All episodes, the newest first."""
-    chosen = {name: request.GET.get(name, "").strip() for name in FILTERS}
-    found = selectors.episode_list(**chosen, sight=sight_for(request))
-    page = Paginator(found, PER_PAGE).get_page(request.GET.get("page"))
+def replay_list(request: HttpRequest) -> HttpResponseBase:
+    """All episodes, the newest first unless they are sorted in another way."""
+    sight = sight_for(request)
+    listing = Listing(request.GET, listed.columns(sight), listed.filters(sight))
+    found = selectors.episode_list(**listing.chosen, sight=sight)
+    if listing.wants_file:
+        return listing.file(request, "episodes", found)
+    page = listing.page(found, PER_PAGE)
     rows = [(episode, stage_of(episode=episode)) for episode in page]
     context = {
+        "listing": listing,
         "page": page,
         "rows": rows,
-        "chosen": chosen,
-        "stations": Station.objects.all(),
-        "statuses": EpisodeStatus.choices,
-        "modes": EpisodeMode.choices,
-        "qualities": [(key, words) for key, (words, _) in selectors.QUALITY.items()],
-        "reviews": [(key, words) for key, (words, _) in selectors.REVIEW.items()],
-        "narrowed": any(chosen.values()),
+        "may_review": role_of(request.user) is not Role.VIEWER,
+        "tags": selectors.tag_counts(sight=sight),
         "passing": any(stage.passing for _, stage in rows),
     }
-    template = "episodes/rows.html" if request.headers.get("HX-Request") else "episodes/list.html"
+    htmx: Any = request.htmx  # type: ignore[attr-defined]
+    template = "episodes/rows.html" if htmx and not htmx.target else "episodes/list.html"
     return render(request, template, context)
 
 
@@ -73,6 +92,8 @@ def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
         "trial": selectors.trial_of(episode=episode),
         "stage": stage,
         "table": table_of(episode=episode),
+        "may_review": role_of(request.user) is not Role.VIEWER,
+        "tags_known": selectors.tag_counts(sight=sight_for(request)),
         "config": replay_config(episode) | player() if stage.name == "ready" else None,
     }
     return render(request, "episodes/replay.html", context)
@@ -128,27 +149,42 @@ def player() -> dict[str, Any]:
 def replay_config(episode: Episode) -> dict[str, Any]:
     """Settings of an episode for the page's modules; a video's first picture is shown at its `start` [s]."""
     address = {
-        name: reverse(f"episode-{name}", args=[episode.uuid]) for name in ("curves", "geometry", "poses")
+        name: reverse(f"episode-{name}", args=[episode.uuid])
+        for name in ("curves", "geometry", "poses", "bench")
     }
     videos = [
-        {"camera": camera, "address": reverse("episode-video", args=[episode.uuid, camera]), "start": 0.0}
+        {
+            "camera": camera,
+            "address": reverse("episode-video", args=[episode.uuid, camera]),
+            "start": 0.0,
+            "sheet": reverse("episode-sheet", args=[episode.uuid, camera])
+            if preview_sheet(episode.uuid, camera).is_file()  # older previews have none
+            else "",
+        }
         for camera in episode.cameras
     ]
     if episode.kind == IMPORTED and episode.robot not in robots.names():
         called = f"calls its robot {episode.robot}" if episode.robot else "names no robot"
         address |= {"geometry": "", "why": f"the dataset {called}: import it with --robot"}
-    return {**address, "videos": videos, "fps": episode.fps, "frames": episode.frames}
+    grid = asdict(Grid.of(episode.frames))
+    return {**address, "videos": videos, "grid": grid, "fps": episode.fps, "frames": episode.frames}
 
 
 # --- files ---------------------------------------------------------------------------------------------------
 
 
 async def video(request: HttpRequest, uuid: UUID, camera: str) -> HttpResponseBase:
-    """The video of one camera, also in parts."""
-    episode = await _known(uuid)
-    if camera not in episode.cameras:
-        raise NotFound(f"episode {uuid} has no camera {camera!r:.80}; it has {', '.join(episode.cameras)}")
-    return await file_answer(request, preview_video(uuid, camera), "video/mp4")
+    """The video of one camera, also in parts; of one that is in the store, where it is for the next five minutes."""
+    await _known_camera(uuid, camera)
+    if address := await asyncio.to_thread(video_address, uuid, camera):
+        return HttpResponseRedirect(address)
+    return await file_answer(request, await asyncio.to_thread(video_file, uuid, camera), TYPE)
+
+
+async def sheet(request: HttpRequest, uuid: UUID, camera: str) -> HttpResponseBase:
+    """Small pictures of one camera, in the order of the rows."""
+    await _known_camera(uuid, camera)
+    return await file_answer(request, preview_sheet(uuid, camera), "image/jpeg")
 
 
 async def thumbnail(request: HttpRequest, uuid: UUID) -> HttpResponseBase:
@@ -160,15 +196,27 @@ async def thumbnail(request: HttpRequest, uuid: UUID) -> HttpResponseBase:
 async def _known(uuid: UUID) -> Episode:
     episode = await Episode.objects.select_related("trial").filter(uuid=uuid).afirst()
     if episode is None:
-        raise NotFound(f"episode {uuid} does not exist in this lab")
+        raise NotFound(_EPISODE_DOES_NOT_EXIST_THIS(uuid=uuid))
     return episode
+
+
+async def _known_camera(uuid: UUID, camera: str) -> None:
+    """NotFound where the row of the episode does not name it: no other name reaches the disk."""
+    cameras = (await _known(uuid)).cameras
+    if camera not in cameras:
+        raise NotFound(_EPISODE_HAS_NO_CAMERA_HAS(uuid=uuid, camera=camera, cameras=", ".join(cameras)))
 
 
 @require_GET
 def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """Joint curves and events, as one message of evaweb.binary_frames."""
-    covered = sight_for(request).hides_episode(episode_get(uuid=uuid))
-    return _message(lambda: curves(journal_folder(uuid), covered=covered))
+    episode, sight = episode_get(uuid=uuid), sight_for(request)
+    told = {
+        "covered": sight.hides_episode(episode),
+        "unscored": selectors.unscored_for(episode=episode, sight=sight),
+        "milestones": selectors.milestones_of(episode=episode),
+    }
+    return _message(lambda: curves(journal_folder(uuid), **told))
 
 
 @require_GET
@@ -181,7 +229,14 @@ def episode_geometry(request: HttpRequest, uuid: UUID) -> HttpResponse:
         raise Conflict(str(error)) from None
     robot = looks_in(manifest).robot
     groups = [group.name for group in robot.groups]
-    return JsonResponse(geometry(robot.name, groups, simulated=False))
+    return JsonResponse(geometry(robot.name, groups, simulated=simulated(manifest)))
+
+
+@require_GET
+def episode_bench(request: HttpRequest, uuid: UUID) -> HttpResponse:
+    """Where the things on a simulated bench lay, row by row as that changed, as JSON."""
+    episode_get(uuid=uuid)
+    return JsonResponse({"course": _readable(lambda: bench_course(journal_folder(uuid)))})
 
 
 @require_GET
@@ -190,13 +245,16 @@ def episode_poses(request: HttpRequest, uuid: UUID) -> HttpResponse:
     episode_get(uuid=uuid)
     first = request.GET.get("first", "0")
     if not (first.isascii() and first.isdecimal()) or len(first) > 9:
-        raise EvaError(f"first = {first!r:.40}; allowed: a whole number from 0")
+        raise EvaError(_FIRST_ALLOWED_WHOLE_NUMBER_FROM(first=first))
     return _message(lambda: poses(journal_folder(uuid), int(first)))
 
 
 def _message(make: Callable[[], bytes]) -> HttpResponse:
+    return HttpResponse(_readable(make), content_type="application/octet-stream")
+
+
+def _readable(make: Callable[[], Result]) -> Result:
     try:
-        content = make()
+        return make()
     except RecordingError as error:
         raise Conflict(str(error)) from None
-    return HttpResponse(content, content_type="application/octet-stream")

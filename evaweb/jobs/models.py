@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from django.conf import settings
 from django.db import models
 from django.db.models.functions import Now
 
@@ -25,7 +26,7 @@ class Job(models.Model):
     kind = models.CharField(max_length=32)
     key = models.CharField(max_length=160)
     args = models.JSONField(default=dict, blank=True)
-    queue = models.CharField(max_length=63, default="lab", help_text="The worker that owns the disk.")
+    queue = models.CharField(max_length=63, default="cpu", help_text="What a worker needs for it.")
     status = models.CharField(max_length=12, choices=JobStatus, default=JobStatus.QUEUED)
     attempts = models.PositiveSmallIntegerField(default=0, help_text="Those that ended in an error.")
     deaths = models.PositiveSmallIntegerField(
@@ -40,6 +41,14 @@ class Job(models.Model):
     progress = models.CharField(max_length=160, blank=True)
     result = models.JSONField(default=dict, blank=True)
     error = models.TextField(blank=True)
+    cancelled_by = models.ForeignKey(
+        settings.AUTH_USER_MODEL,
+        null=True,
+        blank=True,
+        on_delete=models.PROTECT,
+        related_name="+",
+        help_text="Has asked for its end; one that runs ends at its next step, as failed.",
+    )
 
     class Meta:
         ordering = ("-created_at",)
@@ -55,3 +64,41 @@ class Job(models.Model):
 
     def __str__(self) -> str:
         return f"{self.kind} {self.key}: {self.status}"
+
+
+class WorkerProcess(models.Model):
+    """A worker that runs: which queues it takes, and whether its data folder is the lab's. Times are the database's."""
+
+    id = models.UUIDField(primary_key=True, help_text="The owner that its jobs name.")
+    host = models.CharField(max_length=255)
+    queues = models.JSONField(default=list)
+    folder = models.BooleanField(help_text="Its data folder is the lab's.")
+    seen_at = models.DateTimeField(db_default=Now(), help_text="Its last sign of life.")
+
+    def __str__(self) -> str:
+        return f"worker {self.id} of {self.host}"
+
+
+class LabFolder(models.Model):
+    """The data folder of the lab, by its `lab_id`: one row, written by the processes that serve the web."""
+
+    lab_id = models.CharField(max_length=32)
+    host = models.CharField(max_length=255)
+    path = models.CharField(max_length=4096)
+
+    class Meta:
+        constraints = [models.CheckConstraint(condition=models.Q(id=1), name="one_lab_folder")]
+
+    def __str__(self) -> str:
+        return f"{self.path} of {self.host} ({self.lab_id})"
+
+
+class Hold(models.Model):
+    """What no two jobs work on at once, and the one that does; worth nothing once that job is not its owner's."""
+
+    what = models.CharField(max_length=1024, unique=True)
+    job = models.ForeignKey(Job, on_delete=models.CASCADE, related_name="holds")
+    owner = models.UUIDField()
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.job_id}"

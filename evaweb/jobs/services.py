@@ -7,8 +7,10 @@ no clock of a worker decides about another one.
 from __future__ import annotations
 
 import logging
+import os
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from datetime import timedelta
 from functools import partial
@@ -16,24 +18,37 @@ from typing import Any
 from uuid import UUID, uuid4
 
 from django.conf import settings
-from django.db import IntegrityError, transaction
-from django.db.models import QuerySet
+from django.db import IntegrityError, connection, transaction
+from django.db.models import F, QuerySet
 from django.db.models.functions import Now
 
 from evaweb.errors import Conflict
 from evaweb.jobs import doorbell
 from evaweb.jobs.database_retry import patiently
-from evaweb.jobs.heartbeat import Heartbeat
-from evaweb.jobs.kinds import Args, TakenOver, Work, kind_named
+from evaweb.jobs.heartbeat import Heartbeat, Lapse
+from evaweb.jobs.kinds import Args, Cancelled, TakenOver, Work, declared, kind_named, least_role
 from evaweb.jobs.locks import Worker, alone, worker_of
-from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.models import Hold, Job, JobStatus
 from evaweb.jobs.selectors import jobs_ready
+from evaweb.jobs.workers import has_lab_folder
+from evaweb.roles import Role, require
+from runtime.core.sentences import Pattern
 
 log = logging.getLogger(__name__)
+_JOB_ONLY_ONE_FAILED_TRIED = Pattern(
+    "jobs.services.job_only_one_failed_tried",
+    "job {job} ({key}) is {status}: only one that failed is tried again",
+)
+_JOB_THERE_NOTHING_CANCEL = Pattern(
+    "jobs.services.job_there_nothing_cancel",
+    "job {job} ({key}) is {status}: there is nothing to cancel",
+)
 
 RETRY_AFTER_S = (2.0, 10.0, 60.0)
 MOST_ATTEMPTS = len(RETRY_AFTER_S) + 1
 MOST_DEATHS = 8  # of workers over one job, which is no fault of its own most of the time
+_LAPSES = 0.75  # of EVA_JOB_STALE_S, after which a worker that the database has not heard ends
+_HOLD_AGAIN_S = 0.5
 _AGAIN_S = 5.0  # after which a job is looked at again that another process is still at
 OWNER = uuid4()  # this process
 
@@ -44,12 +59,12 @@ _ending = threading.Event()
 # --- asking --------------------------------------------------------------------------------------------------
 
 
-def enqueue(*, kind: str, key: str, args: Args, queue: str = "lab") -> Job:
-    """Ask for a job; where one of that key waits already, it is that one, with these args.
+def enqueue(*, kind: str, key: str, args: Args) -> Job:
+    """Ask for a job, in the queue of its kind; where one of that key waits already, it is that one, with these args.
 
     A job of that key which is running does not count: what it is about may have changed since it looked.
     """
-    kind_named(kind)
+    queue = declared(kind).queue
     with transaction.atomic():
         job = _waiting(kind, key, args, queue)
         transaction.on_commit(partial(doorbell.ring, queue))
@@ -71,21 +86,42 @@ def _waiting(kind: str, key: str, args: Args, queue: str) -> Job:
     raise RuntimeError(f"job {key} is claimed faster than it can be asked for")
 
 
-def try_again(*, job: Job) -> Job:
-    """Ask anew for what a failed job was about; Conflict where it has not failed."""
+def try_again(*, user: Any, job: Job) -> Job:
+    """Ask anew for what a failed job was about, by a user who may ask for it; Conflict where it has not failed."""
+    require(user, least_role(job.kind, job.args))
     if job.status != JobStatus.FAILED:
-        raise Conflict(
-            f"job {job.pk} ({job.key}) is {job.get_status_display()}: only one that failed is tried again"
-        )
-    return enqueue(kind=job.kind, key=job.key, args=job.args, queue=job.queue)
+        raise Conflict(_JOB_ONLY_ONE_FAILED_TRIED(job=job.pk, key=job.key, status=job.get_status_display()))
+    return enqueue(kind=job.kind, key=job.key, args=job.args)
+
+
+@transaction.atomic
+def cancel(*, user: Any, job: Job) -> Job:
+    """End a job, for good: at once where it waits, else at its next step. Operators; Conflict where it has ended."""
+    require(user, Role.OPERATOR)
+    row = Job.objects.filter(pk=job.pk)
+    waiting = row.filter(status=JobStatus.QUEUED)
+    ended = {"status": JobStatus.FAILED, "finished_at": Now(), "error": _cancelled_words(user)}
+    asked = waiting.update(cancelled_by=user, **ended) or row.filter(status=JobStatus.RUNNING).update(
+        cancelled_by=user
+    )
+    job.refresh_from_db()
+    if not asked:
+        raise Conflict(_JOB_THERE_NOTHING_CANCEL(job=job.pk, key=job.key, status=job.get_status_display()))
+    log.info("job %s is cancelled by %s", job.key, user.get_username())
+    return job
+
+
+def _cancelled_words(user: Any) -> str:
+    return f"cancelled by {user.get_username()}"
 
 
 # --- working -------------------------------------------------------------------------------------------------
 
 
 def claim(*, queue: str, owner: UUID) -> Job | None:
-    """Take the oldest job that is ready, None where there is none; of two workers one gets it."""
-    while (found := jobs_ready(queues=[queue]).first()) is not None:
+    """Take the oldest job that is ready and can be done here, None where there is none; of two workers one gets it."""
+    folder = has_lab_folder()
+    while (found := jobs_ready(queues=[queue], folder=folder).first()) is not None:
         taken = Job.objects.filter(pk=found.pk, status=JobStatus.QUEUED).update(
             status=JobStatus.RUNNING,
             owner=owner,
@@ -126,6 +162,8 @@ def _perform(job: Job) -> None:
         except TakenOver as taken:
             log.warning("%s", taken)
             return
+        except Cancelled:
+            ended = partial(_ended_if_cancelled, row=_ours(job))
         except Exception as error:  # whatever a job raises is its own, never the worker's
             log.warning("job %s failed: %s", job.key, error, exc_info=True)
             ended = partial(job_failed, job=job, error=str(error) or type(error).__name__)
@@ -133,13 +171,52 @@ def _perform(job: Job) -> None:
 
 
 def _result_of(job: Job) -> Args:
-    with Heartbeat(partial(seen, job=job), settings.EVA_JOB_STALE_S / 6):
-        return kind_named(job.kind)(Work(job.args, partial(_tell, job)))
+    stale_s = settings.EVA_JOB_STALE_S
+    # Where there may be workers of other machines, whose locks of files may not reach this one, a claim ends in time.
+    lapse = None if connection.vendor == "sqlite" else Lapse(stale_s * _LAPSES, partial(_lapsed, job))
+    with Heartbeat(partial(seen, job=job), stale_s / 6, lapse):
+        return kind_named(job.kind)(Work(job.args, partial(_tell, job), partial(hold, job)))
+
+
+def _lapsed(job: Job) -> None:
+    """End this process: another one may be at work on the job by now, and a job may be ended at any moment."""
+    log.error(
+        "job %s is not known to be ours any more: this worker ends before another one does the same", job.key
+    )
+    os._exit(1)
+
+
+def hold(job: Job, names: Collection[str]) -> None:
+    """Wait until no other job that is being done holds any of `names`, and hold them until the job ends.
+
+    They replace what it held before, so that no two jobs wait for each other. Raises TakenOver or Cancelled.
+    """
+    while (by := patiently(partial(_held_by_another, job, sorted(set(names))))) is not None:
+        _tell(job, f"waits for another job at work on the same: {by}")
+        time.sleep(_HOLD_AGAIN_S)
+
+
+def _held_by_another(job: Job, names: Sequence[str]) -> str | None:
+    """The key of the job that holds one of the names; None once they are held by this one."""
+    at_work = Hold.objects.filter(job__status=JobStatus.RUNNING, job__owner=F("owner"))
+    Hold.objects.filter(job=job).delete()  # also where it has to wait
+    try:
+        with transaction.atomic():
+            Hold.objects.filter(what__in=names).exclude(pk__in=at_work.values("pk")).delete()
+            Hold.objects.bulk_create(Hold(what=name, job=job, owner=job.owner) for name in names)
+    except IntegrityError:
+        other = at_work.filter(what__in=names).exclude(job=job).values_list("job__key", flat=True).first()
+        return other or "which has just ended"
+    return None
 
 
 def _tell(job: Job, progress: str) -> None:
-    if not patiently(lambda: _ours(job).update(progress=progress[:160], seen_at=Now())):
-        raise TakenOver(f"job {job.key} was taken from {job.owner}, which goes no further with it")
+    ours = _ours(job)
+    if patiently(lambda: ours.filter(cancelled_by=None).update(progress=progress[:160], seen_at=Now())):
+        return
+    if patiently(ours.exists):
+        raise Cancelled
+    raise TakenOver(f"job {job.key} was taken from {job.owner}, which goes no further with it")
 
 
 def seen(*, job: Job) -> bool:
@@ -183,8 +260,19 @@ def _ours(job: Job) -> QuerySet[Job]:
     return Job.objects.filter(pk=job.pk, status=JobStatus.RUNNING, owner=job.owner)
 
 
+def _ended_if_cancelled(row: QuerySet[Job]) -> bool:
+    """End it for good if somebody has asked for that."""
+    by = row.exclude(cancelled_by=None).select_related("cancelled_by").first()
+    if by is None:
+        return False
+    words = _cancelled_words(by.cancelled_by)
+    return bool(row.update(status=JobStatus.FAILED, owner=None, finished_at=Now(), error=words))
+
+
 def _waits(row: QuerySet[Job], **facts: Any) -> bool:
-    """Let it wait again; where a newer one of its key waits already, that one is done instead."""
+    """Let it wait again, unless it was cancelled; where a newer one of its key waits, that one is done instead."""
+    if _ended_if_cancelled(row):
+        return True
     try:
         with transaction.atomic():
             return bool(row.update(status=JobStatus.QUEUED, owner=None, **facts))

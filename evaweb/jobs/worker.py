@@ -15,9 +15,10 @@ from django.conf import settings
 from django.db import close_old_connections, connection
 
 from evaweb.celery import app
-from evaweb.jobs import services
+from evaweb.jobs import services, workers
 from evaweb.jobs.database_retry import patiently
-from evaweb.jobs.kinds import chores, starts
+from evaweb.jobs.heartbeat import Heartbeat
+from evaweb.jobs.kinds import Queue, chores, starts
 
 log = logging.getLogger(__name__)
 
@@ -30,19 +31,26 @@ def run(queues: Sequence[str], *, lifeline: bool) -> None:
 
     What is being done then is finished, or put back after EVA_WORKER_GRACE_S seconds.
     """
-    os.nice(19)
+    os.nice(settings.EVA_WORKER_NICE)
     ending = _ending_by_signal()
     if lifeline:
         threading.Thread(target=_watch_input, name="lifeline", daemon=True).start()
     looking = threading.Thread(target=_look, args=(queues, ending), name="looking")
     looking.start()
+    there = Heartbeat(
+        partial(workers.worker_seen, owner=services.OWNER, queues=queues), settings.EVA_JOB_STALE_S / 6
+    )
     log.info("worker %s works on %s in %s", services.OWNER, ", ".join(queues), settings.DATA_DIR)
-    while not ending.is_set():
-        _answer_doorbell(queues)
-        if not ending.is_set():
-            log.error("no doorbell for %g s; jobs are looked for every %g s", BROKER_AGAIN_S, LOOK_EVERY_S)
-            ending.wait(BROKER_AGAIN_S)
-    looking.join()
+    with there:
+        while not ending.is_set():
+            _answer_doorbell(queues)
+            if not ending.is_set():
+                log.error(
+                    "no doorbell for %g s; jobs are looked for every %g s", BROKER_AGAIN_S, LOOK_EVERY_S
+                )
+                ending.wait(BROKER_AGAIN_S)
+        looking.join()
+    _attempt("leaving the list of workers", partial(workers.worker_ended, owner=services.OWNER))
     log.info("the worker has ended")
 
 
@@ -94,21 +102,29 @@ def _answer_doorbell(queues: Sequence[str]) -> None:
 
 def _look(queues: Sequence[str], ending: threading.Event) -> None:
     """Sweep, look after the chores, and do what waits, whether or not a doorbell has rung."""
-    for name, task in starts().items():
-        _attempt(name, partial(patiently, task))
+    _attempt(
+        "list of workers",
+        partial(patiently, partial(workers.worker_seen, owner=services.OWNER, queues=queues)),
+    )
+    begun = False
     while not ending.is_set():
         close_old_connections()
-        for name, task in {"sweep": services.sweep, **chores()}.items():
-            _attempt(name, partial(patiently, task))
+        _attempt("sweep", partial(patiently, services.sweep))
+        if Queue.CPU in queues and _attempt("the data folder", partial(patiently, workers.has_lab_folder)):
+            for name, task in {**(chores() if begun else starts()), **chores()}.items():
+                _attempt(name, partial(patiently, task))
+            begun = True
         for queue in queues:
             _attempt(f"queue {queue}", partial(services.work, queue))
         ending.wait(LOOK_EVERY_S)
     connection.close()
 
 
-def _attempt(name: str, action: Callable[[], object]) -> None:
+def _attempt(name: str, action: Callable[[], object]) -> object:
+    """What it returns; None where it failed."""
     try:
-        action()
+        return action()
     except Exception:  # of whatever kind: the next look is a few seconds away, and this thread must see it
         log.exception("%s failed, again in %g s", name, LOOK_EVERY_S)
         connection.close()
+        return None

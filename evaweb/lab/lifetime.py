@@ -6,6 +6,7 @@ import fcntl
 import os
 import signal
 import socket
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,9 +14,11 @@ from types import FrameType
 
 from evaweb.lab.processes import LabError
 
+_ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-class Ended(Exception):
-    """The lab was asked to end."""
+
+class Ended(BaseException):
+    """The lab was asked to end; nothing that catches errors on the way holds it up."""
 
 
 @contextmanager
@@ -48,12 +51,22 @@ def require_free(host: str, port: int, option: str = "--port") -> None:
 
 
 def end_on_signals() -> None:
-    """SIGINT and SIGTERM raise Ended in the main thread, once; a second one changes nothing."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _end)
+    """SIGINT, SIGTERM and the end of the terminal raise Ended in the main thread, once; a second one changes nothing.
+
+    One that was ignored when we were started, as by nohup, stays so.
+    """
+    for number in _ENDS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _end)
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    for each in (signal.SIGINT, signal.SIGTERM):
+    for each in _ENDS:
         signal.signal(each, signal.SIG_IGN)
+    if number == signal.SIGHUP:  # what is still said has no terminal to go to
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for descriptor in (1, 2):
+            if stat.S_ISCHR(os.fstat(descriptor).st_mode):  # of a terminal that is gone isatty says no
+                os.dup2(nowhere, descriptor)
+        os.close(nowhere)
     raise Ended

@@ -6,15 +6,17 @@ every program of ours ends by itself then: nothing is ever looked for and killed
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
+import math
 import os
 import selectors
 import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -27,6 +29,9 @@ _MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
 _REST_S = 30.0
 _MOST_PROCESSOR_S = 300.0  # of a program that gets ready
 _LONGEST_LOG = 20_000_000  # bytes, beyond which a log starts anew and the old one is kept beside it
+
+
+Starting = Generator[None, None, Mapping[str, Any]]  # it returns the addresses that the program announced
 
 
 class LabError(EvaError):
@@ -59,6 +64,8 @@ class _Child:
     addresses: Mapping[str, Any] = field(default_factory=dict)
     restarts: deque[float] = field(default_factory=deque)
     rests_until: float = 0.0
+    coming: bool = False  # it gets ready, and has not announced itself
+    killed_at: float = 0.0  # when one that is dropped is killed, unless it has ended
 
 
 class Processes:
@@ -69,6 +76,7 @@ class Processes:
         self._logs = logs
         self._environment = dict(environment)
         self._children: dict[str, _Child] = {}
+        self._ending: list[_Child] = []  # dropped, and not seen to have ended
         logs.mkdir(parents=True, exist_ok=True)
 
     def start(self, program: Program, ready_s: float = 60.0) -> Mapping[str, Any]:
@@ -76,11 +84,45 @@ class Processes:
 
         It may be slow, as its machine is: LabError where it does nothing for `ready_s`, or far too much.
         """
+        begun = self.starting(program, ready_s, wait_s=0.2)
+        while True:
+            try:
+                next(begun)
+            except StopIteration as ready:
+                addresses: Mapping[str, Any] = ready.value
+                return addresses
+
+    def starting(self, program: Program, ready_s: float = 60.0, wait_s: float = 0.0) -> Starting:
+        """The same, a look at a time of at most `wait_s`: what else there is to watch is watched between two looks.
+
+        One that does not start is ended, and is none of ours any more.
+        """
+        if program.name in self._children:
+            raise LabError(f"{program.name} is a program of this lab already: give it another name")
         child = _Child(program, *self._spawn(program, program.arguments, program.announces))
         self._children[program.name] = child
-        if program.announces:
-            child.addresses = self._announcement(child, ready_s)
+        if not program.announces:
+            return child.addresses
+        child.coming = True
+        try:
+            child.addresses = yield from self._announcement(child, ready_s, wait_s)
+        except Exception:
+            self.drop(program.name)
+            raise
+        child.coming = False
         return child.addresses
+
+    def drop(self, name: str) -> None:
+        """End one of them for good, waiting for nothing: `watch` sees it end. One that there is not is none."""
+        child = self._children.pop(name, None)
+        if child is not None:
+            self._cut(child)
+            child.killed_at = time.monotonic() + child.program.patience_s
+            self._ending.append(child)
+
+    def ending(self) -> set[str]:
+        """Names of those that are dropped and have not ended yet."""
+        return {child.program.name for child in self._ending}
 
     def pids(self) -> dict[str, int]:
         """The processes that there are now."""
@@ -92,25 +134,44 @@ class Processes:
         What dies too often rests a while between two starts: it must not take a station with it that runs.
         """
         now = time.monotonic()
+        self._ending = [child for child in self._ending if not self._ended(child, now)]
         for child in self._children.values():
             code = child.process.poll()
-            if code is not None and now >= child.rests_until:
+            if code is not None and not child.coming and now >= child.rests_until:
                 self._restart(child, code, now)
 
     def end(self) -> None:
         """Cut the lifelines in reverse order, wait for each; one that does not end in its time is killed."""
         for child in reversed(self._children.values()):
-            assert child.process.stdin is not None
-            child.process.stdin.close()
-        for child in reversed(self._children.values()):
-            try:
-                child.process.wait(child.program.patience_s)
-            except subprocess.TimeoutExpired:
-                log.error("%s does not end by itself: killed", child.program.name)
-                child.process.kill()
-                child.process.wait()
-            child.log.close()
+            self._cut(child)
+        for child in (*self._ending, *reversed(self._children.values())):
+            self._wait(child)
+        self._ending.clear()
         self._children.clear()
+
+    def _cut(self, child: _Child) -> None:
+        assert child.process.stdin is not None
+        child.process.stdin.close()
+
+    def _ended(self, child: _Child, now: float) -> bool:
+        """True once it has ended; one whose time is over is killed."""
+        if child.process.poll() is not None:
+            child.log.close()
+            return True
+        if now >= child.killed_at:
+            log.error("%s does not end by itself: killed", child.program.name)
+            child.process.kill()
+            child.killed_at = math.inf
+        return False
+
+    def _wait(self, child: _Child) -> None:
+        try:
+            child.process.wait(child.program.patience_s)
+        except subprocess.TimeoutExpired:
+            log.error("%s does not end by itself: killed", child.program.name)
+            child.process.kill()
+            child.process.wait()
+        child.log.close()
 
     def _spawn(
         self, program: Program, arguments: tuple[str, ...], heard: bool
@@ -132,23 +193,25 @@ class Processes:
         )
         return process, output
 
-    def _announcement(self, child: _Child, ready_s: float) -> Mapping[str, Any]:
+    def _announcement(self, child: _Child, ready_s: float, wait_s: float) -> Starting:
         output = child.process.stdout
         assert output is not None
         used, since = 0.0, time.monotonic()
         with selectors.DefaultSelector() as selector:
             selector.register(output, selectors.EVENT_READ)
-            while not selector.select(0.2):
+            while not selector.select(wait_s):
                 now, before, used = time.monotonic(), used, processor_s(child.process.pid)
                 since = since if used == before else now
                 if used > _MOST_PROCESSOR_S or now - since > ready_s:
                     spent = f"{used:g} s of the processor, nothing for {now - since:.0f} s"
                     raise LabError(f"{child.program.name} does not get ready ({spent}): {self._why(child)}")
+                yield
         line = output.readline()
         try:
             found = json.loads(line)
         except ValueError:
-            child.process.wait(5)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.process.wait(5)
             raise LabError(f"{child.program.name} did not start: {self._why(child)}") from None
         if not isinstance(found, dict):
             raise LabError(f"{child.program.name} announced {found!r}; expected a map of addresses")

@@ -42,9 +42,20 @@ def stops(descriptor: int, web_port: str) -> Program:
     )
 
 
-def worker(queues: Sequence[str]) -> Program:
-    """Worker that makes datasets of finished episodes; what it was about to do is done at the next start."""
-    return Program("worker", (_MANAGE, "worker", "--queues", ",".join(queues)), patience_s=20.0, of_web=True)
+def gate(host: str, port: int) -> Program:
+    """Where stations on other computers connect: at this port, with their pictures at the next."""
+    return Program(
+        "gate",
+        (_MANAGE, "gate", "--host", host, "--port", str(port)),
+        announces=True,
+        patience_s=10.0,
+        of_web=True,
+    )
+
+
+def worker() -> Program:
+    """Worker of every queue; what it was about to do is done at the next start."""
+    return Program("worker", (_MANAGE, "worker"), patience_s=20.0, of_web=True)
 
 
 def station(deployment: str, assignments: Sequence[str]) -> Program:
@@ -53,16 +64,21 @@ def station(deployment: str, assignments: Sequence[str]) -> Program:
     return Program(f"station-{_stem(deployment)}", ("-m", "runtime", deployment, *sets), patience_s=15.0)
 
 
-def tabletop(robot: str, seed: int) -> Program:
-    """The simulated bench, on free ports that it keeps."""
+def bench(seed: int, width: int, height: int) -> tuple[str, ...]:
+    """Options of a simulated bench: first layout, and pixels of its pictures."""
+    return ("--seed", str(seed), "--width", str(width), "--height", str(height))
+
+
+def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> Program:
+    """The simulated bench with these options, on free ports that it keeps."""
 
     def arguments(observations: str, commands: str) -> tuple[str, ...]:
         ends = ("--obs-endpoint", observations, "--action-endpoint", commands)
-        return ("-m", "runtime.sim.node", "--robot", robot, "--bench", "tabletop", "--seed", str(seed), *ends)
+        return ("-m", "runtime.sim.node", "--robot", robot, "--bench", "tabletop", *options, *ends)
 
     free = "tcp://127.0.0.1:0"
     return Program(
-        "bench",
+        name,
         arguments(free, free),
         announces=True,
         again=lambda found: arguments(found["obs_endpoint"], found["action_endpoint"]),
@@ -106,11 +122,12 @@ def lockstep(
     assignments: Sequence[str],
     robot: str,
     policies: Mapping[str, tuple[Sequence[str], int]],
-    seed: int,
+    bench: Sequence[str],
 ) -> Program:
     """A station, its simulated bench and its policy servers in one process on a virtual clock.
 
-    `policies`: by name, the options of each and its port, 0 for a free one; it announces their addresses.
+    `policies`: by name, the options of each and its port, 0 for a free one; it announces their addresses. `bench`:
+    options of the bench.
     """
     sets = [part for assignment in assignments for part in ("--set", assignment)]
     served = [
@@ -118,7 +135,7 @@ def lockstep(
         for name, (options, port) in policies.items()
         for part in ("--serve", shlex.join(_serving(name, robot, options, port)))
     ]
-    arguments = ("-m", "runtime.sim.lockstep", deployment, *sets, *served, "--seed", str(seed))
+    arguments = ("-m", "runtime.sim.lockstep", deployment, *sets, *served, *bench)
     return Program(f"station-{_stem(deployment)}", arguments, announces=True, patience_s=15.0)
 
 

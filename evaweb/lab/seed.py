@@ -10,7 +10,7 @@ from django.contrib.auth.models import User
 from django.db import transaction
 
 from evaweb.plans.documents import checkpoint_of
-from evaweb.plans.models import Plan, PlanState
+from evaweb.plans.models import Allocation, Plan, PlanState, StoppingRule
 from evaweb.plans.services import plan_amend, plan_freeze
 from evaweb.roles import Role, grant
 from evaweb.stations.models import Station
@@ -111,7 +111,15 @@ _PLAN_CHANGED = "the demo's policy servers listen elsewhere this time"
 
 
 def demo_plan(
-    *, name: str, title: str, owner: str, scene: Scene, checkpoints: Sequence[Checkpoint], repetitions: int
+    *,
+    name: str,
+    title: str,
+    owner: str,
+    scene: Scene,
+    checkpoints: Sequence[Checkpoint],
+    repetitions: int,
+    design: str = StoppingRule.EVIDENCE,
+    order: str = Allocation.PAIRED,
 ) -> Plan:
     """A blind plan that compares two checkpoints at all positions of a scene, frozen; one that is there is brought up
     to date. Conflict where it cannot be, because trials of it are not finished."""
@@ -127,7 +135,8 @@ def demo_plan(
             repetitions=repetitions,
             first=first,
             second=second,
-            stopping="evidence",
+            stopping=design,
+            allocation=order,
         )
         plan.positions.set(scene.positions.all())
         plan.checkpoints.set(checkpoints)

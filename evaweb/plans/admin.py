@@ -34,7 +34,10 @@ _FROZEN = (
     "stations",
     "strategy",
     "blind",
+    "allocation",
     "stopping",
+    "comparing",
+    "drop_arms",
     "outcome",
     "margin",
     "look_after",
@@ -50,6 +53,7 @@ class PlanForm(forms.ModelForm):
     """A draft."""
 
     strategy = Table(required=False, help_text=Plan._meta.get_field("strategy").help_text)
+    look_after = Table(required=False, help_text=Plan._meta.get_field("look_after").help_text)
 
     class Meta:
         model = Plan
@@ -62,7 +66,8 @@ class PlanForm(forms.ModelForm):
     def clean_look_after(self) -> list[int]:
         """An empty field is a look after every pair."""
         try:
-            return looks_of(self.cleaned_data["look_after"] or [])
+            given = self.cleaned_data["look_after"]
+            return [] if given in self.fields["look_after"].empty_values else looks_of(given)
         except EvaError as error:
             raise forms.ValidationError(str(error)) from None
 
@@ -125,9 +130,9 @@ class PlanAdmin(admin.ModelAdmin):
             "Rules",
             {
                 "fields": (
-                    "blind",
-                    ("first", "second"),
-                    ("stopping", "alpha"),
+                    ("blind", "allocation"),
+                    ("comparing", "first", "second"),
+                    ("stopping", "alpha", "drop_arms"),
                     ("outcome", "margin", "look_after"),
                     "second_rater_share",
                     "match_gate",

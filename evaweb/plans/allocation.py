@@ -16,16 +16,54 @@ from evaweb.errors import Conflict, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans.blinding_rules import has_looked_at_a_version
 from evaweb.plans.canonical import digest
-from evaweb.plans.design import conclusion_of, ended_because, told_reason
+from evaweb.plans.design import dropped_of, ended_because, findings_of, told_reason
 from evaweb.plans.documents import checkpoint_of, scene_of, units_of
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
+from evaweb.plans.selectors import without_dropped
 from evaweb.plans.services import plan_end
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials import lifecycle
 from evaweb.trials.models import Position, Trial, TrialStatus
 from evaweb.trials.services import trial_create
-from evaweb.trials.voids import voids_lapse
+from evaweb.trials.voids import voids_lapse, voids_waiting
+from runtime.core.sentences import Pattern
+
+_HAS_ENDED = Pattern("plans.allocation.has_ended", "{plan} has ended: {why}")
+_NO_TRIAL_HANDED_OUT = Pattern(
+    "plans.allocation.no_trial_handed_out",
+    "{plan} is {state}: no trial of it is handed out",
+)
+_YOU_HAVE_SEEN_RESULTS_WHICH = Pattern(
+    "plans.allocation.you_have_seen_results_which",
+    "you have seen results of {plan}, which is blind: ask another operator to run its trials",
+)
+_FOR_NOT_FOR = Pattern("plans.allocation.for_not_for", "{plan} is for {allowed}, not for {name}")
+_HAS_ENDED_CLOSED_ONCE = Pattern(
+    "plans.allocation.has_ended_closed_once",
+    "{plan} has ended: {ended_because}; it is closed once {then}",
+)
+_NOTHING_LEFT_FOR_TRIALS_ON = Pattern(
+    "plans.allocation.nothing_left_for_trials_on",
+    "nothing is left of {plan} for {name}: {count} trials are on {names}",
+)
+_ALL_TRIALS_MADE = Pattern("plans.allocation.all_trials_made", "all {count} trials of {plan} are made")
+_SCENE_CHECKPOINT_RENAMED_SINCE_FROZEN = Pattern(
+    "plans.allocation.scene_checkpoint_renamed_since_frozen",
+    "a scene or a checkpoint was renamed since {plan} was frozen: give it its old name back",
+)
+_SCENE_CHANGED_SINCE_FROZEN_CHANGE = Pattern(
+    "plans.allocation.scene_changed_since_frozen_change",
+    "scene {name} was changed since {plan} was frozen: change it back, or amend the plan",
+)
+_CHECKPOINT_SWITCHED_OFF_OWNER_CAN = Pattern(
+    "plans.allocation.checkpoint_switched_off_owner_can",
+    "a checkpoint of {plan} is switched off: its owner can say why",
+)
+_CHECKPOINT_CHANGED_SINCE_FROZEN_CHANGE = Pattern(
+    "plans.allocation.checkpoint_changed_since_frozen_change",
+    "a checkpoint was changed since {plan} was frozen: change it back, or amend the plan",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +90,9 @@ def hand_out(*, user: User, station: Station, plan: Plan) -> Handout:
     """
     require(user, Role.OPERATOR)
     _check(plan, user, station)
+    with transaction.atomic():  # kept also where no trial is handed out
+        held = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
+        voids_lapse(Trial.objects.filter(handout__plan=held), user=user)
     plan_end(user=user, plan=plan, asked=True)
     return _handed_out(user, station, plan)
 
@@ -60,7 +101,6 @@ def hand_out(*, user: User, station: Station, plan: Plan) -> Handout:
 def _handed_out(user: User, station: Station, plan: Plan) -> Handout:
     held = Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
     _check(held, user, station)
-    voids_lapse(Trial.objects.filter(handout__plan=held), user=user)
     _check_goes_on(held)
     slot, before = _next(held, station)
     _check_unchanged(held, slot)
@@ -107,30 +147,29 @@ def _check(plan: Plan, user: User, station: Station) -> None:
     if plan.state != PlanState.FROZEN:
         why = told_reason(plan, sealed=True)
         raise Conflict(
-            f"{plan} has ended: {why}"
+            _HAS_ENDED(plan=plan, why=why)
             if why
-            else f"{plan} is {plan.get_state_display()}: no trial of it is handed out"
+            else _NO_TRIAL_HANDED_OUT(plan=plan, state=plan.get_state_display())
         )
     if plan.sealed and has_looked_at_a_version(plan, user):
-        raise NotAllowed(
-            f"you have seen results of {plan}, which is blind: ask another operator to run its trials"
-        )
+        raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_WHICH(plan=plan))
     allowed = list(plan.stations.values_list("name", flat=True))
     if allowed and station.name not in allowed:
-        raise Conflict(f"{plan} is for {', '.join(sorted(allowed))}, not for {station.name}")
+        raise Conflict(_FOR_NOT_FOR(plan=plan, allowed=", ".join(sorted(allowed)), name=station.name))
 
 
 def _check_goes_on(plan: Plan) -> None:
-    found = conclusion_of(plan)
+    found = findings_of(plan)
     if found is not None and found.ended == "boundary":
-        raise Conflict(
-            f"{plan} has ended: {ended_because(found)}; it is closed once its last trial is scored"
-        )
+        waits = voids_waiting(Trial.objects.filter(handout__plan=plan)).first()
+        then = f"the void of trial {waits.trial_id} is answered" if waits else "its last trial is scored"
+        raise Conflict(_HAS_ENDED_CLOSED_ONCE(plan=plan, ended_because=ended_because(plan, found), then=then))
 
 
 def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:
     """The slot, and its newest attempt where there was one that does not count."""
-    slots = _with_newest(plan.slots.select_related("scene", "position", "checkpoint").order_by("index"))
+    tried = without_dropped(plan.slots.all(), dropped_of(plan))
+    slots = _with_newest(tried.select_related("scene", "position", "checkpoint").order_by("index"))
     for slot in slots.filter(station=station):
         if slot.newest is None or slot.newest in lifecycle.REPEATED:
             return slot, _newest_trial(slot)
@@ -141,9 +180,9 @@ def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:
     if elsewhere:
         names = ", ".join(sorted({slot.station.name for slot in elsewhere if slot.station}))
         raise Conflict(
-            f"nothing is left of {plan} for {station.name}: {len(elsewhere)} trials are on {names}"
+            _NOTHING_LEFT_FOR_TRIALS_ON(plan=plan, name=station.name, count=len(elsewhere), names=names)
         )
-    raise Conflict(f"all {len(slots)} trials of {plan} are made")
+    raise Conflict(_ALL_TRIALS_MADE(count=len(slots), plan=plan))
 
 
 def _with_newest(slots):  # type: ignore[no-untyped-def]
@@ -172,17 +211,15 @@ def _check_unchanged(plan: Plan, slot: Slot) -> None:
         unit.condition.scene,
         unit.checkpoint,
     ):  # not which: the operator must not learn what comes next
-        raise Conflict(f"a scene or a checkpoint was renamed since {plan} was frozen: call it so again")
+        raise Conflict(_SCENE_CHECKPOINT_RENAMED_SINCE_FROZEN(plan=plan))
     frozen = {scene["name"]: scene for scene in document["scenes"]}[slot.scene.name]
     numbers = [position["number"] for position in frozen["positions"]]
     positions = list(Position.objects.filter(scene=slot.scene, number__in=numbers).order_by("number"))
     if digest(scene_of(slot.scene, positions)) != digest(frozen):
-        raise Conflict(
-            f"scene {slot.scene.name} was changed since {plan} was frozen: change it back, or amend the plan"
-        )
+        raise Conflict(_SCENE_CHANGED_SINCE_FROZEN_CHANGE(name=slot.scene.name, plan=plan))
     # Not which one: the operator must not learn what comes next.
     if not slot.checkpoint.active:
-        raise Conflict(f"a checkpoint of {plan} is switched off: its owner can say why")
+        raise Conflict(_CHECKPOINT_SWITCHED_OFF_OWNER_CAN(plan=plan))
     policy = {row["name"]: row for row in document["checkpoints"]}[slot.checkpoint.name]
     if digest(checkpoint_of(slot.checkpoint)) != digest(policy):
-        raise Conflict(f"a checkpoint was changed since {plan} was frozen: change it back, or amend the plan")
+        raise Conflict(_CHECKPOINT_CHANGED_SINCE_FROZEN_CHANGE(plan=plan))

@@ -26,8 +26,56 @@ from evaweb.trials.models import Position, Trial, TrialStatus
 from evaweb.trials.services import declare_check
 from evaweb.trials.verdicts import LONGEST_NOTE
 from evaweb.trials.voids import declare_by_two
+from runtime.core.sentences import Pattern, fixed
+
+_NO_REFERENCE_PICTURE_YET_LOOK = Pattern(
+    "plans.bench_checks.no_reference_picture_yet_look",
+    "{missing}: no reference picture yet; look at it, then confirm it as the first one",
+)
+_THIS_REFERENCE_SAYS_WHAT_CAMERA = fixed(
+    "plans.bench_checks.this_reference_says_what_camera",
+    "this reference says what a camera shows at all; allowed: regions of a position's",
+)
+_HAS_NEWER_REFERENCE_HERE_BY = Pattern(
+    "plans.bench_checks.has_newer_reference_here_by",
+    "{camera} has a newer reference here, by {user}: draw on that one",
+)
+_RUNNING_HAS_JUDGED_TRIALS_BY = Pattern(
+    "plans.bench_checks.running_has_judged_trials_by",
+    "{plan} is running and has judged trials by the reference of {camera} here: its gate stays as it "
+    "is; amend the plan for another picture or other regions",
+)
+_BEFORE_YOUR_FIRST_TRIAL_CONFIRM = Pattern(
+    "plans.bench_checks.before_your_first_trial_confirm",
+    "before your first trial: confirm that each camera of {name} shows what its reference shows",
+)
+_TRIAL_BENCH_LOOKED_AT_BEFORE = Pattern(
+    "plans.bench_checks.trial_bench_looked_at_before",
+    "trial {trial} is {status}: the bench is looked at before the run",
+)
+_BENCH_NOT_AS_REFERENCE_SHOWS = Pattern(
+    "plans.bench_checks.bench_not_as_reference_shows",
+    "the bench is not as its reference shows: {low}, wanted {least:.2f}; lay it out again, or give a reason",
+)
+_REVEALED_WHAT_VOIDED_NOW_WOULD = Pattern(
+    "plans.bench_checks.revealed_what_voided_now_would",
+    "{plan} was revealed: what is voided now would be chosen with the result in view",
+)
+_CLOSED_TRIAL_COULD_NOT_REPEATED = Pattern(
+    "plans.bench_checks.closed_trial_could_not_repeated",
+    "{plan} is closed: trial {trial} could not be repeated, so it counts",
+)
+_CLOSED_TRIAL_NOT_REPEATED_SO = Pattern(
+    "plans.bench_checks.closed_trial_not_repeated_so",
+    "{plan} is closed: trial {trial} was not repeated, so it counts; refuse its void",
+)
+_YOU_HAVE_SEEN_RESULTS_OPERATOR = Pattern(
+    "plans.bench_checks.you_have_seen_results_operator",
+    "you have seen results of {plan}: an operator who is blind scores, corrects and voids its trials",
+)
 
 HOLDS = timedelta(hours=12)  # somebody's look at the cameras
+LOOK_HOLDS = timedelta(minutes=2)  # at the bench, before the run
 
 
 # --- cameras -------------------------------------------------------------------------------------------------
@@ -57,9 +105,7 @@ def cameras_confirm(*, user: User, station: Station, first: bool = False) -> Cam
     known = references(station=station, position=None)
     missing = [camera for camera in cameras if camera not in known]
     if missing and not first:
-        raise Conflict(
-            f"{', '.join(missing)}: no reference picture yet; look at it, then confirm it as the first one"
-        )
+        raise Conflict(_NO_REFERENCE_PICTURE_YET_LOOK(missing=", ".join(missing)))
     seen = {}
     for camera, jpeg in pictures.now(station, cameras).items():
         name = pictures.keep(jpeg)
@@ -87,12 +133,14 @@ def references(*, station: Station, position: Position | None) -> dict[str, Refe
 def references_take(*, user: User, station: Station, position: Position | None) -> list[Reference]:
     """Make what the cameras show now the references of a position, or of the cameras; others stay in the record.
 
-    Regions that were drawn stay where they are on the picture.
+    Regions that were drawn stay where they are on the picture. Conflict where a running plan judges by one of them.
     """
     require(user, Role.OPERATOR)
     found = pictures.now(station, cameras_of(station))
     Station.objects.select_for_update().get(pk=station.pk)  # regions are drawn on the newest alone
     before = references(station=station, position=position)
+    for reference in before.values():
+        _require_unjudged(reference)
     return [
         Reference.objects.create(
             station=station,
@@ -117,20 +165,13 @@ def regions_draw(*, user: User, reference: Reference, drawn: Any) -> Reference:
     found = regions.regions_of(drawn)
     position = reference.position
     if position is None:
-        raise EvaError("this reference says what a camera shows at all; allowed: regions of a position's")
+        raise EvaError(_THIS_REFERENCE_SAYS_WHAT_CAMERA)
     station = Station.objects.select_for_update().get(pk=reference.station_id)
     newest = references(station=station, position=position)[reference.camera]
     if newest.pk != reference.pk:
-        raise Conflict(
-            f"{reference.camera} has a newer reference here, by {newest.by.get_username()}: draw on that one"
-        )
+        raise Conflict(_HAS_NEWER_REFERENCE_HERE_BY(camera=reference.camera, user=newest.by.get_username()))
     regions.check_sizes(found, pictures.kept(reference.picture))
-    plan = _judging_by(reference)
-    if plan is not None:
-        raise Conflict(
-            f"{plan} is running and has judged trials by the reference of {reference.camera} here: its gate stays as "
-            "it is; amend the plan to draw other regions"
-        )
+    _require_unjudged(reference)
     return Reference.objects.create(
         station=station,
         position=position,
@@ -141,15 +182,18 @@ def regions_draw(*, user: User, reference: Reference, drawn: Any) -> Reference:
     )
 
 
-def _judging_by(reference: Reference) -> Plan | None:
+def _require_unjudged(reference: Reference) -> None:
+    """The gate of a running plan does not change under it."""
     judged = Achieved.objects.filter(
         reference__station=reference.station_id,
         reference__position=reference.position_id,
         camera=reference.camera,
     )
-    return Plan.objects.filter(
+    plan = Plan.objects.filter(
         state=PlanState.FROZEN, match_gate__isnull=False, handouts__trial__in=judged.values("trial")
     ).first()
+    if plan is not None:
+        raise Conflict(_RUNNING_HAS_JUDGED_TRIALS_BY(plan=plan, camera=reference.camera))
 
 
 # --- trials --------------------------------------------------------------------------------------------------
@@ -159,9 +203,7 @@ def next_trial(*, user: User, station: Station, plan: Plan) -> Handout:
     """The next trial of a plan, for a user who has looked at the cameras; see evaweb.plans.allocation."""
     require(user, Role.OPERATOR)
     if cameras_confirmed(user=user, station=station) is None:
-        raise Conflict(
-            f"before your first trial: confirm that each camera of {station.name} shows what its reference shows"
-        )
+        raise Conflict(_BEFORE_YOUR_FIRST_TRIAL_CONFIRM(name=station.name))
     return hand_out(user=user, station=station, plan=plan)
 
 
@@ -197,9 +239,7 @@ def bench_now(*, trial: Trial) -> list[Seen]:
 
 def _look(trial: Trial, cameras: Sequence[str], patience_s: float) -> list[Seen]:
     if trial.status != TrialStatus.PREPARED:
-        raise Conflict(
-            f"trial {trial.pk} is {trial.get_status_display()}: the bench is looked at before the run"
-        )
+        raise Conflict(_TRIAL_BENCH_LOOKED_AT_BEFORE(trial=trial.pk, status=trial.get_status_display()))
     known = references(station=trial.station, position=trial.position)
     found = pictures.now(trial.station, cameras, patience_s)
     return [_seen(camera, jpeg, known.get(camera)) for camera, jpeg in found.items()]
@@ -245,10 +285,7 @@ def _require_match(trial: Trial, seen: Sequence[Seen], why: str) -> None:
         return
     low = sorted(one.worst[1] for one in seen if one.worst is not None and one.worst[0] < least)
     if low:
-        raise Conflict(
-            f"the bench is not as its reference shows: {'; '.join(low)}, wanted {least:.2f}; lay it out again, or give "
-            "a reason"
-        )
+        raise Conflict(_BENCH_NOT_AS_REFERENCE_SHOWS(low="; ".join(low), least=least))
 
 
 def _before(what: str, trial: Trial, user: Any) -> None:
@@ -256,17 +293,25 @@ def _before(what: str, trial: Trial, user: Any) -> None:
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     if handout is None:
         return
-    if what == "run" and not Achieved.objects.filter(trial=trial).exists():
-        achieve(user=user, trial=trial)
+    if what == "run":
+        newest = Achieved.objects.filter(trial=trial).last()
+        if newest is None or timezone.now() - newest.at > LOOK_HOLDS:
+            achieve(user=user, trial=trial, override=newest.override if newest else "")
     if what.startswith("void") and handout.plan.state == PlanState.REVEALED:
-        raise EvaError(
-            f"{handout.plan} was revealed: what is voided now would be chosen with the result in view"
-        )
+        raise EvaError(_REVEALED_WHAT_VOIDED_NOW_WOULD(plan=handout.plan))
+    if what == "voided" and handout.plan.state == PlanState.CLOSED and trial.status == TrialStatus.SCORED:
+        raise Conflict(_CLOSED_TRIAL_COULD_NOT_REPEATED(plan=handout.plan, trial=trial.pk))
+    if what == "void agreed" and handout.plan.state == PlanState.CLOSED and not _repeated(handout):
+        raise Conflict(_CLOSED_TRIAL_NOT_REPEATED_SO(plan=handout.plan, trial=trial.pk))
     judged = what in ("scored", "voided", "void answered")
     if judged and handout.plan.sealed and has_looked_at_a_version(handout.plan, user):
-        raise NotAllowed(
-            f"you have seen results of {handout.plan}: an operator who is blind scores, corrects and voids its trials"
-        )
+        raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_OPERATOR(plan=handout.plan))
+
+
+def _repeated(handout: Handout) -> bool:
+    """Whether another attempt counts in its place."""
+    others = Handout.objects.filter(plan=handout.plan_id, slot=handout.slot_id).exclude(pk=handout.pk)
+    return others.filter(trial__status=TrialStatus.SCORED).exists()
 
 
 def _blind(trial: Trial) -> bool:

@@ -87,9 +87,6 @@ def hidden_from(user: Any) -> Sight:
         names=frozenset({*hidden.values(), *frozen}),
         stations=frozenset(station for station, _ in handed),
         keys=frozenset(keys),
-        revealed=frozenset(
-            Plan.objects.filter(state=PlanState.REVEALED).values_list("evaluation_id", flat=True)
-        ),
         at_work=frozenset(station for station, status in handed if status in UNFINISHED),
         plans=f"{masked(f'{title} v{version}' for _, title, version, *_ in (*found, *lost))} is blind until it is "
         "revealed",

@@ -13,6 +13,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from evaweb.errors import EvaError
+from runtime.core.sentences import Pattern
+
+_ALLOWED_FINITE_NUMBERS = Pattern(
+    "plans.canonical.allowed_finite_numbers",
+    "{where} = {value}; allowed: finite numbers",
+)
+_HAS_KEY_ALLOWED_TEXTS = Pattern(
+    "plans.canonical.has_key_allowed_texts",
+    "{where} has the key {key!r}; allowed: texts",
+)
+_ALLOWED_WHAT_JSON_HAS = Pattern(
+    "plans.canonical.allowed_what_json_has",
+    "{where} is a {name}; allowed: what JSON has",
+)
 
 _MISSING = object()
 
@@ -39,16 +53,16 @@ def _plain(value: Any, where: str) -> Any:
         return value
     if isinstance(value, float):
         if not math.isfinite(value):
-            raise EvaError(f"{where or 'plan'} = {value}; allowed: finite numbers")
+            raise EvaError(_ALLOWED_FINITE_NUMBERS(where=where or "plan", value=value))
         return int(value) if value.is_integer() and abs(value) < 2**53 else value
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):
-                raise EvaError(f"{where or 'plan'} has the key {key!r}; allowed: texts")
+                raise EvaError(_HAS_KEY_ALLOWED_TEXTS(where=where or "plan", key=key))
         return {key: _plain(inner, f"{where}.{key}" if where else key) for key, inner in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, (bytes, bytearray)):
         return [_plain(inner, f"{where}[{i}]") for i, inner in enumerate(value)]
-    raise EvaError(f"{where or 'plan'} is a {type(value).__name__}; allowed: what JSON has")
+    raise EvaError(_ALLOWED_WHAT_JSON_HAS(where=where or "plan", name=type(value).__name__))
 
 
 def _differences(old: Any, new: Any, where: str) -> Iterator[str]:

@@ -14,6 +14,13 @@ from evaweb.errors import EvaError
 from evaweb.plans.canonical import digest
 from evaweb.plans.schedule import Unit
 from evaweb.plans.seeded_draws import KEY_BYTES, Chance
+from runtime.core.sentences import Pattern
+
+_CODES_ALLOWED = Pattern("plans.commitment.codes_allowed", "{count} codes; allowed: {count_2}")
+_KEY_BYTES_ALLOWED = Pattern(
+    "plans.commitment.key_bytes_allowed",
+    "a key of {count} bytes; allowed: {key_bytes}",
+)
 
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"  # without 0 and O, 1 and I: they are read aloud across a bench
 _LENGTH = 5
@@ -22,7 +29,7 @@ _LENGTH = 5
 def codes(key: bytes, count: int) -> list[str]:
     """`count` different codes, in the order of the trials; they say nothing of what they stand for."""
     if count > len(_LETTERS) ** _LENGTH // 100:
-        raise EvaError(f"{count} codes; allowed: {len(_LETTERS) ** _LENGTH // 100}")
+        raise EvaError(_CODES_ALLOWED(count=count, count_2=len(_LETTERS) ** _LENGTH // 100))
     chance, found = Chance(key, "codes"), dict[str, None]()
     while len(found) < count:
         found["".join(_LETTERS[chance.below(len(_LETTERS))] for _ in range(_LENGTH))] = None
@@ -35,7 +42,7 @@ def commitment(plan: str, units: Sequence[Unit], key: bytes) -> str:
     With a key of 256 bits it tells nothing of the schedule, and no second schedule has it.
     """
     if len(key) != KEY_BYTES:
-        raise EvaError(f"a key of {len(key)} bytes; allowed: {KEY_BYTES}")
+        raise EvaError(_KEY_BYTES_ALLOWED(count=len(key), key_bytes=KEY_BYTES))
     return hmac.new(key, f"{plan}\n{schedule_digest(units)}".encode(), hashlib.sha256).hexdigest()
 
 

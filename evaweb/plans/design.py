@@ -1,7 +1,7 @@
-"""The design of a plan's comparison: as it is drafted, as it is frozen, and what it says of the trials there are.
+"""The design of a plan's comparisons: as it is drafted, as it is frozen, and what it says of the trials there are.
 
 Blocks enter in the order of the schedule, never in that in which they were finished: the first one that lacks a scored
-trial of either checkpoint ends what is looked at. A station that is fast cannot choose what counts.
+trial of a compared checkpoint ends what is looked at. A station that is fast cannot choose what counts.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import takewhile
+from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 from django.db.models import OuterRef, Subquery
@@ -18,41 +18,111 @@ from django.utils import timezone
 
 from evaweb.errors import EvaError
 from evaweb.plans.canonical import digest
-from evaweb.plans.models import Plan
+from evaweb.plans.models import Allocation, Comparing, Plan
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.designs import SUCCESS, Conclusion, Design, Values, conclude, design, of_table
+from evaweb.statistics.designs import (
+    SUCCESS,
+    Block,
+    Design,
+    Findings,
+    check_design,
+    design,
+    findings,
+    in_blocks,
+    of_table,
+)
 from evaweb.trials.lifecycle import JUDGED
 from evaweb.trials.models import Score, TrialStatus
+from runtime.core.sentences import Pattern
+
+_LOOKS_ALLOWED_LIST_RISING_NUMBERS = Pattern(
+    "plans.design.looks_allowed_list_rising_numbers",
+    "looks = {given!r:.80}; allowed: a list of rising numbers of pairs, such as [20, 40, 60]",
+)
 
 ENDED = {
     "boundary": "a boundary of its design was crossed",
     "full": "all pairs of its comparison are made",
 }
+Names = tuple[str, str]
 
 
-def drafted(plan: Plan) -> Design | None:
-    """The design of a draft, computed now; None without a comparison. EvaError says what cannot be."""
-    if not (plan.first and plan.second):
+def planned(plan: Plan) -> list[Names]:
+    """The comparisons of a draft, by names; none where it asks for none."""
+    names = list(plan.checkpoints.order_by("name").values_list("name", flat=True))
+    if plan.comparing == Comparing.ALL:
+        return list(combinations(names, 2))
+    if plan.first is None:
+        return []
+    if plan.comparing == Comparing.CONTROL:
+        return [(name, plan.first.name) for name in names if name != plan.first.name]
+    return [(plan.first.name, plan.second.name)] if plan.second else []
+
+
+def compared(document: Mapping[str, Any]) -> list[Names]:
+    """The comparisons of a frozen plan, by names."""
+    before = [document["comparison"]] if document.get("comparison") else []
+    return [(first, second) for first, second in document.get("comparisons", before)]
+
+
+def arms_of(comparisons: Sequence[Names]) -> list[str]:
+    """The checkpoints that are compared, in the order of a design's arms."""
+    return list(dict.fromkeys(name for pair in comparisons for name in pair))
+
+
+def drafted(plan: Plan, counts: Sequence[tuple[int, int]] | None = None) -> Design | None:
+    """The design of a draft, computed now; None without a comparison. EvaError says what cannot be.
+
+    `counts`: trials of both checkpoints after each block, where they are in random order.
+    """
+    said = _said(plan)
+    if said is None:
         return None
-    pairs = plan.positions.count() * plan.repetitions
     try:
-        return design(
-            rule=plan.stopping,
-            pairs=pairs,
-            alpha=plan.alpha,
-            margin=plan.margin,
-            outcome=plan.outcome,
-            looks=looks_of(plan.look_after),
-        )
+        return design(**said, counts=counts)
     except StatisticsError as error:
         raise EvaError(str(error)) from None
 
 
+def check_drafted(plan: Plan) -> None:
+    """EvaError says what of a draft's design cannot be; no boundary is computed."""
+    said = _said(plan)
+    try:
+        if said is not None:
+            check_design(**said, paired=plan.allocation == Allocation.PAIRED)
+    except StatisticsError as error:
+        raise EvaError(str(error)) from None
+
+
+def _said(plan: Plan) -> dict[str, Any] | None:
+    """The design of a draft as `design` takes it; None without a comparison."""
+    comparisons = planned(plan)
+    if not comparisons:
+        return None
+    return {
+        "rule": plan.stopping,
+        "blocks": plan.positions.count() * plan.repetitions,
+        "alpha": plan.alpha,
+        "margin": plan.margin,
+        "outcome": plan.outcome,
+        "looks": looks_of(plan.look_after),
+        "comparisons": _by_number(comparisons),
+        "drops": plan.drop_arms,
+    }
+
+
+def _by_number(comparisons: Sequence[Names]) -> tuple[tuple[int, int], ...]:
+    arms = arms_of(comparisons)
+    return tuple((arms.index(first), arms.index(second)) for first, second in comparisons)
+
+
 def frozen(document: Mapping[str, Any]) -> Design | None:
     """The design of a frozen plan, also of one from before there were boundaries; None without a comparison."""
-    if not document["comparison"]:
+    comparisons = compared(document)
+    if not comparisons:
         return None
-    said = {"outcome": SUCCESS, "margin": None, "boundary": None, **document["stopping"]}
+    before = {"outcome": SUCCESS, "margin": None, "boundary": None, "drops": False, "counts": None}
+    said = {**before, **document["stopping"]}
     positions = sum(len(scene["positions"]) for scene in document["scenes"])
     rows, alpha, margin = said["boundary"], said["alpha"], said["margin"]
     return Design(
@@ -61,41 +131,48 @@ def frozen(document: Mapping[str, Any]) -> Design | None:
         alpha,
         margin,
         said["outcome"],
-        of_table(rows, alpha, margin) if rows else None,
+        of_table(rows, alpha / len(comparisons), margin) if rows else None,
+        _by_number(comparisons),
+        said["drops"],
+        tuple((first, second) for first, second in said["counts"]) if said["counts"] else None,
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Pairs:
-    """Outcomes of the compared checkpoints, block by block as scheduled, up to the first block that is not made.
+class Tried:
+    """Outcomes of the compared checkpoints, block by block as scheduled, up to the last block that a comparison uses.
 
     `counted` is what counts; `at_first` as if no trial had been voided that had a score, nor were to be, and none
-    corrected: of each slot the first score. `repeated` says of each pair that counts for which of the two an attempt
-    was thrown away unscored.
+    corrected: of each slot the first score. `again` says of each trial that counts whether an attempt before it was
+    thrown away unscored.
     """
 
-    counted: list[Values]
-    at_first: list[Values]
-    repeated: list[tuple[bool, bool]]
+    counted: list[Block]
+    at_first: list[Block]
+    again: list[list[bool]]
 
-    def against(self, winner: str) -> list[Values]:
+    def against(self, winner: int, loser: int) -> list[Block]:
         """What counts, had each attempt that was thrown away unscored ended as badly for `winner` as it could."""
-        worst = (0.0, 1.0) if winner == "first" else (1.0, 0.0)
+        worst = {winner: 0.0, loser: 1.0}
         return [
-            (worst[0] if again[0] else one, worst[1] if again[1] else other)
-            for (one, other), again in zip(self.counted, self.repeated, strict=True)
+            tuple(
+                (arm, worst.get(arm, value) if thrown else value)
+                for (arm, value), thrown in zip(block, flags, strict=True)
+            )
+            for block, flags in zip(self.counted, self.again, strict=True)
         ]
 
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """An attempt of one of the compared checkpoints that was judged or broken off, in block `block`.
+    """An attempt of one of the compared checkpoints that was judged or broken off, of slot `slot` in block `block`.
 
     `counts`: its score is the one that counts; `outcome` is that of its newest score and `first` of its first one, None
     where it has none. `attempt` is above 1 where one before it did not count.
     """
 
     block: int
+    slot: int
     checkpoint: str
     counts: bool
     outcome: float | None
@@ -107,7 +184,7 @@ class Attempt:
 
 
 def attempts_of(plan: Plan) -> list[Attempt]:
-    """Those of a frozen plan's comparison, in the order in which they were handed out; one query."""
+    """Those of a frozen plan's comparisons, in the order in which they were handed out; one query."""
     document = plan.document or {}
     found = frozen(document)
     if found is None:
@@ -116,72 +193,113 @@ def attempts_of(plan: Plan) -> list[Attempt]:
     first = Score.objects.filter(trial=OuterRef("trial")).order_by("pk").values(value)[:1]
     rows = plan.handouts.filter(
         trial__status__in=(*JUDGED, TrialStatus.INTERRUPTED),
-        slot__checkpoint__name__in=document["comparison"],
+        slot__checkpoint__name__in=arms_of(compared(document)),
     ).order_by("number")
     named = ("trial_id", "trial__attempt", "trial__operator__username", "trial__station__name")
-    told = ("slot__block", "slot__checkpoint__name", "trial__status", f"trial__verdict__{value}")
+    told = (
+        "slot__block",
+        "slot__index",
+        "slot__checkpoint__name",
+        "trial__status",
+        f"trial__verdict__{value}",
+    )
     return [
         Attempt(
             block,
+            slot,
             name,
             status == TrialStatus.SCORED,
             None if outcome is None else float(outcome),
             None if before is None else float(before),
             *who,
         )
-        for block, name, status, outcome, before, *who in rows.values_list(*told, Subquery(first), *named)
+        for block, slot, name, status, outcome, before, *who in rows.values_list(
+            *told, Subquery(first), *named
+        )
     ]
 
 
-def tried(plan: Plan) -> Pairs:
-    """The pairs of a frozen plan as they are now; none without a comparison. One query."""
-    found = frozen(plan.document or {})
-    return (
-        paired_up(found, (plan.document or {})["comparison"], attempts_of(plan))
-        if found
-        else Pairs([], [], [])
-    )
+def tried(plan: Plan) -> Tried:
+    """The blocks of a frozen plan as they are now; none without a comparison. One query."""
+    document = plan.document or {}
+    found = frozen(document) if document else None
+    if found is None:
+        return Tried([], [], [])
+    return blocks_of(found, arms_of(compared(document)), attempts_of(plan))
 
 
-def paired_up(found: Design, names: Sequence[str], attempts: Iterable[Attempt]) -> Pairs:
-    """The pairs of these attempts, which are in the order in which they were handed out."""
-    counted: dict[int, dict[str, float]] = defaultdict(dict)
-    at_first: dict[int, dict[str, float]] = defaultdict(dict)
-    thrown: set[tuple[int, str]] = set()
+def blocks_of(found: Design, arms: Sequence[str], attempts: Iterable[Attempt]) -> Tried:
+    """The blocks of these attempts, which are in the order in which they were handed out."""
+    counted: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
+    at_first: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
+    thrown: set[int] = set()
     for each in attempts:
         if each.outcome is None or each.first is None:
-            thrown.add((each.block, each.checkpoint))
+            thrown.add(each.slot)
             continue
-        at_first[each.block].setdefault(each.checkpoint, each.first)
+        arm = arms.index(each.checkpoint)
+        at_first[each.block].setdefault(each.slot, (arm, each.first))
         if each.counts:
-            counted[each.block][each.checkpoint] = each.outcome
+            counted[each.block][each.slot] = (arm, each.outcome)
 
-    def made(blocks: Mapping[int, Mapping[str, float]]) -> list[int]:
-        return list(takewhile(lambda block: len(blocks.get(block, ())) == len(names), range(found.pairs)))
+    def used(rows: Mapping[int, Mapping[int, tuple[int, float]]]) -> list[Block]:
+        whole = [tuple(trial for _, trial in sorted(rows.get(at, {}).items())) for at in range(found.blocks)]
+        return list(whole[: max(one.blocks for one in findings(found, whole).each)])
 
-    def pairs(blocks: Mapping[int, Mapping[str, float]]) -> list[Values]:
-        return [(blocks[block][names[0]], blocks[block][names[1]]) for block in made(blocks)]
-
-    repeated = [((block, names[0]) in thrown, (block, names[1]) in thrown) for block in made(counted)]
-    return Pairs(pairs(counted), pairs(at_first), repeated)
-
-
-def pairs_of(plan: Plan) -> list[Values]:
-    """The pairs that count."""
-    return tried(plan).counted
+    now = used(counted)
+    again = [[slot in thrown for slot in sorted(counted.get(at, {}))] for at in range(len(now))]
+    return Tried(now, used(at_first), again)
 
 
-def conclusion_of(plan: Plan) -> Conclusion | None:
+def kept_blocks(plan: Plan) -> list[Block] | None:
+    """Those that the reveal kept; None before it."""
+    return blocks_kept(plan.at_reveal) if plan.at_reveal else None
+
+
+def blocks_kept(kept: Mapping[str, Any]) -> list[Block]:
+    """Those of `at_the_reveal`, also from before there were several comparisons, when it was pairs."""
+    if "blocks" not in kept:
+        return in_blocks([(one, other) for one, other in kept["pairs"]])
+    return [tuple((arm, value) for arm, value in block) for block in kept["blocks"]]
+
+
+def same_blocks(one: Sequence[Block], other: Sequence[Block]) -> bool:
+    """Whether they have the same trials, in whatever order a block lists its own: reveals of pairs did not keep it."""
+    return [sorted(block) for block in one] == [sorted(block) for block in other]
+
+
+def findings_of(plan: Plan) -> Findings | None:
     """What the frozen design says: of a revealed plan as it stood at the reveal, else of the trials there are now."""
     found = frozen(plan.document) if plan.document else None
     if found is None:
         return None
-    return conclude(found, plan.at_reveal["pairs"] if plan.at_reveal else pairs_of(plan))
+    kept = kept_blocks(plan)
+    return findings(found, tried(plan).counted if kept is None else kept)
 
 
-def ended_because(found: Conclusion) -> str:
-    """Reason why a design has ended, which tells nothing of either checkpoint."""
-    return f"{ENDED[found.ended]}, after {found.at} pairs"
+def dropped_of(plan: Plan) -> dict[str, int]:
+    """The checkpoints of a running plan that are tried no more, and after how many blocks, by its own rule.
+
+    A trial that is repeated counts as it was scored until its repetition is: were it open, those that had been left out
+    would come next, and the operator would know which checkpoint they are of.
+    """
+    found = frozen(plan.document) if plan.document else None
+    if found is None or not found.drops:
+        return {}
+    arms = arms_of(compared(plan.document or {}))
+    attempts = attempts_of(plan)
+    made = {each.slot for each in attempts if each.counts}
+    waiting = [replace(each, counts=each.slot not in made) for each in attempts if not each.counts]
+    said = findings(
+        found, blocks_of(found, arms, [*waiting, *(each for each in attempts if each.counts)]).counted
+    )
+    return {arms[arm]: at for arm, at in said.dropped.items() if said.at is None or at < said.at}
+
+
+def ended_because(plan: Plan, found: Findings) -> str:
+    """Reason why a design has ended, which tells nothing of any checkpoint."""
+    planned = frozen(plan.document or {})
+    return f"{ENDED[found.ended]}, after {found.at} {planned.unit if planned else 'pairs'}"
 
 
 def told_reason(plan: Plan, sealed: bool) -> str:
@@ -191,12 +309,13 @@ def told_reason(plan: Plan, sealed: bool) -> str:
 
 
 def at_the_reveal(plan: Plan) -> dict[str, Any] | None:
-    """The pairs that count and the sums of each checkpoint, kept with their digest: what is corrected later makes no
+    """The blocks that count and the sums of each checkpoint, kept with their digest: what is corrected later makes no
     other headline.
     """
     if frozen(plan.document or {}) is None:
         return None
-    kept = {"pairs": [list(pair) for pair in pairs_of(plan)], "arms": _sums(plan)}
+    blocks = [[list(trial) for trial in block] for block in tried(plan).counted]
+    kept = {"blocks": blocks, "arms": _sums(plan)}
     return {**kept, "digest": digest({"plan": plan.digest, **kept}), "at": timezone.now().isoformat()}
 
 
@@ -221,9 +340,10 @@ def _sums(plan: Plan) -> list[dict[str, Any]]:
 
 
 def looks_of(given: Any) -> list[int]:
-    """Pairs after which a design is looked at; EvaError where `given` is no list of numbers."""
-    if not isinstance(given, list) or not all(
+    """Pairs after which a design is looked at; EvaError where `given` is no list of rising numbers."""
+    numbers = isinstance(given, list) and all(
         isinstance(at, int) and not isinstance(at, bool) for at in given
-    ):
-        raise EvaError(f"looks = {given!r:.80}; allowed: a list of numbers of pairs, such as [20, 40, 60]")
-    return given
+    )
+    if not numbers or sorted({*given}) != given:
+        raise EvaError(_LOOKS_ALLOWED_LIST_RISING_NUMBERS(given=given))
+    return list(given)

@@ -5,21 +5,30 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
-from evaweb.plans.design import drafted
-from evaweb.plans.models import Plan
-from evaweb.plans.schedule import Condition, Unit, schedule
+from evaweb.errors import EvaError
+from evaweb.plans.design import drafted, planned
+from evaweb.plans.models import Allocation, Plan
+from evaweb.plans.schedule import PAIRED, Condition, Unit, counts_of, schedule
+from evaweb.statistics.boundaries import MOST, SHAPES
 from evaweb.statistics.designs import table
 from evaweb.trials.models import Checkpoint, Position, Scene
+from runtime.core.sentences import Pattern
 
-FORMAT = 3  # 2 had no outcome, margin, looks or boundary
+_RANDOM_ORDER_TWO_CHECKPOINTS_CAME = Pattern(
+    "plans.documents.random_order_two_checkpoints_came",
+    "in random order two checkpoints came to {made} and {made_2} trials; allowed: 1 to {most} of each: "
+    "plan {which} of them",
+)
+
+FORMAT = 4  # 2 had no outcome, margin, looks or boundary; 3 one "comparison" at most, of paired blocks
 
 
-def document_of(plan: Plan) -> dict[str, Any]:
-    """All that is frozen of a draft, in plain JSON."""
+def document_of(plan: Plan, key: bytes) -> dict[str, Any]:
+    """All that is frozen of a draft, in plain JSON; `key` draws the schedule."""
     positions: dict[Scene, list[Position]] = defaultdict(list)
     for position in plan.positions.select_related("scene").order_by("scene__name", "number"):
         positions[position.scene].append(position)
-    return {
+    document = {
         "format": FORMAT,
         "name": plan.name,
         "version": plan.version,
@@ -33,21 +42,47 @@ def document_of(plan: Plan) -> dict[str, Any]:
         "mode": "continuous",
         "strategy": plan.strategy,
         "blind": plan.blind,
-        "stopping": {"rule": plan.stopping, "alpha": plan.alpha, **_design(plan)},
-        "comparison": [plan.first.name, plan.second.name] if plan.first and plan.second else None,
+        "allocation": plan.allocation,
+        "comparisons": [list(pair) for pair in planned(plan)],
         "second_rater_share": plan.second_rater_share,
         "match_gate": plan.match_gate,
     }
+    return {**document, "stopping": _design(plan, document, key)}
 
 
-def _design(plan: Plan) -> dict[str, Any]:
-    found = drafted(plan)
+def _design(plan: Plan, document: dict[str, Any], key: bytes) -> dict[str, Any]:
+    counts = None
+    if plan.allocation == Allocation.RANDOM:
+        names = next(iter(document["comparisons"]), [row["name"] for row in document["checkpoints"]])
+        counts = counts_of(_units(document, key), names)
+        _check_counts(counts[-1], bounded=plan.stopping in SHAPES or plan.margin is not None)
+    found = drafted(plan, counts)
     return {
+        "rule": plan.stopping,
+        "alpha": plan.alpha,
+        "drops": plan.drop_arms,
         "outcome": plan.outcome,
         "margin": plan.margin,
-        "pairs": found.pairs if found else None,
+        "pairs": found.blocks if found else None,
+        "counts": [list(count) for count in counts] if counts is not None else None,
         "boundary": table(found.boundary) if found and found.boundary else None,
     }
+
+
+class UnevenError(EvaError):
+    """A random order whose numbers of trials the design has no room for; another key draws another one."""
+
+
+def _check_counts(made: tuple[int, int], *, bounded: bool) -> None:
+    if min(made) == 0 or (bounded and max(made) > MOST):
+        raise UnevenError(
+            _RANDOM_ORDER_TWO_CHECKPOINTS_CAME(
+                made=made[0],
+                made_2=made[1],
+                most=MOST if bounded else "any number",
+                which="fewer" if bounded and min(made) else "more",
+            )
+        )
 
 
 def scene_of(scene: Scene, positions: list[Position]) -> dict[str, Any]:
@@ -100,10 +135,14 @@ def conditions_of(document: dict[str, Any]) -> list[Condition]:
 
 def units_of(plan: Plan) -> list[Unit]:
     """The schedule of a frozen plan, drawn by its key."""
-    document = plan.document or {}
+    return _units(plan.document or {}, bytes(plan.key or b""))
+
+
+def _units(document: dict[str, Any], key: bytes) -> list[Unit]:
     return schedule(
         checkpoints=[row["name"] for row in document["checkpoints"]],
         conditions=conditions_of(document),
         repetitions=document["repetitions"],
-        key=bytes(plan.key or b""),
+        key=key,
+        allocation=document.get("allocation", PAIRED),
     )

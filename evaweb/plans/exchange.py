@@ -26,12 +26,39 @@ from evaweb.errors import Conflict, EvaError
 from evaweb.plans.canonical import difference
 from evaweb.plans.documents import checkpoint_of, scene_of
 from evaweb.plans.file import CheckpointTable, File, PlaceTable, PlanTable, SceneTable
-from evaweb.plans.models import Plan, PlanState, Reference
+from evaweb.plans.models import Comparing, Plan, PlanState, Reference
 from evaweb.plans.references import packed, reference_tables, take_references
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
+from evaweb.trials.tables import check_milestones
 from runtime.core import bounded_documents as bounded
+from runtime.core.sentences import Pattern
+
+_CHECKPOINT_PARENT_DOES_NOT_EXIST = Pattern(
+    "plans.exchange.checkpoint_parent_does_not_exist",
+    "checkpoint {name}: parent = {parent!r} does not exist, here or further up in the file",
+)
+_PLAN_AMEND_THEN_CHANGE_DRAFT = Pattern(
+    "plans.exchange.plan_amend_then_change_draft",
+    "plan {name} is {state}: amend it, then change the draft",
+)
+_PLAN_COMPARISON_WITH_COMPARING_ALLOWED = Pattern(
+    "plans.exchange.plan_comparison_with_comparing_allowed",
+    "plan {name}: comparison = {comparison} with comparing = {comparing!r}; allowed: {words} checkpoints",
+)
+_PLAN_POSITION_SCENE_DOES_NOT = Pattern(
+    "plans.exchange.plan_position_scene_does_not",
+    "plan {name}: position {number} of scene {scene!r} does not exist",
+)
+_PLAN_DOES_NOT_EXIST = Pattern(
+    "plans.exchange.plan_does_not_exist",
+    "plan {name}: {kind} {name_2!r} does not exist",
+)
+_HAS_TRIALS_ANOTHER_ONE_FILE = Pattern(
+    "plans.exchange.has_trials_another_one_file",
+    "{what} has trials and is another one in the file ({shown}): give it another name",
+)
 
 _Row = TypeVar("_Row", bound=models.Model)
 
@@ -117,7 +144,10 @@ def _plan_table(plan: Plan) -> dict[str, Any]:
         "stations": list(plan.stations.order_by("name").values_list("name", flat=True)),
         "strategy": plan.strategy,
         "blind": plan.blind,
+        "allocation": plan.allocation,
         "stopping": plan.stopping,
+        "comparing": plan.comparing,
+        "drop_arms": plan.drop_arms,
         "outcome": plan.outcome,
         "margin": plan.margin,
         "look_after": plan.look_after,
@@ -180,6 +210,10 @@ def _take_scene(table: SceneTable) -> str:
             raise _refused(f"scene {made.name}", changes)
         made.positions.all().delete()
         made.milestones.all().delete()
+    try:
+        check_milestones([row["text"] for row in milestones])
+    except Invalid as invalid:
+        raise EvaError(f"scene {table.name}: {'; '.join(invalid.messages)}") from None
     scene = made or Scene(name=table.name)
     for name, value in wanted.items():
         setattr(scene, name, value)
@@ -204,9 +238,7 @@ def _take_checkpoint(table: CheckpointTable) -> str:
     parent = wanted.pop("parent")
     checkpoint.parent = Checkpoint.objects.filter(name=parent).first() if parent else None
     if parent and checkpoint.parent is None:
-        raise EvaError(
-            f"checkpoint {table.name}: parent = {parent!r} does not exist, here or further up in the file"
-        )
+        raise EvaError(_CHECKPOINT_PARENT_DOES_NOT_EXIST(name=table.name, parent=parent))
     for name, value in wanted.items():
         setattr(checkpoint, name, value)
     _kept(checkpoint, f"checkpoint {table.name}")
@@ -216,7 +248,7 @@ def _take_checkpoint(table: CheckpointTable) -> str:
 def _take_plan(table: PlanTable, user: User) -> str:
     newest = Plan.objects.select_for_update().filter(name=table.name).order_by("-version").first()
     if newest is not None and newest.state != PlanState.DRAFT:
-        raise Conflict(f"plan {table.name} is {newest.get_state_display()}: amend it, then change the draft")
+        raise Conflict(_PLAN_AMEND_THEN_CHANGE_DRAFT(name=table.name, state=newest.get_state_display()))
     plan = newest or Plan(name=table.name, owner=user)
     wanted = table.model_dump(exclude={"positions", "checkpoints", "stations", "comparison"})
     for name, value in wanted.items():
@@ -224,11 +256,15 @@ def _take_plan(table: PlanTable, user: User) -> str:
     checkpoints = [_named(Checkpoint, "checkpoint", name, table) for name in table.checkpoints]
     stations = [_named(Station, "station", name, table) for name in table.stations]
     compared = [_named(Checkpoint, "checkpoint", name, table) for name in table.comparison]
-    if len(compared) == 1:
+    allowed = {Comparing.CONTROL: (1,), Comparing.ALL: (0,)}.get(Comparing(table.comparing), (0, 2))
+    if len(compared) not in allowed:
+        words = " or ".join(map(str, allowed))
         raise EvaError(
-            f"plan {table.name}: comparison = {table.comparison}; allowed: two checkpoints, or none"
+            _PLAN_COMPARISON_WITH_COMPARING_ALLOWED(
+                name=table.name, comparison=table.comparison, comparing=table.comparing, words=words
+            )
         )
-    plan.first, plan.second = compared or (None, None)
+    plan.first, plan.second = (*compared, None, None)[:2]
     _kept(plan, f"plan {table.name}")
     plan.positions.set([_position(place, table) for place in table.positions])
     plan.checkpoints.set(checkpoints)
@@ -239,14 +275,14 @@ def _take_plan(table: PlanTable, user: User) -> str:
 def _position(place: PlaceTable, table: PlanTable) -> Position:
     found = Position.objects.filter(scene__name=place.scene, number=place.number).first()
     if found is None:
-        raise EvaError(f"plan {table.name}: position {place.number} of scene {place.scene!r} does not exist")
+        raise EvaError(_PLAN_POSITION_SCENE_DOES_NOT(name=table.name, number=place.number, scene=place.scene))
     return found
 
 
 def _named(model: type[_Row], kind: str, name: str, table: PlanTable) -> _Row:
     found = model._default_manager.filter(name=name).first()
     if found is None:
-        raise EvaError(f"plan {table.name}: {kind} {name!r} does not exist")
+        raise EvaError(_PLAN_DOES_NOT_EXIST(name=table.name, kind=kind, name_2=name))
     return found
 
 
@@ -261,4 +297,4 @@ def _kept(row: models.Model, what: str) -> None:
 
 def _refused(what: str, changes: list[str]) -> Conflict:
     shown = "; ".join(changes[:5]) + (f"; and {len(changes) - 5} more" if len(changes) > 5 else "")
-    return Conflict(f"{what} has trials and is another one in the file ({shown}): give it another name")
+    return Conflict(_HAS_TRIALS_ANOTHER_ONE_FILE(what=what, shown=shown))

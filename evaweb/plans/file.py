@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -23,7 +23,7 @@ class PositionTable(Table):
     number: int = Field(ge=0, lt=2**15)
     label: str = ""
     description: str = ""
-    bench: dict[str, list[float]] | None = None
+    bench: dict[str, list[float] | dict[str, list[float]]] | None = None
 
 
 class MilestoneTable(Table):
@@ -82,7 +82,10 @@ class PlanTable(Table):
     stations: list[str] = []
     strategy: dict[str, Any] | None = None
     blind: bool = True
+    allocation: Literal["paired", "random"] = "paired"
     stopping: str = "none"
+    comparing: Literal["pair", "control", "all"] = "pair"
+    drop_arms: bool = False
     outcome: str = "success"
     margin: float | None = None
     look_after: list[int] = []

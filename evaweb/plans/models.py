@@ -8,6 +8,7 @@ from django.db import models
 from django.db.models import Q
 
 from evaweb.append_only import AppendOnly
+from evaweb.names import check_name
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene, Trial
 
@@ -37,6 +38,21 @@ class PrimaryOutcome(models.TextChoices):
     SCORE = "score", "score (partial credit)"
 
 
+class Allocation(models.TextChoices):
+    """Order of the checkpoints within a block; see evaweb.plans.schedule."""
+
+    PAIRED = "paired", "paired: each checkpoint once in every block"
+    RANDOM = "random", "random: two trials in every block, of whichever of two checkpoints is drawn"
+
+
+class Comparing(models.TextChoices):
+    """Comparisons that a plan's question is about; they share alpha."""
+
+    PAIR = "pair", "first and second"
+    CONTROL = "control", "each checkpoint with the first"
+    ALL = "all", "all checkpoints with each other"
+
+
 class Plan(models.Model):
     """One version of an evaluation: while a draft it is edited, frozen it is a document that nobody changes.
 
@@ -46,7 +62,7 @@ class Plan(models.Model):
 
     name = models.SlugField(max_length=60, help_text="Of all its versions; in addresses and exports.")
     version = models.PositiveIntegerField(default=1, editable=False)
-    title = models.CharField(max_length=120)
+    title = models.CharField(max_length=120, validators=[check_name])
     question = models.TextField(
         blank=True, help_text="What is to be found out, written down before the first trial."
     )
@@ -69,6 +85,13 @@ class Plan(models.Model):
         null=True, blank=True, help_text="The [strategy] table for all trials; empty: as each station has it."
     )
     blind = models.BooleanField(default=True, help_text="Operators are not told which checkpoint runs.")
+    allocation = models.CharField(
+        "order",
+        max_length=6,
+        choices=Allocation,
+        default=Allocation.PAIRED,
+        help_text="Random: an operator who recognises a checkpoint cannot tell by it what comes next.",
+    )
     stopping = models.CharField("design", max_length=8, choices=StoppingRule, default=StoppingRule.NONE)
     outcome = models.CharField(max_length=8, choices=PrimaryOutcome, default=PrimaryOutcome.SUCCESS)
     margin = models.FloatField(
@@ -85,6 +108,19 @@ class Plan(models.Model):
         "Empty: after every pair.",
     )
     alpha = models.FloatField(default=0.05, validators=[MinValueValidator(0.0001), MaxValueValidator(0.5)])
+    comparing = models.CharField(
+        "comparisons",
+        max_length=7,
+        choices=Comparing,
+        default=Comparing.PAIR,
+        help_text="What the question is about. Several share alpha equally.",
+    )
+    drop_arms = models.BooleanField(
+        "drop checkpoints",
+        default=False,
+        help_text="With several comparisons and a design that looks before the end: a checkpoint that one of them "
+        "found worse, or of which nothing is left to be found out, is tried no more.",
+    )
     first = models.ForeignKey(
         Checkpoint,
         null=True,
@@ -128,7 +164,7 @@ class Plan(models.Model):
         null=True,
         blank=True,
         editable=False,
-        help_text="The comparison as it stood at the reveal; see evaweb.plans.design.",
+        help_text="The comparisons as they stood at the reveal; see evaweb.plans.design.",
     )
     revealed_at = models.DateTimeField(null=True, blank=True, editable=False)
     revealed_by = models.ForeignKey(
@@ -150,7 +186,10 @@ class Plan(models.Model):
                 "question",
                 "repetitions",
                 "blind",
+                "allocation",
                 "stopping",
+                "comparing",
+                "drop_arms",
                 "outcome",
                 "margin",
                 "look_after",
@@ -242,6 +281,7 @@ class Handout(models.Model):
             models.UniqueConstraint(fields=("plan", "number"), name="handout_number_once"),
             models.UniqueConstraint(fields=("plan", "code"), name="handout_code_once"),
         ]
+        indexes = [models.Index(fields=("code",), name="handout_code")]
 
     def __str__(self) -> str:
         return f"{self.plan} {self.code}"

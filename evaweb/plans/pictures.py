@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Iterable
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from uuid import uuid4
 
@@ -21,12 +22,32 @@ from django.conf import settings
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import wire_to
+from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CodecError, Subscriber
+
+_NO_PICTURE_FROM_WITHIN_S = Pattern(
+    "plans.pictures.no_picture_from_within_s",
+    "no picture from {missing} within {patience_s:g} s: check the cameras first",
+)
+_PICTURE_NOT_ON_THIS_DISK = Pattern(
+    "plans.pictures.picture_not_on_this_disk",
+    "picture {name:.16} is not on this disk",
+)
+_PICTURE_X_PIXELS_ALLOWED_PIXELS = Pattern(
+    "plans.pictures.picture_x_pixels_allowed_pixels",
+    "a picture of {width} x {height} pixels; allowed: {most_pixels} pixels in all, such as 4096 x 4096",
+)
+_THIS_NO_JPEG = Pattern("plans.pictures.this_no_jpeg", "this is no JPEG: {error}")
+_PICTURE_X_PIXELS_ALLOWED_X = Pattern(
+    "plans.pictures.picture_x_pixels_allowed_x",
+    "a picture of {shape} x {shape_2} pixels; allowed: {width} x {height} or more",
+)
 
 WIDTH, HEIGHT = (
     64,
     48,
 )  # to which both pictures are brought before they are compared; static/console/trial/match.js does too
+MOST_PIXELS = 2**24  # of a picture that is decoded: a small file can be a very large picture
 _TURN_S = 0.1
 
 
@@ -45,9 +66,7 @@ def now(station: Station, cameras: Iterable[str], patience_s: float = 3.0) -> di
             found |= {name[7:]: bytes(jpeg) for name, jpeg in heard.items() if name[7:] in wanted}
     missing = sorted(wanted - set(found))
     if missing:
-        raise Conflict(
-            f"no picture from {', '.join(missing)} within {patience_s:g} s: see to the cameras first"
-        )
+        raise Conflict(_NO_PICTURE_FROM_WITHIN_S(missing=", ".join(missing), patience_s=patience_s))
     return found
 
 
@@ -81,7 +100,7 @@ def kept(name: str) -> bytes:
     try:
         return _path(name).read_bytes()
     except FileNotFoundError:
-        raise NotFound(f"picture {name:.16} is not on this disk") from None
+        raise NotFound(_PICTURE_NOT_ON_THIS_DISK(name=name)) from None
 
 
 def is_kept(name: str) -> bool:
@@ -93,19 +112,44 @@ def _path(name: str) -> Path:
     return Path(settings.DATA_DIR) / "pictures" / f"{name}.jpg"
 
 
-def _grey(jpeg: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Grey values at 64 x 48 around their mean; each is the mean of the pixels that it stands for."""
+def decoded(jpeg: bytes, colorspace: str) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    """The pixels [H, W, channels]; EvaError where it is no JPEG, or so large that it is not decoded."""
     try:
-        picture = simplejpeg.decode_jpeg(jpeg, colorspace="GRAY")[..., 0].astype(np.float64)
+        height, width, _, _ = simplejpeg.decode_jpeg_header(jpeg)
+        if height * width > MOST_PIXELS:
+            raise EvaError(
+                _PICTURE_X_PIXELS_ALLOWED_PIXELS(width=width, height=height, most_pixels=MOST_PIXELS)
+            )
+        return simplejpeg.decode_jpeg(jpeg, colorspace=colorspace)
     except ValueError as error:
-        raise EvaError(f"this is no JPEG: {error}") from None
-    rows = np.linspace(0, picture.shape[0], HEIGHT + 1).round().astype(int)
-    columns = np.linspace(0, picture.shape[1], WIDTH + 1).round().astype(int)
-    if (np.diff(rows) < 1).any() or (np.diff(columns) < 1).any():
+        raise EvaError(_THIS_NO_JPEG(error=error)) from None
+
+
+def brought(
+    picture: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], height: int, width: int
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """The picture at another size, no larger; each pixel is the mean of those that it stands for."""
+    rows = np.linspace(0, picture.shape[0], height + 1).round().astype(int)
+    columns = np.linspace(0, picture.shape[1], width + 1).round().astype(int)
+    bands = np.stack(
+        [picture[first:end].sum(axis=0) for first, end in pairwise(rows)]
+    )  # of a whole one no copy
+    sums = np.add.reduceat(bands, columns[:-1], axis=1)
+    small: np.ndarray[tuple[int, ...], np.dtype[np.float64]] = (
+        sums / np.outer(np.diff(rows), np.diff(columns))[..., None]
+    )
+    return small
+
+
+def _grey(jpeg: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Grey values at 64 x 48 around their mean."""
+    picture = decoded(jpeg, "GRAY")
+    if picture.shape[0] < HEIGHT or picture.shape[1] < WIDTH:
         raise EvaError(
-            f"a picture of {picture.shape[1]} x {picture.shape[0]} pixels; allowed: {WIDTH} x {HEIGHT} or more"
+            _PICTURE_X_PIXELS_ALLOWED_X(
+                shape=picture.shape[1], shape_2=picture.shape[0], width=WIDTH, height=HEIGHT
+            )
         )
-    sums = np.add.reduceat(np.add.reduceat(picture, rows[:-1], axis=0), columns[:-1], axis=1)
-    small = sums / np.outer(np.diff(rows), np.diff(columns))
+    small = brought(picture, HEIGHT, WIDTH)[..., 0]
     centred: np.ndarray[tuple[int, ...], np.dtype[np.float64]] = small - small.mean()
     return centred

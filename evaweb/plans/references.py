@@ -23,6 +23,41 @@ from evaweb.plans import regions as drawing
 from evaweb.plans.models import Reference
 from evaweb.stations.models import Station
 from evaweb.trials.models import Position, Scene
+from runtime.core.sentences import Pattern
+
+_THIS_ARCHIVE_CANNOT_READ = Pattern(
+    "plans.references.this_archive_cannot_read",
+    "this archive cannot be read: {error}",
+)
+_ARCHIVE_HAS_TOML_FILES_AT = Pattern(
+    "plans.references.archive_has_toml_files_at",
+    "the archive has {count} TOML files at its top; allowed: 1",
+)
+_ARCHIVE_HAS_ALLOWED_ONE_TOML = Pattern(
+    "plans.references.archive_has_allowed_one_toml",
+    "the archive has {filename!r:.80}; allowed: one TOML, pictures/<SHA-256>.jpg",
+)
+_ARCHIVE_HAS_PICTURES_ALLOWED_BYTES = Pattern(
+    "plans.references.archive_has_pictures_allowed_bytes",
+    "the archive has {count} pictures; allowed: {most}, and {largest} bytes in all",
+)
+_BYTES_HAVE_ANOTHER_SHA_256 = Pattern(
+    "plans.references.bytes_have_another_sha_256",
+    "{filename}: its bytes have another SHA-256 than its name says",
+)
+_HAS_MORE_THAN_BYTES_WHICH = Pattern(
+    "plans.references.has_more_than_bytes_which",
+    "{filename} has more than {most} bytes, which is the most that is allowed",
+)
+_HAS_BYTES_ALLOWED_ARCHIVE = Pattern(
+    "plans.references.has_bytes_allowed_archive",
+    "{name} has {count} bytes; allowed: {largest_text}, or an archive",
+)
+_NOT_TEXT = Pattern("plans.references.not_text", "{name} is not a text: {error}")
+_REFERENCE_POSITION_SCENE_DOES_NOT = Pattern(
+    "plans.references.reference_position_scene_does_not",
+    "reference: position {position} of scene {scene!r:.60} does not exist",
+)
 
 LARGEST_TEXT = 2_000_000  # bytes of the TOML
 LARGEST_PICTURE = 10_000_000
@@ -80,28 +115,26 @@ def unpacked(content: bytes) -> tuple[str, dict[str, bytes]]:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             return _of(archive)
     except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, RuntimeError) as error:
-        raise EvaError(f"this archive cannot be read: {error}") from None
+        raise EvaError(_THIS_ARCHIVE_CANNOT_READ(error=error)) from None
 
 
 def _of(archive: zipfile.ZipFile) -> tuple[str, dict[str, bytes]]:
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     texts = [entry for entry in entries if entry.filename.endswith(".toml") and "/" not in entry.filename]
     if len(texts) != 1:
-        raise EvaError(f"the archive has {len(texts)} TOML files at its top; allowed: 1")
+        raise EvaError(_ARCHIVE_HAS_TOML_FILES_AT(count=len(texts)))
     others = [entry for entry in entries if entry is not texts[0]]
     strange = next((entry for entry in others if not _PICTURE.fullmatch(entry.filename)), None)
     if strange is not None:
-        raise EvaError(f"the archive has {strange.filename!r:.80}; allowed: one TOML, pictures/<SHA-256>.jpg")
+        raise EvaError(_ARCHIVE_HAS_ALLOWED_ONE_TOML(filename=strange.filename))
     if len(others) > _MOST or sum(entry.file_size for entry in entries) > LARGEST:
-        raise EvaError(
-            f"the archive has {len(others)} pictures; allowed: {_MOST}, and {LARGEST} bytes in all"
-        )
+        raise EvaError(_ARCHIVE_HAS_PICTURES_ALLOWED_BYTES(count=len(others), most=_MOST, largest=LARGEST))
     found = {}
     for entry in others:
         jpeg = _read(archive, entry, LARGEST_PICTURE)
         name = entry.filename.removeprefix("pictures/").removesuffix(".jpg")
         if hashlib.sha256(jpeg).hexdigest() != name:
-            raise EvaError(f"{entry.filename}: its bytes have another SHA-256 than its name says")
+            raise EvaError(_BYTES_HAVE_ANOTHER_SHA_256(filename=entry.filename))
         try:
             pictures.match(jpeg, jpeg)
         except EvaError as error:
@@ -114,17 +147,17 @@ def _read(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, most: int) -> bytes:
     with archive.open(entry) as file:  # what an entry says of its size may be wrong
         content = file.read(most + 1)
     if len(content) > most:
-        raise EvaError(f"{entry.filename} has more than {most} bytes, which is the most that is allowed")
+        raise EvaError(_HAS_MORE_THAN_BYTES_WHICH(filename=entry.filename, most=most))
     return content
 
 
 def _text(content: bytes, name: str) -> str:
     if len(content) > LARGEST_TEXT:
-        raise EvaError(f"{name} has {len(content)} bytes; allowed: {LARGEST_TEXT}, or an archive")
+        raise EvaError(_HAS_BYTES_ALLOWED_ARCHIVE(name=name, count=len(content), largest_text=LARGEST_TEXT))
     try:
         return content.decode()
     except UnicodeDecodeError as error:
-        raise EvaError(f"{name} is not a text: {error}") from None
+        raise EvaError(_NOT_TEXT(name=name, error=error)) from None
 
 
 def take_references(rows: Sequence[Mapping[str, Any]], found: Mapping[str, bytes], user: User) -> list[str]:
@@ -141,21 +174,21 @@ def take_references(rows: Sequence[Mapping[str, Any]], found: Mapping[str, bytes
 def _taken(row: Mapping[str, Any], found: Mapping[str, bytes], user: User) -> str:
     position = Position.objects.filter(scene__name=row["scene"], number=row["position"]).first()
     if position is None:
-        raise EvaError(f"reference: position {row['position']} of scene {row['scene']!r:.60} does not exist")
+        raise EvaError(_REFERENCE_POSITION_SCENE_DOES_NOT(position=row["position"], scene=row["scene"]))
     station = Station.objects.filter(name=row["station"]).first()
     if station is None:
-        return f"left out, for there is no station {row['station']}"
+        return f"left out, because there is no station {row['station']}"
     key = {"station": station, "position": position, "camera": row["camera"]}
     ours = Reference.objects.filter(**key).first()
     if ours is not None and (ours.picture, ours.regions) != (row["picture"], row["regions"]):
-        return "left out, for this lab has its own"
+        return "left out, because this lab has its own"
     jpeg = found.get(row["picture"])
     if ours is not None:
         if jpeg is not None:
             pictures.keep(jpeg)  # its file may have been lost
         return "the same"
     if jpeg is None and not pictures.is_kept(row["picture"]):
-        return "left out, for the file has not their pictures: import the archive"
+        return "left out, because the file lacks their pictures: import the archive"
     drawing.check_sizes(drawing.regions_of(row["regions"]), jpeg or pictures.kept(row["picture"]))
     name = pictures.keep(jpeg) if jpeg else row["picture"]
     Reference.objects.create(**key, picture=name, regions=row["regions"], by=user)

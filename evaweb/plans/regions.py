@@ -11,10 +11,30 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import numpy as np
-import simplejpeg
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from evaweb.errors import EvaError
+from evaweb.plans.pictures import brought, decoded
+from runtime.core.sentences import Pattern
+
+_REGIONS_GIVEN = Pattern("plans.regions.regions_given", "regions: {where}: {msg} (given: {input!r:.80})")
+_REGIONS_THERE_TWICE_ALLOWED_EACH = Pattern(
+    "plans.regions.regions_there_twice_allowed_each",
+    "regions: {twice!r} is there twice; allowed: each name once",
+)
+_REGION_X_PIXELS_PICTURE_ALLOWED = Pattern(
+    "plans.regions.region_x_pixels_picture_allowed",
+    "region {name!r}: {right} x {bottom} pixels of the picture; allowed: {least} x {least} or more",
+)
+_REGION_ONE_COLOUR_PICTURE_DRAW = Pattern(
+    "plans.regions.region_one_colour_picture_draw",
+    "region {name!r} is of one colour in the picture: draw it around an object and its edges",
+)
+_REGION_HAS_NO_PIXEL_PICTURE = Pattern(
+    "plans.regions.region_has_no_pixel_picture",
+    "region {name!r} has no pixel in a picture of {shape} x {shape_2}; allowed: pictures as large as "
+    "the reference is",
+)
 
 MOST = 12  # of one picture
 WIDEST = 640  # pixels of a picture that is compared
@@ -57,38 +77,38 @@ def regions_of(given: Any) -> list[Region]:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "regions"
-        raise EvaError(f"regions: {where}: {first['msg']} (given: {first['input']!r:.80})") from None
+        raise EvaError(_REGIONS_GIVEN(where=where, msg=first["msg"], input=first["input"])) from None
     names = [region.name for region in found]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise EvaError(f"regions: {twice!r} is there twice; allowed: each name once")
+        raise EvaError(_REGIONS_THERE_TWICE_ALLOWED_EACH(twice=twice))
     return found
 
 
 def check_sizes(found: list[Region], jpeg: bytes) -> None:
     """EvaError where a region is too small on this picture, or shows nothing that could be recognised."""
-    picture = _common([_pixels(jpeg)])[0]
+    picture = _common([decoded(jpeg, "RGB")])[0]
     for region in found:
         top, left, bottom, right = _box(region, picture)
         if bottom - top < _LEAST or right - left < _LEAST:
             raise EvaError(
-                f"region {region.name!r}: {right - left} x {bottom - top} pixels of the picture; allowed: "
-                f"{_LEAST} x {_LEAST} or more"
+                _REGION_X_PIXELS_PICTURE_ALLOWED(
+                    name=region.name, right=right - left, bottom=bottom - top, least=_LEAST
+                )
             )
         if _spread(_details(picture, (top, left, bottom, right))) < _FLAT:
-            raise EvaError(
-                f"region {region.name!r} is of one colour in the picture: draw it around an object and its edges"
-            )
+            raise EvaError(_REGION_ONE_COLOUR_PICTURE_DRAW(name=region.name))
 
 
 def matched(found: list[Region], reference: bytes, now: bytes) -> list[dict[str, Any]]:
     """Of each region {"name", "at", "match", "dx", "dy", "words"}; dx and dy are None where its object is not seen.
 
     `at` is the region, [x, y, width, height] as shares; `match` goes from 1, the same, to 0; `dx` to the right and `dy`
-    down say by how many pixels of the live picture the object lies elsewhere, `words` the same in words.
+    down say by how many pixels of the live picture the object lies elsewhere, `words` the same in words. EvaError where
+    the live picture is so small that a region has no pixel.
     """
-    live = _pixels(now)
-    before, after = _common([_pixels(reference), live])
+    live = decoded(now, "RGB")
+    before, after = _common([decoded(reference, "RGB"), live])
     scale = (live.shape[1] / after.shape[1], live.shape[0] / after.shape[0])
     return [
         {
@@ -102,6 +122,10 @@ def matched(found: list[Region], reference: bytes, now: bytes) -> list[dict[str,
 
 def _found(region: Region, before: _Pixels, after: _Pixels, scale: tuple[float, float]) -> dict[str, Any]:
     top, left, bottom, right = box = _box(region, before)
+    if bottom == top or right == left:
+        raise EvaError(
+            _REGION_HAS_NO_PIXEL_PICTURE(name=region.name, shape=after.shape[1], shape_2=after.shape[0])
+        )
     wanted = _details(before, box)
     around = (top - REACH, left - REACH, bottom + REACH, right + REACH)
     first_row, first_column, last_row, last_column = _inside(around, after)
@@ -177,19 +201,10 @@ def _common(pictures: list[_Pixels]) -> list[_Pixels]:
     width = min(picture.shape[1] for picture in pictures)
     if width > WIDEST:
         height, width = round(height * WIDEST / width), WIDEST
-    return [_brought(picture, height, width) for picture in pictures]
-
-
-def _brought(picture: _Pixels, height: int, width: int) -> _Pixels:
-    """Each pixel is the mean of those that it stands for."""
-    if picture.shape[:2] == (height, width):
-        return picture
-    rows = np.linspace(0, picture.shape[0], height + 1).round().astype(int)
-    columns = np.linspace(0, picture.shape[1], width + 1).round().astype(int)
-    exact = picture.astype(np.float64)
-    sums = np.add.reduceat(np.add.reduceat(exact, rows[:-1], axis=0), columns[:-1], axis=1)
-    small: _Pixels = sums / np.outer(np.diff(rows), np.diff(columns))[..., None]
-    return small
+    return [
+        picture if picture.shape[:2] == (height, width) else brought(picture, height, width)
+        for picture in pictures
+    ]
 
 
 def _details(picture: _Pixels, box: tuple[int, int, int, int]) -> _Pixels:
@@ -216,10 +231,3 @@ def _means(values: _Pixels, side: int) -> _Pixels:
 def _inside(box: tuple[int, int, int, int], picture: _Pixels) -> tuple[int, int, int, int]:
     """What of the box lies inside the picture."""
     return max(0, box[0]), max(0, box[1]), min(picture.shape[0], box[2]), min(picture.shape[1], box[3])
-
-
-def _pixels(jpeg: bytes) -> _Pixels:
-    try:
-        return simplejpeg.decode_jpeg(jpeg, colorspace="RGB")
-    except ValueError as error:
-        raise EvaError(f"this is no JPEG: {error}") from None

@@ -1,6 +1,7 @@
 """The reveal of a plan on the disk: a database that is put back does not make it undone.
 
-DATA/reveals/UUID.jsonl, named by the first half of the plan's digest. The first line counts, whatever came later.
+DATA/reveals/UUID.jsonl, named by the first half of the plan's digest. The first line counts, whatever came later. Its
+`at_reveal` has who revealed, and the commitment and key of then: a plan that is frozen again has others.
 """
 
 from __future__ import annotations
@@ -39,7 +40,10 @@ def kept(plan: Plan) -> RevealLine | None:
 
 
 def keep(plan: Plan) -> None:
-    """Write down a reveal that is about to be saved. Raises NotKept."""
+    """Write down a reveal that is about to be saved, and complete its `at_reveal`. Raises NotKept."""
+    if plan.at_reveal is not None and plan.revealed_by is not None:
+        by, key = plan.revealed_by.get_username(), bytes(plan.key or b"").hex()
+        plan.at_reveal = {**plan.at_reveal, "by": by, "commitment": plan.commitment, "key": key}
     REVEALS.append(_file(plan), RevealLine.written(plan))
 
 

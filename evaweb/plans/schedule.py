@@ -1,8 +1,11 @@
-"""The order of the trials of a plan: blocks of all checkpoints at one initial condition, at random and balanced.
+"""The order of the trials of a plan: blocks at one initial condition each, at random and balanced.
 
-A block is one initial condition once: every checkpoint is tried there, one after the other, so that each comparison is
-made under the same condition at nearly the same time (Kress-Gazit et al. 2024). Rounds go through all conditions before
-any is repeated. Within each round of as many blocks as there are checkpoints, each checkpoint comes once at each place.
+Paired: every checkpoint is tried once in a block, one after the other, so that each comparison is made under the same
+condition at nearly the same time (Kress-Gazit et al. 2024). Rounds go through all conditions before any is repeated.
+Within each round of as many blocks as there are checkpoints, each checkpoint comes once at each place.
+
+Random: a block has two trials, each of one of two checkpoints by a fair coin, but where one is `IMBALANCE` trials ahead
+at that condition the other comes (the big stick design, Soares and Wu 1983): what was determines little of what comes.
 """
 
 from __future__ import annotations
@@ -13,8 +16,37 @@ from typing import Any
 
 from evaweb.errors import EvaError
 from evaweb.plans.seeded_draws import Chance
+from runtime.core.sentences import Pattern
+
+_NO_PLAN_NEEDS_AT_LEAST = Pattern(
+    "plans.schedule.no_plan_needs_at_least",
+    "no {what}: a plan needs at least one",
+)
+_NAMED_TWICE = Pattern("plans.schedule.named_twice", "{what} {twice} is named twice")
+_REPETITIONS_ALLOWED_1_MORE = Pattern(
+    "plans.schedule.repetitions_allowed_1_more",
+    "repetitions = {repetitions}; allowed: 1 or more",
+)
+_CHECKPOINTS_RANDOM_ORDER_ALLOWED_2 = Pattern(
+    "plans.schedule.checkpoints_random_order_allowed_2",
+    "{count} checkpoints in random order; allowed: 2",
+)
+_BLOCKS_CHECKPOINTS_RANDOM_ORDER_ALLOWED = Pattern(
+    "plans.schedule.blocks_checkpoints_random_order_allowed",
+    "{count} blocks of checkpoints in random order; allowed: {least} or more",
+)
+_CHECKPOINTS_X_CONDITIONS_X_REPETITIONS = Pattern(
+    "plans.schedule.checkpoints_x_conditions_x_repetitions",
+    "{count} checkpoints x {count_2} conditions x {repetitions} repetitions are {total} trials; "
+    "allowed: {most}",
+)
 
 MOST = 20_000  # trials of one plan: more is a mistake in the form
+IMBALANCE = (
+    3  # trials by which one of two checkpoints may be ahead at a condition: one of six trials is determined
+)
+PAIRED, RANDOM = "paired", "random"
+_LEAST = 5  # blocks in random order: fewer may well have one checkpoint alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,19 +76,54 @@ class Unit:
 
 
 def schedule(
-    *, checkpoints: Sequence[str], conditions: Sequence[Condition], repetitions: int, key: bytes
+    *,
+    checkpoints: Sequence[str],
+    conditions: Sequence[Condition],
+    repetitions: int,
+    key: bytes,
+    allocation: str = PAIRED,
 ) -> list[Unit]:
     """All trials of a plan in the order in which they are handed out; the same for the same plan and key."""
-    _check(checkpoints, conditions, repetitions)
+    check_schedule(checkpoints, conditions, repetitions, allocation)
     units: list[Unit] = []
     block = 0
     orders = _orders(list(checkpoints), Chance(key, "orders"))
+    drawn = _Coins(list(checkpoints), Chance(key, "allocation"))
     for repetition in range(1, repetitions + 1):
         for condition in Chance(key, f"conditions/{repetition}").shuffled(list(conditions)):
-            for place, checkpoint in enumerate(next(orders)):
-                units.append(Unit(len(units), block, place, checkpoint, condition, repetition))
+            there = next(orders) if allocation == PAIRED else [drawn.next(condition) for _ in range(2)]
+            for place, checkpoint in enumerate(there):
+                # Where a block may have two of one checkpoint its number must not say so.
+                number = repetition if allocation == PAIRED else 2 * repetition - 1 + place
+                units.append(Unit(len(units), block, place, checkpoint, condition, number))
             block += 1
     return units
+
+
+class _Coins:
+    """Draws one of two checkpoints, trial by trial."""
+
+    def __init__(self, checkpoints: list[str], chance: Chance) -> None:
+        self._checkpoints, self._chance = checkpoints, chance
+        self._ahead: dict[Condition, int] = {}
+
+    def next(self, condition: Condition) -> str:
+        """The checkpoint of the next trial at a condition."""
+        ahead = self._ahead.get(condition, 0)  # by how many trials the first one is
+        second = ahead == IMBALANCE or (ahead > -IMBALANCE and self._chance.below(2) == 1)
+        self._ahead[condition] = ahead + (-1 if second else 1)
+        return self._checkpoints[second]
+
+
+def counts_of(units: Sequence[Unit], names: Sequence[str]) -> list[tuple[int, int]]:
+    """Trials of two checkpoints after each block."""
+    found: list[tuple[int, int]] = []
+    for unit in units:
+        if unit.block == len(found):
+            found.append(found[-1] if found else (0, 0))
+        first, second = found[-1]
+        found[-1] = (first + (unit.checkpoint == names[0]), second + (unit.checkpoint == names[1]))
+    return found
 
 
 def _orders(checkpoints: list[str], chance: Chance) -> Iterator[list[str]]:
@@ -68,18 +135,32 @@ def _orders(checkpoints: list[str], chance: Chance) -> Iterator[list[str]]:
         yield from chance.shuffled([[names[(row + column) % k] for column in columns] for row in range(k)])
 
 
-def _check(checkpoints: Sequence[str], conditions: Sequence[Condition], repetitions: int) -> None:
+def check_schedule(
+    checkpoints: Sequence[str], conditions: Sequence[Condition], repetitions: int, allocation: str
+) -> None:
+    """EvaError says why there can be no schedule of these."""
     for what, items in (("checkpoint", checkpoints), ("condition", conditions)):
         if not items:
-            raise EvaError(f"no {what}: a plan needs at least one")
+            raise EvaError(_NO_PLAN_NEEDS_AT_LEAST(what=what))
         twice = next((item for item in items if list(items).count(item) > 1), None)
         if twice is not None:
-            raise EvaError(f"{what} {twice} is named twice")
+            raise EvaError(_NAMED_TWICE(what=what, twice=twice))
     if repetitions < 1:
-        raise EvaError(f"repetitions = {repetitions}; allowed: 1 or more")
+        raise EvaError(_REPETITIONS_ALLOWED_1_MORE(repetitions=repetitions))
+    if allocation == RANDOM and len(checkpoints) != 2:
+        raise EvaError(_CHECKPOINTS_RANDOM_ORDER_ALLOWED_2(count=len(checkpoints)))
+    if allocation == RANDOM and len(conditions) * repetitions < _LEAST:
+        raise EvaError(
+            _BLOCKS_CHECKPOINTS_RANDOM_ORDER_ALLOWED(count=len(conditions) * repetitions, least=_LEAST)
+        )
     total = len(checkpoints) * len(conditions) * repetitions
     if total > MOST:
         raise EvaError(
-            f"{len(checkpoints)} checkpoints x {len(conditions)} conditions x {repetitions} repetitions are {total} "
-            f"trials; allowed: {MOST}"
+            _CHECKPOINTS_X_CONDITIONS_X_REPETITIONS(
+                count=len(checkpoints),
+                count_2=len(conditions),
+                repetitions=repetitions,
+                total=total,
+                most=MOST,
+            )
         )

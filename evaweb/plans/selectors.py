@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from django.db.models import Q, QuerySet
 
 from evaweb.errors import NotFound
-from evaweb.plans.models import Handout, Plan, PlanState, Reference
+from evaweb.plans.models import Handout, Plan, PlanState, Reference, Slot
 from evaweb.roles import Role, role_of
 from evaweb.stations.models import Station
 from evaweb.trials.models import Trial, TrialStatus
+from runtime.core.sentences import Pattern
+
+_NO_SUCH_PLAN = Pattern(
+    "plans.selectors.no_such_plan",
+    "plan {name:.60}{value} does not exist; there are: {known}",
+)
+_NO_SUCH_REFERENCE = Pattern(
+    "plans.selectors.no_such_reference",
+    "reference picture {identity} does not exist",
+)
 
 
 def plan_list(*, user: Any) -> QuerySet[Plan]:
@@ -28,9 +39,7 @@ def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
     found = rows.filter(version=version).first() if version is not None else frozen.first() or rows.first()
     if found is None:
         known = ", ".join(sorted(set(plan_list(user=user).values_list("name", flat=True)))) or "none yet"
-        raise NotFound(
-            f"plan {name:.60}{f' v{version}' if version else ''} does not exist; there are: {known}"
-        )
+        raise NotFound(_NO_SUCH_PLAN(name=name, value=f" v{version}" if version else "", known=known))
     return found
 
 
@@ -40,10 +49,17 @@ def plans_open(*, station: Station) -> list[Plan]:
     return list(rows.filter(Q(stations=None) | Q(stations=station)).distinct().order_by("title", "-version"))
 
 
-def remaining(plan: Plan) -> int:
-    """Number of trials that a plan foresees and that do not count yet."""
+def remaining(plan: Plan, dropped: Mapping[str, int] | None = None) -> int:
+    """Number of trials that a plan foresees and that do not count yet, without those of `dropped` checkpoints."""
     counted = plan.handouts.filter(trial__status=TrialStatus.SCORED).values("slot")
-    return plan.slots.exclude(pk__in=counted).count()
+    return without_dropped(plan.slots.exclude(pk__in=counted), dropped or {}).count()
+
+
+def without_dropped(slots: QuerySet[Slot], dropped: Mapping[str, int]) -> QuerySet[Slot]:
+    """Slots but for those of checkpoints in blocks after which they are tried no more."""
+    for name, at in dropped.items():
+        slots = slots.exclude(checkpoint__name=name, block__gte=at)
+    return slots
 
 
 def handout_of(*, trial: Trial) -> Handout | None:
@@ -56,5 +72,5 @@ def reference_get(*, id: int) -> Reference:
     rows = Reference.objects.select_related("station", "position__scene", "by")
     found = rows.filter(pk=id).first() if 0 < id < 2**63 else None
     if found is None:
-        raise NotFound(f"reference picture {id} does not exist")
+        raise NotFound(_NO_SUCH_REFERENCE(identity=id))
     return found

@@ -1,30 +1,100 @@
-"""Actions on plans: freeze, amend, close, reveal."""
+"""Actions on plans: draft, change, freeze, amend, close, reveal."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+from contextlib import suppress
 from typing import Any
 
+from django.contrib.admin.models import ADDITION, CHANGE, LogEntry
 from django.contrib.auth.models import User
+from django.contrib.contenttypes.models import ContentType
+from django.core.exceptions import ValidationError
 from django.db import transaction
 from django.db.models import QuerySet
 from django.utils import timezone
+from django.utils.text import slugify
 
+from evaweb.blinding import sight_of
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans import reveals
 from evaweb.plans.canonical import difference, digest
-from evaweb.plans.design import at_the_reveal, conclusion_of, drafted, ended_because
-from evaweb.plans.documents import document_of, units_of
-from evaweb.plans.models import Plan, PlanEvent, PlanState, PrimaryOutcome, Slot, StoppingRule
+from evaweb.plans.design import at_the_reveal, dropped_of, ended_because, findings_of
+from evaweb.plans.documents import UnevenError, document_of, units_of
+from evaweb.plans.draft_checks import covered, problems
+from evaweb.plans.drafting import Changed, Values, apply, digest_of, merged, values_of
+from evaweb.plans.models import Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.schedule import Unit
 from evaweb.plans.seeded_draws import new_key
 from evaweb.plans.selectors import handout_of, remaining
+from evaweb.races import once_more
 from evaweb.roles import Role, require, role_of
 from evaweb.trials.lifecycle import OPEN
 from evaweb.trials.models import Evaluation, Trial, TrialStatus
 from evaweb.trials.services import declare_settled
-from evaweb.trials.voids import voids_lapse
+from evaweb.trials.voids import voids_lapse, voids_waiting
+from runtime.core.sentences import Pattern, fixed
 
+_ADMINISTRATORS_MAKE_PLANS = fixed(
+    "plans.services.administrators_make_plans",
+    "new plans are made by administrators, because a blind one hides its checkpoints from the whole "
+    "lab: ask one to make it with you as its owner, then you write and freeze it",
+)
+_NO_DRAFT_TO_EDIT = Pattern(
+    "plans.services.no_draft_to_edit",
+    "{plan} is {state}: only a draft is edited; amend it instead",
+)
+_NO_DRAFT_TO_FREEZE = Pattern(
+    "plans.services.no_draft_to_freeze",
+    "{plan} is {state}: only a draft is frozen; amend it instead",
+)
+_CHANGED_SINCE_LOADED = Pattern(
+    "plans.services.changed_since_loaded",
+    "{held} was changed since this page was loaded: look at it again, then freeze it",
+)
+_STILL_A_DRAFT = Pattern("plans.services.still_a_draft", "{held} is a draft: edit it")
+_REVEALED = Pattern(
+    "plans.services.revealed",
+    "{held} was revealed: what is changed now would be changed with the result in view; make another plan",
+)
+_AMENDED_ALREADY = Pattern(
+    "plans.services.amended_already",
+    "{held} is amended by version {version} already",
+)
+_NOT_RUNNING = Pattern(
+    "plans.services.not_running",
+    "{held} is {state}: only a running plan is closed",
+)
+_NOT_CLOSED = Pattern(
+    "plans.services.not_closed",
+    "{held} is {state}: it is closed first, then revealed",
+)
+_COMMITMENT_BROKEN = Pattern(
+    "plans.services.commitment_broken",
+    "{held}: document, schedule and key are not those of the commitment {commitment}: someone has "
+    "changed the database; nothing was revealed",
+)
+_RENAMED_SINCE_FROZEN = Pattern(
+    "plans.services.renamed_since_frozen",
+    "{held}: scenes, positions and checkpoints of its schedule are not called what they were when it "
+    "was frozen: call them so again; nothing was revealed",
+)
+_TRIALS_UNFINISHED = Pattern(
+    "plans.services.trials_unfinished",
+    "{count} trials of {plan} are not finished, {code} on {name} is {status}: score or abandon them first",
+)
+_NOT_THE_OWNER = Pattern(
+    "plans.services.not_the_owner",
+    "{plan} is {user}'s: ask them, or an administrator",
+)
+_NO_REASON = Pattern(
+    "plans.services.no_reason",
+    "reason is empty: {when} only with a reason that others can read",
+)
+
+_DRAWN = ("stopping.counts", "stopping.boundary")  # of a schedule in random order they tell what comes next
+_DRAWS = 200  # of a schedule, until its design has room for it
 _COPIED = (
     "name",
     "title",
@@ -32,7 +102,10 @@ _COPIED = (
     "repetitions",
     "strategy",
     "blind",
+    "allocation",
     "stopping",
+    "comparing",
+    "drop_arms",
     "outcome",
     "margin",
     "look_after",
@@ -42,27 +115,125 @@ _COPIED = (
 )
 
 
-def plan_freeze(*, user: User, plan: Plan) -> Plan:
+@once_more
+@transaction.atomic
+def plan_draft(*, user: User, title: str, question: str = "", **design: Any) -> Plan:
+    """A new draft of the user's; its name is made of the title. Administrators alone.
+
+    `design`: values of further fields of the plan. EvaError names a field that cannot be so.
+    """
+    require_drafter(user)
+    plan = Plan(name=_free_name(title), title=title.strip(), question=question.strip(), owner=user, **design)
+    _keep(plan)
+    _log(plan, user, ADDITION, "drafted")
+    return plan
+
+
+def require_drafter(user: User) -> None:
+    """NotAllowed for users who make no plans: a frozen one hides its checkpoints, and what they did before."""
+    if role_of(user) is not Role.ADMIN:
+        raise NotAllowed(_ADMINISTRATORS_MAKE_PLANS)
+
+
+def require_editor(plan: Plan, user: User) -> None:
+    """NotAllowed for users who may not write this draft, Conflict where it is none any more."""
+    _require_owner(plan, user)
+    if plan.state != PlanState.DRAFT:
+        raise Conflict(_NO_DRAFT_TO_EDIT(plan=plan, state=plan.get_state_display()))
+
+
+@once_more
+@transaction.atomic
+def plan_change(
+    *, user: User, plan: Plan, was: Mapping[str, Any], wanted: Values, keep: Collection[str] = ()
+) -> Changed:
+    """Write what a user changed of a draft: the fields that are `wanted` otherwise than the user `was` shown them.
+
+    What somebody else changed meanwhile stays as it is and is named, unless it is among those to `keep`.
+    """
+    held = _held(plan)
+    require_editor(held, user)
+    sight = sight_of(user)
+    now = values_of(held, sight)
+    written, conflicts = merged(now, was, wanted, keep)
+    if "owner" in written:
+        require(user, Role.ADMIN)
+    if written:
+        apply(held, {**now, **written}, sight.checkpoints)
+        _keep(held)
+        _log(held, user, CHANGE, f"changed {', '.join(sorted(written))}")
+        now = values_of(held, sight)
+    return Changed(now, tuple(conflicts))
+
+
+def _keep(plan: Plan) -> None:
+    try:
+        plan.full_clean()
+    except ValidationError as invalid:
+        field, said = next(iter(invalid.message_dict.items()))
+        raise EvaError(f"{field}: {'; '.join(said)}") from None
+    plan.save()
+
+
+def _free_name(title: str) -> str:
+    """A name for addresses that no plan has; "new" is the address at which plans begin."""
+    stem = slugify(title)[:50].strip("-") or "plan"
+    taken = {*Plan.objects.filter(name__startswith=stem).values_list("name", flat=True), "new"}
+    names = (stem, *(f"{stem}-{number}" for number in range(2, len(taken) + 3)))
+    return next(name for name in names if name not in taken)
+
+
+def _log(plan: Plan, user: User, what: int, text: str) -> None:
+    """In administration's history of the plan; the same thing said once, however often a draft is saved."""
+    rows = LogEntry.objects.filter(
+        content_type=ContentType.objects.get_for_model(Plan), object_id=str(plan.pk)
+    )
+    last = rows.order_by("-pk").first()
+    if last is None or (last.user_id, last.change_message) != (user.pk, text):
+        LogEntry.objects.log_actions(user.pk, [plan], what, text, single_object=True)
+
+
+def plan_freeze(*, user: User, plan: Plan, seen: str = "") -> Plan:
     """Make a draft a document that never changes, with its schedule and commitment; trials can be handed out then.
 
+    `seen`: the digest of the draft as the user has it before them; Conflict where it is another one by now.
     Where the database was lost and trials of such a plan came back from the disk, they are its own, and it is closed at
     once: their schedule and codes are gone. Administrators alone.
     """
     _require_owner(plan, user)
-    if plan.state == PlanState.DRAFT:
-        _check(plan)  # before anything is locked: a boundary takes seconds, and is then known
-    return _frozen(user, plan)
+    if plan.state != PlanState.DRAFT:
+        raise _no_draft(plan)
+    _check(plan, user)
+    key = _drawn(plan)  # before anything is locked: a boundary takes seconds, and is then known
+    return _frozen(user, plan, key, seen)
+
+
+def _no_draft(plan: Plan) -> Conflict:
+    return Conflict(_NO_DRAFT_TO_FREEZE(plan=plan, state=plan.get_state_display()))
+
+
+def _drawn(plan: Plan) -> bytes:
+    """A key whose order the plan's design has room for."""
+    for _ in range(_DRAWS):
+        key = new_key()
+        with suppress(UnevenError):
+            document_of(plan, key)
+            return key
+    document_of(plan, key)  # which says what is wrong with it
+    return key
 
 
 @transaction.atomic
-def _frozen(user: User, plan: Plan) -> Plan:
+def _frozen(user: User, plan: Plan, key: bytes, seen: str) -> Plan:
     held = _held(plan)
     _require_owner(held, user)
     if held.state != PlanState.DRAFT:
-        raise Conflict(f"{held} is {held.get_state_display()}: only a draft is frozen; amend it instead")
-    _check(held)
-    document = document_of(held)
-    held.document, held.digest, held.key = document, digest(document), new_key()
+        raise _no_draft(held)
+    if seen and seen != digest_of(values_of(held, sight_of(user))):
+        raise Conflict(_CHANGED_SINCE_LOADED(held=held))
+    _check(held, user)
+    document = document_of(held, key)
+    held.document, held.digest, held.key = document, digest(document), key
     units = units_of(held)
     held.commitment = blinding.commitment(held.digest, units, bytes(held.key))
     held.evaluation, new = Evaluation.objects.get_or_create(
@@ -76,16 +247,20 @@ def _frozen(user: User, plan: Plan) -> Plan:
     held.save()
     _lay_out(held, units)
     changes = difference(held.amends.document or {}, document) if held.amends else []
+    changes = [line for line in changes if not line.startswith(_DRAWN)]
     told = f"digest {held.digest}, {len(units)} trials, commitment {held.commitment}"
     _note(held, user, "frozen", "\n".join([told, *changes]))
     if held.amends and held.amends.state == PlanState.FROZEN:
         _close(held.amends, user, f"amended by version {held.version}: {held.amended_because}")
+    if held.amends and held.amends.state == PlanState.CLOSED:
+        voids_lapse(_trials(held.amends), user=user, now=True)
     if not new:
         _close(held, user, "its trials were made before the database was lost: amend it to make more")
     plan.refresh_from_db()
     return plan
 
 
+@once_more
 @transaction.atomic
 def plan_amend(*, user: User, plan: Plan, reason: str) -> Plan:
     """A draft of the next version, as the frozen one is now; that one goes on until the new one is frozen."""
@@ -93,13 +268,11 @@ def plan_amend(*, user: User, plan: Plan, reason: str) -> Plan:
     _require_owner(held, user)
     why = _reason(reason, "a plan is amended")
     if held.state == PlanState.DRAFT:
-        raise Conflict(f"{held} is a draft: edit it")
+        raise Conflict(_STILL_A_DRAFT(held=held))
     if held.state == PlanState.REVEALED:
-        raise Conflict(
-            f"{held} was revealed: what is changed now would be changed with the result in view; make another plan"
-        )
+        raise Conflict(_REVEALED(held=held))
     if hasattr(held, "amendment"):
-        raise Conflict(f"{held} is amended by version {held.amendment.version} already")
+        raise Conflict(_AMENDED_ALREADY(held=held, version=held.amendment.version))
     made = Plan.objects.create(
         **{name: getattr(held, name) for name in _COPIED},
         version=held.version + 1,
@@ -122,7 +295,7 @@ def plan_close(*, user: User, plan: Plan, reason: str) -> Plan:
     _require_owner(held, user)
     why = _reason(reason, "a plan is closed")
     if held.state != PlanState.FROZEN:
-        raise Conflict(f"{held} is {held.get_state_display()}: only a running plan is closed")
+        raise Conflict(_NOT_RUNNING(held=held, state=held.get_state_display()))
     _close(held, user, why)
     plan.refresh_from_db()
     return plan
@@ -134,18 +307,12 @@ def plan_reveal(*, user: User, plan: Plan) -> Plan:
     held = _held(plan)
     _require_owner(held, user)
     if held.state != PlanState.CLOSED:
-        raise Conflict(f"{held} is {held.get_state_display()}: it is closed first, then revealed")
+        raise Conflict(_NOT_CLOSED(held=held, state=held.get_state_display()))
     units = units_of(held)
     if not blinding.verified(digest(held.document or {}), units, bytes(held.key or b""), held.commitment):
-        raise EvaError(
-            f"{held}: document, schedule and key are not those of the commitment {held.commitment}: "
-            "somebody has changed the database; nothing was revealed"
-        )
+        raise EvaError(_COMMITMENT_BROKEN(held=held, commitment=held.commitment))
     if _slots(held) != [unit.row for unit in units]:
-        raise EvaError(
-            f"{held}: scenes, positions and checkpoints of its schedule are not called what they were when it was "
-            "frozen: call them so again; nothing was revealed"
-        )
+        raise EvaError(_RENAMED_SINCE_FROZEN(held=held))
     voids_lapse(_trials(held), user=user, now=True)
     before = reveals.kept(held)
     held.at_reveal = before.at_reveal if before else at_the_reveal(held)
@@ -165,18 +332,19 @@ def plan_reveal(*, user: User, plan: Plan) -> Plan:
 
 @transaction.atomic
 def plan_end(*, user: User, plan: Plan, asked: bool = False) -> None:
-    """Close a running plan whose design has ended, as soon as none of its trials is unfinished.
+    """Close a running plan whose design has ended, as soon as none of its trials is unfinished and no void waits.
 
-    With trials left, a boundary that was crossed ends it where the next one is `asked` for: a score that was mistyped
-    can be corrected until then, and corrected to and fro it does not tell at once which trial is of which checkpoint.
+    With trials left, it is closed where the next one is `asked` for: a score that was mistyped can be corrected until
+    then, and corrected to and fro it does not tell at once which trial is of which checkpoint.
     The reason says that a boundary was crossed or that all pairs are made: never for which checkpoint.
     """
     held = _held(plan)
-    found = conclusion_of(held) if held.state == PlanState.FROZEN else None
-    if found is None or not found.ended or _unfinished(held):
+    found = findings_of(held) if held.state == PlanState.FROZEN else None
+    if found is None or not found.ended or _unfinished(held) or voids_waiting(_trials(held)).exists():
         return
-    if not remaining(held) or (asked and found.ended == "boundary"):
-        _close(held, user, ended_because(found))
+    over = found.ended == "boundary" or not remaining(held, dropped_of(held))
+    if not remaining(held) or (asked and over):
+        _close(held, user, ended_because(held, found))
 
 
 def _looked_at(trial: Trial, user: User) -> None:
@@ -205,38 +373,24 @@ def _close(plan: Plan, user: User, why: str) -> None:
     if unfinished:
         trial = unfinished[0]
         raise Conflict(
-            f"{len(unfinished)} trials of {plan} are not finished, {trial.handout.code} on {trial.station.name} "
-            f"is {trial.get_status_display()}: score or abandon them first"
+            _TRIALS_UNFINISHED(
+                count=len(unfinished),
+                plan=plan,
+                code=trial.handout.code,
+                name=trial.station.name,
+                status=trial.get_status_display(),
+            )
         )
     plan.state, plan.closed_at, plan.closed_because = PlanState.CLOSED, timezone.now(), why
     plan.save()
     _note(plan, user, "closed", why)
 
 
-def _check(plan: Plan) -> None:
-    """Check a plan before it is frozen; EvaError says what is missing."""
-    chosen = set(plan.checkpoints.values_list("pk", flat=True))
-    if not plan.positions.exists():
-        raise EvaError(f"{plan} has no position: choose initial conditions")
-    if not chosen:
-        raise EvaError(f"{plan} has no checkpoint: choose at least one")
-    off = plan.checkpoints.filter(active=False).first() or None
-    if off is not None:
-        raise EvaError(f"checkpoint {off} is switched off")
-    compared = [row for row in (plan.first, plan.second) if row]
-    if len(compared) == 1 or (compared and compared[0] == compared[1]):
-        raise EvaError("the comparison needs two checkpoints, or none")
-    for row in compared:
-        if row.pk not in chosen:
-            raise EvaError(f"the comparison is about {row}, which is none of the plan's checkpoints")
-    asked = (
-        plan.stopping != StoppingRule.NONE
-        or plan.margin is not None
-        or plan.outcome != PrimaryOutcome.SUCCESS
-    )
-    if asked and not compared:
-        raise EvaError("a design with looks, a margin or a score needs the comparison that it is about")
-    drafted(plan)
+def _check(plan: Plan, user: User) -> None:
+    """Check a plan before this user freezes it; EvaError says what is missing."""
+    found = next(problems(plan), None)
+    if found is not None:
+        raise EvaError(covered(plan, sight_of(user))(found.text))
 
 
 def _slots(plan: Plan) -> list[list[Any]]:
@@ -272,7 +426,7 @@ def _held(plan: Plan) -> Plan:
 def _require_owner(plan: Plan, user: User) -> None:
     require(user, Role.OPERATOR)
     if plan.owner_id != user.pk and role_of(user) is not Role.ADMIN:
-        raise NotAllowed(f"{plan} is {plan.owner.get_username()}'s: ask them, or an administrator")
+        raise NotAllowed(_NOT_THE_OWNER(plan=plan, user=plan.owner.get_username()))
 
 
 def _note(plan: Plan, user: User, what: str, text: str) -> None:
@@ -282,5 +436,5 @@ def _note(plan: Plan, user: User, what: str, text: str) -> None:
 def _reason(given: str, when: str) -> str:
     why = given.strip()
     if not why:
-        raise EvaError(f"reason is empty: {when} only with a reason that others can read")
+        raise EvaError(_NO_REASON(when=when))
     return why

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from evaweb.jobs.kinds import Work, job_kind
+from evaweb.jobs.kinds import Queue, Work, job_kind
 from evaweb.preflights.models import Preflight, PreflightStatus
 from evaweb.preflights.selectors import preflight_get
 from evaweb.preflights.services import preflight_ended
@@ -13,7 +13,7 @@ from evaweb.preflights.services import preflight_ended
 LONGEST_S = 3600.0
 
 
-@job_kind("preflight")
+@job_kind("preflight", queue=Queue.STATION, folder=False)
 def preflight(work: Work) -> Mapping[str, Any]:
     """Ask the checkpoint's server by the deployment file of the station; args: preflight."""
     row: Preflight = preflight_get(id=work.args["preflight"])

@@ -10,6 +10,12 @@ from evaweb.blinding import EVERYTHING, Sight
 from evaweb.errors import NotFound
 from evaweb.preflights.models import Preflight
 from evaweb.trials.models import Checkpoint
+from runtime.core.sentences import Pattern
+
+_PREFLIGHT_DOES_NOT_EXIST = Pattern(
+    "preflights.selectors.preflight_does_not_exist",
+    "preflight {identity} does not exist",
+)
 
 
 def preflight_list(*, checkpoint: Checkpoint | None = None, sight: Sight = EVERYTHING) -> QuerySet[Preflight]:
@@ -22,7 +28,7 @@ def preflight_get(*, id: UUID | str, sight: Sight = EVERYTHING) -> Preflight:
     """That one; NotFound."""
     found = preflight_list(sight=sight).filter(pk=id).first()
     if found is None:
-        raise NotFound(f"preflight {id} does not exist")
+        raise NotFound(_PREFLIGHT_DOES_NOT_EXIST(identity=id))
     return found
 
 

@@ -20,6 +20,7 @@ from evaweb.errors import Conflict, StationGone
 from evaweb.jobs.models import JobStatus
 from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.services import enqueue
+from evaweb.jobs.workers import waiting_for
 from evaweb.preflights.models import Preflight, PreflightStatus
 from evaweb.roles import Role, require, role_of
 from evaweb.stations.commands import TABLES
@@ -29,10 +30,24 @@ from evaweb.stations.selectors import station_list
 from evaweb.trials.models import Checkpoint
 from runtime.config import loader as deployment
 from runtime.config.loader import ConfigurationError, server_of
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.messages import Command
 from runtime.ipc.session_state import with_meaning
 
 log = logging.getLogger(__name__)
+_NO_STATION_FREE_NONE_HAS = fixed(
+    "preflights.services.no_station_free_none_has",
+    "no station is free, and none has a deployment file for the worker: start a station, or wait for one",
+)
+_WITH_SAME_POLICY_SERVER_PREFLIGHT = Pattern(
+    "preflights.services.with_same_policy_server_preflight",
+    "{other} is {label} with the same policy server: a preflight would disturb it; wait until its run "
+    "is over",
+)
+_DEPLOYMENT_FILE_NOT_KNOWN_HERE = Pattern(
+    "preflights.services.deployment_file_not_known_here",
+    "{gone}; its deployment file is not known here, so the worker cannot ask in its place",
+)
 _LOOK_S = 0.5  # how long another station may take to say which server it uses
 _UNTOLD = timedelta(hours=1)  # after which one is over of which nobody said how long it may take
 
@@ -110,9 +125,7 @@ def _first_station() -> Station:
             continue
     known = next((station for station in stations if station.deployment), None)
     if known is None:
-        raise Conflict(
-            "no station is free, and none has a deployment file for the worker: start a station, or wait for one"
-        )
+        raise Conflict(_NO_STATION_FREE_NONE_HAS)
     return known
 
 
@@ -137,10 +150,7 @@ def _require_free(server: str, besides: Station) -> None:
             continue
         state_is = with_meaning(ack.data)["state_is"]
         if state_is["at_work"]:
-            raise Conflict(
-                f"{other} is {state_is['label']} with the same policy server: a preflight would "
-                "disturb it; wait until its run is over"
-            )
+            raise Conflict(_WITH_SAME_POLICY_SERVER_PREFLIGHT(other=other, label=state_is["label"]))
 
 
 def _of_station(row: Preflight) -> Preflight:
@@ -171,9 +181,7 @@ def _of_worker(row: Preflight, gone: StationGone) -> Preflight:
     """By the worker, with the deployment file of the station that does not run."""
     file = row.station.deployment
     if not file:
-        raise StationGone(
-            f"{gone}; its deployment file is not known here, so the worker cannot ask in its place"
-        )
+        raise StationGone(_DEPLOYMENT_FILE_NOT_KNOWN_HERE(gone=gone))
     try:
         resolved = deployment.changed(deployment.load(Path(file)), {"policy": row.policy}, "the checkpoint")
         _require_free(server_of(resolved.deployment), row.station)
@@ -192,7 +200,15 @@ def _settled_by_job(row: Preflight) -> Preflight:
         return preflight_ended(row=row, reason="its job is gone: ask again")
     if job.status == JobStatus.FAILED:
         return preflight_ended(row=row, reason=job.error)
-    return _overdue(row, "no worker has done it: is one running?")
+    return _overdue(row, waiting_for(job) or "no worker has done it: does one hang?")
+
+
+def lacks(*, row: Preflight) -> str:
+    """Why no running worker can take the job of one that runs; "" where one can, or a station does it."""
+    if (row.status, row.by) != (PreflightStatus.RUNNING, Preflight.By.WORKER):
+        return ""
+    job = job_newest(key=_key(row))
+    return waiting_for(job) if job is not None else ""
 
 
 def _overdue(row: Preflight, reason: str) -> Preflight:

@@ -46,5 +46,6 @@ def context(row: Preflight, user: Any) -> dict[str, Any]:
         "seen": seen,
         "read": read(seen.report),
         "running": row.status == PreflightStatus.RUNNING,
+        "lacks": services.lacks(row=row),
         "age": ago(row.asked_at, timezone.now()),
     }

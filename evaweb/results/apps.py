@@ -11,6 +11,9 @@ class ResultsConfig(AppConfig):
 
     def ready(self) -> None:
         from evaweb.append_only import protect
-        from evaweb.results.ratings import restoring  # noqa: F401  it declares itself to those that reconcile
+        from evaweb.results.ratings import (
+            judging,  # noqa: F401  it declares what is asked before a failure is corrected
+            restoring,  # noqa: F401  it declares itself to those that reconcile
+        )
 
         protect(self)

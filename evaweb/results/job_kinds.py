@@ -6,15 +6,17 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from evaweb.jobs.kinds import Work, job_kind
+from evaweb.jobs.kinds import Queue, Work, job_kind
 from evaweb.plans.models import Plan
 from evaweb.results.ratings import automatic
+from evaweb.roles import Role
 
 _TURN_S = 20.0  # then what else waits has its turn
 _NAMED = 50  # codes of trials without pictures
 
 
-@job_kind(automatic.KIND)
+# Others ask on the page of a plan of theirs.
+@job_kind(automatic.KIND, least=lambda args: Role.ADMIN, queue=Queue.GPU)
 def judge(work: Work) -> Mapping[str, Any]:
     """Show trials of a plan to a judge, and ask for the rest; args: plan, judge."""
     plan, name = Plan.objects.get(pk=work.args["plan"]), work.args["judge"]

@@ -17,6 +17,24 @@ from evaweb.trials.failure_words import NOT_SAID
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import MilestoneOutcome, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED
+from runtime.core.sentences import Pattern
+
+_NO_REVEAL_HAS_DIGEST_STANDS = Pattern(
+    "results.selectors.no_reveal_has_digest_stands",
+    "no reveal has the digest {digest!r:.80}: it stands under Record on the page of its plan",
+)
+_PLAN_HAS_NO_VERSION_THERE = Pattern(
+    "results.selectors.plan_has_no_version_there",
+    "plan {name!r:.80} has no version {version}; there are: {there}",
+)
+_PLAN_DOES_NOT_EXIST = Pattern("results.selectors.plan_does_not_exist", "plan {name!r:.80} does not exist")
+_STATE_ALLOWED = Pattern("results.selectors.state_allowed", "state = {state!r:.80}; allowed: {values}")
+_STATUS_ALLOWED = Pattern("results.selectors.status_allowed", "status = {status!r:.80}; allowed: {values}")
+_SUCCESS_ALLOWED_YES_NO = Pattern(
+    "results.selectors.success_allowed_yes_no",
+    "success = {success!r:.80}; allowed: yes, no",
+)
+_ALLOWED_NUMBER = Pattern("results.selectors.allowed_number", "{name} = {value!r:.80}; allowed: a number")
 
 _HOUR = 3600
 _ORDER = Case(
@@ -96,9 +114,7 @@ def plan_at_reveal(digest: str) -> Plan:
     """The plan whose reveal has this digest; NotFound where none has."""
     found = Plan.objects.filter(state=PlanState.REVEALED, at_reveal__digest=digest).first()
     if found is None:
-        raise NotFound(
-            f"no reveal has the digest {digest!r:.80}: it stands under Record on the page of its plan"
-        )
+        raise NotFound(_NO_REVEAL_HAS_DIGEST_STANDS(digest=digest))
     return found
 
 
@@ -110,9 +126,9 @@ def plan_get(*, name: str, version: int | None = None) -> Plan:
     if not found:
         there = ", ".join(str(row.version) for row in versions)
         raise NotFound(
-            f"plan {name!r:.80} has no version {version}; there are: {there}"
+            _PLAN_HAS_NO_VERSION_THERE(name=name, version=version, there=there)
             if there
-            else f"plan {name!r:.80} does not exist"
+            else _PLAN_DOES_NOT_EXIST(name=name)
         )
     return found[0]
 
@@ -121,7 +137,7 @@ def plan_list(state: str = "", words: str = "") -> QuerySet[Plan]:
     """Plans: those that run, then those that have run, then drafts, the newest of each first."""
     rows = Plan.objects.select_related("owner").defer("document", "key").order_by(_ORDER, "-frozen_at", "-pk")
     if state and state not in PlanState.values:
-        raise EvaError(f"state = {state!r:.80}; allowed: {', '.join(PlanState.values)}")
+        raise EvaError(_STATE_ALLOWED(state=state, values=", ".join(PlanState.values)))
     rows = rows.filter(state=state) if state else rows
     return rows.filter(Q(title__icontains=words) | Q(name__icontains=words)) if words else rows
 
@@ -171,11 +187,11 @@ def trials_of_plan(plan: Plan, question: Question) -> QuerySet[Trial]:
         rows = rows.filter(position__number=_whole("position", question.position))
     if question.status:
         if question.status not in TrialStatus.values:
-            raise EvaError(f"status = {question.status!r:.80}; allowed: {', '.join(TrialStatus.values)}")
+            raise EvaError(_STATUS_ALLOWED(status=question.status, values=", ".join(TrialStatus.values)))
         rows = rows.filter(status=question.status)
     if question.success:
         if question.success not in ("yes", "no"):
-            raise EvaError(f"success = {question.success!r:.80}; allowed: yes, no")
+            raise EvaError(_SUCCESS_ALLOWED_YES_NO(success=question.success))
         rows = rows.filter(verdict__success=question.success == "yes")
     for name, reached in (("missed", False), ("reached", True)):
         if value := getattr(question, name):
@@ -189,7 +205,7 @@ def trials_of_plan(plan: Plan, question: Question) -> QuerySet[Trial]:
 
 def _whole(name: str, value: str) -> int:
     if not (value.isascii() and value.isdecimal() and len(value) < 7):
-        raise EvaError(f"{name} = {value!r:.80}; allowed: a number")
+        raise EvaError(_ALLOWED_NUMBER(name=name, value=value))
     return int(value)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from django.urls import path
 
-from evaweb.results.pages import views, views_judging, views_lab
+from evaweb.results.pages import views, views_draft, views_judging, views_lab
 
 _PLAN = "result/plans/<slug:name>/<int:version>/"
 _FROZEN = "result/frozen/<digest:digest>/"
@@ -15,8 +15,11 @@ urlpatterns = [
     path("result/rate/", views_judging.rate, name="rate"),
     path("result/prefer/", views_judging.prefer, name="prefer"),
     path("result/plans/", views.plans, name="result-plans"),
+    path("result/plans/new/", views_draft.new, name="result-plan-new"),
     path("result/plans/<slug:name>/", views.plan, name="result-plan-newest"),
     path(_PLAN, views.plan, name="result-plan"),
+    path(_PLAN + "draft/", views_draft.edit, name="result-draft"),
+    path(_PLAN + "draft/power/", views_draft.power, name="result-draft-power"),
     path(_PLAN + "compare/", views.compare, name="result-compare"),
     path(_PLAN + "evidence/", views.evidence, name="result-evidence"),
     path(_PLAN + "report.zip", views.report, name="result-report"),

@@ -1,11 +1,12 @@
-"""Reviews in the admin pages: to look at. Rows are written by services alone, after the disk."""
+"""Reviews in the admin pages: to look at, rows are written by services alone, after the disk; labels to be edited."""
 
 from __future__ import annotations
 
 from django.contrib import admin
 from django.http import HttpRequest
 
-from evaweb.reviews.models import Review, Segment, Standing
+from evaweb.administration import LabelledRows
+from evaweb.reviews.models import Review, Segment, SegmentLabel, Standing
 
 
 class _Kept(admin.ModelAdmin):
@@ -49,3 +50,11 @@ class StandingAdmin(_Kept):
     list_filter = ("worst", "clean")
     search_fields = ("episode__uuid",)
     list_select_related = ("episode", "review")
+
+
+@admin.register(SegmentLabel)
+class SegmentLabelAdmin(LabelledRows, admin.ModelAdmin):
+    """The vocabulary of parts, offered in Replay in this order."""
+
+    list_display = ("words", "colour", "key", "order", "active")
+    list_editable = ("colour", "key", "order", "active")

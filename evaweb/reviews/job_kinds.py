@@ -73,6 +73,7 @@ def sides(work: Work) -> Mapping[str, Any]:
     if episode.dataset_index is None:
         return {"attached": False, "why": "it is in no dataset"}
     dataset = data_dir() / episode.dataset
+    work.hold([episode.dataset])
     with TemporaryDirectory() as folder:
         said = written(episode.uuid, Path(folder))
         for kind in ("reviews", "annotations"):

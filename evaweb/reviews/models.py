@@ -5,11 +5,14 @@ from __future__ import annotations
 import uuid
 
 from django.conf import settings
+from django.core.validators import RegexValidator
 from django.db import models
+from django.db.models.functions import Lower
 from django.utils import timezone
 
 from evaweb.append_only import AppendOnly
 from evaweb.episodes.models import Episode
+from evaweb.names import check_name
 
 
 class Verdict(models.TextChoices):
@@ -65,6 +68,64 @@ class Segment(models.Model):
 
     def __str__(self) -> str:
         return f"{self.label}: {self.first} to {self.last}"
+
+
+LABEL_KEYS = "1234567890abdhjkmqstwyz"
+"""Keys that mark a part in Replay: those that do nothing else there."""
+
+
+class SegmentLabel(models.Model):
+    """A word of the lab's vocabulary for parts of an episode, with the colour and key that it has in Replay.
+
+    Segments keep the words, not the label: what becomes of a label changes nothing that was marked.
+    """
+
+    class Colour(models.TextChoices):
+        BLUE = "blue", "blue"
+        ORANGE = "orange", "orange"
+        VIOLET = "violet", "violet"
+        TEAL = "teal", "teal"
+        GREEN = "green", "green"
+        YELLOW = "yellow", "yellow"
+        RED = "red", "red"
+        GREY = "grey", "grey"
+
+    words = models.CharField(max_length=120, validators=[check_name], help_text="As segments have it.")
+    colour = models.CharField(max_length=8, choices=Colour, default=Colour.BLUE)
+    key = models.CharField(
+        max_length=1,
+        blank=True,
+        validators=[
+            RegexValidator(
+                rf"\A[{LABEL_KEYS}]\Z",
+                f"%(value)s was given; allowed: one of {' '.join(LABEL_KEYS)}, or none",
+            )
+        ],
+        help_text=f"Begins and ends such a part in Replay: one of {' '.join(LABEL_KEYS)} that no other has.",
+    )
+    order = models.PositiveSmallIntegerField(default=0)
+    active = models.BooleanField(default=True, help_text="Off: retired, not offered; segments keep it.")
+
+    class Meta:
+        ordering = ("order", "pk")
+        constraints = [
+            models.UniqueConstraint(
+                Lower("words"),
+                name="segment_label_once",
+                violation_error_message="There is one of these words already; one that is retired can be "
+                "switched on.",
+            ),
+            models.UniqueConstraint(
+                fields=("key",),
+                condition=~models.Q(key=""),
+                name="segment_label_key_once",
+                violation_error_message="Another label has this key; a retired one keeps its own until it is "
+                "emptied.",
+            ),
+        ]
+
+    def __str__(self) -> str:
+        return self.words
 
 
 class Severity(models.TextChoices):

@@ -53,8 +53,38 @@ class RemovalLine(Line):
     at: Moment
 
 
-AnyReview = ReviewLine | SegmentLine | RemovalLine
-REVIEWS: Journal[AnyReview] = Journal("reviews", ReviewLine, SegmentLine, RemovalLine)
+class TagLine(Line):
+    """A tag that the episode has from then on."""
+
+    kind: Literal["tag"] = "tag"
+    uuid: UUID
+    words: Annotated[str, Field(min_length=1, max_length=60)]
+    by: Annotated[Person, From("by__username")]
+    at: Moment
+
+
+class UntagLine(Line):
+    """A tag that somebody took off again."""
+
+    kind: Literal["tag_removed"] = "tag_removed"
+    uuid: UUID
+    by: Person
+    at: Moment
+
+
+AnyReview = ReviewLine | SegmentLine | RemovalLine | TagLine | UntagLine
+REVIEWS: Journal[AnyReview] = Journal("reviews", ReviewLine, SegmentLine, RemovalLine, TagLine, UntagLine)
+
+
+def tags_of(lines: Sequence[AnyReview]) -> list[TagLine]:
+    """The tags that are left after all lines, of two of the same words the first."""
+    found: dict[UUID, TagLine] = {}
+    for line in lines:
+        if isinstance(line, TagLine):
+            found[line.uuid] = line
+        elif isinstance(line, UntagLine):
+            found.pop(line.uuid, None)
+    return list({line.words: line for line in reversed(found.values())}.values())
 
 
 def segments_of(lines: Sequence[AnyReview]) -> list[SegmentLine]:

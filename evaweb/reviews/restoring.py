@@ -8,13 +8,13 @@ from uuid import UUID
 
 from django.db import transaction
 
-from evaweb.episodes.models import Episode
+from evaweb.episodes.models import Episode, Tag
 from evaweb.episodes.reconcile import Kept, restores
 from evaweb.journal import absent
 from evaweb.reviews import selectors, services
 from evaweb.reviews.folders import report_file
 from evaweb.reviews.models import DECIDES, Review, Segment, Standing
-from evaweb.reviews.record import REVIEWS, AnyReview, ReviewLine, segments_of
+from evaweb.reviews.record import REVIEWS, AnyReview, ReviewLine, segments_of, tags_of
 from runtime.recording.files import RecordingError
 
 
@@ -33,7 +33,8 @@ def restore(kept: Kept) -> int:
         return 0
     with transaction.atomic():
         made = _reviews(episode, [line for line in lines if isinstance(line, ReviewLine)])
-        return made + _segments(episode, lines, whole=not left_out)
+        made += _segments(episode, lines, whole=not left_out)
+        return made + _tags(episode, lines, whole=not left_out)
 
 
 def _checked(episode: Episode) -> None:
@@ -83,3 +84,15 @@ def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> i
     if changed or gone:
         services.standing_changed(episode=episode)
     return changed + len(gone)
+
+
+def _tags(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> int:
+    """Bring the rows up to what the lines say; where lines were left out, rows are only added."""
+    wanted = tags_of(lines)
+    gone = Tag.objects.filter(episode=episode).exclude(pk__in=[line.uuid for line in wanted])
+    changed = gone.delete()[0] if whole else 0
+    there = set(Tag.objects.filter(episode=episode).values_list("words", flat=True))
+    for line in absent(Tag, [line for line in wanted if line.words not in there], episode=episode):
+        Tag.objects.create(episode=episode, **line.values())
+        changed += 1
+    return changed

@@ -12,8 +12,18 @@ from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.errors import Conflict, NotFound
 from evaweb.reviews.folders import report_file
-from evaweb.reviews.models import Review, Segment, Standing
+from evaweb.reviews.models import Review, Segment, SegmentLabel, Standing
+from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError, read_document
+
+_HAVE_EPISODE_CHECKED_AGAIN = Pattern(
+    "reviews.selectors.have_episode_checked_again",
+    "{error}: have the episode checked again",
+)
+_EPISODE_HAS_NOT_BEEN_CHECKED = Pattern(
+    "reviews.selectors.episode_has_not_been_checked",
+    "episode {uuid} has not been checked yet: POST to this address has it done",
+)
 
 
 def standing_of(*, episode: Episode) -> Standing:
@@ -29,14 +39,14 @@ def report_of(*, uuid: UUID) -> Mapping[str, Any] | None:
     try:
         return read_document(path) if path.exists() else None
     except RecordingError as error:
-        raise Conflict(f"{error}: have the episode checked again") from None
+        raise Conflict(_HAVE_EPISODE_CHECKED_AGAIN(error=error)) from None
 
 
 def report_get(*, uuid: UUID) -> Mapping[str, Any]:
     """The same; NotFound where the checks were not done."""
     found = report_of(uuid=uuid)
     if found is None:
-        raise NotFound(f"episode {uuid} has not been checked yet: POST to this address has it done")
+        raise NotFound(_EPISODE_HAS_NOT_BEEN_CHECKED(uuid=uuid))
     return found
 
 
@@ -48,6 +58,11 @@ def reviews_of(*, episode: Episode) -> QuerySet[Review]:
 def segments_of(*, episode: Episode) -> QuerySet[Segment]:
     """Its annotated parts, in order."""
     return Segment.objects.filter(episode=episode).select_related("annotator")
+
+
+def labels_offered() -> QuerySet[SegmentLabel]:
+    """The lab's vocabulary of parts, without what is retired."""
+    return SegmentLabel.objects.filter(active=True)
 
 
 def unreviewed() -> QuerySet[Episode]:
@@ -76,8 +91,9 @@ def unreviewed_next(*, after: UUID | None) -> tuple[Episode | None, int]:
 
 
 def unchecked() -> QuerySet[Episode]:
-    """Closed episodes of which no checks were ever asked for, the oldest first."""
-    return Episode.objects.filter(status__in=CLOSED, standing__asked_at=None).order_by("created_at")
+    """Closed episodes that are here and of which no checks were ever asked for, the oldest first."""
+    here = Episode.objects.filter(status__in=CLOSED, away_since=None)
+    return here.filter(standing__asked_at=None).order_by("created_at")
 
 
 def outdated() -> QuerySet[Standing]:

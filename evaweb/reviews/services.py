@@ -2,27 +2,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 from uuid import UUID
 
+from django.core.exceptions import ValidationError
 from django.db import transaction
 from django.db.models.functions import Now
 from django.utils import timezone
 
-from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.episodes.models import LONGEST_TAG, Episode, EpisodeStatus, Tag
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
 from evaweb.journal import text
+from evaweb.names import check_name
 from evaweb.reviews.models import DECIDES, Review, Segment, Standing, Verdict
-from evaweb.reviews.record import REVIEWS, RemovalLine, ReviewLine, SegmentLine
+from evaweb.reviews.record import REVIEWS, RemovalLine, ReviewLine, SegmentLine, TagLine, UntagLine
 from evaweb.roles import Role, require, role_of
+from runtime.core.sentences import Pattern, fixed
+
+_VERDICT_ALLOWED = Pattern("reviews.services.verdict_allowed", "verdict = {verdict!r:.40}; allowed: {values}")
+_NOTE_EMPTY_NOTE_NEEDS_WORDS = fixed(
+    "reviews.services.note_empty_note_needs_words",
+    "note is empty: a note needs words",
+)
+_LABEL_EMPTY_SAY_WHAT_DONE = fixed(
+    "reviews.services.label_empty_say_what_done",
+    "label is empty: say what is done in this part",
+)
+_FIRST_LAST_ALLOWED_FRAMES_0 = Pattern(
+    "reviews.services.first_last_allowed_frames_0",
+    "first = {first}, last = {last}; allowed: frames 0 to {frames}, the last not before the first",
+)
+_EPISODE_HAS_NO_SEGMENT = Pattern(
+    "reviews.services.episode_has_no_segment",
+    "episode {uuid} has no segment {uuid_2}",
+)
+_SEGMENT_MARK_ONE_YOUR_OWN = Pattern(
+    "reviews.services.segment_mark_one_your_own",
+    "the segment is {annotator}'s: mark one of your own",
+)
+_EPISODE_STILL_BEING_RECORDED_CHECKED = Pattern(
+    "reviews.services.episode_still_being_recorded_checked",
+    "episode {uuid} is still being recorded: it is checked when it is closed",
+)
+_EPISODE_STILL_BEING_RECORDED_REVIEW = Pattern(
+    "reviews.services.episode_still_being_recorded_review",
+    "episode {uuid} is still being recorded: review it when it is closed",
+)
 
 LONGEST_NOTE = 8000  # characters
 LONGEST_LABEL = 120
 LONGEST_MILESTONE = 200
+MOST_TAGS = 30  # of an episode
 
 
 # --- verdicts ------------------------------------------------------------------------------------------------
@@ -33,10 +68,10 @@ def review_add(*, user: Any, episode: Episode, verdict: str, note: str = "") -> 
     """Say pass, fail or a note of an episode that is closed; operators. The newest pass or fail counts."""
     require(user, Role.OPERATOR)
     if verdict not in Verdict.values:
-        raise EvaError(f"verdict = {verdict!r:.40}; allowed: {', '.join(Verdict.values)}")
+        raise EvaError(_VERDICT_ALLOWED(verdict=verdict, values=", ".join(Verdict.values)))
     note = text("note", note, LONGEST_NOTE)
     if verdict == Verdict.NOTE and not note:
-        raise EvaError("note is empty: a note needs words")
+        raise EvaError(_NOTE_EMPTY_NOTE_NEEDS_WORDS)
     _held(episode)
     newest = Review.objects.filter(episode=episode).order_by("-at", "-pk").first()
     if newest is not None and (newest.reviewer, newest.verdict, newest.note) == (user, verdict, note):
@@ -66,12 +101,10 @@ def segment_put(
     require(user, Role.OPERATOR)
     label, milestone = text("label", label, LONGEST_LABEL), text("milestone", milestone, LONGEST_MILESTONE)
     if not label:
-        raise EvaError("label is empty: say what is done in this part")
+        raise EvaError(_LABEL_EMPTY_SAY_WHAT_DONE)
     _held(episode)
     if not 0 <= first <= last < episode.frames:
-        raise EvaError(
-            f"first = {first}, last = {last}; allowed: frames 0 to {episode.frames - 1}, the last not before the first"
-        )
+        raise EvaError(_FIRST_LAST_ALLOWED_FRAMES_0(first=first, last=last, frames=episode.frames - 1))
     said = {"first": first, "last": last, "label": label, "milestone": milestone}
     there = Segment.objects.filter(episode=episode, annotator=user, **said).first()
     if there is not None and segment in (None, there.pk):
@@ -99,10 +132,61 @@ def segment_remove(*, user: Any, episode: Episode, segment: UUID) -> None:
 def _own(user: Any, episode: Episode, uuid: UUID) -> Segment:
     row = Segment.objects.select_related("annotator").filter(episode=episode, uuid=uuid).first()
     if row is None:
-        raise NotFound(f"episode {episode.uuid} has no segment {uuid}")
+        raise NotFound(_EPISODE_HAS_NO_SEGMENT(uuid=episode.uuid, uuid_2=uuid))
     if row.annotator_id != user.pk and role_of(user) is not Role.ADMIN:
-        raise NotAllowed(f"the segment is {row.annotator}'s: mark one of your own")
+        raise NotAllowed(_SEGMENT_MARK_ONE_YOUR_OWN(annotator=row.annotator))
     return row
+
+
+# --- tags ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Tagged:
+    """What was changed, which is less than what was asked for where it was so already."""
+
+    added: tuple[str, ...]
+    removed: tuple[str, ...]
+
+
+@transaction.atomic
+def tags_change(
+    *, user: Any, episode: Episode, add: Sequence[str] = (), remove: Sequence[str] = ()
+) -> Tagged:
+    """Put tags on an episode that is closed, and take others off, whoever put them there; operators."""
+    require(user, Role.OPERATOR)
+    wanted, unwanted = [tag_of(words) for words in add], {tag_of(words) for words in remove}
+    if both := unwanted & set(wanted):
+        raise EvaError(f"add and remove both say {', '.join(sorted(both))}: say it in one of them")
+    _held(episode)
+    there = {row.words: row for row in Tag.objects.filter(episode=episode)}
+    gone = [there.pop(words) for words in sorted(unwanted) if words in there]
+    new = [words for words in dict.fromkeys(wanted) if words not in there]
+    if len(there) + len(new) > MOST_TAGS:
+        raise Conflict(
+            f"episode {episode.uuid} would have {len(there) + len(new)} tags; allowed: at most {MOST_TAGS}"
+        )
+    for row in gone:
+        said = {"by": user.get_username(), "at": timezone.now().isoformat()}
+        REVIEWS.append(episode.uuid, UntagLine.written(row, **said))
+        row.delete()
+    for words in new:
+        row = Tag(episode=episode, words=words, by=user, at=timezone.now())
+        REVIEWS.append(episode.uuid, TagLine.written(row))
+        row.save(force_insert=True)
+    return Tagged(tuple(new), tuple(row.words for row in gone))
+
+
+def tag_of(given: str) -> str:
+    """The tag that is meant; EvaError where it cannot be one."""
+    words = " ".join(text("tag", given, LONGEST_TAG).casefold().split())
+    try:
+        check_name(words)
+    except ValidationError as fault:
+        raise EvaError(f"tag: {fault.messages[0]}") from None
+    if not words or "," in words or len(words) > LONGEST_TAG:  # casefold makes two letters of some
+        raise EvaError(f"tag = {given!r:.80}; allowed: 1 to {LONGEST_TAG} characters without a comma")
+    return words
 
 
 # --- checks --------------------------------------------------------------------------------------------------
@@ -112,7 +196,7 @@ def _own(user: Any, episode: Episode, uuid: UUID) -> Segment:
 def quality_asked(*, episode: Episode) -> Job:
     """Have the worker look the episode through, again where it has."""
     if episode.status == EpisodeStatus.RECORDING:
-        raise Conflict(f"episode {episode.uuid} is still being recorded: it is checked when it is closed")
+        raise Conflict(_EPISODE_STILL_BEING_RECORDED_CHECKED(uuid=episode.uuid))
     Standing.objects.update_or_create(episode=episode, defaults={"asked_at": timezone.now()})
     return enqueue(kind="quality", key=f"quality:{episode.uuid}", args={"uuid": str(episode.uuid)})
 
@@ -149,4 +233,4 @@ def _held(episode: Episode) -> None:
     """Make this the one writer of the episode's file; Conflict while it is being recorded."""
     row = Episode.objects.select_for_update().get(pk=episode.pk)
     if row.status == EpisodeStatus.RECORDING:
-        raise Conflict(f"episode {episode.uuid} is still being recorded: review it when it is closed")
+        raise Conflict(_EPISODE_STILL_BEING_RECORDED_REVIEW(uuid=episode.uuid))

@@ -5,11 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from django import forms
-from django.contrib import admin
-from django.http import HttpRequest
+from django.contrib import admin, messages
+from django.db.models import QuerySet
+from django.http import HttpRequest, HttpResponse, HttpResponseRedirect
+from django.shortcuts import get_object_or_404, render
+from django.urls import URLPattern, path, reverse
 
 import robots
-from evaweb.stations.models import Command, Lease, LeaseRequest, Station
+from evaweb.errors import EvaError
+from evaweb.stations.enrolment import VALID, code_make, key_withdraw
+from evaweb.stations.models import Command, Lease, LeaseRequest, Station, StationKey
 
 
 class StationForm(forms.ModelForm):
@@ -29,6 +34,7 @@ class StationAdmin(admin.ModelAdmin):
     """A station is switched off rather than removed: its records refer to it."""
 
     form = StationForm
+    change_form_template = "stations/admin_station.html"
     list_display = ("name", "title", "robot", "simulated", "active", "message")
     list_filter = ("active", "simulated", "robot")
     search_fields = ("name", "title")
@@ -38,6 +44,33 @@ class StationAdmin(admin.ModelAdmin):
 
     def has_delete_permission(self, request: HttpRequest, obj: Station | None = None) -> bool:
         return False
+
+    def get_urls(self) -> list[URLPattern]:
+        """With the page on which a computer's code is shown."""
+        own = self.admin_site.admin_view(self.enrol_view)
+        return [path("<int:object_id>/enrol/", own, name="stations_station_enrol"), *super().get_urls()]
+
+    def enrol_view(self, request: HttpRequest, object_id: int) -> HttpResponse:
+        """Say what a code does; by POST make one and show it, this once."""
+        station = get_object_or_404(Station, pk=object_id)
+        shown = None
+        if request.method == "POST":
+            try:
+                shown = code_make(user=request.user, station=station)
+            except EvaError as fault:
+                messages.error(request, str(fault))
+                back = reverse("admin:stations_station_change", args=[object_id])
+                return HttpResponseRedirect(back)
+        context = {
+            **self.admin_site.each_context(request),
+            "title": f"Enrol a computer as {station.name}",
+            "opts": self.opts,
+            "station": station,
+            "key": station.keys.filter(withdrawn_at=None).first(),
+            "shown": shown,
+            "minutes": int(VALID.total_seconds() // 60),
+        }
+        return render(request, "stations/admin_enrol.html", context)
 
 
 class RecordAdmin(admin.ModelAdmin):
@@ -51,6 +84,23 @@ class RecordAdmin(admin.ModelAdmin):
 
     def has_delete_permission(self, request: HttpRequest, obj: Any = None) -> bool:
         return False
+
+
+@admin.register(StationKey)
+class StationKeyAdmin(RecordAdmin):
+    """Computers that are stations, and that were."""
+
+    list_display = ("station", "computer", "enrolled_at", "enrolled_by", "withdrawn_at", "withdrawn")
+    list_filter = ("station",)
+    list_select_related = ("station", "enrolled_by")
+    actions = ("withdraw",)
+
+    @admin.action(description="Withdraw: the computer is cut off within a second")
+    def withdraw(self, request: HttpRequest, rows: QuerySet[StationKey]) -> None:
+        """Those chosen."""
+        for key in rows.select_related("station"):
+            key_withdraw(user=request.user, key=key)
+            messages.success(request, f"The key of {key.station.name} is withdrawn.")
 
 
 @admin.register(Lease)

@@ -28,10 +28,40 @@ from evaweb.stations.runtime_client import NoAnswer, wire_to
 from evaweb.stations.selectors import station_get
 from evaweb.stations.stops import Answer, answer_of, ask, press, spoken
 from evaweb.stations.unwritten import Unwritten
+from runtime.core.sentences import Pattern
 from runtime.ipc import messages
 from runtime.ipc.bus import CodecError
 
 log = logging.getLogger(__name__)
+_DATABASE_SLOW = Pattern(
+    "stations.commands.database_slow",
+    "not sent: the database took {seconds:.0f} s to write it down; look at the robot, press again",
+)
+_NO_UUID = Pattern(
+    "stations.commands.no_uuid",
+    "uuid {given!r:.60}: must be a UUID such as {example}",
+)
+_UNKNOWN = Pattern(
+    "stations.commands.unknown",
+    "command {kind!r:.40} is unknown; allowed: {kinds}",
+)
+_TABLES_FOR_ADMINISTRATORS = Pattern(
+    "stations.commands.tables_for_administrators",
+    "{kind}: args say {given}, and {user} is {role}: tables are for administrators; allowed: a checkpoint,"
+    " or a recorded episode (replay), by its name beside args",
+)
+_NOT_WRITTEN_DOWN = Pattern(
+    "stations.commands.not_written_down",
+    "{kind} was not sent: the database does not take it now ({error}); stopping works",
+)
+_NOT_SENDABLE = Pattern(
+    "stations.commands.not_sendable",
+    "{kind} cannot be sent with these args: {error}",
+)
+_UUID_OF_ANOTHER = Pattern(
+    "stations.commands.uuid_of_another",
+    "uuid {uuid} is that of another command ({first}); each needs one of its own",
+)
 STOPPING = ("stop", "halt", "estop")  # never stale; the runtime has the same list
 COLLECTING = ("arm", "disarm", "label", "discard")
 KINDS = (
@@ -58,7 +88,7 @@ def identity_of(given: UUID | str | None) -> UUID:
     try:
         return UUID(str(given))
     except ValueError:
-        raise EvaError(f"uuid {given!r:.60}: must be a UUID such as {uuid4()}") from None
+        raise EvaError(_NO_UUID(given=given, example=uuid4())) from None
 
 
 def issue(
@@ -93,7 +123,7 @@ def issue(
         sequence=sequence,
     )
     if kind not in KINDS:
-        raise EvaError(f"command {kind!r:.40} is unknown; allowed: {', '.join(KINDS)}")
+        raise EvaError(_UNKNOWN(kind=kind, kinds=", ".join(KINDS)))
     if kind == "estop":
         return _stop(row)
     role = require(user, Role.OPERATOR)
@@ -108,8 +138,7 @@ def _require_no_table(row: Command, role: Role, vouched: Sequence[str]) -> None:
     given = [key for key in TABLES if row.args.get(key) is not None and key not in vouched]
     if given and role is not Role.ADMIN:
         raise NotAllowed(
-            f"{row.kind}: args say {' and '.join(given)}, and {row.user} is {role.a}: tables are for administrators; "
-            "allowed: a checkpoint, or a recorded episode (replay), by its name beside args"
+            _TABLES_FOR_ADMINISTRATORS(kind=row.kind, given=" and ".join(given), user=row.user, role=role.a)
         )
 
 
@@ -206,9 +235,7 @@ def _give(row: Command, command: messages.Command) -> Command:
             raise
         return first
     except Error as error:
-        raise NotSent(
-            f"{row.kind} was not sent: the database does not take it now ({error}); stopping works"
-        ) from error
+        raise NotSent(_NOT_WRITTEN_DOWN(kind=row.kind, error=error)) from error
     _put(row, _asked(row, command, waited=time.monotonic() - pressed))
     _update(row)
     return row
@@ -219,14 +246,13 @@ def _require_sendable(command: messages.Command) -> None:
     try:
         messages.encode(command)
     except CodecError as error:
-        raise EvaError(f"{command.kind} cannot be sent with these args: {error}") from None
+        raise EvaError(_NOT_SENDABLE(kind=command.kind, error=error)) from None
 
 
 def _asked(row: Command, command: messages.Command, waited: float) -> Answer:
     """The runtime's answer to a command whose row took `waited` seconds to be written."""
     if waited > settings.EVA_COMMAND_TIMEOUT_S:
-        late = f"not sent: the database took {waited:.0f} s to write it down; look at the robot, press again"
-        return Answer(CommandStatus.FAILED, late)
+        return Answer(CommandStatus.FAILED, _DATABASE_SLOW(seconds=waited))
     try:
         return answer_of(wire_to(row.station.name).request(command, expires=True))
     except NoAnswer as fault:
@@ -334,7 +360,7 @@ def _first(row: Command) -> Command | None:
     )  # by one of the ways that it came
     same_user = first.user_id == row.user_id or unverified
     if (first.station_id, first.kind) != (row.station_id, row.kind) or not same_user:
-        raise Conflict(f"uuid {row.uuid} is that of another command ({first}); each needs one of its own")
+        raise Conflict(_UUID_OF_ANOTHER(uuid=row.uuid, first=first))
     return first
 
 

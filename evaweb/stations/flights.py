@@ -14,7 +14,13 @@ from dataclasses import dataclass, field
 from threading import Lock, Thread
 from typing import Generic, TypeVar
 
+from runtime.core.sentences import Pattern
+
 log = logging.getLogger(__name__)
+_REQUESTS_UNDER_WAY = Pattern(
+    "stations.flights.requests_under_way",
+    "{most} requests to {station} are under way",
+)
 T = TypeVar("T")
 
 
@@ -63,7 +69,7 @@ class Flights(Generic[T]):
             if flights is not None:
                 return _joined(flights, flight, shared)
             if self._most is not None and self._keys[station] >= self._most:
-                raise TooMany(f"{self._most} requests to {station} are under way")
+                raise TooMany(_REQUESTS_UNDER_WAY(most=self._most, station=station))
             self._under_way[place] = [flight]
             self._keys[station] += 1
         self._start(place)

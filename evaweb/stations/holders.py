@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from runtime.core.sentences import rewritten
+
 _PAGE = re.compile(r"\bweb:([^:\s]+):[A-Za-z0-9_-]+")
 
 
@@ -19,4 +21,4 @@ def who(holder: str) -> str:
 
 def readable(reason: str) -> str:
     """A sentence of the runtime with people's names where it names their pages."""
-    return _PAGE.sub(r"\1", reason)
+    return rewritten(reason, lambda text: _PAGE.sub(r"\1", text))

@@ -21,7 +21,49 @@ from evaweb.roles import Role, require, role_of
 from evaweb.stations.holders import holder_of, readable, who
 from evaweb.stations.models import Lease, LeaseRequest, Station
 from evaweb.stations.runtime_client import wire_to
+from runtime.core.sentences import Pattern, fixed
 from runtime.ipc import messages
+
+_HELD_BY = Pattern(
+    "stations.leases.held_by",
+    "{who} has {station}: ask for it, and it can be handed over",
+)
+_NOBODY_HAS = Pattern("stations.leases.nobody_has", "nobody has {station}: take it")
+_HELD_ALREADY = Pattern("stations.leases.held_already", "this page has {station} already")
+_NOT_ASKED = Pattern(
+    "stations.leases.not_asked",
+    "{user} has not asked for {station}, or was answered already",
+)
+_ENDED_MEANWHILE = Pattern(
+    "stations.leases.ended_meanwhile",
+    "the lease has ended: {who} has {station} now",
+)
+_NO_PAGE_OF_YOURS = Pattern(
+    "stations.leases.no_page_of_yours",
+    "{who} has {station}, no other page of yours",
+)
+_TAKE_WITHOUT_REASON = fixed(
+    "stations.leases.take_without_reason",
+    "taking a station from someone needs a reason, which is recorded and shown",
+)
+_USER_SWITCHED_OFF = Pattern(
+    "stations.leases.user_switched_off",
+    "{user} is switched off: decline the request",
+)
+_SWITCHED_OFF = Pattern("stations.leases.switched_off", "{station} is switched off: {message}")
+_NOT_GIVEN = Pattern("stations.leases.not_given", "{station} was not given: {why}")
+_NOT_HELD = Pattern(
+    "stations.leases.not_held",
+    "this page does not have {station}",
+)
+_NO_SUCH_REQUEST = Pattern(
+    "stations.leases.no_such_request",
+    "request {request} for {station} does not exist",
+)
+_ANSWERED_ALREADY = Pattern(
+    "stations.leases.answered_already",
+    "the request of {user} was {answer} already",
+)
 
 _ECHO = timedelta(seconds=3)  # for which an old snapshot may still be under way
 
@@ -33,14 +75,18 @@ def claim(*, user: Any, station: Station, page: str) -> Lease:
     holder = holder_of(user.get_username(), page)
     held = _held(station)
     if held["holder"] not in ("", holder):
-        raise Conflict(f"{who(held['holder'])} has {station}: ask for it, and it can be handed over")
+        raise Conflict(_HELD_BY(who=who(held["holder"]), station=station))
     epoch = held["epoch"] if held["holder"] else _next_epoch(station, held)
     return _grant(user, station, holder, epoch, end_reason="expired")
 
 
-def renew(*, username: str, page: str, station: str, epoch: int) -> messages.Ack:
-    """Pass a page's sign of life on to the runtime, which alone decides; no row, no database."""
-    return _tell(station, "lease_renew", holder_of(username, page), epoch)
+def renew(*, username: str, page: str, station: str, epoch: int, hidden: bool = False) -> messages.Ack:
+    """Pass a page's sign of life on to the runtime, which alone decides; no row, no database.
+
+    That of a `hidden` page counts while nothing moves.
+    """
+    args = {"hidden": True} if hidden else {}
+    return _tell(station, "lease_renew", holder_of(username, page), epoch, args=args)
 
 
 def give_up(*, user: Any, station: Station, page: str) -> Lease:
@@ -59,9 +105,9 @@ def request(*, user: Any, station: Station, page: str) -> LeaseRequest:
     _require_active(station)
     holder, held = holder_of(user.get_username(), page), _held(station)["holder"]
     if not held:
-        raise Conflict(f"nobody has {station}: take it")
+        raise Conflict(_NOBODY_HAS(station=station))
     if held == holder:
-        raise Conflict(f"this page has {station} already")
+        raise Conflict(_HELD_ALREADY(station=station))
     asked, _ = LeaseRequest.objects.update_or_create(
         station=station, user=user, answer=LeaseRequest.Answer.OPEN, defaults={"holder": holder}
     )
@@ -72,7 +118,7 @@ def withdraw(*, user: Any, station: Station) -> LeaseRequest:
     """Take one's request back."""
     asked = LeaseRequest.objects.filter(station=station, user=user, answer=LeaseRequest.Answer.OPEN).first()
     if asked is None:
-        raise NotFound(f"{user.get_username()} has not asked for {station}, or was answered already")
+        raise NotFound(_NOT_ASKED(user=user.get_username(), station=station))
     return _answered(asked, LeaseRequest.Answer.WITHDRAWN)
 
 
@@ -89,7 +135,7 @@ def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
     _require_commander(asked.user)
     held = _held(station)
     if (held["holder"], held["epoch"]) != (own.holder, own.epoch):
-        raise Conflict(f"the lease has ended: {who(held['holder']) or 'nobody'} has {station} now")
+        raise Conflict(_ENDED_MEANWHILE(who=who(held["holder"]) or "nobody", station=station))
     epoch = _next_epoch(station, held)
     return _grant(asked.user, station, asked.holder, epoch, f"handed over to {asked.user}")
 
@@ -105,7 +151,7 @@ def move(*, user: Any, station: Station, page: str) -> Lease:
     if held["holder"] == holder:
         return _grant(user, station, holder, held["epoch"], end_reason="expired")
     if not held["holder"].startswith(holder_of(user.get_username(), "")):
-        raise Conflict(f"{who(held['holder']) or 'nobody'} has {station}, no other page of yours")
+        raise Conflict(_NO_PAGE_OF_YOURS(who=who(held["holder"]) or "nobody", station=station))
     return _grant(user, station, holder, _next_epoch(station, held), "moved to another page")
 
 
@@ -113,7 +159,7 @@ def take(*, user: Any, station: Station, page: str, reason: str) -> Lease:
     """An administrator takes the station from its holder, and says why."""
     require(user, Role.ADMIN)
     if not reason.strip():
-        raise EvaError("taking a station from somebody needs a reason; it is written down and shown")
+        raise EvaError(_TAKE_WITHOUT_REASON)
     holder = holder_of(user.get_username(), page)
     epoch = _next_epoch(station, _held(station))
     return _grant(user, station, holder, epoch, f"taken by {user.get_username()}: {reason.strip()}"[:240])
@@ -143,13 +189,13 @@ def _why_over(lease: Lease, boot: str) -> str:
 def _require_commander(user: Any) -> None:
     """A user who was switched off, or became a viewer, after asking gets no station any more."""
     if not user.is_active:
-        raise NotAllowed(f"{user.get_username()} is switched off: decline the request")
+        raise NotAllowed(_USER_SWITCHED_OFF(user=user.get_username()))
     require(user, Role.OPERATOR)
 
 
 def _require_active(station: Station) -> None:
     if not station.active:
-        raise NotAllowed(f"{station} is switched off: {station.message or 'ask an administrator'}")
+        raise NotAllowed(_SWITCHED_OFF(station=station, message=station.message or "ask an administrator"))
 
 
 def _held(station: Station) -> dict[str, Any]:
@@ -163,10 +209,19 @@ def _next_epoch(station: Station, held: Mapping[str, Any]) -> int:
     return 1 + max(int(held["epoch"]), station.leases.aggregate(newest=Max("epoch"))["newest"] or 0)
 
 
-def _tell(station: str, kind: str, holder: str, epoch: int, role: str = "") -> messages.Ack:
+def _tell(
+    station: str,
+    kind: str,
+    holder: str,
+    epoch: int,
+    role: str = "",
+    args: Mapping[str, Any] | None = None,
+) -> messages.Ack:
     """A lease command to the runtime; to keep or end a lease needs no role."""
     user = who(holder)
-    command = messages.Command(str(uuid4()), kind, user=user, holder=holder, epoch=epoch, role=role)
+    command = messages.Command(
+        str(uuid4()), kind, args or {}, user=user, holder=holder, epoch=epoch, role=role
+    )
     return wire_to(station).request(command)
 
 
@@ -177,7 +232,7 @@ def _grant(user: Any, station: Station, holder: str, epoch: int, end_reason: str
     """
     ack = _tell(station.name, "lease_claim", holder, epoch, role_of(user))
     if ack.status == "refused":
-        raise Conflict(f"{station} was not given: {readable(ack.reason)}")
+        raise Conflict(_NOT_GIVEN(station=station, why=readable(ack.reason)))
     with transaction.atomic():
         _lock(station)
         lease = _record(station, holder, epoch, ack.boot, end_reason)[0]
@@ -222,16 +277,16 @@ def _own(user: Any, station: Station, page: str) -> Lease:
     holder = holder_of(user.get_username(), page)
     lease = station.leases.filter(ended_at=None, holder=holder).first()
     if lease is None:
-        raise Conflict(f"this page does not have {station}")
+        raise Conflict(_NOT_HELD(station=station))
     return lease
 
 
 def _open_request(station: Station, request: int) -> LeaseRequest:
     found = LeaseRequest.objects.filter(pk=request, station=station).select_related("user").first()
     if found is None:
-        raise NotFound(f"request {request} for {station} does not exist")
+        raise NotFound(_NO_SUCH_REQUEST(request=request, station=station))
     if found.answer != LeaseRequest.Answer.OPEN:
-        raise Conflict(f"the request of {found.user} was {found.get_answer_display()} already")
+        raise Conflict(_ANSWERED_ALREADY(user=found.user, answer=found.get_answer_display()))
     return found
 
 

@@ -9,6 +9,13 @@ from pathlib import Path
 
 from evaweb.errors import NotFound
 from evaweb.stations.robot_geometry import looks_of
+from runtime.core.sentences import Pattern
+
+_SHOWS_NO_MESH_LOAD_PAGE = Pattern(
+    "stations.meshes.shows_no_mesh_load_page",
+    "{robot} shows no mesh {digest!r:.80}: load the page again",
+)
+_MESH_CANNOT_READ = Pattern("stations.meshes.mesh_cannot_read", "the mesh {name} cannot be read: {strerror}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +39,7 @@ def mesh_content(*, robot: str, digest: str) -> bytes:
             content = file.read_bytes()
             if sha256(content).hexdigest() == digest:
                 return content
-    raise NotFound(f"{robot} shows no mesh {digest!r:.80}: load the page again")
+    raise NotFound(_SHOWS_NO_MESH_LOAD_PAGE(robot=robot, digest=digest))
 
 
 def _digest(file: Path) -> str:
@@ -40,7 +47,7 @@ def _digest(file: Path) -> str:
         stat = file.stat()
         return _digest_of(file, stat.st_mtime_ns, stat.st_size)
     except OSError as error:
-        raise NotFound(f"the mesh {file.name} cannot be read: {error.strerror}") from None
+        raise NotFound(_MESH_CANNOT_READ(name=file.name, strerror=error.strerror)) from None
 
 
 @lru_cache(1024)

@@ -48,6 +48,47 @@ class Station(models.Model):
         return self.title or self.name
 
 
+class StationKey(models.Model):
+    """A computer's key, with which it is this station; one that was withdrawn stays as a record."""
+
+    station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="keys")
+    key = models.CharField(max_length=64, editable=False, help_text="Public, of CURVE, hexadecimal.")
+    computer = models.CharField(max_length=120, blank=True, editable=False, help_text="As it names itself.")
+    enrolled_at = models.DateTimeField(auto_now_add=True)
+    enrolled_by = models.ForeignKey(
+        settings.AUTH_USER_MODEL, null=True, on_delete=models.PROTECT, related_name="+", editable=False
+    )
+    withdrawn_at = models.DateTimeField(null=True, blank=True, editable=False)
+    withdrawn = models.CharField(max_length=240, blank=True, editable=False, help_text="By whom and why.")
+
+    class Meta:
+        ordering = ("-enrolled_at",)
+        constraints = [
+            models.UniqueConstraint(
+                fields=("station",), condition=models.Q(withdrawn_at=None), name="station_key_one_each"
+            )
+        ]
+
+    def __str__(self) -> str:
+        return f"{self.station.name}: {self.computer or 'a computer'}"
+
+
+class EnrolmentCode(models.Model):
+    """A code that was shown once, to enrol a computer as this station; of it a digest is kept."""
+
+    station = models.ForeignKey(Station, on_delete=models.CASCADE, related_name="codes")
+    digest = models.CharField(max_length=64, unique=True)
+    made_by = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.CASCADE, related_name="+")
+    made_at = models.DateTimeField(auto_now_add=True)
+    expires_at = models.DateTimeField()
+
+    class Meta:
+        ordering = ("-made_at",)
+
+    def __str__(self) -> str:
+        return f"a code for {self.station.name}"
+
+
 class Lease(models.Model):
     """Who had the right to command a station, from when to when; the runtime enforces the epoch."""
 

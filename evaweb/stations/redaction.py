@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from evaweb.blinding import Sight
+from runtime.core.sentences import shows, texts
 
 # Of a snapshot: the robot, the bench, who commands; nothing of the policy, its times and its chunks.
 _SHOWN = (
@@ -27,7 +28,6 @@ _SHOWN = (
     "drives",
     "collect",
     "simulated",
-    "truth",
     "transport",
     "lease",
     "estop",
@@ -57,7 +57,8 @@ _FACTS = ("strategies", "strategy")  # what the policy is asked by
 _JOINTS = ("measured", "commanded", "simulated", "engaged", "limited", "clock")
 
 # Kinds of events, of which nothing but the sentence is shown; of all others nothing.
-_EVENTS = ("camera_back", "camera_lost", "drives", "estopped", "labelled", "released", "truth")
+_EVENTS = ("camera_back", "camera_lost", "drives", "estopped", "labelled", "released")
+_JUDGED = ("milestones", "success")  # of the bench's truth: people score before they hear it
 
 
 def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
@@ -65,6 +66,8 @@ def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
     shown = {key: snapshot[key] for key in _SHOWN if key in snapshot}
     shown["reason"] = sight.told(str(snapshot.get("reason") or ""))
     shown |= {key: empty for key, empty in _COVERED.items() if key in snapshot}
+    if isinstance(snapshot.get("truth"), Mapping):
+        shown["truth"] = {key: said for key, said in snapshot["truth"].items() if key not in _JUDGED}
     if (snapshot.get("state_is") or {}).get("preparing"):
         shown["stage"] = "setting up"
     if isinstance(snapshot.get("facts"), Mapping):
@@ -76,7 +79,27 @@ def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
         shown["recording"] = dict(snapshot["recording"])
     if isinstance(snapshot.get("episode"), Mapping):
         shown["episode"] = {key: snapshot["episode"][key] for key in ("uuid",) if key in snapshot["episode"]}
+    if isinstance(snapshot.get("sentences"), Mapping):
+        shown["sentences"] = _sentences(snapshot, shown)
     return shown | {"veiled": True}
+
+
+def _sentences(snapshot: Mapping[str, Any], shown: Mapping[str, Any]) -> dict[str, Any]:
+    """Ids and arguments of the texts that are shown as they were, where these say all that the arguments say."""
+    before, now = texts(snapshot), texts(shown)
+    return {
+        path: one
+        for path, one in snapshot["sentences"].items()
+        if path in now and now[path] == before.get(path) and shows(now[path], one["arguments"])
+    }
+
+
+def _identity(row: Mapping[str, Any], text: str) -> dict[str, Any]:
+    """Id and arguments of an event, where its whole text is shown and says all that they say."""
+    arguments = row.get("arguments") or {}
+    if not row.get("id") or text != row.get("text") or not shows(text, arguments):
+        return {}
+    return {"id": row["id"], "arguments": arguments}
 
 
 def events(rows: Iterable[Mapping[str, Any]], sight: Sight) -> list[dict[str, Any]]:
@@ -97,19 +120,14 @@ def answer(data: Mapping[str, Any]) -> dict[str, Any]:
 def _event(row: Mapping[str, Any], sight: Sight) -> dict[str, Any] | None:
     kind, text = row.get("kind"), str(row.get("text") or "")
     kept = {key: row[key] for key in ("number", "time", "wall") if key in row}
-    if kind in _EVENTS:
-        return {**kept, "kind": kind, "text": text, "data": {}}
     if kind == "command":  # "stop by ann: accepted", "setup by ann: refused, the reason"
         said, _, reason = text.partition(", ")
-        return {**kept, "kind": kind, "text": f"{said}, {sight.told(reason)}" if reason else said, "data": {}}
-    if kind == "state":  # "running -> holding: the reason"
+        text = f"{said}, {sight.told(reason)}" if reason else said
+    elif kind == "state":  # "running -> holding: the reason"
         moved, _, reason = text.partition(": ")
-        return {
-            **kept,
-            "kind": kind,
-            "text": f"{moved}: {sight.told(reason)}" if reason else moved,
-            "data": {},
-        }
-    if kind in ("episode_opened", "episode_closed"):
-        return {**kept, "kind": kind, "text": str(kind).replace("_", " "), "data": {}}
-    return None
+        text = f"{moved}: {sight.told(reason)}" if reason else moved
+    elif kind in ("episode_opened", "episode_closed"):
+        text = str(kind).replace("_", " ")
+    elif kind not in _EVENTS:
+        return None
+    return {**kept, "kind": kind, "text": text, "data": {}, **_identity(row, text)}

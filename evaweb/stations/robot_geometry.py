@@ -14,9 +14,14 @@ from numpy.typing import NDArray
 import robots
 from evaweb.errors import NotFound
 from robots.units import units_of
+from runtime.core.sentences import Pattern
 from runtime.kinematics.links import Links
 
 log = logging.getLogger(__name__)
+_ROBOT_DOES_NOT_EXIST_THERE = Pattern(
+    "stations.robot_geometry.robot_does_not_exist_there",
+    "robot {robot!r:.80} does not exist; there are: {names}",
+)
 _KEPT = 64  # robots in the groups of some station or episode
 _kernels = ThreadPoolExecutor(1, "links")
 
@@ -106,7 +111,7 @@ def looks_of(robot: str, groups: Sequence[str] | None = None) -> Looks:
 @lru_cache(_KEPT)
 def _looks(robot: str, groups: tuple[str, ...] | None) -> Looks:
     if robot not in robots.names():  # a name, never a path: it may come from an address
-        raise NotFound(f"robot {robot!r:.80} does not exist; there are: {', '.join(robots.names())}")
+        raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.names())))
     try:
         described = robots.load(robot, groups)
         return Looks(described, robots.scene_of(described))

@@ -10,21 +10,49 @@ import re
 import threading
 import time
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import cache
 from typing import Any
 from uuid import uuid4
 
 import zmq
 from django.conf import settings
+from django.utils.timezone import localtime
 
 from evaweb.binary_frames import plain
 from evaweb.errors import NotFound, StationGone
 from evaweb.stations.models import STATION_NAME
+from runtime.core.sentences import Pattern, checked_row
 from runtime.ipc.bus import CodecError, CommandClient, Endpoints, Key, TransportError
 from runtime.ipc.estop_client import NoAnswer as Unanswered
 from runtime.ipc.estop_client import NotSent, urgent
 from runtime.ipc.messages import Ack, Command
 from runtime.ipc.session_state import with_meaning
+
+_LATE = Pattern("stations.runtime_client.late", "{name} has not answered {kind} in time")
+_OUTCOME_UNKNOWN = Pattern(
+    "stations.runtime_client.outcome_unknown",
+    "{name} has not answered {kind} in time: outcome unknown, look at the robot",
+)
+_SILENT_BECAUSE = Pattern("stations.runtime_client.late_because", "{what}{why}")
+_SAYS = Pattern("stations.runtime_client.says", "{name}: {why}")
+_NO_NAME = Pattern(
+    "stations.runtime_client.no_name",
+    "station {name!r:.80}: letters, digits, '.', '_' and '-' make a name",
+)
+_NOT_SENT = Pattern(
+    "stations.runtime_client.not_sent",
+    "{name} does not answer: {kind} was not sent",
+)
+_LINK = Pattern("stations.runtime_client.link", "{name}, since {since}: {why}")
+_NOT_RUNNING = Pattern(
+    "stations.runtime_client.not_running",
+    "{name} is not running: its runtime has to be started",
+)
+_UNREADABLE = Pattern(
+    "stations.runtime_client.unreadable",
+    "{name} answered {kind} with what cannot be read: {error}",
+)
 
 _CLOCK_KNOWN_S = 60.0  # how long the difference of two computers' clocks is believed
 
@@ -40,7 +68,7 @@ class StationWire:
 
     def __init__(self, name: str) -> None:
         if not re.fullmatch(STATION_NAME, name):
-            raise NotFound(f"station {name!r:.80}: letters, digits, '.', '_' and '-' make a name")
+            raise NotFound(_NO_NAME(name=name))
         self.name = name
         folder = settings.DATA_DIR / "stations" / name
         self.endpoints = Endpoints(folder)
@@ -60,7 +88,7 @@ class StationWire:
         """
         deadline = time.monotonic() + (timeout or settings.EVA_COMMAND_TIMEOUT_S)
         if not self._lock.acquire(timeout=max(0.0, deadline - time.monotonic())):
-            raise StationGone(f"{self.name} does not answer: {command.kind} was not sent")
+            raise StationGone(_NOT_SENT(name=self.name, kind=command.kind))
         try:
             client = self._connected()
             if expires:
@@ -81,9 +109,9 @@ class StationWire:
         except CodecError as error:
             raise self._unreadable(command, error) from error
         except Unanswered as error:
-            raise NoAnswer(f"{self._silence(command)}{error.why}") from None
+            raise NoAnswer(_SILENT_BECAUSE(what=self._silence(command), why=error.why)) from None
         except NotSent as error:
-            raise StationGone(f"{self.name}: {error}") from None
+            raise StationGone(_SAYS(name=self.name, why=error)) from None
         except TransportError:
             raise self._not_running() from None
 
@@ -94,7 +122,7 @@ class StationWire:
     def events_since(self, number: int, timeout: float | None = None) -> tuple[str, list[dict[str, Any]]]:
         """The runtime's boot id and its events after `number`, as JSON may carry them; raises StationGone."""
         ack = self.request(Command(str(uuid4()), "events_since", {"number": number}), timeout=timeout)
-        return ack.boot, plain(ack.data.get("events", []))
+        return ack.boot, [checked_row(row) for row in plain(ack.data.get("events", []))]
 
     def address(self, process: str, key: str) -> str:
         """Address of a socket, as its process last wrote it; raises StationGone where there is none."""
@@ -104,7 +132,16 @@ class StationWire:
             raise self._not_running() from None
 
     def _not_running(self) -> StationGone:
-        return StationGone(f"{self.name} is not running: its runtime has to be started")
+        return StationGone(self._link() or _NOT_RUNNING(name=self.name))
+
+    def _link(self) -> str:
+        """What the gate says of the link to a station on another computer; "" where it says nothing."""
+        try:
+            told = self.endpoints.read("link")
+            since = localtime(datetime.fromtimestamp(float(told["since"]), UTC))
+            return _LINK(name=self.name, since=f"{since:%H:%M:%S}", why=str(told["why"]))
+        except (TransportError, KeyError, ValueError, OverflowError, OSError):
+            return ""
 
     def _connected(self) -> CommandClient:
         endpoint = self.address("coordinator", "commands")
@@ -124,7 +161,7 @@ class StationWire:
             ack = self._ask(client, Command(str(uuid4()), "status"), deadline)
             clock = float(ack.data["clock"])
         except (NoAnswer, KeyError):
-            raise StationGone(f"{self.name} does not answer: {kind} was not sent") from None
+            raise StationGone(_NOT_SENT(name=self.name, kind=kind)) from None
         self._ahead_known = time.monotonic()
         self._ahead = clock - self._ahead_known
 
@@ -140,11 +177,11 @@ class StationWire:
         return NoAnswer(self._silence(command))
 
     def _silence(self, command: Command) -> str:
-        unknown = "" if command.kind == "status" else ": outcome unknown, look at the robot"
-        return f"{self.name} has not answered {command.kind} in time{unknown}"
+        late = _LATE if command.kind == "status" else _OUTCOME_UNKNOWN
+        return late(name=self.name, kind=command.kind)
 
     def _unreadable(self, command: Command, error: CodecError) -> NoAnswer:
-        return NoAnswer(f"{self.name} answered {command.kind} with what cannot be read: {error}")
+        return NoAnswer(_UNREADABLE(name=self.name, kind=command.kind, error=error))
 
 
 def wire_to(name: str) -> StationWire:

@@ -9,6 +9,12 @@ from django.db.models import QuerySet
 from evaweb.errors import NotFound
 from evaweb.refusals import is_text
 from evaweb.stations.models import NOT_CARRIED_OUT, Command, Lease, LeaseRequest, Station
+from runtime.core.sentences import Pattern
+
+_NO_SUCH_STATION = Pattern(
+    "stations.selectors.no_such_station",
+    "station {name!r:.80} does not exist; there are: {known}",
+)
 
 
 def station_list(*, all_of_them: bool = False) -> QuerySet[Station]:
@@ -21,7 +27,7 @@ def station_get(*, name: str) -> Station:
     found = Station.objects.filter(name=name).first() if is_text(name) else None
     if found is None:
         known = ", ".join(Station.objects.values_list("name", flat=True)) or "none yet"
-        raise NotFound(f"station {name!r:.80} does not exist; there are: {known}")
+        raise NotFound(_NO_SUCH_STATION(name=name, known=known))
     return found
 
 

@@ -20,10 +20,29 @@ from evaweb.stations.flights import Flights, TooMany
 from evaweb.stations.holders import holder_of, readable
 from evaweb.stations.models import CommandStatus
 from evaweb.stations.runtime_client import NoAnswer, wire_to
+from runtime.core.sentences import Pattern
 from runtime.ipc import estop_requests as pressing
 from runtime.ipc import messages
 
+_E_STOP_GOES_ANOTHER_WAY = Pattern(
+    "stations.stops.e_stop_goes_another_way",
+    "{fault}; the e-stop goes another way",
+)
+
 HARDWARE_STOP = "USE THE HARDWARE STOP"
+UNKNOWN_STOPPER = Pattern(
+    "stations.stops.unknown_stopper",
+    "{why}: who may stop is not known; the e-stop works",
+)
+_STOP_BY_HAND = Pattern("stations.stops.by_hand", "USE THE HARDWARE STOP: {why}")
+_ANOTHER_ANSWERED = Pattern(
+    "stations.stops.another_answered",
+    "the station {other} answered instead of {station}, and was stopped",
+)
+_VIEWER = Pattern(
+    "stations.stops.viewer",
+    "{user} is a viewer; this needs an operator: ask an administrator, or press the e-stop",
+)
 _ESTOP_S = 1.0  # what a person waits for before the page turns red
 _MOST_STOPS = 32  # of different leases that one station is asked at once
 
@@ -69,13 +88,13 @@ def ask(command: messages.Command, station: str) -> Future[Answer]:
         return _stops.ask(station, partial(stopped, command, station), key=key, identity=command.uuid)
     except TooMany as fault:
         answer: Future[Answer] = Future()
-        answer.set_result(Answer(CommandStatus.FAILED, f"{fault}; the e-stop goes another way"))
+        answer.set_result(Answer(CommandStatus.FAILED, _E_STOP_GOES_ANOTHER_WAY(fault=fault)))
         return answer
 
 
 def refused_to_a_viewer(username: str) -> str:
     """Why a viewer's stop or halt goes nowhere."""
-    return f"{username} is a viewer; this needs an operator: ask an administrator, or press the e-stop"
+    return _VIEWER(user=username)
 
 
 def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
@@ -86,14 +105,15 @@ def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
         answer = replace(answer_of(ack), uuid=str(uuid))
         said = answer.data.get("station", station)
         if said != station:  # its socket is where another station's was before that one was killed
-            reason = f"the station {said} answered instead of {station}, and was stopped"
-            return Answer(CommandStatus.FAILED, f"{HARDWARE_STOP}: {reason}", [], answer.data)
+            reason = _STOP_BY_HAND(why=_ANOTHER_ANSWERED(other=said, station=station))
+            return Answer(CommandStatus.FAILED, reason, [], answer.data)
     except NoAnswer as fault:
-        answer = Answer(CommandStatus.UNKNOWN, f"{HARDWARE_STOP}: {fault}")
+        answer = Answer(CommandStatus.UNKNOWN, _STOP_BY_HAND(why=fault))
     except StationGone as fault:
-        answer = Answer(CommandStatus.FAILED, f"{HARDWARE_STOP}: {fault}")
+        answer = Answer(CommandStatus.FAILED, _STOP_BY_HAND(why=fault))
     if answer.status is CommandStatus.REFUSED:
-        return Answer(CommandStatus.FAILED, f"{HARDWARE_STOP}: {answer.reason}", answer.allowed, answer.data)
+        reason = _STOP_BY_HAND(why=answer.reason)
+        return Answer(CommandStatus.FAILED, reason, answer.allowed, answer.data)
     return answer
 
 
@@ -109,7 +129,7 @@ def stopped(command: messages.Command, station: str) -> Answer:
         timeout = settings.EVA_COMMAND_TIMEOUT_S
         return answer_of(wire_to(station).urgent(command, "coordinator", "commands", timeout))
     except NoAnswer as fault:
-        return Answer(CommandStatus.UNKNOWN, f"{fault}; the e-stop goes another way")
+        return Answer(CommandStatus.UNKNOWN, _E_STOP_GOES_ANOTHER_WAY(fault=fault))
     except StationGone as fault:
         return Answer(CommandStatus.FAILED, str(fault))
 

@@ -269,11 +269,24 @@ class _Null:
         """Probabilities of tables whose probability at rates of a half is `even` [cells]: float64 [cells, rates]."""
         import numpy as np
 
-        (a, b), (n, m) = (of[:, None].astype(float) for of in cells), trials
+        if (
+            self.margin is None
+        ):  # only the successes of both arms together count: one exponential of each number
+            numbers, where = np.unique(cells[0] + cells[1], return_inverse=True)
+            return np.asarray(even[:, None] * self.powers(numbers, sum(trials))[where])
         one, not_one, other, not_other = self._logs
+        (a, b), (n, m) = (of[:, None].astype(float) for of in cells), trials
         with np.errstate(divide="ignore"):
             weights = np.log(even)[:, None]
         return np.asarray(np.exp(weights + a * one + (n - a) * not_one + b * other + (m - b) * not_other))
+
+    def powers(self, successes: NDArray[Any], trials: int) -> NDArray[np.float64]:
+        """Of equal rates: how much likelier than at a half outcomes with so many successes are: float64 [., rates]."""
+        import numpy as np
+
+        one, not_one = self._logs[:2]
+        number = successes[:, None].astype(float)
+        return np.asarray(np.exp(number * one + (trials - number) * not_one))
 
     def total(
         self, cells: tuple[NDArray[Any], ...], even: NDArray[np.float64], trials: tuple[int, int]
@@ -337,6 +350,12 @@ def _taken(
     ends = np.append(
         levels[1:] < levels[:-1] * (1 - _TIE), True
     )  # at the last one of those that are as extreme
+    if null.margin is None:
+        numbers = np.add(*np.unravel_index(order, alive.shape))
+        taken, spent = _within(
+            null, sum(look), numbers, alive.ravel()[order], np.flatnonzero(ends), spent, most
+        )
+        return _least(order[:taken], levels, alive.shape, look, None) if taken else None, spent
     least: tuple[int, int] | None = None
     so_far = spent
     for start in range(0, len(order), _CELLS):
@@ -353,6 +372,35 @@ def _taken(
             break
         so_far = errors[-1]
     return least, spent
+
+
+def _within(
+    null: _Null,
+    trials: int,
+    numbers: NDArray[np.intp],
+    even: NDArray[np.float64],
+    ends: NDArray[np.intp],
+    spent: NDArray[np.float64],
+    most: float,
+) -> tuple[int, NDArray[np.float64]]:
+    """Of equal rates: how many tables may stop, up to one of `ends`, and the error at each rate with them.
+
+    `numbers` and `even` are their successes, of both arms together, and probabilities at rates of a half. The more
+    tables, the larger is the error at every rate: the number is found by halving.
+    """
+    import numpy as np
+
+    likelier = null.powers(np.arange(trials + 1), trials)
+    before, low, high = spent, 0, len(ends)
+    while low < high:
+        middle = (low + high + 1) // 2
+        upto = ends[middle - 1] + 1
+        error = before + np.bincount(numbers[:upto], even[:upto], minlength=trials + 1) @ likelier
+        if error.max() <= most:
+            low, spent = middle, error
+        else:
+            high = middle - 1
+    return int(ends[low - 1]) + 1 if low else 0, spent
 
 
 def _least(

@@ -32,16 +32,33 @@ class Course:
 
 
 @lru_cache(maxsize=512)
-def course(rule: str, pairs: int, p_first: float, p_second: float, alpha: float) -> Course:
-    """That of a design of so many pairs, exact but for "evidence", which is simulated 4,000 times."""
+def course(
+    rule: str,
+    pairs: int,
+    p_first: float,
+    p_second: float,
+    alpha: float,
+    margin: float | None = None,
+    looks: tuple[int, ...] = (),
+) -> Course:
+    """That of a design of so many pairs, exact but for "evidence", which is simulated 4,000 times.
+
+    With a `margin` its power is the probability of finding that the first's rate is not lower than the second's by that
+    much; `looks` are pairs, none: after every one.
+    """
     _check(rule, alpha, p_first, p_second)
     if not 1 <= pairs <= MOST:
         raise StatisticsError(f"{pairs} pairs; allowed: 1 to {MOST}")
-    if rule == FIXED:
-        return Course(rule, pairs, exact_power(pairs, p_first, p_second, alpha), float(pairs), pairs)
     if rule == ANYTIME:
+        if margin is not None:
+            raise StatisticsError(f"margin = {margin:g} with the design {rule!r}; allowed: none")
         return _simulated(pairs, p_first, p_second, alpha)
-    found = _boundary(rule, pairs, alpha).course(p_first, p_second)
+    if rule == FIXED and margin is None:
+        return Course(rule, pairs, exact_power(pairs, p_first, p_second, alpha), float(pairs), pairs)
+    shape, at = ("late", (pairs,)) if rule == FIXED else (rule, looks)  # of one look there is no shape
+    # With a margin a boundary asks about its second arm.
+    rates = (p_first, p_second) if margin is None else (p_second, p_first)
+    found = _boundary(shape, pairs, alpha, margin, at).course(*rates)
     return Course(rule, pairs, found.power, found.mean / 2, found.median // 2)
 
 
@@ -51,24 +68,26 @@ def pairs_needed(rule: str, p_first: float, p_second: float, power: float, alpha
     check_share("power", power)
     if p_first == p_second:
         raise StatisticsError(f"p_first = p_second = {p_first}: there is no difference to be found")
-    low, high = 0, min(MOST, trials_needed(p_first, p_second, power, alpha))
+    low, reached = 0, 0.0
+    high = min(MOST, trials_needed(p_first, p_second, power, alpha))
     while (found := course(rule, high, p_first, p_second, alpha)).power < power:
         if high == MOST:
             return None
-        low, high = high, min(MOST, math.ceil(1.3 * high))
+        low, reached, high = high, found.power, min(MOST, math.ceil(1.15 * high))
     while high - low > 1:
-        middle = (low + high) // 2
+        share = (power - reached) / (found.power - reached)  # power grows almost evenly with the pairs
+        middle = min(max(round(low + share * (high - low)), low + 1), high - 1)
         tried = course(rule, middle, p_first, p_second, alpha)
         if tried.power >= power:
             high, found = middle, tried
         else:
-            low = middle
+            low, reached = middle, tried.power
     return found
 
 
 @lru_cache(maxsize=128)
-def _boundary(rule: str, pairs: int, alpha: float) -> Boundary:
-    return boundary(in_pairs(pairs), alpha=alpha, shape=rule)
+def _boundary(shape: str, pairs: int, alpha: float, margin: float | None, at: tuple[int, ...]) -> Boundary:
+    return boundary(in_pairs(pairs, at or None), alpha=alpha, shape=shape, margin=margin)
 
 
 def _simulated(pairs: int, p_first: float, p_second: float, alpha: float) -> Course:
@@ -76,16 +95,16 @@ def _simulated(pairs: int, p_first: float, p_second: float, alpha: float) -> Cou
     import numpy as np
 
     chance = np.random.default_rng(_SEED)
-    one = (chance.random((_RUNS, pairs)) < p_first).astype(float)
-    other = (chance.random((_RUNS, pairs)) < p_second).astype(float)
+    one = chance.random((_RUNS, pairs)) < p_first
+    other = chance.random((_RUNS, pairs)) < p_second
     before = np.arange(pairs)
 
-    def gains(worse: NDArray[np.float64], better: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gains(worse: NDArray[np.bool_], better: NDArray[np.bool_]) -> NDArray[np.float64]:
         p = (1 + np.cumsum(worse, axis=1) - worse) / (3 + before)
         q = (2 + np.cumsum(better, axis=1) - better) / (3 + before)
         m = (p + q) / 2
-        won = worse * np.log(p / m) + (1 - worse) * np.log((1 - p) / (1 - m))
-        won += better * np.log(q / m) + (1 - better) * np.log((1 - q) / (1 - m))
+        won = np.log(np.where(worse, p / m, (1 - p) / (1 - m)))
+        won += np.log(np.where(better, q / m, (1 - q) / (1 - m)))
         return np.asarray(np.cumsum(np.where(p < q, won, 0.0), axis=1))
 
     reached = np.maximum(gains(other, one), gains(one, other)) >= math.log(2 / alpha)

@@ -1,13 +1,14 @@
-"""Designs of a comparison: how many pairs there are, after which one looks, what ends it, and what may be said then.
+"""Designs of comparisons: how many blocks there are, after which one looks, what ends it, and what may be said then.
 
-Nothing but the design decides on the primary comparison. Pairs are taken in the order in which they were scheduled;
-what comes after the end belongs to the record, not to the decision.
+Nothing but the design decides on planned comparisons. Blocks are taken in the order in which they were scheduled; what
+comes after the end belongs to the record, not to the decision. A paired block has one trial of each arm; of two arms in
+random order a block has two trials of whichever was drawn. Several comparisons share alpha equally (Bonferroni).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 from evaweb.statistics.base import StatisticsError, check_alpha
 from evaweb.statistics.boundaries import MOST, SHAPES, Boundary, Look, boundary, in_pairs
@@ -19,72 +20,161 @@ FIXED, ANYTIME = "none", "evidence"  # as plans have named them since there are 
 RULES = (FIXED, ANYTIME, *SHAPES)
 SUCCESS, SCORE = "success", "score"
 _TIE = 1e-9  # relative: a p that is alpha but for its last bits
-Values = tuple[float, float]  # of the first and the second checkpoint in one block
+Values = tuple[float, float]  # of the first and the second arm in one paired block
+Block = Sequence[
+    tuple[int, float]
+]  # arm and outcome of each of its trials that count, in the schedule's order
 
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """The design of a primary comparison, as it is frozen.
+    """The design of a plan's comparisons, as it is frozen.
 
-    `rule`: "none", a fixed number of pairs with one test at the end; "evidence", an e-process after every pair; "late"
-    and "early", an exact `boundary` at its looks. Without a `margin` the question is whether the two differ; with one,
+    `rule`: "none", a fixed number of blocks with one test at the end; "evidence", an e-process after every pair; "late"
+    and "early", an exact `boundary` at its looks. Without a `margin` the question is whether two arms differ; with one,
     whether the first's success rate is lower than the second's by less than that. `outcome` is "success" or "score".
+    `comparisons` are pairs of arms, each at its share of `alpha`; `drops`: an arm that one of them found worse, or that
+    is in none that is open, is tried no more. `counts` [blocks, 2]: trials of both arms after each block, where they
+    are not one of each.
     """
 
     rule: str
-    pairs: int
+    blocks: int
     alpha: float
     margin: float | None = None
     outcome: str = SUCCESS
     boundary: Boundary | None = None
+    comparisons: tuple[tuple[int, int], ...] = ((0, 1),)
+    drops: bool = False
+    counts: tuple[tuple[int, int], ...] | None = None
+
+    @property
+    def share(self) -> float:
+        """Alpha of each comparison."""
+        return self.alpha / len(self.comparisons)
+
+    @property
+    def unit(self) -> str:
+        """Word for what enters one after the other."""
+        return "pairs" if self.counts is None else "blocks"
 
 
 @dataclass(frozen=True, slots=True)
 class Conclusion:
-    """What a design says of the pairs there are, of those that are `foreseen`.
+    """What a design says of one comparison, from the blocks there are, of those that are `foreseen`.
 
-    `at` is the number of pairs after which it ended, None while it goes on, and `winner` the checkpoint ("first" or
+    `at` is the number of blocks after which it ended, None while it goes on, and `winner` the arm ("first" or
     "second") that a boundary was crossed for. `p` is that of the one test of a fixed number, None with any other rule.
+    `dropped`: it ended because one of its arms was dropped.
     """
 
-    pairs: int
+    blocks: int
     at: int | None
     winner: str | None
     p: float | None
     foreseen: int
+    dropped: bool = False
 
     @property
     def ended(self) -> str:
-        """Empty while it goes on, "full" where all pairs are made, whatever is found then, "boundary" before that."""
+        """Empty while it goes on, "full" where all blocks are made, whatever is found then, "boundary" before that."""
         return "" if self.at is None else "full" if self.at == self.foreseen else "boundary"
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What a design says of each of its comparisons; `dropped`: after which block an arm is tried no more."""
+
+    each: tuple[Conclusion, ...]
+    dropped: dict[int, int]
+
+    @property
+    def at(self) -> int | None:
+        """Number of blocks after which the last comparison ended; None while one goes on."""
+        ends = [one.at for one in self.each if one.at is not None]
+        return max(ends) if len(ends) == len(self.each) else None
+
+    @property
+    def ended(self) -> str:
+        """As that of the last comparison to end."""
+        return "" if self.at is None else next(one.ended for one in self.each if one.at == self.at)
 
 
 def design(
     *,
     rule: str,
-    pairs: int,
+    blocks: int,
     alpha: float,
     margin: float | None = None,
     outcome: str = SUCCESS,
     looks: Sequence[int] = (),
+    comparisons: Sequence[tuple[int, int]] = ((0, 1),),
+    drops: bool = False,
+    counts: Sequence[tuple[int, int]] | None = None,
 ) -> Design:
-    """A design with its boundary, which is computed now; `looks` are pairs, none: after every one.
+    """A design with its boundary, which is computed now; `looks` are blocks, none: after every one.
 
-    StatisticsError names what cannot be: a margin or looks with a rule that has none, a boundary of over 250 pairs.
+    StatisticsError names what cannot be: a margin or looks with a rule that has none, a boundary of over 250 trials an
+    arm, scores or an e-process of arms in random order.
     """
+    check_design(
+        rule=rule,
+        blocks=blocks,
+        alpha=alpha,
+        margin=margin,
+        outcome=outcome,
+        looks=looks,
+        comparisons=comparisons,
+        drops=drops,
+        paired=counts is None,
+    )
+    exact = rule in SHAPES or (rule == FIXED and margin is not None)
+    found = Design(
+        rule,
+        blocks,
+        alpha,
+        margin,
+        outcome,
+        None,
+        tuple(comparisons),
+        drops,
+        tuple(counts) if counts is not None else None,
+    )
+    return replace(found, boundary=_bounded(found, looks)) if exact else found
+
+
+def check_design(
+    *,
+    rule: str,
+    blocks: int,
+    alpha: float,
+    margin: float | None = None,
+    outcome: str = SUCCESS,
+    looks: Sequence[int] = (),
+    comparisons: Sequence[tuple[int, int]] = ((0, 1),),
+    drops: bool = False,
+    paired: bool = True,
+) -> None:
+    """What `design` refuses, without computing a boundary; not `paired`: two arms in random order."""
     check_alpha(alpha)
     if rule not in RULES:
         raise StatisticsError(f"design = {rule!r}; allowed: {', '.join(RULES)}")
     if outcome not in (SUCCESS, SCORE):
         raise StatisticsError(f"outcome = {outcome!r}; allowed: {SUCCESS}, {SCORE}")
-    if pairs < 1:
-        raise StatisticsError(f"{pairs} pairs; allowed: 1 or more")
+    if blocks < 1:
+        raise StatisticsError(f"{blocks} pairs; allowed: 1 or more")
     if looks and rule not in SHAPES:
         raise StatisticsError(
             f"looks = {list(looks)} with the design {rule!r}; allowed with: {', '.join(SHAPES)}"
         )
-    if looks and not 1 <= min(looks) <= max(looks) <= pairs:
-        raise StatisticsError(f"looks = {list(looks)}; allowed: from 1 to {pairs}, the number of pairs")
+    if looks and not 1 <= min(looks) <= max(looks) <= blocks:
+        raise StatisticsError(f"looks = {list(looks)}; allowed: from 1 to {blocks}, the number of pairs")
+    if drops and rule == FIXED:
+        raise StatisticsError(
+            f"arms are dropped with the design {rule!r}; allowed with: {', '.join(RULES[1:])}"
+        )
+    if drops and len(comparisons) < 2:
+        raise StatisticsError("arms are dropped with 1 comparison; allowed: 2 or more")
     exact = rule in SHAPES or (rule == FIXED and margin is not None)
     if outcome == SCORE and exact:
         raise StatisticsError(f"outcome = {SCORE!r} with a boundary of successes; allowed: {SUCCESS}")
@@ -92,49 +182,126 @@ def design(
         raise StatisticsError(
             f"margin = {margin:g} with the design {rule!r}; allowed with: none, {', '.join(SHAPES)}"
         )
-    if not exact:
-        return Design(rule, pairs, alpha, None, outcome)
-    if pairs > MOST:
-        raise StatisticsError(f"{pairs} pairs of a design with an exact boundary; allowed: 1 to {MOST}")
-    at = [pairs] if rule == FIXED else list(looks) or None
-    shape = rule if rule in SHAPES else "late"  # of one look there is no shape
-    return Design(
-        rule,
-        pairs,
-        alpha,
-        margin,
-        outcome,
-        boundary(in_pairs(pairs, at), alpha=alpha, shape=shape, margin=margin),
-    )
+    if not paired and (outcome == SCORE or rule == ANYTIME or len(comparisons) != 1):
+        raise StatisticsError(
+            "two arms in random order; allowed with: success, one comparison, and the designs "
+            f"{', '.join(one for one in RULES if one != ANYTIME)}"
+        )
+    if exact and paired and blocks > MOST:
+        raise StatisticsError(f"{blocks} pairs of a design with an exact boundary; allowed: 1 to {MOST}")
 
 
-def conclude(found: Design, values: Sequence[Values]) -> Conclusion:
-    """What `found` says of the pairs that are made, in the order of the schedule, the first one that is not made
-    ending the list. More of them than the design foresees are not looked at.
+def _bounded(found: Design, looks: Sequence[int]) -> Boundary:
+    at = [found.blocks] if found.rule == FIXED else list(looks) or None
+    shape = found.rule if found.rule in SHAPES else "late"  # of one look there is no shape
+    if found.counts is None:
+        made = in_pairs(found.blocks, at)
+    else:
+        chosen = range(found.blocks) if at is None else [one - 1 for one in sorted({*at, found.blocks})]
+        # With a margin a boundary asks about its second arm: the comparison's first.
+        sides = (0, 1) if found.margin is None else (1, 0)
+        counted = ((found.counts[one][sides[0]], found.counts[one][sides[1]]) for one in chosen)
+        made = [count for count in counted if min(count) > 0]
+    return boundary(made, alpha=found.share, shape=shape, margin=found.margin)
+
+
+def findings(found: Design, blocks: Sequence[Block]) -> Findings:
+    """What `found` says of these blocks, in the schedule's order; the first one that is not made ends the list.
+
+    Comparisons are decided in the order of the blocks at which they end, so that it is the same whoever finishes first:
+    where arms are dropped a block is made when all arms that were not dropped before it are. An arm that one of them
+    found worse is in no other one any more, but for a control, which is in all; with a margin none is found worse.
     """
-    given = values[: found.pairs]
-    full = len(given) if len(given) == found.pairs else None
+    given = blocks[: found.blocks]
+    if not found.drops:
+        return Findings(tuple(conclude(found, given, pair) for pair in found.comparisons), {})
+    decided: dict[int, Conclusion] = {}
+    dropped: dict[int, int] = {}
+    arms = sorted({arm for pair in found.comparisons for arm in pair})
+    spared = set(arms) if found.margin is not None else set(arms).intersection(*found.comparisons)
+    while len(decided) < len(found.comparisons):
+        made = _whole(given, arms, dropped)
+        open_ = {
+            n: conclude(found, made, pair) for n, pair in enumerate(found.comparisons) if n not in decided
+        }
+        first = min((one.at for one in open_.values() if one.at and one.winner), default=None)
+        if first is None:
+            decided |= open_
+            break
+        crossed = {
+            n: replace(one, blocks=first) for n, one in open_.items() if one.at == first and one.winner
+        }
+        decided |= crossed
+        worse = {found.comparisons[n][one.winner == "first"] for n, one in crossed.items()} - spared
+        for n in open_.keys() - crossed.keys():
+            if worse & {*found.comparisons[n]}:
+                decided[n] = Conclusion(first, first, None, None, found.blocks, dropped=first < found.blocks)
+        still = {arm for n, pair in enumerate(found.comparisons) if n not in decided for arm in pair}
+        dropped |= {arm: first for arm in arms if arm not in still and arm not in dropped}
+    return Findings(tuple(decided[n] for n in range(len(found.comparisons))), dropped)
+
+
+def _whole(blocks: Sequence[Block], arms: Sequence[int], dropped: dict[int, int]) -> list[Block]:
+    """The blocks before the first one that lacks an arm which was not dropped before it."""
+    made = []
+    for number, block in enumerate(blocks):
+        there = {arm for arm, _ in block}
+        if any(arm not in there and dropped.get(arm, number + 1) > number for arm in arms):
+            break
+        made.append(block)
+    return made
+
+
+def conclude(found: Design, blocks: Sequence[Block], pair: tuple[int, int] = (0, 1)) -> Conclusion:
+    """What `found` says of one comparison; the first block that lacks a trial of it ends the list. More blocks than
+    the design foresees are not looked at.
+    """
+    given = list(_made(found, blocks[: found.blocks], pair))
+    full = len(given) if len(given) == found.blocks else None
     if found.boundary is not None:
         at, winner = _crossed(found.boundary, given)
-        return Conclusion(len(given), at or full, winner, None, found.pairs)
+        return Conclusion(len(given), at or full, winner, None, found.blocks)
     if found.rule == ANYTIME:
         of = score_evidence if found.outcome == SCORE else _of_successes
-        evidence = of(given, found.alpha)
-        return Conclusion(len(given), evidence.stop or full, evidence.winner, None, found.pairs)
+        evidence = of([(first[0], second[0]) for first, second in given], found.share)
+        return Conclusion(len(given), evidence.stop or full, evidence.winner, None, found.blocks)
     if full is None:
-        return Conclusion(len(given), None, None, None, found.pairs)
+        return Conclusion(len(given), None, None, None, found.blocks)
     p, lead = _scored(given) if found.outcome == SCORE else _succeeded(given)
-    return Conclusion(full, full, _ahead(lead, 0) if p <= found.alpha * (1 + _TIE) else None, p, found.pairs)
+    winner = _ahead(lead, 0) if p <= found.share * (1 + _TIE) else None
+    return Conclusion(full, full, winner, p, found.blocks)
 
 
-def _succeeded(values: Sequence[Values]) -> tuple[float, float]:
-    """Probability of the one test of a fixed number of pairs, and by how much the first is ahead."""
-    first, second = _successes(values)
-    return barnard(first, len(values), second, len(values)).p, first - second
+Sides = tuple[list[float], list[float]]  # outcomes of the first and of the second arm in one block
 
 
-def _scored(values: Sequence[Values]) -> tuple[float, float]:
-    flips = sign_flips([one - other for one, other in values])
+def _made(found: Design, blocks: Sequence[Block], pair: tuple[int, int]) -> Iterator[Sides]:
+    """The blocks before the first one that is not made, by side."""
+    before = (0, 0)
+    for number, block in enumerate(blocks):
+        sides = ([value for arm, value in block if arm == pair[0]], [v for arm, v in block if arm == pair[1]])
+        after = (number + 1, number + 1) if found.counts is None else found.counts[number]
+        if (len(sides[0]), len(sides[1])) != (after[0] - before[0], after[1] - before[1]):
+            return
+        before = after
+        yield sides
+
+
+def _succeeded(given: Sequence[Sides]) -> tuple[float, float]:
+    """Probability of the one test of a fixed number of blocks, and by how much the first's rate is ahead."""
+    (first, n), (second, m) = (_sum(given, side) for side in (0, 1))
+    if not n or not m:
+        return 1.0, 0.0
+    return barnard(first, n, second, m).p, first / n - second / m
+
+
+def _sum(given: Sequence[Sides], side: int) -> tuple[int, int]:
+    """Successes and trials of one side."""
+    return sum(bool(v) for sides in given for v in sides[side]), sum(len(sides[side]) for sides in given)
+
+
+def _scored(given: Sequence[Sides]) -> tuple[float, float]:
+    flips = sign_flips([first[0] - second[0] for first, second in given])
     return flips.p, flips.value
 
 
@@ -142,25 +309,60 @@ def _of_successes(values: Sequence[Values], alpha: float):  # type: ignore[no-un
     return success_evidence([(bool(one), bool(other)) for one, other in values], alpha)
 
 
-def _crossed(found: Boundary, values: Sequence[Values]) -> tuple[int | None, str | None]:
-    """The pair after which a boundary was crossed, and for which checkpoint."""
-    for number, look in enumerate(found.looks):
-        if look.first > len(values):
-            break
-        first, second = _successes(values[: look.first])
-        # With a margin a boundary asks about its second arm: the plan's first checkpoint.
-        winner = found.winner(number, *((first, second) if found.margin is None else (second, first)))
+def _crossed(found: Boundary, given: Sequence[Sides]) -> tuple[int | None, str | None]:
+    """The block after which a boundary was crossed, and for which side."""
+    # With a margin a boundary asks about its second arm: the comparison's first.
+    sides = (0, 1) if found.margin is None else (1, 0)
+    totals = [(0, 0), (0, 0)]  # successes and trials
+    looks = {(look.first, look.second): number for number, look in enumerate(found.looks)}
+    for at, block in enumerate(given, start=1):
+        totals = [
+            (wins + sum(bool(v) for v in block[side]), trials + len(block[side]))
+            for side, (wins, trials) in zip(sides, totals, strict=True)
+        ]
+        number = looks.get((totals[0][1], totals[1][1]))
+        winner = None if number is None else found.winner(number, totals[0][0], totals[1][0])
         if winner:
-            return look.first, winner if found.margin is None else "first"
+            return at, winner if found.margin is None else "first"
     return None, None
-
-
-def _successes(values: Sequence[Values]) -> tuple[int, int]:
-    return sum(bool(one) for one, _ in values), sum(bool(other) for _, other in values)
 
 
 def _ahead(first: float, second: float) -> str:
     return "first" if first > second else "second"
+
+
+def alone(found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> tuple[Design, list[Block]]:
+    """One comparison of a paired design by itself, at its share of alpha, and the blocks that have both its arms.
+
+    For doubts about a design that dropped arms, whose later blocks lack some.
+    """
+    both = [block for block in blocks if {*pair} <= {arm for arm, _ in block}]
+    return replace(found, alpha=found.share, comparisons=(pair,), drops=False), both
+
+
+def of_so_many(found: Design, blocks: int) -> Design:
+    """The design of one comparison as it would have been for so many pairs, its looks beyond them left out."""
+    looks = looks_at(found) if found.rule in SHAPES else []
+    made = design(
+        rule=found.rule,
+        blocks=blocks,
+        alpha=found.alpha,
+        margin=found.margin,
+        outcome=found.outcome,
+        looks=[] if len(looks) == found.blocks else [look for look in looks if look <= blocks],
+    )
+    return replace(made, comparisons=found.comparisons)
+
+
+def in_blocks(values: Sequence[Values]) -> list[Block]:
+    """Paired blocks of two arms."""
+    return [((0, one), (1, other)) for one, other in values]
+
+
+def looks_at(found: Design) -> list[int]:
+    """Numbers of blocks after which its boundary is looked at; none without a boundary."""
+    looks = found.boundary.looks if found.boundary else ()
+    return [(look.first + look.second) // 2 for look in looks]  # a block of a comparison has two trials
 
 
 def table(found: Boundary) -> list[list[int]]:

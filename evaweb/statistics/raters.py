@@ -7,7 +7,7 @@ the same way, Krippendorff's alpha (2004) where ratings are missing.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Collection, Hashable, Sequence
 from itertools import permutations
 from typing import Literal
 
@@ -18,12 +18,16 @@ Metric = Literal["nominal", "interval"]
 
 
 def cohen_kappa(pairs: Sequence[tuple[Hashable, Hashable]]) -> float:
-    """Agreement of two raters on unordered categories, 1 where they always agree, about 0 where by chance."""
+    """Agreement of two raters on unordered categories, 1 where they always agree, about 0 where by chance.
+
+    StatisticsError where both always said the same word: chance alone would agree as often.
+    """
     _some(pairs)
     n = len(pairs)
     observed = sum(one == other for one, other in pairs) / n
     first, second = Counter(one for one, _ in pairs), Counter(other for _, other in pairs)
     chance = sum(first[name] * second[name] for name in first) / (n * n)
+    _varied({*first, *second})
     return _beyond(observed, chance)
 
 
@@ -41,6 +45,7 @@ def weighted_kappa(pairs: Sequence[tuple[int, int]], levels: int, weights: Weigh
     apart = {(i, j): _distance(i, j, levels, weights) for i in range(levels) for j in range(levels) if i != j}
     observed = sum(apart.get(pair, 0.0) for pair in pairs) / n
     expected = sum(apart[i, j] * first[i] * second[j] for i, j in apart) / (n * n)
+    _varied({*first, *second})
     return 1.0 if observed == 0 else 1 - observed / expected
 
 
@@ -50,7 +55,7 @@ def _distance(i: int, j: int, levels: int, weights: Weights) -> float:
 
 
 def gwet_ac1(pairs: Sequence[tuple[Hashable, Hashable]], categories: int = 2) -> float:
-    """Agreement of two raters that stays readable where one category is rare."""
+    """Agreement of two raters that stays readable where one category is rare; 1 where both always said the same."""
     _some(pairs)
     used = Counter(name for pair in pairs for name in pair)
     if len(used) > categories or categories < 2:
@@ -65,7 +70,10 @@ def gwet_ac1(pairs: Sequence[tuple[Hashable, Hashable]], categories: int = 2) ->
 
 
 def krippendorff_alpha(units: Sequence[Sequence[float | None]], metric: Metric = "nominal") -> float:
-    """Agreement of any number of raters; `units` are trials, each with what each rater said, None where nothing."""
+    """Agreement of any number of raters; `units` are trials, each with what each rater said, None where nothing.
+
+    StatisticsError where no value but one was ever said.
+    """
     rated = [[value for value in unit if value is not None] for unit in units]
     rated = [unit for unit in rated if len(unit) > 1]
     if not rated:
@@ -81,6 +89,7 @@ def krippendorff_alpha(units: Sequence[Sequence[float | None]], metric: Metric =
     totals: Counter[float] = Counter()
     for (one, _), weight in coincidences.items():
         totals[one] += weight
+    _varied(totals)
     n = sum(totals.values())
     observed = sum(weight * apart(*pair) for pair, weight in coincidences.items()) / n
     expected = sum(totals[one] * totals[other] * apart(one, other) for one in totals for other in totals) / (
@@ -92,6 +101,11 @@ def krippendorff_alpha(units: Sequence[Sequence[float | None]], metric: Metric =
 def _some(pairs: Sequence[object]) -> None:
     if not pairs:
         raise StatisticsError("no trial was rated by both")
+
+
+def _varied(used: Collection[object]) -> None:
+    if len(used) < 2:
+        raise StatisticsError(f"all ratings say {next(iter(used))!r}: how often chance agrees is not defined")
 
 
 def _beyond(observed: float, chance: float) -> float:

@@ -14,6 +14,7 @@ from django.http import HttpRequest
 from django.urls import reverse
 from django.utils.html import format_html
 
+from evaweb.administration import LabelledRows
 from evaweb.trials.models import (
     Checkpoint,
     Evaluation,
@@ -25,6 +26,7 @@ from evaweb.trials.models import (
     Score,
     Trial,
 )
+from evaweb.trials.tables import check_milestones
 from runtime.core import bounded_documents as bounded
 
 LONGEST_TABLE = 64 * 1024  # characters; a station takes no more
@@ -32,7 +34,7 @@ _SHORT = {models.TextField: {"widget": forms.Textarea(attrs={"rows": 2, "cols": 
 
 
 class Table(forms.JSONField):
-    """JSON that says where it cannot be read."""
+    """JSON that says where it cannot be read; every field for JSON is one, for Django's own reads to any depth."""
 
     widget = forms.Textarea(attrs={"rows": 3, "cols": 60, "spellcheck": "false", "class": "mono"})
 
@@ -85,10 +87,28 @@ class PositionInline(admin.StackedInline):
         return super().get_formset(request, obj, **{"validate_min": True, **named})
 
 
+class MilestoneFormSet(forms.BaseInlineFormSet):
+    """Milestones of a scene; one that had the same words twice before may keep them."""
+
+    def add_fields(self, form: forms.BaseForm, index: int | None) -> None:
+        """Django's table has its heads as the only labels, which no reader of screens finds."""
+        super().add_fields(form, index)
+        for name, field in form.fields.items():
+            field.widget.attrs.setdefault("aria-label", str(field.label or name))
+
+    def clean(self) -> None:
+        """Different words for each, where any were changed."""
+        super().clean()
+        rows = [form for form in self.forms if form not in self.deleted_forms]
+        if any("text" in form.changed_data for form in rows):
+            check_milestones([text for form in rows if (text := form.cleaned_data.get("text"))])
+
+
 class MilestoneInline(admin.TabularInline):
     """Milestones of a scene."""
 
     model = Milestone
+    formset = MilestoneFormSet
     extra = 0
     fields = ("order", "text", "points", "required", "time_limit_s", "truth")
 
@@ -179,7 +199,7 @@ class SceneAdmin(ActiveActions, admin.ModelAdmin):
 
 
 @admin.register(FailureTerm)
-class FailureTermAdmin(ActiveActions, admin.ModelAdmin):
+class FailureTermAdmin(LabelledRows, ActiveActions, admin.ModelAdmin):
     """The taxonomy of failures; scores keep its words, whatever becomes of them here."""
 
     list_display = ("words", "level", "shortcut", "order", "active")

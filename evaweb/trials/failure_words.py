@@ -5,6 +5,11 @@ from __future__ import annotations
 NOT_SAID = "not said"
 
 
+def is_not_said(words: str) -> bool:
+    """True if these words stand for none."""
+    return words.strip().casefold() == NOT_SAID
+
+
 def why_words(phase: str, cause: str) -> str:
     """ "grasp: dropped"; what was not said is left out."""
     return ": ".join(filter(None, (phase, cause)))

@@ -7,8 +7,23 @@ from dataclasses import dataclass
 
 from evaweb.errors import EvaError
 from evaweb.journal import text
+from evaweb.trials.failure_words import is_not_said
 from evaweb.trials.models import FailureTerm, Scene, Score
 from evaweb.trials.verdicts import LONGEST_FAILURE
+from runtime.core.sentences import Pattern
+
+_ALLOWED_OTHER_WORDS_NONE_WHERE = Pattern(
+    "trials.failures.allowed_other_words_none_where",
+    "{field} = {words!r}; allowed: other words, or none where nothing is said of it",
+)
+_BUT_TRIAL_SUCCESS_LEAVE_EMPTY = Pattern(
+    "trials.failures.but_trial_success_leave_empty",
+    "{field} = {words!r} but the trial is a success: leave {field} empty",
+)
+_MISSING_SCENE_WANTS_EVERY_FAILED = Pattern(
+    "trials.failures.missing_scene_wants_every_failed",
+    "{field} is missing: scene {name} wants it of every failed trial; allowed: {allowed}",
+)
 
 FIELDS = {"failure_phase": FailureTerm.Level.PHASE, "failure": FailureTerm.Level.CAUSE}
 """What scores, forms and REST call each level."""
@@ -66,10 +81,14 @@ def in_order() -> Mapping[str, tuple[str, ...]]:
 
 def stripped(*, failure_phase: str, failure: str) -> dict[str, str]:
     """Both as they are kept; EvaError where they cannot be."""
-    return {
+    found = {
         "failure": text("failure", failure, LONGEST_FAILURE),
         "failure_phase": text("failure_phase", failure_phase, LONGEST_FAILURE),
     }
+    for field, words in found.items():
+        if is_not_said(words):
+            raise EvaError(_ALLOWED_OTHER_WORDS_NONE_WHERE(field=field, words=words))
+    return found
 
 
 def check_failure(
@@ -87,7 +106,7 @@ def check_failure(
     """
     for field in FIELDS if success else ():
         if words[field]:
-            raise EvaError(f"{field} = {words[field]!r} but the trial is a success: leave {field} empty")
+            raise EvaError(_BUT_TRIAL_SUCCESS_LEAVE_EMPTY(field=field, words=words[field]))
     wanted = scene.failure_required and by_person and not success
     if not (wanted or any(words[field] for field in FIELDS)):
         return
@@ -96,8 +115,7 @@ def check_failure(
         value, allowed = words[field], offers.get(field, [])
         if wanted and allowed and not value:
             raise EvaError(
-                f"{field} is missing: scene {scene.name} wants it of every failed trial; allowed: "
-                f"{', '.join(allowed)}"
+                _MISSING_SCENE_WANTS_EVERY_FAILED(field=field, name=scene.name, allowed=", ".join(allowed))
             )
         listed = wanted or field == "failure_phase" or words["failure_phase"]
         if listed and value and value not in allowed:

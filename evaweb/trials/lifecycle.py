@@ -6,6 +6,12 @@ from enum import StrEnum
 
 from evaweb.errors import Conflict
 from evaweb.trials.models import Trial, TrialStatus
+from runtime.core.sentences import Pattern
+
+_TRIAL_CANNOT = Pattern(
+    "trials.lifecycle.trial_cannot",
+    "trial {trial} is {label} and cannot be {move}: {advice}",
+)
 
 
 class Move(StrEnum):
@@ -83,7 +89,7 @@ def require(trial: Trial, move: Move) -> None:
     """Raise Conflict, with what can be done instead, unless the table has `move` for this trial."""
     if not allows(trial, move):
         status = TrialStatus(trial.status)
-        raise Conflict(f"trial {trial.pk} is {status.label} and cannot be {move}: {advice(status)}")
+        raise Conflict(_TRIAL_CANNOT(trial=trial.pk, label=status.label, move=move, advice=advice(status)))
 
 
 def apply(trial: Trial, move: Move) -> None:

@@ -6,28 +6,24 @@ import uuid
 
 from django.conf import settings
 from django.core.exceptions import ValidationError
-from django.core.validators import (
-    MaxValueValidator,
-    MinValueValidator,
-    ProhibitNullCharactersValidator,
-    RegexValidator,
-)
+from django.core.validators import MaxValueValidator, MinValueValidator, RegexValidator
 from django.db import models
 from django.db.models.functions import Lower
 from django.utils import timezone
 
 from evaweb.append_only import AppendOnly
 from evaweb.episodes.models import Episode
+from evaweb.names import check_name
 from evaweb.stations.models import Station
 from evaweb.trials.failure_words import why_words
-from evaweb.trials.tables import check_bench, check_policy, check_tags
+from evaweb.trials.tables import check_bench, check_policy, check_tags, check_term
 
 
 class Scene(models.Model):
     """A task on a bench: what the robot is told, how the bench is laid out, what counts as success."""
 
     name = models.SlugField(max_length=60, unique=True, help_text="Short name for addresses and exports.")
-    title = models.CharField(max_length=120)
+    title = models.CharField(max_length=120, validators=[check_name])
     instruction = models.TextField(help_text="The words the policy is given.")
     criterion = models.TextField(
         blank=True, help_text="When is it a success? Written down before the first trial."
@@ -63,7 +59,7 @@ class Position(models.Model):
 
     scene = models.ForeignKey(Scene, on_delete=models.CASCADE, related_name="positions")
     number = models.PositiveSmallIntegerField()
-    label = models.CharField(max_length=120, blank=True)
+    label = models.CharField(max_length=120, blank=True, validators=[check_name])
     description = models.TextField(blank=True, help_text="Where things stand, in words.")
     bench = models.JSONField(
         null=True,
@@ -85,7 +81,7 @@ class Milestone(models.Model):
 
     scene = models.ForeignKey(Scene, on_delete=models.CASCADE, related_name="milestones")
     order = models.PositiveSmallIntegerField()
-    text = models.CharField(max_length=200)
+    text = models.CharField(max_length=200, validators=[check_name])
     points = models.PositiveSmallIntegerField(
         default=1, validators=[MinValueValidator(1), MaxValueValidator(100)]
     )
@@ -130,7 +126,7 @@ class FailureTerm(models.Model):
 
     level = models.CharField(max_length=5, choices=Level)
     words = models.CharField(
-        max_length=60, validators=[ProhibitNullCharactersValidator()], help_text="As scores have it."
+        max_length=60, validators=[check_name, check_term], help_text="As scores have it."
     )
     key = models.CharField(
         max_length=1,
@@ -175,7 +171,7 @@ class FailureTerm(models.Model):
 class Checkpoint(models.Model):
     """A trained policy: which weights, trained on from what, and how it is reached."""
 
-    name = models.CharField(max_length=120, unique=True)
+    name = models.CharField(max_length=120, unique=True, validators=[check_name])
     description = models.TextField(blank=True, help_text="Trained on what, for how long, by whom.")
     digest = models.CharField(
         "digest of the weights",
@@ -420,6 +416,7 @@ class Trial(models.Model):
             models.Index(fields=("status", "scene", "checkpoint")),
             models.Index(fields=("station", "status")),
             models.Index(fields=("station", "-changed_at")),
+            models.Index(fields=("-changed_at", "-id"), name="trial_changed"),
             models.Index(fields=("station", "-prepared_at")),
             models.Index(fields=("-prepared_at", "-id"), name="trial_newest"),
         ]

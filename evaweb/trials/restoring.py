@@ -46,9 +46,18 @@ from evaweb.trials.record import (
     VoidRequestLine,
     asked_trial,
 )
+from runtime.core.sentences import Pattern
 from runtime.recording.reader import read_events
 
 log = logging.getLogger(__name__)
+_SCORES_SEVERAL_TRIALS = Pattern(
+    "trials.restoring.scores_several_trials",
+    "its scores are of several trials: {named}",
+)
+_TRIAL_HAS_EPISODE_CANNOT_HAVE = Pattern(
+    "trials.restoring.trial_has_episode_cannot_have",
+    "trial {trial} has episode {episode_id}, and cannot have another one",
+)
 
 _BEHIND = (*lifecycle.OPEN, TrialStatus.ABANDONED)  # what a trial with a closed recording cannot be
 _GHOST_S = 0.1  # the clock of a run that never began stood at a few hundredths of a second
@@ -107,7 +116,7 @@ def _facts(lines: Sequence[Judgement], asked: Mapping[str, Any]) -> TrialRecord 
     """The newest line knows most of its trial; without one it is as its run was asked for."""
     named = {line.trial.uuid for line in lines}
     if len(named) > 1:
-        raise EvaError(f"its scores are of several trials: {', '.join(sorted(map(str, named)))}")
+        raise EvaError(_SCORES_SEVERAL_TRIALS(named=", ".join(sorted(map(str, named)))))
     return lines[-1].trial if lines else asked_trial(asked)
 
 
@@ -120,7 +129,7 @@ def _trial(facts: TrialRecord, kept: Kept, episode: Episode | None) -> tuple[Tri
     if trial is None:
         return _made(facts, _episode(facts, kept, episode)), True
     if kept.uuid not in (trial.uuid, trial.episode_id or kept.uuid):
-        raise EvaError(f"trial {trial.pk} has episode {trial.episode_id}, and cannot have another one")
+        raise EvaError(_TRIAL_HAS_EPISODE_CANNOT_HAVE(trial=trial.pk, episode_id=trial.episode_id))
     if trial.status in _BEHIND:
         for name, value in _course(facts, _episode(facts, kept, episode)).items():
             setattr(trial, name, value)

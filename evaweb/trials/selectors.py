@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, time
+from datetime import UTC, datetime, time, timedelta
 from typing import TypeVar
 
-from django.db.models import Count, Max, Model, Prefetch, Q, QuerySet, Sum, TextField
+from django.db.models import Count, Model, Prefetch, Q, QuerySet, TextField
 from django.db.models.functions import Cast
 from django.utils import timezone
 from django.utils.dateparse import parse_date, parse_datetime
 
 from evaweb.blinding import EVERYTHING, Sight
-from evaweb.episodes.models import Episode
 from evaweb.errors import EvaError, NotFound
-from evaweb.memo import Kept, steady
+from evaweb.memo import Kept
 from evaweb.stations.models import Command, Station
 from evaweb.statistics.proportions import Summary, summary
 from evaweb.trials import lifecycle
@@ -30,6 +29,26 @@ from evaweb.trials.models import (
     Trial,
     TrialStatus,
     VoidRequest,
+)
+from runtime.core.sentences import Pattern
+
+_POSITION_SCENE_DOES_NOT_EXIST = Pattern(
+    "trials.selectors.position_scene_does_not_exist",
+    "position {number} of scene {name} does not exist; there are: {known}",
+)
+_DOES_NOT_EXIST_THERE = Pattern(
+    "trials.selectors.does_not_exist_there",
+    "{kind} {name!r:.80} does not exist; there are: {known}",
+)
+_TRIAL_DOES_NOT_EXIST = Pattern("trials.selectors.trial_does_not_exist", "trial {identity} does not exist")
+_STATUS_ALLOWED = Pattern("trials.selectors.status_allowed", "status = {given!r:.80}; allowed: {values}")
+_SINCE_ALLOWED_DAY_SUCH_AS = Pattern(
+    "trials.selectors.since_allowed_day_such_as",
+    "since = {given!r:.80}; allowed: a day such as 2026-01-31, or a time such as 2026-01-31T08:00:00Z",
+)
+_SINCE_THERE_NO_SUCH_TIME = Pattern(
+    "trials.selectors.since_there_no_such_time",
+    "since = {given!r:.80}: there is no such time in UTC",
 )
 
 UNFINISHED = (*lifecycle.OPEN, TrialStatus.ENDED)
@@ -59,7 +78,7 @@ def position_get(*, scene: Scene, number: int) -> Position:
     found = scene.positions.filter(number=number).first()
     if found is None:
         known = ", ".join(map(str, scene.positions.values_list("number", flat=True))) or "none yet"
-        raise NotFound(f"position {number} of scene {scene.name} does not exist; there are: {known}")
+        raise NotFound(_POSITION_SCENE_DOES_NOT_EXIST(number=number, name=scene.name, known=known))
     return found
 
 
@@ -69,7 +88,7 @@ def _by_name(rows: QuerySet[_Named], kind: str, name: str | int) -> _Named:
         found = rows.filter(pk=int(name)).first()
     if found is None:
         known = ", ".join(dict.fromkeys(rows.values_list("name", flat=True))) or "none yet"
-        raise NotFound(f"{kind} {str(name)!r:.80} does not exist; there are: {known}")
+        raise NotFound(_DOES_NOT_EXIST_THERE(kind=kind, name=str(name), known=known))
     return found
 
 
@@ -122,7 +141,7 @@ def trial_get(*, id: int) -> Trial:
         else None
     )
     if found is None:
-        raise NotFound(f"trial {id} does not exist")
+        raise NotFound(_TRIAL_DOES_NOT_EXIST(identity=id))
     return found
 
 
@@ -219,7 +238,7 @@ def statistics(filters: TrialFilters | None = None, sight: Sight = EVERYTHING) -
     """
     which = filters or TrialFilters()
     trials = which.apply(sight.open(Trial.objects.order_by()), sight)
-    cells = _summaries.get((which, sight.checkpoints), _fingerprint(trials), lambda: _summarised(trials))
+    cells = _cells(trials)
     others = _other_counts(trials)
     keys = {*cells, *others}
     scenes = Scene.objects.in_bulk({scene for scene, _ in keys})
@@ -239,23 +258,62 @@ def statistics(filters: TrialFilters | None = None, sight: Sight = EVERYTHING) -
 
 
 _Cell = tuple[int, int]  # scene, checkpoint
+_Row = tuple[int, datetime, int, int]  # trial, its last change, scene, checkpoint
 _Outcome = tuple[bool, float, float | None, float | None]  # success, score, seconds, smoothness
-_summaries: Kept[dict[_Cell, Summary]] = Kept()
+_LATE = timedelta(minutes=10)  # a change may be seen so long after its time: clocks differ, transactions last
+_MOST_CHANGED = 2000  # beyond which all cells are made anew
 
 
-def _fingerprint(trials: QuerySet[Trial]) -> Hashable:
-    """Changes whenever a summary of these trials would."""
-    scored = Q(status=TrialStatus.SCORED)
-    counted = trials.aggregate(
-        n=Count("pk", filter=scored),
-        verdicts=Sum("verdict_id", filter=scored),
-        newest=Max("verdict_id", filter=scored),
-        seconds=Sum("duration_s", filter=scored),
-        changed=Max("changed_at"),
-    )
-    measured = Episode.objects.filter(smoothness__isnull=False).count()  # of all: no join over every trial
-    counted["seconds"] = steady(counted["seconds"])
-    return (*counted.values(), measured)
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Cells as they were made, and the changes of trials that had been seen by then."""
+
+    cells: dict[_Cell, Summary]
+    newest: datetime | None
+    recent: frozenset[_Row]
+
+
+_known: Kept[_Known] = Kept()
+
+
+def forget() -> None:
+    """Drop what is kept, as where the database was exchanged."""
+    _known.clear()
+
+
+def _cells(trials: QuerySet[Trial]) -> dict[_Cell, Summary]:
+    """Summaries of the scored among these trials, which the query tells by their own columns alone.
+
+    Whatever a summary is made of, its trial was saved with it, or is marked as changed. The query is what they are kept
+    by, with the ids of what was named: a name may come to mean another row.
+    """
+    return _known.renew(str(trials.query), lambda before: _brought_up(before, trials)).cells
+
+
+def _brought_up(before: _Known | None, trials: QuerySet[Trial]) -> _Known:
+    """Only cells with trials that were changed since are made anew."""
+    since = before.newest - _LATE if before and before.newest else None
+    rows = Trial.objects.order_by("-changed_at", "-pk")
+    named = rows.values_list("pk", "changed_at", "scene_id", "checkpoint_id")
+    # Before the cells are read: what is changed meanwhile is then seen the next time.
+    seen = list((named if since is None else named.filter(changed_at__gte=since))[: _MOST_CHANGED + 1])
+    newest = seen[0][1] if seen else None
+    recent = frozenset(row for row in seen if newest and row[1] >= newest - _LATE)
+    if before is None or since is None or len(seen) > _MOST_CHANGED or not _same(before.recent, seen):
+        cells = _summarised(trials)
+    else:
+        changed = {(scene, checkpoint) for _, _, scene, checkpoint in set(seen) - before.recent}
+        cells = {cell: kept for cell, kept in before.cells.items() if cell not in changed}
+        for scene, checkpoint in changed:
+            cells |= _summarised(trials.filter(scene=scene, checkpoint=checkpoint))
+    return _Known(cells, newest, recent)
+
+
+def _same(before: Collection[_Row], seen: Collection[_Row]) -> bool:
+    """False where a trial is gone or another one: the database was lost, or its clock went back."""
+    return {(pk, scene, checkpoint) for pk, _, scene, checkpoint in before} <= {
+        (pk, scene, checkpoint) for pk, _, scene, checkpoint in seen
+    }
 
 
 def _summarised(trials: QuerySet[Trial]) -> dict[_Cell, Summary]:
@@ -294,7 +352,7 @@ def _summary(outcomes: Sequence[_Outcome]) -> Summary:
 
 def _status(given: str) -> str:
     if given not in TrialStatus.values:
-        raise EvaError(f"status = {given!r:.80}; allowed: {', '.join(TrialStatus.values)}")
+        raise EvaError(_STATUS_ALLOWED(given=given, values=", ".join(TrialStatus.values)))
     return given
 
 
@@ -307,11 +365,9 @@ def _since(given: str) -> datetime:
     if day is not None:
         moment = datetime.combine(day, time.min)
     if moment is None:
-        raise EvaError(
-            f"since = {given!r:.80}; allowed: a day such as 2026-01-31, or a time such as 2026-01-31T08:00:00Z"
-        )
+        raise EvaError(_SINCE_ALLOWED_DAY_SUCH_AS(given=given))
     try:
         moment = moment if timezone.is_aware(moment) else timezone.make_aware(moment)
         return moment.astimezone(UTC)
     except OverflowError:  # at an end of the calendar: no time in another zone
-        raise EvaError(f"since = {given!r:.80}: there is no such time in UTC") from None
+        raise EvaError(_SINCE_THERE_NO_SUCH_TIME(given=given)) from None

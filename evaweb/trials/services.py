@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 from uuid import UUID
@@ -24,6 +24,7 @@ from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import (
     Checkpoint,
     Evaluation,
+    Milestone,
     MilestoneOutcome,
     Position,
     Scene,
@@ -35,6 +36,51 @@ from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, file_of
 from evaweb.trials.selectors import attempts_of, trial_open
 from evaweb.trials.station_events import run_changed
 from evaweb.trials.verdicts import LONGEST_NOTE, Verdict, verdict
+from runtime.core.sentences import Pattern
+
+_PREPARED_AT_ONCE = Pattern(
+    "trials.services.prepared_at_once",
+    "others prepare trials of {checkpoint} at {scene} at the same moment: try again",
+)
+_SWITCHED_OFF = Pattern(
+    "trials.services.switched_off",
+    "{kind} {name} is switched off{why}: choose another, or ask an administrator",
+)
+_POSITION_OF_ANOTHER_SCENE = Pattern(
+    "trials.services.position_of_another_scene",
+    "position {position} is not one of scene {name}",
+)
+_SEED = Pattern("trials.services.seed", "seed = {seed}; allowed: 0 to {highest_seed}")
+_UNFINISHED = Pattern(
+    "trials.services.unfinished",
+    "trial {trial} of {name} is {label}: {advice}, then prepare the next one",
+)
+_SOURCE = Pattern("trials.services.source", "source = {source!r}; allowed: {values}")
+_UUID_OF_ANOTHER_SCORE = Pattern(
+    "trials.services.uuid_of_another_score",
+    "uuid {uuid} is that of another score (trial {trial_id}): give each its own",
+)
+_SCORED_ALREADY = Pattern(
+    "trials.services.scored_already",
+    "trial {trial} has a score already: to correct it, give a reason; both stay in the record",
+)
+_REPEATED_SINCE = Pattern(
+    "trials.services.repeated_since",
+    "trial {trial} was interrupted and has been repeated since: its repetition counts; score that one",
+)
+_ANOTHER_COUNTS = Pattern(
+    "trials.services.another_counts",
+    "trial {other} counts in place of trial {trial}: void this one with a reason",
+)
+_NEVER_RAN = Pattern(
+    "trials.services.never_ran",
+    "trial {trial} cannot be scored: {unrecorded}; what never ran is voided with a reason and repeated as "
+    "a new attempt",
+)
+_NO_REASON = Pattern(
+    "trials.services.no_reason",
+    "reason is empty: {when} only with a reason that others can read",
+)
 
 __all__ = [
     "checked",
@@ -57,6 +103,8 @@ _TRIES = 5  # to get a number that nobody else takes at the same moment
 
 def declare_check(check: Check) -> None:
     """`check` is asked before a trial is "run", "scored", "voided" or the like, with the trial and the user.
+
+    Before a correction that leaves success and milestones as they were it is asked of "scored", then of "reworded".
 
     It raises EvaError.
     """
@@ -99,7 +147,7 @@ def trial_prepare(
                 return _prepared(user, station, scene, position, checkpoint, seed)
         except IntegrityError:
             continue  # somebody took the number, or the station: both are looked at anew
-    raise Conflict(f"others prepare trials of {checkpoint} at {scene} at the same moment: try again")
+    raise Conflict(_PREPARED_AT_ONCE(checkpoint=checkpoint, scene=scene))
 
 
 def open_bench(station: Station) -> Evaluation:
@@ -118,11 +166,11 @@ def _check_choice(
     for kind, name, chosen in (*named, ("checkpoint", checkpoint.name, checkpoint)):
         if not chosen.active:
             why = f" ({station.message})" if chosen is station and station.message else ""
-            raise Conflict(f"{kind} {name} is switched off{why}: choose another, or ask an administrator")
+            raise Conflict(_SWITCHED_OFF(kind=kind, name=name, why=why))
     if position.scene_id != scene.pk:
-        raise NotFound(f"position {position.pk} is not one of scene {scene.name}")
+        raise NotFound(_POSITION_OF_ANOTHER_SCENE(position=position.pk, name=scene.name))
     if seed is not None and not 0 <= seed <= HIGHEST_SEED:
-        raise EvaError(f"seed = {seed}; allowed: 0 to {HIGHEST_SEED}")
+        raise EvaError(_SEED(seed=seed, highest_seed=HIGHEST_SEED))
 
 
 def _prepared(
@@ -180,8 +228,9 @@ def trial_create(
     if unfinished is not None:
         status = TrialStatus(unfinished.status)
         raise Conflict(
-            f"trial {unfinished.pk} of {station.name} is {status.label}: {lifecycle.advice(status)}, "
-            "then prepare the next one"
+            _UNFINISHED(
+                trial=unfinished.pk, name=station.name, label=status.label, advice=lifecycle.advice(status)
+            )
         )
     if seed is None and station.simulated:
         seed = seed_of(scene, position, number)
@@ -238,15 +287,15 @@ def trial_score(
     """Add a score; of a trial that has one it is a correction, needs a reason, and counts from then on.
 
     `milestones`: id -> reached, for every milestone of the scene; `times`: id -> when [s after the start of the run],
-    as far as known. What `failure` and `failure_phase` may be says `failures.check_failure`. Disk first, then the row,
-    then publication.
+    as far as known; a correction without `times` keeps those of the score that stood. What `failure` and
+    `failure_phase` may be says `failures.check_failure`. Disk first, then the row, then publication.
 
     The same `uuid` again, or without one word by word what this rater said and counts already, is the first score,
     whose answer was lost: nothing is added. Conflict for a uuid that is another score's.
     """
     require(user, Role.OPERATOR)
     if source not in Score.Source.values:
-        raise EvaError(f"source = {source!r}; allowed: {', '.join(Score.Source.values)}")
+        raise EvaError(_SOURCE(source=source, values=", ".join(Score.Source.values)))
     words = {
         "note": text("note", note, LONGEST_NOTE),
         **failures.stripped(failure_phase=failure_phase, failure=failure),
@@ -256,16 +305,15 @@ def trial_score(
     with transaction.atomic():
         held = locked(trial)
         rows = list(held.scene.milestones.order_by("order"))
-        judged = partial(verdict, rows, milestones, success, times=times, ordered=held.scene.ordered)
+        when = _times_before(held, rows, milestones) if times is None else times
+        judged = partial(verdict, rows, milestones, success, times=when, ordered=held.scene.ordered)
         said = {"rater": user, "source": source, **words}
         first = held.verdict if uuid is None else Score.objects.filter(uuid=identity_of(uuid)).first()
         if first is not None and first.trial == held and _says(first, said, judged()):
             return first
         if first is not None and uuid is not None:
-            raise Conflict(
-                f"uuid {uuid} is that of another score (trial {first.trial_id}): give each its own"
-            )
-        _check_scorable(held, words["reason"])
+            raise Conflict(_UUID_OF_ANOTHER_SCORE(uuid=uuid, trial_id=first.trial_id))
+        require_scorable(held, words["reason"])
         found = judged()
         failures.check_failure(
             held.scene,
@@ -274,10 +322,10 @@ def trial_score(
             by_person=source == Score.Source.HUMAN,
             said=failures.said_of(held.verdict),
         )
+        if held.status == TrialStatus.SCORED and _judges_alike(held.verdict, found):
+            checked("reworded", held, user)
         score = Score(uuid=identity_of(uuid), trial=held, success=found.success, score=found.score, **said)
-        _keep(held, score, found)
-        publish(held)
-        settled(held, user)
+        counts_now(held, score, _outcomes(score, found), user)
     trial.refresh_from_db()
     return score
 
@@ -324,23 +372,42 @@ def _says(score: Score, said: Mapping[str, Any], found: Verdict) -> bool:
     return same and words and score.success == found.success
 
 
-def _check_scorable(trial: Trial, reason: str) -> None:
+def _judges_alike(score: Score | None, found: Verdict) -> bool:
+    """True if that score has the same milestones and success: what is new are words."""
+    if score is None or score.success != found.success:
+        return False
+    said = dict(score.outcomes.values_list("milestone_id", "reached"))
+    return said == {milestone.pk: reached for milestone, reached, _ in found.reached}
+
+
+def _times_before(
+    trial: Trial, milestones: Sequence[Milestone], ticks: Mapping[object, object]
+) -> dict[object, float]:
+    """Times of the score that stands, of what is ticked still; none where the scene as it is now forbids them."""
+    outcomes = trial.verdict.outcomes.exclude(at_s=None) if trial.verdict else ()
+    known = {outcome.milestone_id: outcome.at_s for outcome in outcomes if outcome.reached}
+    ticked = {str(key) for key, reached in ticks.items() if reached is True}
+    kept = [(row, known[row.pk]) for row in milestones if row.pk in known and str(row.pk) in ticked]
+    late = any(row.time_limit_s is not None and at > row.time_limit_s for row, at in kept)
+    times = [at for _, at in kept]
+    return (
+        {} if late or (trial.scene.ordered and sorted(times) != times) else {row.pk: at for row, at in kept}
+    )
+
+
+def require_scorable(trial: Trial, reason: str) -> None:
+    """Conflict or EvaError says why a score, a correction for that `reason`, cannot be added."""
     lifecycle.require(trial, Move.SCORE)
     if trial.status == TrialStatus.SCORED and not reason:
-        raise EvaError(
-            f"trial {trial.pk} has a score already: to correct it, give a reason; both stay in the record"
-        )
+        raise EvaError(_SCORED_ALREADY(trial=trial.pk))
     if trial.status == TrialStatus.INTERRUPTED and _repeated(trial):
-        raise Conflict(
-            f"trial {trial.pk} was interrupted and has been repeated since: its repetition counts; "
-            "score that one"
-        )
+        raise Conflict(_REPEATED_SINCE(trial=trial.pk))
+    other = attempts_of(trial=trial).filter(status=TrialStatus.SCORED).exclude(pk=trial.pk).first()
+    if other is not None:  # as where this one had been given up, and its run turns out to have been accepted
+        raise Conflict(_ANOTHER_COUNTS(other=other.pk, trial=trial.pk))
     unrecorded = "" if trial.status == TrialStatus.SCORED else unrecorded_because(episode=trial.episode)
     if unrecorded:
-        raise Conflict(
-            f"trial {trial.pk} cannot be scored: {unrecorded}; what never ran is voided with a reason and repeated as "
-            "a new attempt"
-        )
+        raise Conflict(_NEVER_RAN(trial=trial.pk, unrecorded=unrecorded))
 
 
 def _repeated(trial: Trial) -> bool:
@@ -348,8 +415,8 @@ def _repeated(trial: Trial) -> bool:
     return bool(newest > trial.attempt)
 
 
-def _keep(trial: Trial, score: Score, found: Verdict) -> None:
-    outcomes = [
+def _outcomes(score: Score, found: Verdict) -> list[MilestoneOutcome]:
+    return [
         MilestoneOutcome(
             score=score,
             milestone=milestone,
@@ -362,6 +429,10 @@ def _keep(trial: Trial, score: Score, found: Verdict) -> None:
         )
         for milestone, reached, at in found.reached
     ]
+
+
+def counts_now(trial: Trial, score: Score, outcomes: Sequence[MilestoneOutcome], user: User) -> None:
+    """Keep a new score with its outcomes, which counts from then on: disk first, then the rows, then publication."""
     milestones = [OutcomeLine.written(outcome) for outcome in outcomes]
     JUDGEMENTS.append(file_of(trial), ScoreLine.written(score, milestones=milestones))
     score.save()
@@ -369,10 +440,12 @@ def _keep(trial: Trial, score: Score, found: Verdict) -> None:
     lifecycle.apply(trial, Move.SCORE)
     trial.verdict = score
     trial.save()
+    publish(trial)
+    settled(trial, user)
 
 
 def reason_given(reason: str, when: str) -> str:
     why = text("reason", reason, LONGEST_NOTE)
     if not why:
-        raise EvaError(f"reason is empty: {when} only with a reason that others can read")
+        raise EvaError(_NO_REASON(when=when))
     return why

@@ -25,6 +25,46 @@ from evaweb.trials.models import Checkpoint, Trial, TrialStatus
 from evaweb.trials.record import TrialRecord
 from evaweb.trials.services import checked
 from evaweb.trials.station_events import run_begun
+from evaweb.trials.tables import simulated_bench
+from runtime.core.sentences import Pattern, fixed
+
+_CHECKPOINT_OF_SETUP_ALONE = Pattern(
+    "trials.station_commands.checkpoint_of_setup_alone",
+    "{kind} takes no checkpoint: setup does",
+)
+_NAMED_TWICE = fixed(
+    "trials.station_commands.named_twice",
+    "args say policy or checkpoint beside the checkpoint that is named: give one of them",
+)
+_CHECKPOINT_OFF = Pattern(
+    "trials.station_commands.checkpoint_off",
+    "checkpoint {name} is switched off: choose another one",
+)
+_NOT_IN_THIS_STATE = Pattern(
+    "trials.station_commands.not_in_this_state",
+    "trial {trial} is {label} and cannot be {what}: {advice}; a repetition is another trial",
+)
+_CHECKPOINT_OFF_SINCE = Pattern(
+    "trials.station_commands.checkpoint_off_since",
+    "checkpoint {label} was switched off since trial {trial} was prepared: abandon it, and choose another one",
+)
+_NOT_SET_UP = Pattern(
+    "trials.station_commands.not_set_up",
+    "trial {trial} is not set up: press Set up, then Run",
+)
+_SET_UP_FOR_ELSE = Pattern(
+    "trials.station_commands.set_up_for_else",
+    "{name} was set up for something else since trial {trial} was: press Set up again",
+)
+_SET_UP_BY_SOMEONE = Pattern(
+    "trials.station_commands.set_up_by_someone",
+    "{name} was set up for {other} by someone else, not for {label}: press Set up again",
+)
+_UUID_OF_ANOTHER = Pattern(
+    "trials.station_commands.uuid_of_another",
+    "uuid {uuid} is that of another command ({first}), which was not for trial {trial}; each needs one of "
+    "its own",
+)
 
 
 def trial_command(
@@ -69,11 +109,11 @@ def checkpoint_command(
     """Set a station up for a checkpoint, for no trial; `given` as in `issue`. Raises EvaError for other commands."""
     require(user, Role.OPERATOR)
     if kind != "setup":
-        raise EvaError(f"{kind} takes no checkpoint: setup does")
+        raise EvaError(_CHECKPOINT_OF_SETUP_ALONE(kind=kind))
     if "policy" in (args or {}) or "checkpoint" in (args or {}):
-        raise EvaError("args say policy or checkpoint beside the checkpoint that is named: give one of them")
+        raise EvaError(_NAMED_TWICE)
     if not checkpoint.active:
-        raise Conflict(f"checkpoint {checkpoint.name} is switched off: choose another one")
+        raise Conflict(_CHECKPOINT_OFF(name=checkpoint.name))
     return issue(
         user=user, kind=kind, args={**(args or {}), **_policy_args(checkpoint)}, vouched=TABLES, **given
     )
@@ -103,7 +143,8 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
     for least in (found for find in _least if (found := find(trial))):
         args["least"] = dict(least)
     if trial.station.simulated and trial.seed is not None:
-        args["bench"] = {"id": str(reset), "seed": trial.seed, "positions": trial.position.bench}
+        laid = simulated_bench(trial.position.bench)
+        args["bench"] = {"id": str(reset), "seed": trial.seed, "positions": laid}
     return args
 
 
@@ -166,14 +207,10 @@ def _require_prepared(trial: Trial, what: str, user: User) -> None:
     status = TrialStatus(_held_status(trial))
     if status is not TrialStatus.PREPARED:
         raise Conflict(
-            f"trial {trial.pk} is {status.label} and cannot be {what}: {lifecycle.advice(status)}; "
-            "a repetition is another trial"
+            _NOT_IN_THIS_STATE(trial=trial.pk, label=status.label, what=what, advice=lifecycle.advice(status))
         )
     if not trial.checkpoint.active:
-        raise Conflict(
-            f"checkpoint {sight_of(user).label(trial)} was switched off since trial {trial.pk} was prepared: "
-            "abandon it, and choose another one"
-        )
+        raise Conflict(_CHECKPOINT_OFF_SINCE(label=sight_of(user).label(trial), trial=trial.pk))
 
 
 def _require_set_up(trial: Trial) -> None:
@@ -181,11 +218,9 @@ def _require_set_up(trial: Trial) -> None:
     last = last_set_up(station=trial.station)
     mine = Trial.objects.values_list("setup", flat=True).get(pk=trial.pk)
     if mine is None:
-        raise Conflict(f"trial {trial.pk} is not set up: press Set up, then Run")
+        raise Conflict(_NOT_SET_UP(trial=trial.pk))
     if last != mine:
-        raise Conflict(
-            f"{trial.station.name} was set up for something else since trial {trial.pk} was: press Set up again"
-        )
+        raise Conflict(_SET_UP_FOR_ELSE(name=trial.station.name, trial=trial.pk))
 
 
 def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
@@ -199,8 +234,9 @@ def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
         seen = sight_of(user)
         other = "another checkpoint" if told.get("id") in seen.checkpoints else told.get("name")
         raise Conflict(
-            f"{trial.station.name} was set up for {other or 'no checkpoint'} by somebody else, "
-            f"not for {seen.label(trial)}: press Set up again"
+            _SET_UP_BY_SOMEONE(
+                name=trial.station.name, other=other or "no checkpoint", label=seen.label(trial)
+            )
         )
     took = status.get("setup_took")
     return {str(name): float(seconds) for name, seconds in took.items()} if took else None
@@ -209,10 +245,7 @@ def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
 def _require_same(first: Command, trial: Trial, same: bool) -> None:
     """A uuid that was used before brings back the answer that it had, for the trial that it was used for."""
     if not same:
-        raise Conflict(
-            f"uuid {first.pk} is that of another command ({first}), which was not for trial {trial.pk}; "
-            "each needs one of its own"
-        )
+        raise Conflict(_UUID_OF_ANOTHER(uuid=first.pk, first=first, trial=trial.pk))
 
 
 def _is_about(row: Command, trial: Trial) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
 from typing import Any, get_args
@@ -12,10 +12,14 @@ from typing import Any, get_args
 import pydantic
 from django.core.exceptions import ValidationError
 
+from evaweb.trials.failure_words import is_not_said
 from runtime.config.schema import policy_tables
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
 _PLACES = {"block": ("x", "y", "yaw in degrees"), "plate": ("x", "y")}
+_OBJECT_NAME = re.compile(r"[^\W_](?:[\w .-]{0,38}[\w.-])?")
+_SMALLEST, _LARGEST = 0.005, 1.0  # m, of an object's side
+_OBJECT = ("x", "y", "yaw in degrees", "width", "depth")
 
 
 def check_policy(given: object) -> None:
@@ -40,28 +44,74 @@ def check_tags(given: object) -> None:
         raise ValidationError(_sentence(given, "each tag once"))
 
 
+def check_term(given: str) -> None:
+    """ValidationError where a phase or cause of failure would be taken for another one, or for none."""
+    if given != given.strip():
+        raise ValidationError(_sentence(given, "words without blanks around them"))
+    if is_not_said(given):
+        raise ValidationError(
+            _sentence(given, "other words: these stand for failures of which nothing was said")
+        )
+
+
+def check_milestones(texts: Sequence[str]) -> None:
+    """ValidationError where two milestones of a scene have the same words: in results they could not be told apart."""
+    twice = next((text for text in texts if texts.count(text) > 1), None)
+    if twice is not None:
+        raise ValidationError(
+            f"two milestones are {twice!r:.80}; allowed: different words for each of a scene"
+        )
+
+
 def check_bench(given: object) -> None:
-    """ValidationError unless `given` says where things lie: "block": [x, y, yaw], "plate": [x, y]."""
+    """ValidationError unless `given` says where things lie: "block": [x, y, yaw], "plate": [x, y].
+
+    These are the simulated bench's. "objects" are those of any bench, which people lay: name -> [x, y, yaw, width,
+    depth], all but the yaw in metres.
+    """
     if given is None:
         return
     if not isinstance(given, Mapping):
         raise ValidationError(
             _sentence(given, 'a table such as {"block": [0.1, 0.3, 0], "plate": [-0.1, 0.3]}')
         )
-    problems = [problem for key, value in given.items() if (problem := _place_problem(key, value))]
-    if problems:
-        raise ValidationError(problems)
+    laid = {key: value for key, value in given.items() if key != "objects"}
+    objects = given.get("objects", {})
+    if not isinstance(objects, Mapping):
+        raise ValidationError(
+            _sentence(objects, 'a table such as {"cup": [0.1, 0.3, 0, 0.08, 0.08]}', "objects")
+        )
+    problems = [*map(_place_problem, laid, laid.values()), *map(_object_problem, objects, objects.values())]
+    if any(problems):
+        raise ValidationError([problem for problem in problems if problem])
+
+
+def simulated_bench(given: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """What of a position's bench a simulated one lays by itself."""
+    return None if given is None else {key: given[key] for key in _PLACES if key in given}
+
+
+def _object_problem(name: object, value: object) -> str:
+    if not isinstance(name, str) or not _OBJECT_NAME.fullmatch(name):
+        return _sentence(name, "a name of an object of 1 to 40 letters, digits, blanks and _-.")
+    problem = _numbers_problem(name, value, _OBJECT)
+    if not problem and not all(_SMALLEST <= side <= _LARGEST for side in value[3:]):  # type: ignore[index]
+        return _sentence(value, f"width and depth from {_SMALLEST} to {_LARGEST} metres", name)
+    return problem
 
 
 def _place_problem(key: object, value: object) -> str:
     if key not in _PLACES:
-        return f"{key}: unknown key; allowed: {', '.join(_PLACES)}"
-    parts = _PLACES[str(key)]
+        return f"{key}: unknown key; allowed: {', '.join(_PLACES)}, objects"
+    return _numbers_problem(str(key), value, _PLACES[str(key)])
+
+
+def _numbers_problem(key: str, value: object, parts: Sequence[str]) -> str:
     numbers = isinstance(value, list) and all(_is_number(part) for part in value)
     if not numbers or len(value) != len(parts):  # type: ignore[arg-type]
-        return _sentence(value, f"{len(parts)} numbers: [{', '.join(parts)}], x and y in metres", str(key))
+        return _sentence(value, f"{len(parts)} numbers: [{', '.join(parts)}], x and y in metres", key)
     if max(map(abs, value[:2])) > 2:  # type: ignore[index]
-        return _sentence(value, "x and y in metres, at most 2 from the middle", str(key))
+        return _sentence(value, "x and y in metres, at most 2 from the middle", key)
     return ""
 
 

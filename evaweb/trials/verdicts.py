@@ -7,6 +7,54 @@ from dataclasses import dataclass
 
 from evaweb.errors import EvaError
 from evaweb.trials.models import Milestone
+from runtime.core.sentences import Pattern, fixed
+
+_SUCCESS_MISSING_NO_MILESTONE_THIS = fixed(
+    "trials.verdicts.success_missing_no_milestone_this",
+    "success is missing: no milestone of this scene is required, so say true or false",
+)
+_SUCCESS_CONTRADICTS_REQUIRED_MILESTONES_WHICH = Pattern(
+    "trials.verdicts.success_contradicts_required_milestones_which",
+    "success = {success} contradicts the required milestones, which say {implied}: correct the "
+    "milestones, or leave success out",
+)
+_MILESTONE_NOT_ONE_THIS_SCENE = Pattern(
+    "trials.verdicts.milestone_not_one_this_scene",
+    "milestone {key!r} is not one of this scene; allowed: {names}",
+)
+_MILESTONE_ALLOWED_TRUE_FALSE = Pattern(
+    "trials.verdicts.milestone_allowed_true_false",
+    "milestone {key}: {value!r}; allowed: true, false",
+)
+_MILESTONE_NOT_ANSWERED_SAY_TRUE = Pattern(
+    "trials.verdicts.milestone_not_answered_say_true",
+    "milestone {missing} is not answered: say true or false for each of {names}",
+)
+_TIMES_MILESTONE_NOT_ONE_THIS = Pattern(
+    "trials.verdicts.times_milestone_not_one_this",
+    "times: milestone {key!r} is not one of this scene; allowed: {known}",
+)
+_TIMES_MILESTONE_ALLOWED_SECONDS_FROM = Pattern(
+    "trials.verdicts.times_milestone_allowed_seconds_from",
+    "times: milestone {key}: {at!r}; allowed: seconds from 0, or null",
+)
+_TIMES_HAS_TIME_S_BUT = Pattern(
+    "trials.verdicts.times_has_time_s_but",
+    "times: {text!r} has the time {at:g} s, but was not reached",
+)
+_REACHED_AFTER_S_COUNTS_WITHIN = Pattern(
+    "trials.verdicts.reached_after_s_counts_within",
+    "{text!r} was reached after {at:g} s and counts within {limit:g} s: leave it unticked",
+)
+_TICKED_BEFORE_NOT_MILESTONES_THIS = Pattern(
+    "trials.verdicts.ticked_before_not_milestones_this",
+    "{text!r} is ticked and {missed!r} before it is not: the milestones of this scene come one after "
+    "the other",
+)
+_REACHED_AFTER_S_BEFORE_ONE = Pattern(
+    "trials.verdicts.reached_after_s_before_one",
+    "{text!r} was reached after {at:g} s, before the one that comes first",
+)
 
 LONGEST_NOTE = 8000  # characters
 LONGEST_FAILURE = 60
@@ -45,12 +93,9 @@ def verdict(
         _require_order(reached)
     implied = _implied(reached)
     if implied is None and success is None:
-        raise EvaError("success is missing: no milestone of this scene is required, so say true or false")
+        raise EvaError(_SUCCESS_MISSING_NO_MILESTONE_THIS)
     if implied is not None and success is not None and success != implied:
-        raise EvaError(
-            f"success = {success} contradicts the required milestones, which say {implied}: "
-            "correct the milestones, or leave success out"
-        )
+        raise EvaError(_SUCCESS_CONTRADICTS_REQUIRED_MILESTONES_WHICH(success=success, implied=implied))
     final = bool(success if implied is None else implied)
     return Verdict(reached, _share(reached, final), final)
 
@@ -63,15 +108,13 @@ def _answers(milestones: Sequence[Milestone], ticks: Mapping[object, object]) ->
     for key, value in ticks.items():
         pk = by_name.get(str(key))
         if pk is None:
-            raise EvaError(f"milestone {key!r} is not one of this scene; allowed: {names}")
+            raise EvaError(_MILESTONE_NOT_ONE_THIS_SCENE(key=key, names=names))
         if not isinstance(value, bool):
-            raise EvaError(f"milestone {key}: {value!r}; allowed: true, false")
+            raise EvaError(_MILESTONE_ALLOWED_TRUE_FALSE(key=key, value=value))
         found[pk] = value
     missing = [str(pk) for pk in known if pk not in found]
     if missing:
-        raise EvaError(
-            f"milestone {', '.join(missing)} is not answered: say true or false for each of {names}"
-        )
+        raise EvaError(_MILESTONE_NOT_ANSWERED_SAY_TRUE(missing=", ".join(missing), names=names))
     return found
 
 
@@ -83,18 +126,16 @@ def _times(
     for key, at in given.items():
         milestone = known.get(str(key))
         if milestone is None:
-            raise EvaError(f"times: milestone {key!r} is not one of this scene; allowed: {', '.join(known)}")
+            raise EvaError(_TIMES_MILESTONE_NOT_ONE_THIS(key=key, known=", ".join(known)))
         if at is None:
             continue
         if isinstance(at, bool) or not isinstance(at, int | float) or not 0 <= at < LONGEST_RUN_S:
-            raise EvaError(f"times: milestone {key}: {at!r}; allowed: seconds from 0, or null")
+            raise EvaError(_TIMES_MILESTONE_ALLOWED_SECONDS_FROM(key=key, at=at))
         if not answers[milestone.pk]:
-            raise EvaError(f"times: {milestone.text!r} has the time {at:g} s, but was not reached")
+            raise EvaError(_TIMES_HAS_TIME_S_BUT(text=milestone.text, at=at))
         limit = milestone.time_limit_s
         if limit is not None and at > limit:
-            raise EvaError(
-                f"{milestone.text!r} was reached after {at:g} s and counts within {limit:g} s: leave it unticked"
-            )
+            raise EvaError(_REACHED_AFTER_S_COUNTS_WITHIN(text=milestone.text, at=at, limit=limit))
         found[milestone.pk] = float(at)
     return found
 
@@ -103,12 +144,9 @@ def _require_order(reached: Sequence[tuple[Milestone, bool, float | None]]) -> N
     missed, last = "", 0.0
     for milestone, done, at in reached:
         if done and missed:
-            raise EvaError(
-                f"{milestone.text!r} is ticked and {missed!r} before it is not: the milestones of this scene "
-                "come one after the other"
-            )
+            raise EvaError(_TICKED_BEFORE_NOT_MILESTONES_THIS(text=milestone.text, missed=missed))
         if done and at is not None and at < last:
-            raise EvaError(f"{milestone.text!r} was reached after {at:g} s, before the one that comes first")
+            raise EvaError(_REACHED_AFTER_S_BEFORE_ONE(text=milestone.text, at=at))
         missed, last = missed or ("" if done else milestone.text), at if at is not None else last
 
 

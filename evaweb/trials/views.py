@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 from uuid import uuid4
 
-from django.core.paginator import Paginator
 from django.http import HttpRequest, HttpResponse
 from django.shortcuts import redirect, render
 from django.views.decorators.http import require_GET, require_POST
@@ -15,6 +14,7 @@ from django.views.decorators.http import require_GET, require_POST
 from evaweb.blinding import Sight, sight_for
 from evaweb.episodes.selectors import stage_of
 from evaweb.errors import EvaError
+from evaweb.lists import DAY, Column, Filter, Listing
 from evaweb.roles import Role, role_of
 from evaweb.stations.selectors import station_list
 from evaweb.trials import failures, lifecycle, selectors, services, voids
@@ -29,21 +29,20 @@ PER_PAGE = 50
 
 @require_GET
 def result(request: HttpRequest) -> HttpResponse:
-    """Success per scene and checkpoint, then the trials; the filters are in the address."""
+    """Success per scene and checkpoint, then the trials; filters and order are in the address."""
     seen = sight_for(request)
-    filters, fault = _filters(request.GET, seen)
+    listing = Listing(request.GET, _columns(seen), _filters(seen))
+    filters = TrialFilters(**listing.chosen)
+    try:
+        filters.apply(Trial.objects.all(), seen)
+    except EvaError as fault:
+        listing.refuse(fault)
+        filters = TrialFilters()
     rows = selectors.statistics(replace(filters, status=""), seen)  # which is about the list of trials
     context = {
         "figures": scene_figures(rows),
-        "page": Paginator(selectors.trial_list(filters, seen), PER_PAGE).get_page(request.GET.get("page")),
-        "chosen": asdict(filters),
-        "query": _query(filters),
-        "fault": fault,
-        "scenes": selectors.scene_list(all_of_them=True).prefetch_related(None),
-        "checkpoints": selectors.checkpoint_list(all_of_them=True, sight=seen),
-        "stations": station_list(all_of_them=True),
-        "evaluations": selectors.evaluation_list(),
-        "statuses": TrialStatus.choices,
+        "page": listing.page(selectors.trial_list(filters, seen), PER_PAGE),
+        "listing": listing,
     }
     fragment = request.headers.get("HX-Request") and not request.headers.get("HX-History-Restore-Request")
     return render(request, "trials/body.html" if fragment else "trials/result.html", context)
@@ -107,6 +106,11 @@ def void_answer(request: HttpRequest, id: int) -> HttpResponse:
     return redirect("result-trial", id=id)
 
 
+def _truth(trial: Trial) -> list[tuple[str, Any]]:
+    """What the simulated bench says of its milestones; a blind trial's operator scores before hearing it."""
+    return sorted((trial.truth or {}).get("milestones", {}).items())
+
+
 def _trial_page(
     request: HttpRequest, id: int, fault: EvaError | None = None, typed: Mapping[str, Any] | None = None
 ) -> HttpResponse:
@@ -120,7 +124,7 @@ def _trial_page(
         "episode": found.episode,
         "stage": stage_of(episode=found.episode) if found.episode else None,
         "scores": list(found.scores.all()),
-        "truth": sorted((found.truth or {}).get("milestones", {}).items()),
+        "truth": () if hidden and not found.verdict_id else _truth(found),
         "milestones": [(milestone, _ticked(found, milestone.pk, typed)) for milestone in milestones],
         "implied": any(milestone.required for milestone in milestones),
         "may_score": operator and lifecycle.allows(found, Move.SCORE),
@@ -169,16 +173,39 @@ def _as_scored(trial: Trial) -> dict[str, Any]:
     return {"note": verdict.note, "success": success, **failures.said_of(verdict)}
 
 
-def _filters(given: Mapping[str, str], sight: Sight) -> tuple[TrialFilters, EvaError | None]:
-    """The filters of the address; where they name what does not exist, none of them and the sentence."""
-    names = ("evaluation", "checkpoint", "scene", "station", "status", "since")
-    filters = TrialFilters(**{name: given.get(name, "").strip() for name in names})
-    try:
-        filters.apply(Trial.objects.all(), sight)
-    except EvaError as fault:
-        return TrialFilters(), fault
-    return filters, None
+def _filters(sight: Sight) -> list[Filter]:
+    """What the list of trials is narrowed by; TrialFilters says what it does not know."""
+    scenes = selectors.scene_list(all_of_them=True).prefetch_related(None)
+    checkpoints = selectors.checkpoint_list(all_of_them=True, sight=sight).prefetch_related(None)
+    evaluations = [(str(row.pk), str(row)) for row in selectors.evaluation_list()]
+    return [
+        Filter("scene", "Scene", [(row.name, row.title) for row in scenes], strict=False),
+        Filter("checkpoint", "Checkpoint", [(row.name, row.name) for row in checkpoints], strict=False),
+        Filter(
+            "station",
+            "Station",
+            [(row.name, str(row)) for row in station_list(all_of_them=True)],
+            strict=False,
+        ),
+        Filter("evaluation", "Evaluation", evaluations, strict=False),
+        Filter("since", "Since", kind=DAY),
+        Filter("status", "Status", TrialStatus.choices, strict=False),
+    ]
 
 
-def _query(filters: TrialFilters) -> dict[str, str]:
-    return {name: value for name, value in asdict(filters).items() if value}
+def _columns(sight: Sight) -> list[Column]:
+    """By checkpoint it is sorted only where none is hidden: the order of codes would tell which are of one."""
+    return [
+        Column("trial", "Trial", ("pk",), down=True),
+        Column("prepared", "Prepared", ("prepared_at",), down=True),
+        Column("scene", "Scene", ("scene__title", "position__number")),
+        Column("position", "Position", ("position__number",), number=True),
+        Column("checkpoint", "Checkpoint", ("checkpoint__name",) if sight.clear else ()),
+        Column("number", "No.", ("number", "attempt") if sight.clear else (), number=True),
+        Column("status", "Status", ("status",)),
+        Column("success", "Success", ("verdict__success",), down=True),
+        Column("score", "Score", ("verdict__score",), number=True),
+        Column("time", "Time", ("duration_s",), number=True),
+        Column("failure", "Failure, note", ("verdict__failure_phase", "verdict__failure")),
+        Column("operator", "Operator", ("operator__username",)),
+    ]

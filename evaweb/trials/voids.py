@@ -29,6 +29,28 @@ from evaweb.trials.record import (
     file_of,
 )
 from evaweb.trials.services import checked, locked, publish, reason_given, settled
+from runtime.core.sentences import Pattern
+
+_ASKED_ALREADY = Pattern(
+    "trials.voids.asked_already",
+    "the void of trial {trial} was asked for already: {advice}",
+)
+_NOBODY_ASKS = Pattern(
+    "trials.voids.nobody_asks",
+    "trial {trial} is {label}: nobody asks for its void",
+)
+_ASKED_BY_YOU = Pattern(
+    "trials.voids.asked_by_you",
+    "you asked for the void of trial {trial_id}: another operator has to answer",
+)
+_ASKED_TOO_LONG_AGO = Pattern(
+    "trials.voids.asked_too_long_ago",
+    "the void of trial {trial_id} was asked for more than {days} days ago: it counts",
+)
+_BEING_REPEATED = Pattern(
+    "trials.voids.being_repeated",
+    "trial {trial} is being repeated, by trial {other}: {advice}, then refuse",
+)
 
 ANSWERED_WITHIN = timedelta(days=14)
 KEPT = "the trial that it repeats counts: its void was not agreed to"
@@ -64,9 +86,7 @@ def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
         if _said_already(held, user, why):
             return held
         if held.status == TrialStatus.VOID_ASKED:
-            raise Conflict(
-                f"the void of trial {held.pk} was asked for already: {lifecycle.advice(held.status)}"
-            )
+            raise Conflict(_ASKED_ALREADY(trial=held.pk, advice=lifecycle.advice(held.status)))
         if by_two(held):
             _ask(held, user, why)
         else:
@@ -84,11 +104,12 @@ def void_answer(*, user: User, trial: Trial, agree: bool, reason: str = "") -> T
         held = locked(trial)
         asked = held.void_requests.filter(answer="").select_for_update().first()
         if asked is None:
-            raise Conflict(f"trial {held.pk} is {TrialStatus(held.status).label}: nobody asks for its void")
+            raise Conflict(_NOBODY_ASKS(trial=held.pk, label=TrialStatus(held.status).label))
         fault = _why_not(asked, user)
         if fault is not None:
             raise fault
         if agree:
+            checked("void agreed", held, user)
             _answered(asked, VoidRequest.Answer.AGREED, user, why)
             _void(held, asked.by, asked.reason)
         else:
@@ -111,8 +132,11 @@ def voids_lapse(trials: QuerySet[Trial], *, user: User, now: bool = False) -> No
     asked = voids_waiting(trials)
     if not now:
         asked = asked.filter(at__lt=timezone.now() - ANSWERED_WITHIN)
-    for each in asked:
+    for each in asked.order_by("pk"):
         held = locked(each.trial)
+        each.refresh_from_db(fields=("answer",))
+        if each.answer:
+            continue  # with one before it, whose repetition this trial is
         if not _repetitions(held).filter(status__in=lifecycle.OPEN).exists():
             _keep(held, each, VoidRequest.Answer.LAPSED, user, "")
 
@@ -120,11 +144,9 @@ def voids_lapse(trials: QuerySet[Trial], *, user: User, now: bool = False) -> No
 def _why_not(asked: VoidRequest, user: User) -> EvaError | None:
     """Why this user cannot answer it; None where they can."""
     if asked.by_id == user.pk:
-        return NotAllowed(f"you asked for the void of trial {asked.trial_id}: another operator has to answer")
+        return NotAllowed(_ASKED_BY_YOU(trial_id=asked.trial_id))
     if asked.at + ANSWERED_WITHIN < timezone.now():
-        return Conflict(
-            f"the void of trial {asked.trial_id} was asked for more than {ANSWERED_WITHIN.days} days ago: it counts"
-        )
+        return Conflict(_ASKED_TOO_LONG_AGO(trial_id=asked.trial_id, days=ANSWERED_WITHIN.days))
     try:
         checked("void answered", asked.trial, user)
     except EvaError as fault:
@@ -160,10 +182,14 @@ def _keep(held: Trial, asked: VoidRequest, answer: str, user: User, why: str) ->
     for other in _repetitions(held):
         if other.status in lifecycle.OPEN:
             raise Conflict(
-                f"trial {held.pk} is being repeated, by trial {other.pk}: {lifecycle.advice(other.status)}, then refuse"
+                _BEING_REPEATED(trial=held.pk, other=other.pk, advice=lifecycle.advice(other.status))
             )
         if lifecycle.allows(other, Move.VOID):
-            _void(locked(other), user, KEPT)
+            row = locked(other)
+            for pending in row.void_requests.filter(answer=""):
+                lifecycle.apply(row, Move.KEEP)
+                _answered(pending, VoidRequest.Answer.LAPSED, user, KEPT)
+            _void(row, user, KEPT)
     lifecycle.apply(held, Move.KEEP)
     _answered(asked, answer, user, why)
     held.save()

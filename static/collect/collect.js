@@ -18,6 +18,7 @@ export class CollectPanel {
   #twice = new Twice(ASK_MS);
   #seen = ""; // the newest episode that this page knows of
   #closed = ""; // the newest that is on disk
+  #older = ""; // one after which a start was pressed that did not take: it is not the newest attempt
   #kind = "run";
   #changed = -Infinity;
   #drawnQueue = 0;
@@ -142,11 +143,12 @@ export class CollectPanel {
     const button = event.target.closest("[data-collect]");
     if (!button) return;
     const what = button.dataset.collect;
+    if (what === "big" && this.#kind === "run" && !("settling" in button.dataset)) this.#older = this.#episode;
     if (button.getAttribute("aria-disabled") === "true") {
       this.#commands.say(`${nameOf(button)}: ${button.title}`, "refused");
       return;
     }
-    if (!["discard", "rerecord"].includes(what)) this.#twice.clear();
+    if (!["discard", "rerecord", "label"].includes(what)) this.#twice.clear();
     const stops = what === "big" && this.#kind === "stop";
     if (this.#busy && !stops) this.#commands.say(`${nameOf(button)}: not yet, ${this.#busy} is on its way`, "refused");
     else this.#do(what, button);
@@ -159,7 +161,7 @@ export class CollectPanel {
       big: () => (this.#kind === "stop" ? this.#commands.give("stop") : this.#start()),
       discard: () => this.#discard(),
       rerecord: () => this.#rerecord(),
-      label: () => this.#commands.give("label", { episode: this.#episode, result: button.dataset.result }),
+      label: () => this.#label(button.dataset.result),
       open: () => this.#ask("Open", config.sessions, opening()),
       close: () => this.#ask("Close", `${config.session}/${this.session}/close`),
       resume: () => this.#ask("Resume", `${config.session}/${document.getElementById("session-earlier").value}/resume`),
@@ -194,6 +196,16 @@ export class CollectPanel {
     const answer = await this.#give("run");
     if (answer?.data?.episode) this.#seen = answer.data.episode;
     return answer;
+  }
+
+  /** Of the newest attempt; of one before a start that did not take it asks once. */
+  async #label(result) {
+    const episode = this.#episode;
+    if (episode && episode === this.#older && !this.#twice.press(result)) {
+      this.#commands.say(`${result}: the last start did not take; press again to label the episode before it`, "pressed");
+      return;
+    }
+    if (await this.#commands.give("label", { episode, result })) this.#older = "";
   }
 
   async #discard() {
@@ -237,7 +249,7 @@ export class CollectPanel {
     this.#commands.say(`${name}: pressed …`, "pressed");
     try {
       await post(address, content);
-      this.#commands.say(`${name}: done`, "accepted");
+      this.#commands.say(name === "Publish" ? "Publish: asked for; the queue below shows how far it is" : `${name}: done`, "accepted");
       const form = name === "Open" && document.getElementById("open-session");
       if (form) form.dispatchEvent(new Event("eva:saved", { bubbles: true }));
     } catch (error) {

@@ -1,4 +1,5 @@
 // The buttons of gamepads as presses: of a button that went down while we looked, never of one that was held before.
+// A pedal is a keyboard: its key can stand in the place of a button.
 
 /** What can be pressed by a pad, and which button does it as delivered (numbers of the standard mapping). */
 export const ACTIONS = {
@@ -13,9 +14,10 @@ export const ACTIONS = {
 
 const NAMES = ["A", "B", "X", "Y", "LB", "RB", "LT", "RT", "Back", "Start", "left stick", "right stick", "up", "down", "left", "right", "Guide"];
 
-/** A button as it stands on a pad of the standard mapping, else its number. */
+/** A button as it stands on a pad of the standard mapping, else its number; a key by its name. */
 export function buttonName(button, mapping) {
   if (button === null || button === undefined) return "none";
+  if (typeof button === "string") return `key ${button.length === 1 ? button.toUpperCase() : button}`;
   return mapping === "standard" && NAMES[button] ? `${NAMES[button]} (${button})` : `button ${button}`;
 }
 
@@ -23,7 +25,14 @@ export function delivered() {
   return Object.fromEntries(Object.entries(ACTIONS).map(([action, { button }]) => [action, button]));
 }
 
-/** `mapping` with `action` on `button`; whatever was on that button before is on none. */
+/** Why a key cannot be that of a pedal, "" where it can; `taken` are the keys that the page has. */
+export function whyNotKey(key, taken) {
+  if (key === " " || key === "Escape") return `${key === " " ? "Space" : "Esc"} is the e-stop`;
+  if (/^(Tab|Shift|Control|Alt|Meta|AltGraph|CapsLock|Dead|Process|Unidentified)$/.test(key)) return `${key} alone cannot be assigned`;
+  return taken.includes(key.toLowerCase()) || key === "?" ? `the page already uses ${key}` : "";
+}
+
+/** `mapping` with `action` on `button`, or on a key; whatever was on that before is on none. */
 export function assigned(mapping, action, button) {
   const freed = Object.entries(mapping).map(([other, at]) => [other, at === button ? null : at]);
   return { ...Object.fromEntries(freed), [action]: button };
@@ -37,7 +46,7 @@ export function restored(text) {
   } catch {
     kept = {};
   }
-  const fits = (at) => at === null || (Number.isInteger(at) && at >= 0 && at < 64);
+  const fits = (at) => at === null || (Number.isInteger(at) && at >= 0 && at < 64) || (typeof at === "string" && at !== "" && !whyNotKey(at, []));
   return Object.fromEntries(Object.entries(delivered()).map(([action, at]) => [action, fits(kept[action]) ? kept[action] : at]));
 }
 

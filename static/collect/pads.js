@@ -1,8 +1,9 @@
-// A gamepad at the Collect page: looked at while the page is visible, its buttons shown and changed.
+// A gamepad at the Collect page: looked at while the page is visible, its buttons shown and changed. A pedal's key, too.
 
-import { ACTIONS, assigned, buttonName, delivered, Presses, restored } from "./pad_buttons.js";
+import { ACTIONS, assigned, buttonName, delivered, Presses, restored, whyNotKey } from "./pad_buttons.js";
 
 const KEY = "eva-pad";
+const TYPED = 'input, textarea, select, [contenteditable="true"]'; // keep their keys
 const LATE_MS = 500; // between two looks: what happened meanwhile is nobody's press
 
 /** `press(action)` hears what is pressed; resolves nothing, goes on as long as the page lives. */
@@ -42,10 +43,10 @@ export function gamepads(press) {
   function draw() {
     const [first] = pads();
     for (const row of rows) {
-      row.querySelector(".pad-button").textContent = changing === row.dataset.action ? "press a button …" : buttonName(mapping[row.dataset.action], first?.mapping);
+      row.querySelector(".pad-button").textContent = changing === row.dataset.action ? "press a button or a key …" : buttonName(mapping[row.dataset.action], first?.mapping);
       row.querySelector("button").textContent = changing === row.dataset.action ? "Cancel" : "Change";
     }
-    part("state").textContent = first ? first.id.slice(0, 32) : "none connected: press a button on it";
+    part("state").textContent = first ? first.id.slice(0, 32) : "none connected: press one of its buttons";
   }
 
   function pressed(button) {
@@ -56,6 +57,19 @@ export function gamepads(press) {
     const action = Object.keys(mapping).find((one) => mapping[one] === button);
     part("said").textContent = `${buttonName(button, pads()[0]?.mapping)}: ${action ? ACTIONS[action].name : "does nothing"}`;
     if (action) press(action);
+  }
+
+  function keyed(event) {
+    if (event.repeat || event.ctrlKey || event.altKey || event.metaKey || event.target.closest?.(TYPED)) return;
+    const { key } = event;
+    if (!changing && !Object.values(mapping).includes(key)) return;
+    if (changing && /^(Enter| |Tab)$/.test(key) && event.target.closest?.("button")) return; // Cancel, by the keyboard
+    const why = whyNotKey(key, [...document.querySelectorAll("[data-key]")].map(({ dataset }) => dataset.key));
+    if (why) part("said").textContent = why;
+    else {
+      event.preventDefault(); // which keys.js heeds
+      pressed(key);
+    }
   }
 
   function look() {
@@ -72,6 +86,7 @@ export function gamepads(press) {
     for (const { button } of presses.look(there)) pressed(button);
   }
 
+  window.addEventListener("keydown", keyed, { capture: true });
   draw();
   look();
 }

@@ -1,10 +1,12 @@
-// The list of stations: how each stands, asked every few seconds.
+// The home page: how each station stands and what its first camera shows, asked every few seconds.
 
 import { get, RequestFailed } from "../site/api.js";
 import { quietFragments } from "../site/fragments.js";
+import { localized } from "../site/sentences.js";
 import { badge } from "./live/badge.js";
 
 const EVERY_MS = 4000;
+const STILL_MS = 8000;
 
 async function ask(element) {
   const name = element.dataset.live;
@@ -12,7 +14,7 @@ async function ask(element) {
   try {
     const { snapshot, gone } = await get(`/api/v1/stations/${encodeURIComponent(name)}`);
     show(element, snapshot?.state_is);
-    reason.textContent = snapshot ? snapshot.reason : gone;
+    reason.textContent = snapshot ? localized(snapshot).reason : gone;
   } catch (error) {
     if (!(error instanceof RequestFailed)) throw error;
     show(element, undefined);
@@ -26,12 +28,37 @@ function show(element, session) {
   element.textContent = session ? session.label : "not running";
 }
 
+/** The newest picture in place of the one before, which stays until it is here; none where there is none. */
+async function look(shown) {
+  const fresh = shown.cloneNode();
+  fresh.src = `${shown.dataset.still}?at=${Date.now()}`;
+  try {
+    await fresh.decode();
+    fresh.hidden = false;
+    shown.replaceWith(fresh);
+  } catch (error) {
+    if (error.name !== "EncodingError") throw error; // what an answer without a picture is to a browser
+    shown.hidden = true;
+  }
+}
+
+function lookAll() {
+  if (document.hidden) return;
+  for (const element of document.querySelectorAll("[data-still]")) look(element);
+}
+
 function askAll() {
   if (document.hidden) return;
   for (const element of document.querySelectorAll("[data-live]")) ask(element);
 }
 
 quietFragments();
-document.body.addEventListener("htmx:afterSettle", askAll);
+document.body.addEventListener("htmx:afterSettle", ({ target }) => {
+  if (!target.querySelector("[data-live]")) return;
+  askAll();
+  lookAll();
+});
 setInterval(askAll, EVERY_MS);
+setInterval(lookAll, STILL_MS);
 askAll();
+lookAll();

@@ -3,6 +3,7 @@
 import { CollectPanel } from "../collect/collect.js";
 import { drafts } from "../site/drafts.js";
 import { quietFragments } from "../site/fragments.js";
+import { reasoned, sentence } from "../site/sentences.js";
 import { pageId } from "../site/identity.js";
 import { byHand } from "./manual/by_hand.js";
 import { Cameras } from "./live/cameras.js";
@@ -25,6 +26,7 @@ import { StopWay } from "./commands/stop_way.js";
 import { statusBar } from "./live/status.js";
 import { current, mark } from "./trial/steps.js";
 import { Store } from "./live/store.js";
+import { tour } from "./tour.js";
 import { TrialPanel } from "./trial/trial.js";
 import { veil } from "./trial/veil.js";
 import { CLOSED } from "./live/words.js";
@@ -39,17 +41,17 @@ function listen(store, events) {
       store.tell("hello");
     },
     link: (link) => {
-      store.link = link;
+      store.link = { ...link, told: true }; // before that nothing is wrong yet
       store.tell("link");
     },
     events: (news) => events.add(news),
     ack: (ack) => store.tell("ack", ack),
-    aimed: (answer) => store.tell("aimed", answer),
+    aimed: (answer) => store.tell("aimed", { ...answer, reason: sentence({ ...answer.sentence, text: answer.reason }) }), // its id is the question's
     renewed: (answer) => store.tell("renewed", answer),
     changed: ({ what }) => store.tell("changed", what),
     error: ({ reason }) => console.error(`the server did not understand this page: ${reason}`),
   };
-  return (message) => answers[message.type]?.(message);
+  return (message) => answers[message.type]?.(reasoned(message));
 }
 
 async function start() {
@@ -79,6 +81,7 @@ async function start() {
   const commands = new Commands(store, socket, way);
   new LeaseControls(store, socket, commands);
   if (config.page === "eval") {
+    tour(store);
     new TrialPanel(store, commands);
     resetAid(regionLook());
   }

@@ -43,7 +43,7 @@ class Drawing {
     const index = pressed ? Number(pressed.dataset.region) : this.#regions.length;
     const before = this.#regions[index];
     if (!before && this.#regions.length >= this.#most) {
-      this.#tell(`${this.#most} regions are the most that a picture has`);
+      this.#tell(`A picture has at most ${this.#most} regions`);
       return;
     }
     const sized = event.target.matches(".region-corner");
@@ -73,7 +73,7 @@ class Drawing {
   }
 
   #add(rectangle) {
-    if (this.#regions.length >= this.#most) return this.#tell(`${this.#most} regions are the most that a picture has`);
+    if (this.#regions.length >= this.#most) return this.#tell(`A picture has at most ${this.#most} regions`);
     this.#regions.push({ name: this.#fresh(), ...rectangle });
     return this.#name(this.#regions.length - 1);
   }

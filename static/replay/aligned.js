@@ -22,6 +22,18 @@ export function grid({ fps, frames }) {
   return Array.from({ length: frames }, (_, row) => row / fps);
 }
 
+/** The joint [index of `joints`] whose state differs most between the episodes at a time; the first where none does. */
+export function differing(times, read, joints) {
+  const spreads = joints.map((joint) => {
+    const states = read.map((episode) => sampled(times, episode, joint).state);
+    return times.reduce((widest, _, at) => {
+      const known = states.map((state) => state[at]).filter((value) => value !== null);
+      return known.length > 1 ? Math.max(widest, Math.max(...known) - Math.min(...known)) : widest;
+    }, 0);
+  });
+  return spreads.indexOf(Math.max(...spreads));
+}
+
 /** State and executed action of a joint at `times`; null where the episode has none: {state, executed}. */
 export function sampled(times, { header, numbers, shift }, joint) {
   const index = header.joints.indexOf(joint);

@@ -1,16 +1,18 @@
-// The pane of the curves: which joint, what its values are at the clock, and the plot.
+// The pane of the curves: small multiples of the joints that were chosen, or move most, and what holds for all of them.
 
 import { Legend } from "../console/curves/curve_legend.js";
-import { jointOptions } from "../console/manual/joint_names.js";
 import { last } from "../site/ascending.js";
 import { Chunks } from "./chunks.js";
+import { CurveCell } from "./curve_cell.js";
 import { joint, message } from "./data.js";
-import { Plot, tunes } from "./plot.js";
+import { movingMost } from "./moving.js";
+import { tunes } from "./plot.js";
 import { readout, write } from "./readout.js";
 
-const KEY = "eva-replay-joint";
+const KEY = "eva-replay-joints"; // names, as they were chosen; without it those that move most
+const MULTIPLES = 4;
 
-/** Fill the pane, or put a sentence in its place; resolves to {held, marks}, empty where nothing is known. */
+/** Fill the pane, or put a sentence in its place; resolves to {held, marks, chunks}, empty where nothing is known. */
 export async function curvePane({ clock, address, uplot }) {
   const note = document.getElementById("curves-note");
   try {
@@ -20,11 +22,11 @@ export async function curvePane({ clock, address, uplot }) {
     if (library) new Pane(clock, episode, library);
     note.hidden = Boolean(library);
     note.textContent = library ? "" : "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.";
-    return { held: header.held, marks: header.marks };
+    return { held: header.held, marks: header.marks, chunks: episode.chunks.spans };
   } catch (error) {
     note.textContent = `No curves: ${error.message}.`;
     console.error(error);
-    return { held: [], marks: [] };
+    return { held: [], marks: [], chunks: [] };
   }
 }
 
@@ -38,25 +40,96 @@ function read(header, numbers) {
 class Pane {
   #clock;
   #episode;
-  #plot;
-  #curves = null;
-  #raw = []; // what each chunk wanted of the joint
+  #library;
+  #behind;
+  #cells = [];
+  #place = document.getElementById("plots");
   #legend;
+  #moving; // joints by how far they move
   #hovered = null; // [s], null where the pointer is elsewhere
   #said = document.getElementById("chunk");
 
   constructor(clock, episode, library) {
     this.#clock = clock;
     this.#episode = episode;
-    const { held, marks } = episode.header;
-    const behind = { held, marks, safety: this.#safety(), owners: episode.chunks };
-    const element = document.getElementById("legend");
-    this.#legend = new Legend(element, (name, shown) => this.#plot.reveal(name, shown));
-    this.#explain(element);
-    const seek = (time) => clock.seekRow(Math.floor(time * clock.fps));
-    this.#plot = new Plot({ element: document.getElementById("curves"), library, behind, shown: (name) => this.#legend.shown(name), seek, hover: (time) => this.#hover(time) });
-    this.#select();
+    this.#library = library;
+    const { held, marks, joints, units } = episode.header;
+    this.#behind = { held, marks, safety: this.#safety(), owners: episode.chunks };
+    this.#legend = new Legend(document.getElementById("legend"), (name, shown) => this.#cells.forEach((cell) => cell.reveal(name, shown)));
+    this.#explain(document.getElementById("legend-marks"));
+    this.#moving = movingMost(episode.ticks.measured, joints.length, units);
+    document.getElementById("joints-moving").addEventListener("click", () => {
+      localStorage.removeItem(KEY);
+      this.#lay(this.#moving.slice(0, MULTIPLES));
+    });
+    document.getElementById("joint-add").addEventListener("click", () => this.#add());
+    this.#lay(this.#chosen());
     for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.#at());
+  }
+
+  /** Those of this browser's choice that the episode has, else those that move most. */
+  #chosen() {
+    const names = this.#episode.header.joints;
+    const kept = JSON.parse(localStorage.getItem(KEY) ?? "[]").map((name) => names.indexOf(name));
+    const known = [...new Set(kept)].filter((index) => index >= 0);
+    return known.length ? known : this.#moving.slice(0, MULTIPLES);
+  }
+
+  #lay(joints) {
+    for (const cell of this.#cells) cell.destroy();
+    this.#cells = joints.map((index, number) => this.#cell(index, number, joints.length));
+    this.#place.replaceChildren(...this.#cells.map(({ element }) => element));
+    for (const cell of this.#cells) cell.draw();
+    const missing = this.#moving.length - joints.length;
+    const add = document.getElementById("joint-add");
+    add.setAttribute("aria-disabled", String(!missing));
+    add.title = missing ? "Draw one more joint" : "All joints are drawn";
+    this.#at();
+  }
+
+  #cell(index, number, count) {
+    const { header, ticks, raw } = this.#episode;
+    const length = ticks.time.length;
+    const read = (of) => {
+      const pick = (name) => joint(ticks[name], of, length);
+      const curves = { time: ticks.time, state: pick("measured"), executed: pick("executed"), smoothed: pick("smoothed") };
+      return { curves, raw: answers(raw.time, joint(raw.values, of, raw.time.length), raw.chunk), unit: header.units[of] ?? "" };
+    };
+    return new CurveCell({
+      ...{ index, number, count, read, joints: header.joints, grippers: header.grippers, library: this.#library, behind: this.#behind },
+      shown: (name) => this.#legend.shown(name),
+      seek: (time) => this.#clock.seekRow(Math.floor(time * this.#clock.fps)),
+      hover: (time) => this.#hover(time),
+      chose: () => {
+        this.#keep();
+        this.#at();
+      },
+      remove: () => this.#remove(number),
+    });
+  }
+
+  get #joints() {
+    return this.#cells.map(({ index }) => index);
+  }
+
+  #keep() {
+    localStorage.setItem(KEY, JSON.stringify(this.#joints.map((index) => this.#episode.header.joints[index])));
+  }
+
+  #add() {
+    const drawn = this.#joints;
+    const next = this.#moving.find((index) => !drawn.includes(index));
+    if (next === undefined) return;
+    this.#lay([...drawn, next]);
+    this.#keep();
+    this.#cells.at(-1).focus();
+  }
+
+  #remove(number) {
+    if (this.#cells.length < 2) return;
+    this.#lay(this.#joints.filter((_, place) => place !== number));
+    this.#keep();
+    this.#cells[Math.min(number, this.#cells.length - 1)].focus();
   }
 
   #safety() {
@@ -66,78 +139,46 @@ class Pane {
     return found;
   }
 
-  #select() {
-    const select = document.getElementById("joint");
-    const names = this.#episode.header.joints;
-    select.replaceChildren(...jointOptions(names, this.#episode.header.grippers));
-    const wanted = names.indexOf(localStorage.getItem(KEY));
-    select.selectedIndex = Math.max(0, wanted);
-    select.addEventListener("change", () => {
-      localStorage.setItem(KEY, names[select.selectedIndex]);
-      this.#show(select.selectedIndex);
-    });
-    this.#show(select.selectedIndex);
-  }
-
-  #show(index) {
-    const { ticks, raw } = this.#episode;
-    const length = ticks.time.length;
-    const pick = (name) => joint(ticks[name], index, length);
-    this.#curves = { time: ticks.time, state: pick("measured"), executed: pick("executed"), smoothed: pick("smoothed") };
-    document.getElementById("unit").textContent = this.#episode.header.units[index] ?? "";
-    this.#raw = answers(raw.time, joint(raw.values, index, raw.time.length), raw.chunk);
-    this.#plot.show(this.#curves, this.#raw);
-    this.#at();
-  }
-
   #explain(element) {
     const { safety } = this.#episode.ticks;
     const { chunks, header } = this.#episode;
-    if (chunks.spans.length) mark(element, "chunk", "--mark-chunk", "hairline", "Where another chunk takes over; the strip over the curves has its number");
-    if (chunks.overlaps.length) mark(element, "overlap", "--mark-overlap", "patch", "Steps that several chunks made");
-    if (header.held.length) mark(element, "held", "--warn-soft", "patch", "Nobody asked the robot for anything");
-    if (safety.includes(1)) mark(element, "changed", "--warn", "tick", "Safety had another action sent than was asked for");
-    if (safety.includes(2)) mark(element, "refused", "--danger", "tick", "Safety let nothing be sent");
-    if (header.marks.length) mark(element, "event", "--text-normal", "tick", "Something that the list of events tells, at the top of the plot");
-    if (header.marks.some(({ kind }) => tunes(kind))) mark(element, "tuned", "--active", "hairline", "Another strategy, or other parameters, from here on");
+    if (chunks.spans.length) mark(element, "chunk", "--mark-chunk", "hairline", "another chunk takes over; the strip over the curves has its number");
+    if (chunks.overlaps.length) mark(element, "overlap", "--mark-overlap", "patch", "steps that several chunks made");
+    if (header.held.length) mark(element, "held", "--warn-soft", "patch", "nothing was asked of the robot");
+    if (safety.includes(1)) mark(element, "changed", "--warn", "tick", "safety sent another action than the one requested");
+    if (safety.includes(2)) mark(element, "refused", "--danger", "tick", "safety sent nothing");
+    if (header.marks.length) mark(element, "event", "--text-normal", "tick", "an event from the list");
+    if (header.marks.some(({ kind }) => tunes(kind))) mark(element, "tuned", "--active", "hairline", "another strategy, or other parameters, from here on");
     const { spaces } = this.#episode;
-    if (!spaces.includes("joint")) this.#legend.explain("raw", `The policy speaks in ${spaces.join(", ") || "no"} space: it has no joint to draw.`);
+    if (!spaces.includes("joint")) this.#legend.explain("raw", `The policy acts in ${spaces.join(", ") || "no"} space: it has no joints to draw.`);
   }
 
   #hover(time) {
+    if (time === this.#hovered) return;
     this.#hovered = time;
     this.#at();
   }
 
   /** The values and the chunk under the pointer, or else at the clock. */
   #at() {
-    this.#plot.at(this.#clock.time);
-    const time = this.#hovered ?? this.#clock.time;
-    const { chunks } = this.#episode;
-    this.#plot.choose(chunks.ownerAt(time + 1e-6));
-    write(this.#said, readout(chunks, time + 1e-6));
-    const tick = last(this.#curves.time, time + 1e-6);
-    for (const name of ["state", "executed", "smoothed"]) this.#legend.value(name, tick < 0 ? NaN : this.#curves[name][tick]);
-    this.#legend.value("raw", wanted(this.#raw, time + 1e-6));
+    const time = (this.#hovered ?? this.#clock.time) + 1e-6;
+    const { chunks, ticks } = this.#episode;
+    const owner = chunks.ownerAt(time);
+    const tick = last(ticks.time, time);
+    for (const cell of this.#cells) cell.at(this.#clock.time, { tick, time, owner });
+    write(this.#said, readout(chunks, time));
   }
 }
 
 /** Say what a colour behind the curves means. */
 function mark(element, name, colour, shape, means) {
-  const part = document.createElement("span");
+  const part = document.createElement("p");
   part.className = "legend legend-mark";
-  part.title = means;
   const swatch = document.createElement("i");
   swatch.className = shape;
   swatch.style.setProperty("--colour", `var(${colour})`);
-  part.append(swatch, name);
+  part.append(swatch, Object.assign(document.createElement("span"), { className: "strong", textContent: name }), ` ${means}`);
   element.append(part);
-}
-
-/** What the newest chunk wants at `time`; NaN where it says nothing. */
-function wanted(chunks, time) {
-  const chunk = chunks.findLast(({ times }) => times[0] <= time);
-  return chunk ? chunk.values[last(chunk.times, time)] : NaN;
 }
 
 /** Consecutive values of one chunk belong to one line: [{id, times, values}]. */

@@ -7,6 +7,7 @@ if (form) {
   const count = form.querySelector("[data-count]");
   const show = () => (count.textContent = String(chosen().length));
   document.getElementById("chosen").addEventListener("change", show);
+  document.body.addEventListener("htmx:afterSwap", show); // the list was narrowed: those that are gone are chosen no more
   window.addEventListener("pageshow", show); // a browser that comes back fills its fields again
   form.addEventListener("submit", (event) => {
     if (!chosen().length) {

@@ -2,6 +2,7 @@
 
 import { cameras, firstPictures } from "./cameras.js";
 import { Clock } from "./clock.js";
+import { enlarged } from "./enlarged.js";
 import { Review } from "./review.js";
 import { travelled } from "./segments.js";
 import { Timeline } from "./timeline.js";
@@ -9,7 +10,7 @@ import { transport } from "./transport.js";
 
 const config = JSON.parse(document.getElementById("config").textContent);
 const clock = new Clock(config);
-const timeline = new Timeline(clock);
+const timeline = new Timeline(clock, { videos: config.videos, grid: config.grid });
 
 /** Say in a pane's note why its scripts are not there. */
 function absent(note, error) {
@@ -18,6 +19,7 @@ function absent(note, error) {
 }
 
 cameras(document, config.videos, clock);
+enlarged(document.getElementById("cameras"));
 transport(clock);
 if (document.getElementById("review")) new Review(clock);
 if (config.segments) travelled(clock, config.segments);
@@ -27,5 +29,5 @@ import("./curves.js")
   .then((found) => timeline.fill(found))
   .catch((error) => absent("curves-note", error));
 import("./robot.js")
-  .then(({ robotPane }) => robotPane({ root: document, clock, viewer: config.viewer, geometry: config.geometry, poses: config.poses, why: config.why }))
+  .then(({ robotPane }) => robotPane({ root: document, clock, viewer: config.viewer, geometry: config.geometry, poses: config.poses, bench: config.bench, why: config.why }))
   .catch((error) => absent("scene-note", error));

@@ -17,32 +17,45 @@ export function tunes(kind) {
 export class Plot {
   #element;
   #library;
+  #strip;
+  #over = new AbortController();
+  #sized;
   #plot = null;
   #cursor = document.createElement("i");
   #data;
-  #behind; // {held, marks, safety, raw, owners}
+  #behind; // {held, marks, safety, owners}
+  #raw = [];
   #time = 0;
   #shown;
   #lane;
   #chosen = -1; // the chunk under the cursor
   #hover;
 
-  constructor({ element, library, behind, shown, seek, hover }) {
+  /** `strip`: whether it has the strip of the chunks and the words of the time axis, which several below each other share. */
+  constructor({ element, library, behind, strip, shown, seek, hover }) {
     this.#element = element;
     this.#library = library;
+    this.#strip = strip ? LANE : 0;
     this.#behind = behind;
     this.#shown = shown;
     this.seek = seek;
     this.#hover = hover;
     this.#lane = new Lane(behind.owners);
     this.#cursor.className = "replay-cursor";
-    new ResizeObserver(() => this.#fit()).observe(element);
-    document.addEventListener("eva:theme", () => this.#build());
+    this.#sized = new ResizeObserver(() => this.#fit());
+    this.#sized.observe(element);
+    document.addEventListener("eva:theme", () => this.#build(), { signal: this.#over.signal });
+  }
+
+  destroy() {
+    this.#over.abort();
+    this.#sized.disconnect();
+    this.#plot?.destroy();
   }
 
   /** `curves`: {time, state, executed, smoothed} of one joint; `raw`: [{id, times, values}] as the policy gave them. */
   show(curves, raw) {
-    this.#behind.raw = raw;
+    this.#raw = raw;
     this.#data = [Array.from(curves.time), ...LINES.map((kind) => blank(curves[kind.name]))];
     if (this.#plot) this.#plot.setData(this.#data);
     else this.#build();
@@ -83,11 +96,11 @@ export class Plot {
     const options = {
       width: this.#element.clientWidth || 600,
       height: this.#element.clientHeight || 160,
-      padding: [LANE, null, null, null],
+      padding: [this.#strip || 6, null, null, null],
       legend: { show: false },
-      cursor: { drag: { x: true, y: false }, points: { show: false } },
+      cursor: { y: false, drag: { x: true, y: false }, points: { show: false }, sync: { key: "replay" } },
       scales: { x: { time: false }, y: { range: (plot, low, high) => spread(low, high) } },
-      axes: axes(),
+      axes: this.#axes(),
       series: series(LINES, this.#shown),
       hooks: {
         drawAxes: [(plot) => this.#drawBehind(plot)],
@@ -100,6 +113,11 @@ export class Plot {
     this.#plot.over.append(this.#cursor);
     this.#pick(this.#plot);
     this.at(this.#time);
+  }
+
+  #axes() {
+    const [time, values] = axes();
+    return this.#strip ? [time, values] : [{ ...time, size: 6, values: () => [] }, values];
   }
 
   /** A click goes there; a drag looks closer, a double click at everything. */
@@ -138,14 +156,15 @@ export class Plot {
       }
       if (this.#shown(RAW.name)) this.#drawRaw(plot, ctx, x);
     });
-    const above = LANE * devicePixelRatio;
+    if (!this.#strip) return;
+    const above = this.#strip * devicePixelRatio;
     this.#inside(plot, (ctx, x, place) => this.#lane.strip(ctx, x, { ...place, chosen: this.#chosen }), above);
   }
 
   /** What each chunk wanted, the one under the cursor on top. */
   #drawRaw(plot, ctx, x) {
     const own = ({ id }) => id === this.#chosen;
-    const { raw } = this.#behind;
+    const raw = this.#raw;
     ctx.strokeStyle = css(RAW.colour);
     const kinds = [
       [raw.filter((chunk) => !own(chunk)), 1, FAINT],

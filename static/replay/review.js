@@ -1,8 +1,9 @@
 // The review of an episode: what the checks found, verdicts, annotated parts; everything has a key.
 
 import { get, post } from "../site/api.js";
+import { Annotation } from "./annotation.js";
 import { sayLost } from "./lost.js";
-import { bands, flagFrom, flagsAt, list, stacked } from "./review_lanes.js";
+import { bands, flagFrom, flagsAt, list } from "./review_lanes.js";
 
 const LOOK_AGAIN_MS = 4000; // while the checks are not done
 const element = (id) => document.getElementById(id);
@@ -11,10 +12,10 @@ export class Review {
   #clock;
   #bar = element("review");
   #said = { flags: [], segments: [], reviews: [], quality: null, verdict: null };
-  #begin = null; // the row at which a segment begins that has no end yet
-  #edited = null; // what the segment's form is about: {first, last, segment?}
-  #busy = false;
+  #annotation;
+  #asked = Promise.resolve(); // what was pressed, one after the other
   #shown = 0; // answers to what was pressed
+  #leaving = false; // for the next episode: what is pressed now is meant for that one
 
   constructor(clock) {
     this.#clock = clock;
@@ -23,10 +24,17 @@ export class Review {
       if (button) this.#do(button.dataset.review);
     });
     element("note-form").addEventListener("submit", (event) => this.#saveNote(event));
-    element("segment-form").addEventListener("submit", (event) => this.#saveSegment(event));
+    this.#annotation = new Annotation({
+      ...{ clock, bar: this.#bar },
+      ask: (request, done) => this.#ask(request, done),
+      tell: (sentence, bad) => this.#tell(sentence, bad),
+      open: (form) => this.#open(form),
+      close: () => this.#close(),
+    });
     document.addEventListener("keydown", (event) => this.#key(event));
     for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.#at());
-    this.#load();
+    window.addEventListener("pageshow", () => (this.#leaving = false)); // somebody came back
+    this.#load().then(() => this.#tellWaiting());
   }
 
   async #load() {
@@ -40,25 +48,22 @@ export class Review {
     if (!this.#said.quality) setTimeout(() => this.#load(), LOOK_AGAIN_MS);
   }
 
-  /** Show what a request answers; its failure is said, and nothing else changes. */
-  async #ask(request, done = "") {
-    if (this.#busy) {
-      this.#tell("not yet: what was pressed before is on its way", true);
-      return false;
-    }
-    this.#busy = true;
-    try {
-      const said = await request();
-      this.#shown += 1;
-      this.#show(said);
-      if (done) this.#tell(done);
-      return true;
-    } catch (error) {
-      this.#tell(error.message, true);
-      return false;
-    } finally {
-      this.#busy = false;
-    }
+  /** Show what a request answers, after those before it; its failure is said, and nothing else changes. */
+  #ask(request, done = "") {
+    const answer = this.#asked.then(async () => {
+      try {
+        const said = await request();
+        this.#shown += 1;
+        this.#show(said);
+        if (done) this.#tell(done);
+        return true;
+      } catch (error) {
+        this.#tell(error.message, true);
+        return false;
+      }
+    });
+    this.#asked = answer;
+    return answer;
   }
 
   #tell(sentence, bad = false) {
@@ -86,19 +91,18 @@ export class Review {
     list(
       element("segments-list"),
       segments.map((one) => ({ words: one.label, detail: `${one.first} to ${one.last}${one.milestone ? `, then ${one.milestone}` : ""}, ${one.annotator}`, go: go(one) })),
-      "No part is annotated yet.",
+      "No segment is annotated yet.",
     );
     list(
       element("history-list"),
       reviews.map((one) => ({ words: one.note ? `${one.verdict}: ${one.note}` : one.verdict, detail: `${one.reviewer}, ${new Date(one.at).toLocaleString()}`, mark: one.verdict })),
-      "Nobody has said anything yet.",
+      "No review yet.",
     );
     element("flags-count").textContent = quality ? (flags.length ? `Flags ${flags.length}` : "Clean") : "Unchecked";
     element("flags-count").dataset.severity = quality?.worst ?? "";
     element("segments-count").textContent = `Segments ${segments.length || ""}`.trim();
     element("history-count").textContent = `History ${reviews.length || ""}`.trim();
-    const labels = [...new Set(segments.map(({ label }) => label))];
-    element("segment-labels").replaceChildren(...labels.map((value) => Object.assign(document.createElement("option"), { value })));
+    this.#annotation.show(segments);
     this.#at();
   }
 
@@ -117,21 +121,9 @@ export class Review {
     return Number(this.#bar.dataset.frames);
   }
 
-  /** What belongs to the row that is shown: the open segment's band, and the words beside the buttons. */
+  /** The words beside the buttons that belong to the row that is shown. */
   #at() {
     const row = this.#clock.row;
-    const segments = stacked(this.#said.segments);
-    if (this.#begin !== null) segments.push({ first: Math.min(this.#begin, row), last: Math.max(this.#begin, row), label: "…", open: true, lane: 0 });
-    const strip = element("segments");
-    strip.style.setProperty("--lanes", String(1 + Math.max(0, ...segments.map(({ lane }) => lane))));
-    strip.hidden = !segments.length;
-    bands(strip, segments, this.#frames, (band, segment) => {
-      band.textContent = segment.label;
-      band.style.setProperty("--lane", String(segment.lane));
-      band.title = segment.open ? "" : `${segment.label}, ${segment.annotator}`;
-      band.dataset.own = String(segment.annotator === this.#bar.dataset.user);
-      band.toggleAttribute("data-open", Boolean(segment.open));
-    });
     const [flag] = flagsAt(this.#said.flags, row);
     const here = element("flag-here");
     here.textContent = here.title = flag?.text ?? "";
@@ -145,87 +137,38 @@ export class Review {
     const actions = {
       pass: () => this.#verdict("pass"),
       fail: () => this.#verdict("fail"),
+      passNext: () => this.#verdictAndNext("pass"),
+      failNext: () => this.#verdictAndNext("fail"),
       note: () => this.#open("note-form"),
-      begin: () => this.#beginSegment(),
-      end: () => this.#endSegment(),
-      edit: () => this.#editSegment(),
-      remove: () => this.#removeSegment(),
+      begin: () => this.#annotation.begin(),
+      end: () => this.#annotation.end(),
+      edit: () => this.#annotation.edit(),
+      remove: () => this.#annotation.remove(),
       next: () => this.#next(),
       flag: () => this.#toFlag(1),
       flagBack: () => this.#toFlag(-1),
       check: () => this.#check(),
       keys: () => element("review-keys").showModal(),
-      cancel: () => this.#close(),
+      cancel: () => this.#annotation.cancel(),
     };
     actions[what]();
   }
 
   #verdict(verdict) {
-    this.#ask(() => post(this.#bar.dataset.address, { verdict }), verdict === "pass" ? "Passed." : "Failed.");
+    return this.#ask(() => post(this.#bar.dataset.address, { verdict }), verdict === "pass" ? "Passed." : "Failed.");
+  }
+
+  async #verdictAndNext(verdict) {
+    if (await this.#verdict(verdict)) this.#next();
   }
 
   async #saveNote(event) {
     event.preventDefault();
     const field = event.target.elements.note;
-    if (await this.#ask(() => post(this.#bar.dataset.address, { verdict: "note", note: field.value }), "The note is kept.")) {
+    if (await this.#ask(() => post(this.#bar.dataset.address, { verdict: "note", note: field.value }), "The note is saved.")) {
       field.value = "";
       this.#close();
     }
-  }
-
-  #beginSegment() {
-    this.#begin = this.#clock.row;
-    this.#tell(`Segment from row ${this.#begin} on.`);
-    this.#at();
-  }
-
-  #endSegment() {
-    if (this.#begin === null) {
-      this.#tell("No segment has begun: press [ at its first row.", true);
-      return;
-    }
-    const ends = [this.#begin, this.#clock.row].sort((one, other) => one - other);
-    this.#fill({ first: ends[0], last: ends[1] }, "", "");
-  }
-
-  #editSegment() {
-    const found = this.#own();
-    if (found) this.#fill({ first: found.first, last: found.last, segment: found.uuid }, found.label, found.milestone);
-  }
-
-  #fill(edited, label, milestone) {
-    this.#clock.pause();
-    this.#edited = edited;
-    element("segment-span").textContent = `${edited.first} to ${edited.last}`;
-    const { elements } = element("segment-form");
-    elements.label.value = label;
-    elements.milestone.value = milestone;
-    this.#open("segment-form");
-  }
-
-  async #saveSegment(event) {
-    event.preventDefault();
-    const { label, milestone } = event.target.elements;
-    const content = { ...this.#edited, label: label.value, milestone: milestone.value };
-    if (await this.#ask(() => post(this.#bar.dataset.segments, content), "The segment is kept.")) {
-      this.#begin = null;
-      this.#close();
-      this.#at();
-    }
-  }
-
-  #removeSegment() {
-    const found = this.#own();
-    if (found) this.#ask(() => post(`${this.#bar.dataset.segments}/${found.uuid}/remove`, {}), `“${found.label}” is removed.`);
-  }
-
-  /** The user's shortest segment at this row; says so where there is none. */
-  #own() {
-    const row = this.#clock.row;
-    const own = this.#said.segments.filter((one) => one.annotator === this.#bar.dataset.user && one.first <= row && row <= one.last);
-    own.sort((one, other) => one.last - one.first - (other.last - other.first));
-    if (!own.length) this.#tell("None of your segments is at this row.", true);
-    return own[0];
   }
 
   #toFlag(step) {
@@ -237,17 +180,36 @@ export class Review {
   async #check() {
     try {
       await post(this.#bar.dataset.quality, {});
-      this.#tell("It is checked again; reload the page in a moment.");
+      this.#tell("It is being checked again; reload the page in a moment.");
     } catch (error) {
       this.#tell(error.message, true);
     }
   }
 
+  /** To the next episode once everything that was pressed has its answer, as fast as this one is played. */
   async #next() {
+    if (this.#leaving) return;
+    this.#leaving = true;
+    await this.#asked;
     try {
       const { episode } = await get(this.#bar.dataset.next);
-      if (episode) window.location.assign(`${this.#bar.dataset.replay}${episode}/`);
-      else this.#tell("No other episode waits for a review.");
+      const { rate } = this.#clock;
+      if (episode) {
+        this.#tell("Opening the next episode …");
+        window.location.assign(`${this.#bar.dataset.replay}${episode}/${rate === 1 ? "" : `?speed=${rate}`}`);
+        return;
+      }
+      this.#tell("No other episode is waiting for a review.");
+    } catch (error) {
+      this.#tell(error.message, true);
+    }
+    this.#leaving = false;
+  }
+
+  async #tellWaiting() {
+    try {
+      const { waiting } = await get(this.#bar.dataset.next);
+      if (!this.#shown && !this.#leaving) this.#tell(waiting === 1 ? "1 episode is waiting for a review." : `${waiting} episodes are waiting for a review.`);
     } catch (error) {
       this.#tell(error.message, true);
     }
@@ -268,16 +230,16 @@ export class Review {
   #key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || element("review-keys").open) return;
     if (event.key === "Escape") {
-      this.#begin = null;
-      this.#close();
-      this.#at();
+      this.#annotation.cancel();
       return;
     }
     if (event.target.closest("select, textarea, input:not([type=range])")) return;
-    const keys = { p: "pass", f: "fail", n: "note", "[": "begin", "]": "end", e: "edit", x: "remove", u: "next", g: "flag", G: "flagBack", c: "check", "?": "keys" };
-    const action = keys[event.key];
-    if (!action || event.repeat) return;
+    const keys = { p: "pass", f: "fail", n: "note", "[": "begin", "]": "end", e: "edit", x: "remove", P: "passNext", F: "failNext", u: "next", g: "flag", G: "flagBack", c: "check", "?": "keys" };
+    const [action, label] = [keys[event.key], this.#annotation.labelOf(event.key)];
+    if ((!action && !label) || event.repeat) return;
     event.preventDefault();
-    this.#do(action);
+    if (this.#leaving) this.#tell("Not counted: the next episode is still being opened.");
+    else if (action) this.#do(action);
+    else this.#annotation.mark(label);
   }
 }

@@ -57,3 +57,20 @@ export function list(element, items, none) {
   if (!made.length) made.push(Object.assign(document.createElement("li"), { className: "muted", textContent: none }));
   element.replaceChildren(...made);
 }
+
+/** Where several of the segments lie over each other: [{first, last, count}]. */
+export function overlaps(segments) {
+  const edges = segments.flatMap(({ first, last }) => [
+    [first, 1],
+    [last + 1, -1],
+  ]);
+  edges.sort((one, other) => one[0] - other[0]);
+  const found = [];
+  let count = 0;
+  edges.forEach(([row, step], index) => {
+    count += step;
+    const next = edges[index + 1]?.[0];
+    if (count > 1 && next > row) found.push({ first: row, last: next - 1, count });
+  });
+  return found;
+}

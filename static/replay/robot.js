@@ -2,6 +2,7 @@
 
 import { get } from "../site/api.js";
 import { Scene3D } from "../console/scene/scene3d.js";
+import { followBench } from "./bench.js";
 import { message } from "./data.js";
 import { viewer as loaded } from "./viewer.js";
 
@@ -61,7 +62,7 @@ export class Robot {
 }
 
 /** Fill the pane in `root`, or put a sentence in its place; without an address that is `why`. */
-export async function robotPane({ root, clock, viewer, geometry: address, poses, why = "the episode names no robot" }) {
+export async function robotPane({ root, clock, viewer, geometry: address, poses, bench = "", why = "the episode names no robot" }) {
   const note = root.querySelector("[data-scene-note]");
   if (!address) {
     note.textContent = `No 3D scene: ${why}.`;
@@ -76,6 +77,7 @@ export async function robotPane({ root, clock, viewer, geometry: address, poses,
       button.addEventListener("click", () => scene.view(button.dataset.view));
     }
     await new Robot({ scene, clock, address: poses, size: geometry.parts.length * MATRIX }).begin();
+    if (bench) await followBench(scene, clock, bench);
     note.hidden = true;
   } catch (error) {
     note.textContent = `No 3D scene: ${error.message}.`;

@@ -4,7 +4,7 @@ import { jointOptions } from "../console/manual/joint_names.js";
 import { cameras } from "./cameras.js";
 import { Clock, Shifted } from "./clock.js";
 import { message } from "./data.js";
-import { begins, grid, sampled, spanned } from "./aligned.js";
+import { begins, differing, grid, sampled, spanned } from "./aligned.js";
 import { SharedPlot } from "./shared_plot.js";
 import { robotPane } from "./robot.js";
 import { Timeline } from "./timeline.js";
@@ -59,7 +59,8 @@ if (scenes) {
   });
 }
 
-const KEY = "eva-replay-joint";
+const KEY = `eva-beside-joint:${given.getAll("show").join()}`; // of these episodes, while the tab is open
+const SAMPLES = 400; // times at which episodes are held against each other
 
 async function curves() {
   const library = (await import(config.uplot).catch(() => null))?.default;
@@ -71,17 +72,21 @@ async function curves() {
   const grippers = joints.map((name, index) => index).filter((index) => read.some(({ header }) => header.grippers.includes(header.joints.indexOf(joints[index]))));
   const select = element("joint");
   select.replaceChildren(...jointOptions(joints, grippers));
-  select.selectedIndex = Math.max(0, joints.indexOf(localStorage.getItem(KEY)));
   const time = grid(shared);
+  const chosen = joints.indexOf(sessionStorage.getItem(KEY));
+  const every = Math.max(1, Math.floor(time.length / SAMPLES));
+  select.selectedIndex = chosen >= 0 ? chosen : differing(time.filter((_, row) => row % every === 0), read, joints);
   const plots = new Plots(library, time, read);
   const show = () => {
     const joint = joints[select.selectedIndex];
-    localStorage.setItem(KEY, joint);
     const owner = read.find(({ header }) => header.joints.includes(joint));
     element("unit").textContent = owner.header.units[owner.header.joints.indexOf(joint)] ?? "";
     plots.show(joint);
   };
-  select.addEventListener("change", show);
+  select.addEventListener("change", () => {
+    sessionStorage.setItem(KEY, joints[select.selectedIndex]);
+    show();
+  });
   element("overlaid").addEventListener("click", () => plots.toggle());
   show();
 }

@@ -1,4 +1,6 @@
-// The time axis of the transport, with held spans shaded and events marked, and the list of events.
+// The time axis of the transport, with held spans shaded, events, milestones and chunks marked, and the list of events.
+
+import { Hover } from "./hover.js";
 
 function stamp(seconds) {
   const minutes = Math.floor(seconds / 60);
@@ -10,9 +12,12 @@ export class Timeline {
   #scrub = document.getElementById("scrub");
   #rows = [];
   #now = -1;
+  #hover;
 
-  constructor(clock) {
+  /** `pictures`: {videos, grid} of the small pictures, where there are any. */
+  constructor(clock, pictures = {}) {
     this.#clock = clock;
+    this.#hover = new Hover({ clock, axis: this.#scrub, stamp, ...pictures });
     this.#scrub.addEventListener("input", () => {
       clock.pause();
       clock.seekRow(Number(this.#scrub.value));
@@ -20,8 +25,8 @@ export class Timeline {
     for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.#at());
   }
 
-  /** `held`: [[from, to]] and `marks`: [{time, kind, text}], in seconds. */
-  fill({ held, marks }) {
+  /** `held`: [[from, to]], `marks`: [{time, kind, text}] and `chunks`: [{from}], in seconds. */
+  fill({ held, marks, chunks = [] }) {
     const strip = document.getElementById("marks");
     const share = (time) => `${(100 * Math.min(time, this.#clock.duration)) / this.#clock.duration}%`;
     for (const [from, to] of held) strip.append(piece("timeline-held", share(from), share(to - from)));
@@ -30,17 +35,28 @@ export class Timeline {
       mark.dataset.kind = kind;
       strip.append(mark);
     }
+    this.#chunks(chunks);
+    this.#hover.mark(marks.map(({ time, kind, text }) => ({ time, text: text || kind })));
     this.#list(marks);
     this.#at();
   }
 
+  /** A hairline where each chunk takes over. */
+  #chunks(chunks) {
+    const lane = document.getElementById("chunks");
+    const places = chunks.map(({ from }) => Math.min(from, this.#clock.duration) / this.#clock.duration);
+    lane.toggleAttribute("hidden", !places.length);
+    lane.firstElementChild.setAttribute("d", places.map((place) => `M${place.toFixed(5)} 0V1`).join(""));
+  }
+
   #list(marks) {
     const list = document.getElementById("events");
-    if (!marks.length) list.append(Object.assign(document.createElement("li"), { className: "muted", textContent: "Nothing happened but the run." }));
+    if (!marks.length) list.append(Object.assign(document.createElement("li"), { className: "muted", textContent: "No events but the run itself." }));
     for (const mark of [...marks].sort((one, other) => one.time - other.time)) {
       const item = document.createElement("li");
       const button = document.createElement("button");
       button.type = "button";
+      if (mark.kind === "milestone") button.className = "timeline-reached";
       button.append(Object.assign(document.createElement("span"), { className: "mono", textContent: stamp(mark.time) }), ` ${mark.text || mark.kind}`);
       button.addEventListener("click", () => this.#clock.seek(mark.time));
       item.append(button);

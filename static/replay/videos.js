@@ -6,6 +6,7 @@ const BEHIND_S = 0.06; // beyond it the clock waits for the video
 const FAR_S = 0.3; // beyond it a jump is quicker than catching up
 const CATCH_UP = 0.12; // share of the rate by which a video that is off runs faster or slower
 const CHECK_MS = 200;
+const AGAIN_MS = 60000; // after which a video that failed is asked for once more: its address may have run out
 
 export class Videos {
   #clock;
@@ -24,8 +25,13 @@ export class Videos {
   }
 
   #add(element, address, start) {
-    const video = { element, start, broken: false };
+    const video = { element, start, broken: false, asked: performance.now() };
     const broken = () => {
+      if (performance.now() - video.asked > AGAIN_MS) {
+        video.asked = performance.now();
+        element.load(); // our own address leads to a new one of the store
+        return;
+      }
       video.broken = true;
       element.parentElement.querySelector("[data-fault]").textContent = "this video cannot be played";
     };

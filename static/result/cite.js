@@ -20,7 +20,7 @@ for (const button of document.querySelectorAll("[data-copy]")) {
   const words = button.textContent;
   button.addEventListener("click", async () => {
     const done = await copy(button.closest("details").querySelector("textarea"));
-    button.textContent = done ? "Copied" : "Marked: copy it with the keyboard";
+    button.textContent = done ? "Copied" : "Selected: copy it with the keyboard";
     setTimeout(() => (button.textContent = words), SAID_MS);
   });
 }

@@ -1,53 +1,116 @@
-// The cameras of a trial on one clock: what is done to one is done to all.
+// Cameras of one recording, or of several that begin together, on one clock: play, step, speed, one slider, moments.
 
-const TOLERANCE_S = 0.1;
+import { cameras } from "../replay/cameras.js";
+import { Clock, Shifted } from "../replay/clock.js";
+import { link } from "../replay/link.js";
 
-const videos = [...document.querySelectorAll(".result-videos video")];
-const button = document.querySelector("[data-videos]");
+const SECOND = { ArrowLeft: -1, ArrowRight: 1 };
 
-function others(video) {
-  return videos.filter((other) => other !== video);
-}
+class Player {
+  #bar;
+  #clock;
 
-function align(video) {
-  for (const other of others(video)) {
-    if (Math.abs(other.currentTime - video.currentTime) > TOLERANCE_S) other.currentTime = video.currentTime;
+  constructor(bar, groups) {
+    const recordings = groups.map(({ dataset }) => ({ fps: Number(dataset.fps), frames: Number(dataset.frames) }));
+    const fps = Math.max(...recordings.map((one) => one.fps));
+    const seconds = Math.max(...recordings.map((one) => one.frames / one.fps));
+    this.#bar = bar;
+    this.#clock = new Clock({ fps, frames: Math.max(1, Math.round(seconds * fps)) });
+    groups.forEach((group, index) => {
+      const videos = [...group.querySelectorAll("video[data-camera]")];
+      for (const video of videos) video.controls = false;
+      const shown = videos.map((video) => ({ camera: video.dataset.camera, address: video.getAttribute("src") }));
+      cameras(group, shown, new Shifted(this.#clock, recordings[index]));
+    });
+    this.#controls();
+    bar.hidden = false;
+    if ("link" in bar.dataset) link(this.#clock, (wanted) => this.#choose(wanted));
+  }
+
+  #part(name) {
+    return this.#bar.querySelector(`[data-player-${name}]`);
+  }
+
+  #controls() {
+    const clock = this.#clock;
+    const [play, slider, speed, whole] = ["play", "slider", "speed", "whole"].map((name) => this.#part(name));
+    slider.max = String(clock.rows - 1);
+    play.addEventListener("click", () => clock.toggle());
+    this.#part("back").addEventListener("click", () => clock.step(-1));
+    this.#part("forth").addEventListener("click", () => clock.step(1));
+    slider.addEventListener("input", () => clock.seekRow(Number(slider.value)));
+    speed.addEventListener("change", () => (clock.rate = Number(speed.value)));
+    whole.addEventListener("click", () => {
+      clock.narrow(null);
+      clock.loop = false;
+      play.focus();
+    });
+    const say = () => {
+      play.firstChild.textContent = clock.playing ? "Pause " : "Play ";
+      whole.hidden = !clock.narrowed;
+    };
+    const show = () => {
+      const words = `${(clock.row / clock.fps).toFixed(2)} of ${clock.duration.toFixed(2)} s`;
+      slider.value = String(clock.row);
+      slider.setAttribute("aria-valuetext", words);
+      this.#part("time").textContent = words;
+    };
+    for (const kind of ["play", "pause", "range"]) clock.addEventListener(kind, say);
+    for (const kind of ["tick", "seek"]) clock.addEventListener(kind, show);
+    say();
+    show();
+  }
+
+  /** The nearest of the speeds there are. */
+  #choose(wanted) {
+    const speed = this.#part("speed");
+    const away = [...speed.options].map(({ value }) => Math.abs(Number(value) - wanted));
+    speed.selectedIndex = away.indexOf(Math.min(...away));
+    this.#clock.rate = Number(speed.value);
+  }
+
+  /** Stand at a moment [s], with the pictures in view. */
+  goTo(seconds) {
+    this.#clock.pause();
+    this.#clock.seekRow(Math.round(seconds * this.#clock.fps));
+    this.#bar.scrollIntoView({ block: "nearest" });
+  }
+
+  key(event) {
+    const clock = this.#clock;
+    const moment = document.querySelector(`[data-seek][data-key="${CSS.escape(event.key)}"]`);
+    const actions = { " ": () => clock.toggle(), Home: () => clock.seekRow(0), End: () => clock.seekRow(clock.rows - 1) };
+    const by = SECOND[event.key];
+    if (moment) this.goTo(Number(moment.dataset.seek));
+    else if (by && event.shiftKey) clock.seek(clock.time + by);
+    else if (by) clock.step(by);
+    else if (actions[event.key]) actions[event.key]();
+    else return;
+    event.preventDefault();
   }
 }
 
-function say() {
-  if (button) button.textContent = videos.some((video) => !video.paused) ? "Pause all" : "Play all";
+let player = null;
+
+/** For the videos of the page, again where they came later. */
+function start() {
+  const bar = document.querySelector("[data-player][hidden]");
+  const groups = [...document.querySelectorAll(".result-videos[data-frames]")];
+  if (bar && groups.length) player = new Player(bar, groups);
 }
 
-function playAll() {
-  if (videos.every((video) => video.ended)) for (const video of videos) video.currentTime = 0;
-  for (const video of videos) {
-    // A browser may refuse to play: the button then goes on saying so.
-    if (!video.ended) video.play().catch(say);
-  }
-}
-
-function pauseAll() {
-  for (const video of videos) video.pause();
-}
-
-for (const video of videos) {
-  video.addEventListener("play", () => {
-    align(video);
-    for (const other of others(video)) if (other.paused && !other.ended) other.play().catch(say);
-    say();
-  });
-  video.addEventListener("pause", () => {
-    if (!video.ended && !video.seeking) for (const other of others(video)) other.pause();
-    say();
-  });
-  video.addEventListener("seeked", () => align(video));
-  video.addEventListener("ratechange", () => {
-    for (const other of others(video)) other.playbackRate = video.playbackRate;
-  });
-}
-
-if (button && videos.length) {
-  button.hidden = false;
-  button.addEventListener("click", () => (videos.some((video) => !video.paused) ? pauseAll() : playAll()));
-}
+start();
+document.body.addEventListener("htmx:afterSettle", start);
+document.addEventListener("click", (event) => {
+  const moment = player && event.target.closest("[data-seek]");
+  if (!moment || event.ctrlKey || event.metaKey || event.shiftKey) return;
+  event.preventDefault();
+  player.goTo(Number(moment.dataset.seek));
+});
+document.addEventListener("keydown", (event) => {
+  if (!player || event.ctrlKey || event.metaKey || event.altKey) return;
+  const { target } = event;
+  const pressing = event.key === " " && target.closest("button, a, summary");
+  if (pressing || target.closest("select, textarea, dialog, input:not([type=range])")) return;
+  player.key(event);
+});

@@ -1,5 +1,7 @@
 // Requests to our own server: the session's cookie, the CSRF token, and one sentence for whatever goes wrong.
 
+import { sentence } from "./sentences.js";
+
 const TIMEOUT_MS = 8000;
 
 /** What the server refused, or that it did not answer; `unknown` where nobody knows whether it was done. */
@@ -17,9 +19,9 @@ function token() {
   return field ? field.value : "";
 }
 
-function sentence(status, body) {
+function why(status, body) {
   const words = body.reason || body.error || body.detail || body.message;
-  if (typeof words === "string" && words) return words;
+  if (typeof words === "string" && words) return sentence({ ...body, text: words });
   if (Array.isArray(words)) return words.map((one) => one.msg || String(one)).join("; ");
   if (status === 401) return "your session has ended: log in again";
   return `the server answered with HTTP ${status}`;
@@ -50,8 +52,8 @@ export async function post(address, content, { timeout = TIMEOUT_MS, simple = fa
       signal: AbortSignal.timeout(timeout),
     });
   } catch (error) {
-    const why = error.name === "TimeoutError" ? `no answer within ${timeout / 1000} s` : "the server cannot be reached";
-    throw new RequestFailed(`${why}: outcome unknown`, { unknown: true });
+    const what = error.name === "TimeoutError" ? `no answer within ${timeout / 1000} s` : "the server cannot be reached";
+    throw new RequestFailed(`${what}: outcome unknown`, { unknown: true });
   }
   if (response.type === "opaqueredirect") {
     throw new RequestFailed("your session has ended: log in again", { status: 401 });
@@ -59,7 +61,7 @@ export async function post(address, content, { timeout = TIMEOUT_MS, simple = fa
   const body = await bodyOf(response);
   if (!response.ok) {
     const unknown = body.status === "unknown" || response.status === 504;
-    throw new RequestFailed(sentence(response.status, body), { status: response.status, body, unknown });
+    throw new RequestFailed(why(response.status, body), { status: response.status, body, unknown });
   }
   return body;
 }
@@ -73,6 +75,6 @@ export async function get(address) {
     throw new RequestFailed("the server cannot be reached");
   }
   const body = await bodyOf(response);
-  if (!response.ok) throw new RequestFailed(sentence(response.status, body), { status: response.status, body });
+  if (!response.ok) throw new RequestFailed(why(response.status, body), { status: response.status, body });
   return body;
 }

@@ -56,6 +56,8 @@ export function drafts() {
     const owner = event.target.closest("[data-draft]");
     if (owner) sessionStorage.removeItem(KEY(owner.dataset.draft));
   });
+  // At once: what is typed into a new fragment before it was filled would take the place of its draft.
+  document.body.addEventListener("htmx:afterSwap", restore);
   document.body.addEventListener("htmx:afterSettle", restore);
   restore();
 }

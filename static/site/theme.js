@@ -1,14 +1,31 @@
-// Dark or light before anything is drawn: what the page asks for, unless this browser was told otherwise.
+// Dark or light before anything is drawn: as this browser was told, else dark at the bench, and elsewhere as the system.
 // A classic script, because modules run only after the first paint.
 (() => {
+  const KEY = "eva-theme";
   const root = document.documentElement;
-  const key = `eva-theme-${root.dataset.theme}`; // bench and paper are remembered apart
-  const chosen = localStorage.getItem(key);
-  if (chosen === "dark" || chosen === "light") root.dataset.theme = chosen;
-  document.addEventListener("click", (event) => {
-    if (!event.target.closest("[data-theme-toggle]")) return;
-    root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
-    localStorage.setItem(key, root.dataset.theme);
+  const atBench = root.dataset.theme === "dark";
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  const chosen = () => {
+    const found = localStorage.getItem(KEY);
+    return found === "dark" || found === "light" ? found : "system";
+  };
+
+  function apply() {
+    const theme = chosen() === "system" ? (atBench || system.matches ? "dark" : "light") : chosen();
+    if (root.dataset.theme === theme) return;
+    root.dataset.theme = theme;
     document.dispatchEvent(new Event("eva:theme"));
+  }
+
+  apply();
+  system.addEventListener("change", apply);
+  window.addEventListener("storage", apply); // chosen in another tab
+  document.addEventListener("DOMContentLoaded", () => {
+    for (const radio of document.querySelectorAll("[data-theme-choice]")) radio.checked = radio.value === chosen();
+  });
+  document.addEventListener("change", ({ target }) => {
+    if (!target.matches("[data-theme-choice]")) return;
+    localStorage.setItem(KEY, target.value);
+    apply();
   });
 })();

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from typing import Any
+
+from django.db.models import F, Q
 
 from evaweb.plans.models import Plan
 from evaweb.results.models import Judgement, Preference, Rating
@@ -37,7 +40,9 @@ def agreement_of(plan: Plan) -> dict[str, Any] | None:
         "blind": sum(row.blind for row in rows),
         "success": agreement([(first.success, second.success) for first, second in verdicts]),
         "milestones": _milestones(verdicts),
-        "score_alpha": _alpha([[first.score, second.score] for first, second in verdicts]),
+        "score_alpha": _defined(
+            krippendorff_alpha, [[first.score, second.score] for first, second in verdicts], "interval"
+        ),
     }
 
 
@@ -48,10 +53,22 @@ def agreement(pairs: list[tuple[bool, bool]]) -> dict[str, Any]:
         "n": same.n,
         "same": same.successes,
         "wilson": [same.interval.low, same.interval.high] if same.interval else None,
-        "kappa": cohen_kappa(pairs),
+        "kappa": _defined(cohen_kappa, pairs),
         "ac1": gwet_ac1(pairs),
-        "alpha": krippendorff_alpha([[float(one), float(other)] for one, other in pairs]),
+        "alpha": _defined(krippendorff_alpha, [[float(one), float(other)] for one, other in pairs]),
     }
+
+
+def by_words(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """What was said of each milestone; of several with the same words the second is "held (2)", in their order."""
+    found: dict[str, Any] = {}
+    for text, said in milestones:
+        label, n = text, 1
+        while label in found:
+            n += 1
+            label = f"{text} ({n})"
+        found[label] = said
+    return found
 
 
 def _stood(rating: Rating | Judgement) -> Score:
@@ -63,16 +80,21 @@ def _stood(rating: Rating | Judgement) -> Score:
 def _milestones(verdicts: list[tuple[Score, Rating]]) -> dict[str, Any]:
     pairs: dict[str, list[tuple[bool, bool]]] = {}
     for verdict, rating in verdicts:
-        again = {text: bool(reached) for text, reached in rating.milestones}
-        for row in verdict.outcomes.all():
-            if row.text in again:
-                pairs.setdefault(row.text, []).append((row.reached, again[row.text]))
+        again = by_words((text, bool(reached)) for text, reached in rating.milestones)
+        for text, reached in _scored(verdict).items():
+            if text in again:
+                pairs.setdefault(text, []).append((reached, again[text]))
     return {text: agreement(found) for text, found in pairs.items()}
 
 
-def _alpha(units: list[list[float]]) -> float | None:
+def _scored(score: Score) -> dict[str, bool]:
+    return by_words((row.text, row.reached) for row in score.outcomes.all())
+
+
+def _defined(statistic: Callable[..., float], *given: Any) -> float | None:
+    """None where the data do not give it, as where everybody always said the same word."""
     try:
-        return krippendorff_alpha(units, "interval")
+        return statistic(*given)
     except StatisticsError:
         return None
 
@@ -94,10 +116,10 @@ def judges_of(plan: Plan) -> list[dict[str, Any]] | None:
 def _judged(judge: str, version: str, rows: list[Judgement]) -> dict[str, Any]:
     said: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
     for row in rows:
-        words = {text: (reached, probability) for text, reached, probability in row.milestones}
-        for outcome in _stood(row).outcomes.all():
-            if outcome.text in words:
-                said.setdefault(outcome.text, []).append((outcome.reached, *words[outcome.text]))
+        words = by_words((text, own) for text, *own in row.milestones)
+        for text, reached in _scored(_stood(row)).items():
+            if text in words:
+                said.setdefault(text, []).append((reached, *words[text]))
     return {
         "judge": judge,
         "version": version,
@@ -125,8 +147,12 @@ def _calibration(said: list[tuple[bool, bool | None, float | None]]) -> dict[str
 
 
 def comparisons_of(plan: Plan) -> list[Comparison]:
-    """Preferences of people, by checkpoint: all that were said of the same two trials weigh as one."""
-    rows = Preference.objects.filter(plan=plan).order_by("pk")
+    """Preferences of people, by checkpoint: all that were said of the same two trials weigh as one.
+
+    In random order two trials of a block may be of one checkpoint: they are asked about like others and say nothing.
+    """
+    same = Q(first__checkpoint=F("second__checkpoint"))
+    rows = Preference.objects.filter(~same, plan=plan).order_by("pk")
     names = ("first__checkpoint__name", "second__checkpoint__name", "outcome")
     said = list(rows.values_list("first_id", "second_id", *names))
     people = Counter((first, second) for first, second, *_ in said)

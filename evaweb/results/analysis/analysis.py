@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeVar
 
@@ -29,6 +29,7 @@ from evaweb.statistics.success_times import Curve, RestrictedMean, incidence, re
 from evaweb.trials.failure_words import NOT_SAID, why_words
 
 SEED = 20_260  # of all that is drawn: the same data give the same interval
+_RANDOM = "checkpoints came in random order: there are no pairs"
 T = TypeVar("T")
 
 
@@ -68,7 +69,8 @@ class Arm:
     `speed` successes per hour of running, `interventions` how often a run was broken off. `curve` and `mean_time` are
     of time to success [s], up to one horizon for all arms, by which a trial that failed has not succeeded.
     `smoothness` is SPARC of what was measured, `commanded` of what was sent, over those trials of which there is a
-    recording. `failures` are all that failed, the most frequent mode first.
+    recording. `failures` are all that failed, the most frequent mode first. `series`: as which series it is drawn, in
+    every figure of its evaluation.
     """
 
     checkpoint: str
@@ -87,12 +89,24 @@ class Arm:
     failures: tuple[FailureMode, ...]
     smoothness: Average | None
     commanded: Average | None
+    series: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Within:
+    """The exact test within strata, of `strata` in which both checkpoints were tried."""
+
+    p: float
+    strata: int
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
     """Two checkpoints: the first minus the second.
 
+    `within` has the exact test within conditions, scenes, operators and stations, where there are several that tell
+    something; `scenes` the difference in each scene, of several, and `interaction` the probability of their being as
+    different were the odds ratio the same in all.
     `test` is Barnard's and `corrected` its probability after Holm's correction for all pairs of the evaluation; valid
     for a number of trials fixed beforehand, as is `scored`, of the pairs' scores. `evidence` and `score_evidence` may
     be looked at any time, as may `anytime` and `score_anytime`: what the mean difference of the pairs' successes, and
@@ -111,6 +125,9 @@ class Comparison:
     scored: Flips | None
     clustered: Difference | None
     stratified: strata.Stratified | None
+    within: dict[str, Within]
+    scenes: dict[str, Difference]
+    interaction: float | None
     evidence: Evidence
     score_evidence: Evidence
     anytime: Interval | None
@@ -144,24 +161,38 @@ def analyse(
     interruptions: Sequence[Interruption] = (),
     *,
     alpha: float = 0.05,
-    primary: tuple[str, str] | None = None,
+    planned: Sequence[tuple[str, str]] = (),
+    in_pairs: bool = True,
     limits: Mapping[str, float] | None = None,
+    checkpoints: Sequence[str] = (),
 ) -> Analysis:
-    """All of it; `primary` is compared in this direction, others the better one first.
+    """All of it; `planned` comparisons are made in their direction, others the better one first.
+
+    Without `in_pairs` blocks are no pairs: a block has trials of whichever checkpoint was drawn.
 
     `limits` [s] are those of the evaluation's scenes that have one: the smallest is the horizon of times to success;
     without any, the longest run.
 
-    `interruptions` count for how often a checkpoint needs an operator, and for nothing else.
+    `interruptions` count for how often a checkpoint needs an operator, and for nothing else. `checkpoints` are those of
+    the evaluation, in the order in which they have their colours, whichever of them are chosen.
     """
     arms, timing = by_checkpoint(outcomes), _Timing.of(outcomes, limits or {})
+    series = list(dict.fromkeys([*checkpoints, *sorted(arms)]))
     ranked = sorted(arms, key=lambda name: (-sum(o.success for o in arms[name]) / len(arms[name]), name))
-    couples = [_directed(couple, primary) for couple in combinations(ranked, 2)]
+    couples = [_directed(couple, planned) for couple in combinations(ranked, 2)]
     tests = [_test(arms[one], arms[other]) for one, other in couples]
     corrected = holm([test.p for test in tests])
     comparisons = tuple(
         _comparison(
-            one, other, arms[one], arms[other], test, p, _share(alpha, couples, primary, (one, other)), timing
+            one,
+            other,
+            arms[one],
+            arms[other],
+            test,
+            p,
+            _share(alpha, couples, planned, (one, other)),
+            timing,
+            in_pairs,
         )
         for (one, other), test, p in zip(couples, tests, corrected, strict=True)
     )
@@ -169,7 +200,10 @@ def analyse(
     return Analysis(
         len(outcomes),
         tuple(
-            _arm(name, arms[name], [i for i in interruptions if i.checkpoint == name], timing)
+            replace(
+                _arm(name, arms[name], [i for i in interruptions if i.checkpoint == name], timing),
+                series=series.index(name),
+            )
             for name in ranked
         ),
         comparisons,
@@ -207,15 +241,18 @@ class _Timing:
         return self.until if time is None else min(time, self.until)
 
 
-def _directed(couple: tuple[str, str], primary: tuple[str, str] | None) -> tuple[str, str]:
-    return primary if primary is not None and set(couple) == set(primary) else couple
+def _directed(couple: tuple[str, str], planned: Sequence[tuple[str, str]]) -> tuple[str, str]:
+    return next((pair for pair in planned if set(pair) == set(couple)), couple)
 
 
 def _share(
-    alpha: float, couples: Sequence[tuple[str, str]], primary: tuple[str, str] | None, couple: tuple[str, str]
+    alpha: float,
+    couples: Sequence[tuple[str, str]],
+    planned: Sequence[tuple[str, str]],
+    couple: tuple[str, str],
 ) -> float:
-    """Alpha of the evidence: all of it for the comparison that was planned, an equal share for each of the others."""
-    return alpha if couple == primary else alpha / len(couples)
+    """Alpha of the evidence: planned comparisons share all of it, each of the others has an equal share of all."""
+    return alpha / (len(planned) if couple in planned else len(couples))
 
 
 def _counts(trials: Sequence[Outcome]) -> tuple[int, int]:
@@ -284,9 +321,10 @@ def _comparison(
     corrected: float,
     alpha: float,
     timing: _Timing,
+    in_pairs: bool,
 ) -> Comparison:
     notes: list[str] = []
-    pairs = paired(first, second)
+    pairs = paired(first, second) if in_pairs else []
     counts = (*_counts(first), *_counts(second))
     return Comparison(
         one,
@@ -300,12 +338,14 @@ def _comparison(
         sign_flips([p.first.score - p.second.score for p in pairs]) if pairs else None,
         _said(notes, lambda: _clustered(first, second)),
         _said(notes, lambda: _stratified(first, second)),
+        _within(first, second),
+        *_by_scene(first, second),
         success_evidence([(p.first.success, p.second.success) for p in pairs], alpha),
         score_evidence([(p.first.score, p.second.score) for p in pairs], alpha),
         confidence_sequence([float(p.first.success) - p.second.success for p in pairs], alpha),
         confidence_sequence([p.first.score - p.second.score for p in pairs], alpha),
         _sooner(pairs, timing),
-        (*notes, *_waiting(pairs, first, second)),
+        (*notes, *(_waiting(pairs, first, second) if in_pairs else [_RANDOM])),
     )
 
 
@@ -325,6 +365,44 @@ def _stratified(first: Sequence[Outcome], second: Sequence[Outcome]) -> strata.S
     return strata.mantel_haenszel(
         [strata.Table(*_counts(ours[key]), *_counts(theirs[key])) for key in shared]
     )
+
+
+STRATA: dict[str, Callable[[Outcome], str]] = {
+    "condition": lambda o: o.condition,
+    "scene": lambda o: o.scene,
+    "operator": lambda o: o.operator,
+    "station": lambda o: o.station,
+}
+
+
+def _tables(
+    first: Sequence[Outcome], second: Sequence[Outcome], key: Callable[[Outcome], str]
+) -> dict[str, strata.Table]:
+    """Those strata in which both were tried."""
+    ours, theirs = _grouped(first, key), _grouped(second, key)
+    return {
+        name: strata.Table(*_counts(ours[name]), *_counts(theirs[name])) for name in ours if name in theirs
+    }
+
+
+def _within(first: Sequence[Outcome], second: Sequence[Outcome]) -> dict[str, Within]:
+    found = {}
+    for name, key in STRATA.items():
+        tables = list(_tables(first, second, key).values())
+        p = strata.exact_within(tables)
+        if p is not None:
+            found[name] = Within(p, len(tables))
+    return found
+
+
+def _by_scene(
+    first: Sequence[Outcome], second: Sequence[Outcome]
+) -> tuple[dict[str, Difference], float | None]:
+    tables = _tables(first, second, STRATA["scene"])
+    if len(tables) < 2:
+        return {}, None
+    differences = {name: newcombe(t.x1, t.n1, t.x2, t.n2) for name, t in tables.items()}
+    return differences, strata.interaction(list(tables.values()))
 
 
 def _sooner(pairs: Sequence[Pair], timing: _Timing) -> Flips | None:

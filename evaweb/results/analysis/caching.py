@@ -13,7 +13,8 @@ from typing import Any
 from django.db.models import Count, Max, Q, Sum
 
 from evaweb.memo import Kept, steady
-from evaweb.plans.models import Plan
+from evaweb.plans.design import compared, planned
+from evaweb.plans.models import Allocation, Plan
 from evaweb.results.analysis.analysis import Analysis, analyse
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.analysis.load_outcomes import interruptions_of_plan, outcomes_of_plan
@@ -67,13 +68,14 @@ def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> 
     runs, which = runs_of(plan, now), only or Chosen()
 
     def make() -> Analysis:
-        primary = (plan.first.name, plan.second.name) if plan.first and plan.second else None
         return analyse(
             which.apply(runs.outcomes),
             which.apply(runs.interruptions),
             alpha=plan.alpha,
-            primary=primary,
+            planned=compared(plan.document or {}) or planned(plan),
+            in_pairs=plan.allocation == Allocation.PAIRED,
             limits=limits_of(plan),
+            checkpoints=[row["name"] for row in (plan.document or {}).get("checkpoints", ())],
         )
 
     return _analyses.get((plan.pk, plan.digest, which), now, make)

@@ -12,12 +12,13 @@ from datetime import datetime, timedelta
 from statistics import median
 from typing import Any
 
-from django.db.models import F, Min
+from django.db.models import F
 
 from evaweb.memo import Kept
 from evaweb.plans.bench_checks import HOLDS
-from evaweb.plans.models import CameraCheck, Plan
-from evaweb.results.analysis.integrity import changes_of
+from evaweb.plans.design import Names, compared
+from evaweb.plans.models import Achieved, CameraCheck, Plan
+from evaweb.results.analysis.integrity import changes_of, with_changes
 from evaweb.statistics.many import holm
 from evaweb.statistics.permutation import sign_flips
 from evaweb.trials.models import Score, TrialStatus, VoidRequest
@@ -36,7 +37,10 @@ _delays: Kept[list[dict[str, Any]]] = Kept()
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """An attempt as it was handed out; delays are in s, None where they are not known."""
+    """An attempt as it was handed out; delays are in s, None where they are not known.
+
+    `match` is the least of its bench when last looked at before the run, `override` the reason that was given then.
+    """
 
     number: int
     code: str
@@ -55,6 +59,7 @@ class Run:
     voided_at: datetime | None
     voided_by: str | None
     match: float | None
+    override: str
     connect: float | None
     warm_up: float | None
     latency: float | None
@@ -70,8 +75,11 @@ class Run:
         return _seconds(self.handed_at, self.started_at)
 
 
-def conduct_of(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
-    """All of it, `runs` being all attempts; one query more for each version of the plan before this one."""
+def conduct_of(plan: Plan, runs: Sequence[Run], looks: Iterable[Look]) -> dict[str, Any]:
+    """All of it, `runs` being all attempts and `looks` all looks at their bench.
+
+    One query more for each version of the plan before this one.
+    """
     given_back = plan.events.filter(what="given back").order_by("pk")
     return {
         "looks": list(plan.looks.order_by("at").values("at", by_name=F("user__username"))),
@@ -83,11 +91,12 @@ def conduct_of(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
         "operators": balance(runs, "operator"),
         "stations": balance(runs, "station"),
         "cameras": _cameras(plan, runs),
+        "bench": _bench(plan, runs, looks),
         "delays": _compared(plan, runs),
     }
 
 
-def runs_of(plan: Plan) -> list[Run]:
+def runs_of(plan: Plan, looks: Iterable[Look]) -> list[Run]:
     """Every attempt in the order in which it was handed out; one query."""
     fields = (
         "number",
@@ -100,27 +109,88 @@ def runs_of(plan: Plan) -> list[Run]:
     )
     own = ("status", "attempt", "operator__username", "station__name", "started_at", "ended_at")
     voided = ("reason", "voided_at", "voided_by__username")
-    rows = plan.handouts.annotate(match=Min("trial__achieved__match")).order_by("number")
-    told = ("match", "trial__setup_took", "trial__episode__policy")
+    rows, accepted = plan.handouts.order_by("number"), _accepted(looks)
+    told = ("trial__setup_took", "trial__episode__policy")
     found = []
     named = [f"trial__{name}" for name in (*own, *voided)]
     for row in rows.values_list(*fields, *named, *told):
         plain, took, policy = row[:-2], row[-2], row[-1]
         latency = _number(policy, "latency_ms", "p50")
         delays = (_number(took, "connect_s"), _number(took, "warm_up_s"), latency and latency / 1000)
-        found.append(Run(*plain, *delays))
+        found.append(Run(*plain, *accepted.get(row[fields.index("trial_id")], (None, "")), *delays))
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class Look:
+    """A camera at the bench before a run: its least match, None without a reference, and why that was accepted.
+
+    Where the reference has regions they count, not the whole picture: that is what the gate looks at.
+    """
+
+    trial: int
+    place: tuple[str, str, int, str]
+    reference: int | None
+    match: float | None
+    override: str
+
+    @property
+    def camera(self) -> str:
+        """Its name."""
+        return self.place[-1]
+
+
+def looks_of(plan: Plan) -> list[Look]:
+    """All of them in the order in which they were made; one query."""
+    rows = Achieved.objects.filter(trial__handout__plan=plan).order_by("pk")
+    place = ("trial__station__name", "trial__scene__name", "trial__position__number", "camera")
+    return [
+        Look(
+            trial,
+            (station, scene, position, camera),
+            reference,
+            min((region["match"] for region in regions), default=match),
+            override,
+        )
+        for trial, station, scene, position, camera, reference, match, regions, override in rows.values_list(
+            "trial_id", *place, "reference_id", "match", "regions", "override"
+        )
+    ]
+
+
+def _accepted(looks: Iterable[Look]) -> dict[int, tuple[float | None, str]]:
+    """The least match of each trial's last look at its bench, and why it was accepted."""
+    newest: dict[int, dict[str, Look]] = defaultdict(dict)
+    for look in looks:
+        newest[look.trial][look.camera] = look
+    return {
+        trial: (
+            min((look.match for look in cameras.values() if look.match is not None), default=None),
+            next((look.override for look in cameras.values() if look.override), ""),
+        )
+        for trial, cameras in newest.items()
+    }
+
+
 def balance(runs: Iterable[Run], name: str) -> dict[str, Any]:
-    """Trials that count of each operator or station with each checkpoint; `uneven` is the widest difference."""
+    """Trials that count of each operator or station with each checkpoint.
+
+    `uneven`: the most trials by which one of them is off its share of a checkpoint's. Checkpoints that were dropped, or
+    are in random order, have unlike numbers of trials without that.
+    """
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     counted = [run for run in runs if run.counts]
     names = sorted({run.checkpoint for run in counted})
     for run in counted:
         counts[getattr(run, name)][run.checkpoint] += 1
     trials = {who: [of[each] for each in names] for who, of in sorted(counts.items())}
-    uneven = max((max(made) - min(made) for made in trials.values()), default=0)
+    of_all = [sum(made) for made in zip(*trials.values(), strict=True)]
+    off = [
+        abs(count - sum(made) * all_ / len(counted))
+        for made in trials.values()
+        for count, all_ in zip(made, of_all, strict=True)
+    ]
+    uneven = round(max(off, default=0.0), 1)
     rows = [{"name": who, "trials": made} for who, made in trials.items()]
     return {"checkpoints": names, "rows": rows, "uneven": uneven}
 
@@ -170,20 +240,29 @@ def _voids(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def _corrections(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Every score but the first of its trial, and first scores that came after the reveal; `late`: after it."""
-    known, before, found = {run.trial: run for run in runs}, dict[int, tuple[bool, float]](), []
-    scores = Score.objects.filter(trial__handout__plan=plan).order_by("pk")
-    for row in scores.values(
-        "trial_id", "success", "score", "reason", at=F("scored_at"), by_name=F("rater__username")
-    ):
-        earlier = before.get(row["trial_id"])
-        before[row["trial_id"]] = (row["success"], row["score"])
+    """Every score but the first of its trial, and first scores that came after the reveal; `late`: after it.
+
+    `changed`: the "verdict", or with the verdict as it was the "category" of a failure or the "note" alone.
+    """
+    known, found = {run.trial: run for run in runs}, []
+    scores = Score.objects.filter(trial__handout__plan=plan)
+    for row in with_changes(scores, why=F("reason"), at=F("scored_at"), by_name=F("rater__username")):
+        earlier, run = row["earlier"], known[row["trial_id"]]
         late = bool(plan.revealed_at and row["at"] >= plan.revealed_at)
         if earlier is None and not late:
             continue
-        run = known[row["trial_id"]]
-        was = {"before": earlier and earlier[0], "score_before": earlier and earlier[1], "late": late}
-        found.append({**row, **was, "code": run.code, "checkpoint": run.checkpoint})
+        told = {name: row[name] for name in ("trial_id", "success", "score", "at", "by_name", "changed")}
+        was = {"before": earlier and earlier["success"], "score_before": earlier and earlier["score"]}
+        found.append(
+            {
+                **told,
+                **was,
+                "reason": row["why"],
+                "late": late,
+                "code": run.code,
+                "checkpoint": run.checkpoint,
+            }
+        )
     return found
 
 
@@ -279,12 +358,42 @@ def _cameras(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
     return {"checks": checks, "unchecked": unchecked}
 
 
+def _bench(plan: Plan, runs: Iterable[Run], looks: Iterable[Look]) -> dict[str, Any]:
+    """The plan's least match, trials that ran below it, those of which no match is known, and changed references."""
+    gate = (plan.document or {}).get("match_gate")
+    ran = [run for run in runs if run.started_at is not None] if gate is not None else []
+    references: dict[tuple[str, str, int, str], set[int]] = defaultdict(set)
+    for look in looks:
+        if look.reference is not None:
+            references[look.place].add(look.reference)
+    return {
+        "gate": gate,
+        "low": [
+            {
+                "code": run.code,
+                "checkpoint": run.checkpoint,
+                "match": run.match,
+                "override": run.override,
+                "operator": run.operator,
+            }
+            for run in ran
+            if run.match is not None and gate is not None and run.match < gate
+        ],
+        "unmatched": [run.code for run in ran if run.match is None],
+        "references": [
+            {"station": station, "scene": scene, "position": position, "camera": camera, "used": len(used)}
+            for (station, scene, position, camera), used in sorted(references.items())
+            if len(used) > 1
+        ],
+    }
+
+
 # --- delays ---------------------------------------------------------------------------------------------------
 
 
 def _compared(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
     """Each delay of each checkpoint, and of the compared ones a test within pairs, corrected for how many there are."""
-    names = (plan.document or {}).get("comparison") or []
+    names = compared(plan.document or {})
     gaps = _gaps(runs)
     values = tuple(
         (
@@ -299,19 +408,17 @@ def _compared(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
     )
     key: Hashable = (values, tuple(names))
     rows = _delays.get(plan.pk, key, lambda: _tested(values, names))
-    differing = [row for row in rows if row["corrected"] is not None and row["corrected"] <= plan.alpha]
-    tested = sum(row["p"] is not None for row in rows)
-    return {
-        "alpha": plan.alpha,
-        "comparison": names,
-        "rows": rows,
-        "tested": tested,
-        "differing": [row["what"] for row in differing],
-    }
+    tests = [test for row in rows for test in row["tests"] if test["p"] is not None]
+    differing = [row["what"] for row in rows if any(_differs(test, plan.alpha) for test in row["tests"])]
+    return {"alpha": plan.alpha, "rows": rows, "tested": len(tests), "differing": differing}
+
+
+def _differs(test: dict[str, Any], alpha: float) -> bool:
+    return test["corrected"] is not None and test["corrected"] <= alpha
 
 
 def _tested(
-    values: Iterable[tuple[str, Sequence[tuple[int, str, float | None]]]], names: Sequence[str]
+    values: Iterable[tuple[str, Sequence[tuple[int, str, float | None]]]], comparisons: Sequence[Names]
 ) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for name, told in values:
@@ -323,13 +430,6 @@ def _tested(
         for block, checkpoint, value in known:
             arms[checkpoint].append(value)
             blocks[block][checkpoint] = value
-        pairs = [
-            found[names[0]] - found[names[1]]
-            for found in blocks.values()
-            if names and set(names) <= set(found)
-        ]
-        widest = max(map(abs, pairs), default=0.0)
-        test = sign_flips(pairs, widest) if widest else None
         rows.append(
             {
                 "what": DELAYS[name],
@@ -337,13 +437,29 @@ def _tested(
                     {"checkpoint": each, "n": len(of), "median": median(of), "longest": max(of)}
                     for each, of in sorted(arms.items())
                 ],
-                "pairs": len(pairs),
-                "difference": test.value if test else 0.0 if pairs else None,
-                "p": test.p if test else 1.0 if pairs else None,
+                "tests": [_test(names, blocks.values()) for names in comparisons],
             }
         )
-    corrected = iter(holm([row["p"] for row in rows if row["p"] is not None]))
-    return [{**row, "corrected": None if row["p"] is None else next(corrected)} for row in rows]
+    tests = [test for row in rows for test in row["tests"]]
+    corrected = iter(holm([test["p"] for test in tests if test["p"] is not None]))
+    for test in tests:
+        test["corrected"] = None if test["p"] is None else next(corrected)
+    return rows
+
+
+def _test(names: Names, blocks: Iterable[dict[str, float]]) -> dict[str, Any]:
+    """The first minus the second, in the blocks that have both."""
+    first, second = names
+    pairs = [found[first] - found[second] for found in blocks if first in found and second in found]
+    widest = max(map(abs, pairs), default=0.0)
+    test = sign_flips(pairs, widest) if widest else None
+    return {
+        "first": first,
+        "second": second,
+        "pairs": len(pairs),
+        "difference": test.value if test else 0.0 if pairs else None,
+        "p": test.p if test else 1.0 if pairs else None,
+    }
 
 
 def _gaps(runs: Iterable[Run]) -> dict[int, float]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field
+from typing import Any
 
-from django.db.models import F, OuterRef, Subquery
+from django.db.models import Count, F, QuerySet
 
 from evaweb.plans.models import Plan
-from evaweb.trials.models import Score, Trial, TrialStatus
+from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
+
+VERDICT, CATEGORY, NOTE = "verdict", "category", "note"
+"""What a score changes of the one before it: success, score or milestones; else why it failed; else words alone."""
 
 
 @dataclass
@@ -16,7 +21,7 @@ class Changes:
 
     Voided trials are told apart by what their score said before (`voided_unscored`: there was none); of `asked`
     the void waits for a second operator. Scores that were corrected: `to_success`, `to_failure`, and `late` those
-    after the reveal.
+    after the reveal, without corrections of a failure's category alone.
     """
 
     checkpoint: str
@@ -41,7 +46,7 @@ class Changes:
 
 
 def changes_of(plan: Plan) -> list[Changes]:
-    """Those of each checkpoint, in the order of their names; two queries whatever the number of trials."""
+    """Those of each checkpoint, in the order of their names; as many queries whatever the number of trials."""
     found: dict[str, Changes] = {}
     trials = Trial.objects.filter(handout__plan=plan).order_by("checkpoint__name")
     for name, status, success, operator, station in trials.values_list(
@@ -58,21 +63,52 @@ def changes_of(plan: Plan) -> list[Changes]:
         row.abandoned += status == TrialStatus.ABANDONED
         row.operators.add(operator)
         row.stations.add(station)
-    for name, success, before, at in _corrections(plan):
-        row = found[name]
-        row.to_success += success and not before
-        row.to_failure += before and not success
-        row.late += bool(plan.revealed_at and at >= plan.revealed_at)
+    scores = Score.objects.filter(trial__handout__plan=plan)
+    for score in with_changes(scores, name=F("trial__checkpoint__name"), at=F("scored_at")):
+        earlier, success = score["earlier"], score["success"]
+        if earlier is None:
+            continue
+        row = found[score["name"]]
+        row.to_success += success and not earlier["success"]
+        row.to_failure += earlier["success"] and not success
+        row.late += score["changed"] == VERDICT and bool(plan.revealed_at and score["at"] >= plan.revealed_at)
     return list(found.values())
 
 
-def _corrections(plan: Plan):  # type: ignore[no-untyped-def]
-    """Checkpoint, what the correction says, what the score before it said, and when it was made."""
-    earlier = Score.objects.filter(trial=OuterRef("trial"), pk__lt=OuterRef("pk")).order_by("-pk")
-    return (
-        Score.objects.filter(trial__handout__plan=plan)
-        .annotate(before=Subquery(earlier.values("success")[:1]))
-        .exclude(before=None)
-        .order_by("pk")
-        .values_list(F("trial__checkpoint__name"), "success", "before", "scored_at")
-    )
+def with_changes(scores: QuerySet[Score], **named: F) -> list[dict[str, Any]]:
+    """These scores in the order in which they were given, all of each trial among them, with what is `named`.
+
+    `earlier` is the row of the one before on its trial, None of a first one; `changed` is what it changes of that, of a
+    first one its verdict. One query, and one more where a score says success and points of the one before again.
+    """
+    fields = ("pk", "trial_id", "success", "score", "failure_phase", "failure")
+    rows = list(scores.order_by("pk").values(*fields, **named))
+    newest: dict[int, dict[str, Any]] = {}
+    for row in rows:
+        row["earlier"] = newest.get(row["trial_id"])
+        newest[row["trial_id"]] = row
+    same = any(row["earlier"] and _same(row, ("success", "score")) for row in rows)
+    outcomes = _outcomes(scores) if same else {}
+    for row in rows:
+        judged = row["earlier"] and _same(row, ("success", "score"))
+        if judged and outcomes.get(row["pk"]) == outcomes.get(row["earlier"]["pk"]):
+            row["changed"] = NOTE if _same(row, ("failure_phase", "failure")) else CATEGORY
+        else:
+            row["changed"] = VERDICT
+    return rows
+
+
+def _same(row: dict[str, Any], fields: tuple[str, ...]) -> bool:
+    return all(row[name] == row["earlier"][name] for name in fields)
+
+
+def _outcomes(scores: QuerySet[Score]) -> dict[int, list[tuple[Any, ...]]]:
+    """The milestones as they were judged, by score, of trials that have more than one."""
+    corrected = scores.order_by().values("trial").annotate(n=Count("pk")).filter(n__gt=1).values("trial")
+    rows = MilestoneOutcome.objects.filter(score__trial__in=corrected).order_by("order")
+    found: dict[int, list[tuple[Any, ...]]] = defaultdict(list)
+    for score, *outcome in rows.values_list(
+        "score", "order", "text", "points", "required", "reached", "at_s"
+    ):
+        found[score].append(tuple(outcome))
+    return found

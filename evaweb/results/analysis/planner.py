@@ -7,10 +7,29 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from evaweb.errors import EvaError
+from evaweb.plans.models import Comparing
 from evaweb.statistics.boundaries import MOST
-from evaweb.statistics.courses import course, pairs_needed
+from evaweb.statistics.courses import Course, course, pairs_needed
 from evaweb.statistics.designs import RULES
 from evaweb.statistics.planning import detectable
+from runtime.core.sentences import Pattern
+
+_COMPARING_ALLOWED = Pattern(
+    "results.analysis.planner.comparing_allowed",
+    "comparing = {text!r:.80}; allowed: {comparisons}",
+)
+_ALLOWED_2 = Pattern(
+    "results.analysis.planner.allowed_2",
+    "{name} = {text!r:.80}; allowed: {low:g} to {high:g}",
+)
+_RATE_BETTER_BOTH_WITHOUT_DIFFERENCE = Pattern(
+    "results.analysis.planner.rate_better_both_without_difference",
+    "rate and better are both {rate:g}: without a difference nothing can be found",
+)
+_RATE_BETTER_ALLOWED_DIFFERENCE_AT = Pattern(
+    "results.analysis.planner.rate_better_allowed_difference_at",
+    "rate = {rate!r} and better = {better!r}; allowed: a difference of at least {least:g}",
+)
 
 LEAST = 0.001  # difference of rates: some four million trials an arm
 _GAINS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)
@@ -20,7 +39,8 @@ _GAINS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)
 class Question:
     """Rates of the weaker and of the better checkpoint, alpha, power, time per trial [s], and what there is of it.
 
-    `checkpoints` are compared, on `stations` at once; `hours` are those that there is time for at each.
+    `checkpoints` are compared as a plan's `comparing` says, on `stations` at once; `hours` are those that there is time
+    for at each.
     """
 
     rate: float = 0.5
@@ -29,10 +49,16 @@ class Question:
     power: float = 0.8
     cycle_s: float = 90.0
     checkpoints: int = 2
+    comparing: str = Comparing.ALL.value
     stations: int = 1
     hours: float = 8.0
 
 
+COMPARISONS = {  # of so many checkpoints
+    Comparing.ALL: lambda checkpoints: checkpoints * (checkpoints - 1) // 2,
+    Comparing.CONTROL: lambda checkpoints: checkpoints - 1,
+    Comparing.PAIR: lambda checkpoints: 1,
+}
 _ALLOWED: dict[str, tuple[float, float]] = {
     "rate": (0.0, 1.0),
     "better": (0.0, 1.0),
@@ -45,12 +71,17 @@ _ALLOWED: dict[str, tuple[float, float]] = {
 }
 
 
-def question_of(given: Mapping[str, str]) -> Question:
-    """The question of an address; EvaError names what is not allowed."""
+def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
+    """The question of an address; EvaError names what is not allowed. `alike`: both rates may be the same."""
     found: dict[str, Any] = {}
     for field in fields(Question):
         text = given.get(field.name, "").strip()
         if not text:
+            continue
+        if field.name == "comparing":
+            if text not in COMPARISONS:
+                raise EvaError(_COMPARING_ALLOWED(text=text, comparisons=", ".join(COMPARISONS)))
+            found[field.name] = text
             continue
         low, high = _ALLOWED[field.name]
         try:
@@ -58,23 +89,23 @@ def question_of(given: Mapping[str, str]) -> Question:
         except ValueError:
             value = None
         if value is None or not low <= value <= high:
-            raise EvaError(f"{field.name} = {text!r:.80}; allowed: {low:g} to {high:g}")
+            raise EvaError(_ALLOWED_2(name=field.name, text=text, low=low, high=high))
         found[field.name] = value
     question = Question(**found)
+    if alike:
+        return question
     if question.better == question.rate:
-        raise EvaError(
-            f"rate and better are both {question.rate:g}: without a difference nothing can be found"
-        )
+        raise EvaError(_RATE_BETTER_BOTH_WITHOUT_DIFFERENCE(rate=question.rate))
     if abs(question.better - question.rate) < LEAST:
         raise EvaError(
-            f"rate = {question.rate!r} and better = {question.better!r}; allowed: a difference of at least {LEAST:g}"
+            _RATE_BETTER_ALLOWED_DIFFERENCE_AT(rate=question.rate, better=question.better, least=LEAST)
         )
     return question
 
 
 def table_of(q: Question) -> dict[str, Any]:
     """What each design needs for the question, what the time there is for finds, and the gains that it finds."""
-    comparisons = q.checkpoints * (q.checkpoints - 1) // 2
+    comparisons = COMPARISONS[Comparing(q.comparing)](q.checkpoints)
     alpha = q.alpha / comparisons
     affordable = int(q.hours * 3600 * q.stations / q.cycle_s / q.checkpoints)
     tried = min(affordable, MOST)
@@ -82,7 +113,7 @@ def table_of(q: Question) -> dict[str, Any]:
         "comparisons": comparisons,
         "alpha": alpha,
         "most": MOST,
-        "designs": [_needed(q, rule, alpha) for rule in RULES],
+        "designs": [needed(q, rule, alpha, alone=comparisons == 1) for rule in RULES],
         "affordable": affordable,
         "tried": tried,
         "chances": [asdict(course(rule, tried, q.rate, q.better, alpha)) for rule in RULES] if tried else [],
@@ -91,17 +122,23 @@ def table_of(q: Question) -> dict[str, Any]:
     }
 
 
-def _needed(q: Question, rule: str, alpha: float) -> dict[str, Any]:
+def needed(q: Question, rule: str, alpha: float, *, alone: bool) -> dict[str, Any]:
     """A design that has the power that is asked for: its trials at worst and on average, with hours at the robots."""
-    found = pairs_needed(rule, q.rate, q.better, q.power, alpha)
+    return told(q, rule, pairs_needed(rule, q.rate, q.better, q.power, alpha), alone=alone)
+
+
+def told(q: Question, rule: str, found: Course | None, *, alone: bool) -> dict[str, Any]:
+    """The same of a design that was found, None where none has the power."""
     if found is None:
         return {"rule": rule, "pairs": None}
     hour = q.checkpoints * q.cycle_s / 3600
     return {
         **asdict(found),
+        # Several comparisons go on until the last one has ended: at a few rates that is hardly before all are made.
+        **({} if alone else {"mean": None, "median": None}),
         "total": found.pairs * q.checkpoints,
         "robot_hours": found.pairs * hour,
-        "mean_hours": found.mean * hour,
+        "mean_hours": found.mean * hour if alone else None,
         "hours": found.pairs * hour / q.stations,
     }
 

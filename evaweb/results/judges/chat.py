@@ -15,7 +15,7 @@ import socket
 import ssl
 import threading
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from ipaddress import ip_address
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
@@ -24,6 +24,34 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from evaweb.errors import EvaError
 from evaweb.results.judges.base import Case, NoVerdict, Said, Setup, Still, Verdict
+from runtime.core.sentences import Pattern, fixed
+
+_ADDRESS_PORT_0_ALLOWED_1 = Pattern(
+    "results.judges.chat.address_port_0_allowed_1",
+    "address = {given!r:.200}: port 0; allowed: 1 to 65535, or none for the usual one",
+)
+_ADDRESS_PICTURES_WOULD_TRAVEL_FOR = Pattern(
+    "results.judges.chat.address_pictures_would_travel_for",
+    "address = {given!r:.200}: pictures would travel for everybody to read; allowed: https, http on "
+    "this machine, or http elsewhere where that is ticked",
+)
+_MODEL_EMPTY_NAME_ONE_ASKED = fixed(
+    "results.judges.chat.model_empty_name_one_asked",
+    "model is empty: name the one that is asked",
+)
+_KEY_VARIABLE_ALLOWED_NAME_ENVIRONMENT = Pattern(
+    "results.judges.chat.key_variable_allowed_name_environment",
+    "key_variable = {key_variable!r:.80}; allowed: the name of an environment variable that begins with"
+    " EVA_JUDGE_, or none",
+)
+_VARIABLE_WORKER_ENVIRONMENT_NOT_SET = Pattern(
+    "results.judges.chat.variable_worker_environment_not_set",
+    "the variable {name} of the worker's environment is not set, or holds what is no key",
+)
+_MODEL_CONTAINS_WHAT_VARIABLE_HOLDS = Pattern(
+    "results.judges.chat.model_contains_what_variable_holds",
+    "model contains what the variable {name} holds: name the model without its key",
+)
 
 SEES: Literal["pictures", "truth"] = "pictures"
 SERVED = True
@@ -62,12 +90,11 @@ def endpoint_of(setup: Setup) -> Endpoint:
     odd = parts.query or parts.fragment or parts.username is not None or parts.password is not None
     if parts.scheme not in ("http", "https") or odd or not re.fullmatch(r"[!-~]+", given) or not host:
         raise EvaError(f"address = {given!r:.200}; {allowed}")
+    if port == 0:
+        raise EvaError(_ADDRESS_PORT_0_ALLOWED_1(given=given))
     secure = parts.scheme == "https"
     if not (secure or setup.plain or _on_this_machine(host)):
-        raise EvaError(
-            f"address = {given!r:.200}: pictures would travel for everybody to read; allowed: https, http on this "
-            "machine, or http elsewhere where that is ticked"
-        )
+        raise EvaError(_ADDRESS_PICTURES_WOULD_TRAVEL_FOR(given=given))
     return Endpoint(
         secure, host, port or (443 if secure else 80), f"{parts.path.rstrip('/')}/chat/completions"
     )
@@ -116,12 +143,9 @@ class Chat:
         self._setup = setup
         self._endpoint = endpoint_of(setup)
         if not setup.model.strip():
-            raise EvaError("model is empty: name the one that is asked")
+            raise EvaError(_MODEL_EMPTY_NAME_ONE_ASKED)
         if setup.key_variable and not _KEY.fullmatch(setup.key_variable):
-            raise EvaError(
-                f"key_variable = {setup.key_variable!r:.80}; allowed: the name of an environment variable that begins "
-                "with EVA_JUDGE_, or none"
-            )
+            raise EvaError(_KEY_VARIABLE_ALLOWED_NAME_ENVIRONMENT(key_variable=setup.key_variable))
 
     @property
     def version(self) -> str:
@@ -136,9 +160,11 @@ class Chat:
         """What the server says; NoVerdict with the reason otherwise, EvaError where its key is not there."""
         key = self._key()
         content = self._posted(json.dumps(_request(case, self._setup.model)).encode(), key)
-        if key:  # there are servers that quote it
-            content = content.replace(key.encode(), b"...")
-        return _read(content, len(case.steps))
+        try:
+            found = _read(content, len(case.steps))
+        except NoVerdict as none:
+            raise NoVerdict(_without(key, str(none))) from None
+        return replace(found, model=_without(key, found.model))
 
     def _key(self) -> str:
         name = self._setup.key_variable
@@ -146,9 +172,9 @@ class Chat:
             return ""
         key = os.environ.get(name, "").strip()
         if not re.fullmatch(r"[!-~]{1,4096}", key):
-            raise EvaError(
-                f"the variable {name} of the worker's environment is not set, or holds what is no key"
-            )
+            raise EvaError(_VARIABLE_WORKER_ENVIRONMENT_NOT_SET(name=name))
+        if key in self._setup.model:  # which is kept, with every judgement
+            raise EvaError(_MODEL_CONTAINS_WHAT_VARIABLE_HOLDS(name=name))
         return key
 
     def _posted(self, body: bytes, key: str) -> bytes:
@@ -269,7 +295,7 @@ def _read(content: bytes, n: int) -> Verdict:
     if choice.message.refusal or choice.finish_reason == "content_filter":
         raise NoVerdict(f"it refused: {choice.message.refusal or 'its filter of contents did'}")
     if choice.finish_reason not in (None, "stop"):
-        raise NoVerdict(f"it did not come to its end: {choice.finish_reason!a:.40}")
+        raise NoVerdict(f"it did not come to its end: '{choice.finish_reason}'")  # whole: it may have the key
     try:
         lines = _Answer.model_validate_json(choice.message.content or "").milestones
     except ValidationError as error:
@@ -281,6 +307,11 @@ def _read(content: bytes, n: int) -> Verdict:
         tuple(_said(line) for line in sorted(lines, key=lambda line: line.number)),
         completion.model or "",
     )
+
+
+def _without(key: str, text: str) -> str:
+    """There are servers that quote the key, in any of the ways in which JSON writes a text."""
+    return text.replace(key, "...") if key else text
 
 
 def _said(line: _Line) -> Said:

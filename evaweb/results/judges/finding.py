@@ -10,6 +10,16 @@ from types import ModuleType
 from evaweb.errors import EvaError
 from evaweb.results.judges.base import Case, Judge, NoVerdict, Setup, Verdict
 from runtime.core.plugins import variants
+from runtime.core.sentences import Pattern
+
+_JUDGE_VERDICTS_ON_MILESTONES = Pattern(
+    "results.judges.finding.judge_verdicts_on_milestones",
+    "judge {name}: {count} verdicts on {count_2} milestones",
+)
+_JUDGE_KIND_ALLOWED = Pattern(
+    "results.judges.finding.judge_kind_allowed",
+    "judge {name}: kind = {kind!r:.40}; allowed: {kinds}",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +43,9 @@ class Found:
             verdict = self.judge.judge(case)
         if len(verdict.milestones) != len(case.steps):
             raise EvaError(
-                f"judge {self.name}: {len(verdict.milestones)} verdicts on {len(case.steps)} milestones"
+                _JUDGE_VERDICTS_ON_MILESTONES(
+                    name=self.name, count=len(verdict.milestones), count_2=len(case.steps)
+                )
             )
         return verdict
 
@@ -42,7 +54,7 @@ def built(name: str, kind: str, setup: Setup) -> Found:
     """The judge `name`, of that kind; EvaError where the kind or the set-up cannot be."""
     kinds = variants("evaweb.results.judges")
     if kind not in kinds:
-        raise EvaError(f"judge {name}: kind = {kind!r:.40}; allowed: {', '.join(kinds)}")
+        raise EvaError(_JUDGE_KIND_ALLOWED(name=name, kind=kind, kinds=", ".join(kinds)))
     with _named(name):
         module: ModuleType = kinds[kind]
         judge = module.build(setup)

@@ -3,25 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from evaweb.errors import EvaError
+from evaweb.plans.design import frozen
 from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.analysis import Analysis, Comparison
 from evaweb.results.analysis.filters import Chosen, choices
 from evaweb.results.analysis.integrity import changes_of
-from evaweb.results.analysis.outcomes import by_checkpoint
+from evaweb.results.analysis.outcomes import by_checkpoint, paired
 from evaweb.results.presentation.addresses import compare_address, trials_address
 from evaweb.results.presentation.drawings import conditions, courses, rates
 from evaweb.results.presentation.drawings.svg import Drawing
-from evaweb.results.presentation.facts import comparison_facts, comparison_sentence, missed_words, primary_of
-from evaweb.results.presentation.headline import headline
-from evaweb.results.presentation.listings import MOST_PAIRS, arm_rows, failure_tables, pair_rows, scene_rows
+from evaweb.results.presentation.facts import (
+    comparison_facts,
+    comparison_sentence,
+    missed_words,
+    primaries_of,
+)
+from evaweb.results.presentation.headline import headline, with_planned_letters
+from evaweb.results.presentation.listings import (
+    MOST_PAIRS,
+    arm_rows,
+    differs,
+    failure_tables,
+    pair_rows,
+    scene_rows,
+)
 from evaweb.results.presentation.wording import anytime_words, evidence_words
+from evaweb.statistics.designs import Design
 from evaweb.trials.failures import in_order
+from runtime.core.sentences import Pattern
+
+_NO_COMPARISON_THERE_TRIALS = Pattern(
+    "results.pages.pages.no_comparison_there_trials",
+    "no comparison of {first!r} and {second!r}; there are trials of: {names}",
+)
+_DIFFERS_ALLOWED_1_NOTHING = Pattern(
+    "results.pages.pages.differs_allowed_1_nothing",
+    "differs = {only!r:.80}; allowed: 1, or nothing",
+)
+_VIEW_ALLOWED = Pattern("results.pages.pages.view_allowed", "view = {view!r:.80}; allowed: {views}")
+
+VIEWS = ("table", "grid")
 
 
 def summary_page(plan: Plan, only: Chosen) -> dict[str, Any]:
@@ -33,17 +60,18 @@ def summary_page(plan: Plan, only: Chosen) -> dict[str, Any]:
 
 def _summary(plan: Plan, only: Chosen, at: Hashable, order: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
     outcomes = caching.runs_of(plan, at).outcomes
-    analysis = caching.analysis_of(plan, only, at)
-    place = {arm.checkpoint: i for i, arm in enumerate(analysis.arms)}
-    primary = primary_of(plan, analysis)
+    analysis = with_planned_letters(plan, caching.analysis_of(plan, only, at))
+    primaries = primaries_of(plan, analysis)
+    facts = [comparison_facts(plan, analysis, found) for found in primaries]
     scenes = sorted({name for arm in analysis.arms for name in arm.scenes})
     return {
         "analysis": analysis,
         "only": only,
         "choices": choices(outcomes),
-        "primary": primary and comparison_facts(plan, analysis, primary),
+        "headline": facts[0]["headline"] if facts else None,
+        "primaries": facts,
         "table": arm_rows(plan, analysis, only),
-        "intervals": _intervals(plan, "Success rates", analysis, place, only),
+        "intervals": _intervals(plan, "Success rates", analysis, only),
         "violins": rates.violins(analysis.arms, analysis.letters) if analysis.arms else None,
         "funnels": [drawn for scene in scenes if (drawn := _funnel(plan, analysis, scene, only))],
         "success_times": courses.success_times(analysis.arms),
@@ -53,7 +81,7 @@ def _summary(plan: Plan, only: Chosen, at: Hashable, order: Mapping[str, tuple[s
         "others": [
             (found, comparison_sentence(analysis, found), compare_address(plan, found, only))
             for found in analysis.comparisons
-            if found is not primary
+            if found not in primaries
         ],
         "missed": [missed_words(analysis)] if analysis.arms else [],
         "changes": changes_of(plan),
@@ -69,15 +97,15 @@ def comparison_page(plan: Plan, only: Chosen, first: str, second: str) -> dict[s
 
 
 def _compared(plan: Plan, only: Chosen, first: str, second: str, at: Hashable) -> dict[str, Any]:
-    analysis = caching.analysis_of(plan, only, at)
+    analysis = with_planned_letters(plan, caching.analysis_of(plan, only, at))
     names = [arm.checkpoint for arm in analysis.arms]
-    primary = primary_of(plan, analysis)
-    if not first and not second and primary:
-        first, second = primary.first, primary.second
+    primaries = primaries_of(plan, analysis)
+    if not first and not second and primaries:
+        first, second = primaries[0].first, primaries[0].second
     found = analysis.compared(first, second)
     if found is None:
         raise EvaError(
-            f"no comparison of {first!r} and {second!r}; there are trials of: {', '.join(names) or 'none'}"
+            _NO_COMPARISON_THERE_TRIALS(first=first, second=second, names=", ".join(names) or "none")
         )
     arms = (analysis.arm(found.first), analysis.arm(found.second))
     runs = by_checkpoint(only.apply(caching.runs_of(plan, at).outcomes))
@@ -94,7 +122,7 @@ def _compared(plan: Plan, only: Chosen, first: str, second: str, at: Hashable) -
                 (arm.checkpoint, arm.success, trials_address(plan, only, checkpoint=arm.checkpoint))
                 for arm in arms
             ],
-            {arm.checkpoint: i for i, arm in enumerate(arms)},
+            {arm.checkpoint: arm.series for arm in arms},
         ),
         "violins": rates.violins(arms, analysis.letters),
         "funnels": [
@@ -103,8 +131,40 @@ def _compared(plan: Plan, only: Chosen, first: str, second: str, at: Hashable) -
             if (drawn := _funnel(plan, replace(analysis, arms=arms), scene, only))
         ],
         "success_times": courses.success_times(arms),
-        "evidence": courses.evidence(found.evidence, found.first, found.second),
-        "pairs": pair_rows(runs.get(found.first, []), runs.get(found.second, []))[:MOST_PAIRS],
+        "evidence": courses.evidence(
+            found.evidence, found.first, found.second, drawn=(arms[0].series, arms[1].series)
+        ),
+        "paired": list(enumerate(paired(runs.get(found.first, []), runs.get(found.second, [])), 1)),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class PairView:
+    """How the pairs of a comparison are shown: those alone that `differs`, as a table or in a grid."""
+
+    differs: bool = False
+    view: str = "table"
+
+
+def pair_view(given: Mapping[str, str]) -> PairView:
+    """As the address has it; EvaError says what is allowed."""
+    only, view = given.get("differs", ""), given.get("view", "") or "table"
+    if only not in ("", "1"):
+        raise EvaError(_DIFFERS_ALLOWED_1_NOTHING(only=only))
+    if view not in VIEWS:
+        raise EvaError(_VIEW_ALLOWED(view=view, views=", ".join(VIEWS)))
+    return PairView(only == "1", view)
+
+
+def pairs_shown(page: Mapping[str, Any], how: PairView) -> dict[str, Any]:
+    """The pairs of a comparison's page with what is on the disk of them now."""
+    differing = [row for row in page["paired"] if differs(row[1])]
+    fitting = differing if how.differs else page["paired"]
+    return {
+        "pairs": pair_rows(fitting[:MOST_PAIRS]),
+        "fitting": len(fitting),
+        "differing": len(differing),
+        "how": how,
         "most": MOST_PAIRS,
     }
 
@@ -117,41 +177,46 @@ def evidence_page(plan: Plan) -> dict[str, Any]:
 
 def _evidence(plan: Plan, at: Hashable) -> dict[str, Any]:
     analysis = caching.analysis_of(plan, None, at)
-    found = primary_of(plan, analysis)
-    if found is None:
-        return {"found": None, "analysis": analysis}
-    foreseen = plan.slots.filter(checkpoint=plan.first).count()
+    found, design = primaries_of(plan, analysis), frozen(plan.document) if plan.document else None
+    if not found or design is None:
+        return {"meters": [], "compared": design is not None}
     return {
-        "analysis": analysis,
-        "found": found,
-        "foreseen": foreseen,
-        "meter": courses.evidence(found.evidence, found.first, found.second, foreseen),
-        "score_meter": courses.evidence(found.score_evidence, found.first, found.second, foreseen),
         "headline": headline(plan),
+        "meters": [_meter(analysis, one, design) for one in found],
+        "missed": missed_words(analysis),
+    }
+
+
+def _meter(analysis: Analysis, found: Comparison, design: Design) -> dict[str, Any]:
+    names = (found.first, found.second)
+    drawn = (analysis.arm(found.first).series, analysis.arm(found.second).series)
+    return {
+        "found": found,
+        "foreseen": design.blocks,
+        "meter": courses.evidence(found.evidence, *names, design.blocks, drawn),
+        "score_meter": courses.evidence(found.score_evidence, *names, design.blocks, drawn),
         "words": evidence_words(found.evidence),
         "score_words": evidence_words(found.score_evidence),
         "difference": anytime_words(found.anytime, found.pairs),
         "score_difference": anytime_words(found.score_anytime, found.pairs),
-        "level": 100 * (1 - plan.alpha),
-        "wanted": 2 / plan.alpha,
-        "missed": missed_words(analysis, found),
+        "level": 100 * (1 - design.share),
+        "wanted": 2 / design.share,
     }
 
 
-def _intervals(
-    plan: Plan, title: str, analysis: Analysis, order: Mapping[str, int], only: Chosen
-) -> Drawing | None:
+def _intervals(plan: Plan, title: str, analysis: Analysis, only: Chosen) -> Drawing | None:
     rows = [
         (arm.checkpoint, arm.success, trials_address(plan, only, checkpoint=arm.checkpoint))
         for arm in analysis.arms
     ]
+    order = {arm.checkpoint: arm.series for arm in analysis.arms}
     return rates.intervals(title, rows, order) if rows else None
 
 
 def _funnel(plan: Plan, analysis: Analysis, scene: str, only: Chosen) -> Drawing | None:
     found = [
-        (i, arm.checkpoint, funnel)
-        for i, arm in enumerate(analysis.arms)
+        (arm.series, arm.checkpoint, funnel)
+        for arm in analysis.arms
         for funnel in arm.funnels
         if funnel.scene == scene
     ]

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from django.core.paginator import Paginator
 from django.http import HttpRequest, HttpResponse
+from django.http.response import HttpResponseBase
 from django.shortcuts import redirect, render
 from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
 from evaweb.blinding import sight_for
 from evaweb.errors import EvaError
+from evaweb.lists import Listing
 from evaweb.plans import services
 from evaweb.plans.blinding_rules import look, may_look
 from evaweb.plans.models import Plan, PlanState
@@ -26,15 +26,13 @@ from evaweb.results.analysis.agreement import agreement_of, judges_of, preferenc
 from evaweb.results.analysis.filters import chosen
 from evaweb.results.pages import pages
 from evaweb.results.presentation import listings
-from evaweb.results.presentation.addresses import frozen_address
 from evaweb.results.presentation.citing import HEAD, Citation, citation
 from evaweb.results.presentation.integrity import delays_banner, integrity_document
 from evaweb.results.ratings.automatic import judge_ask, judges_ready
 from evaweb.results.ratings.unblinding import has_results, require_seen, sealing, why_sealed
 from evaweb.results.reports.reporting import write_report
-from evaweb.results.selectors import Question
 from evaweb.roles import Role, role_of
-from evaweb.trials.models import Trial, TrialStatus
+from evaweb.trials.models import Trial
 from evaweb.trials.voids import voids_waiting
 
 PER_PAGE = 50
@@ -45,21 +43,18 @@ MOST_PICTURES = 32_000_000  # bytes of a report that is packed in memory; the co
 
 
 @require_GET
-def plans(request: HttpRequest) -> HttpResponse:
+def plans(request: HttpRequest) -> HttpResponseBase:
     """All plans with their progress."""
-    state, words, fault = request.GET.get("state", ""), request.GET.get("words", "").strip(), None
-    try:
-        rows = selectors.plan_list(state, words)
-    except EvaError as error:
-        rows, fault = selectors.plan_list(), error
-    page = Paginator(rows, PLANS_PER_PAGE).get_page(request.GET.get("page"))
+    listing = Listing(request.GET, listings.PLAN_COLUMNS, listings.PLAN_FILTERS)
+    found = selectors.plan_list(**listing.chosen)
+    if listing.wants_file:
+        return listing.file(request, "evaluations", selectors.plan_rows(listing.ordered(found)))
+    page = listing.page(found, PLANS_PER_PAGE)
     context = {
+        "listing": listing,
         "page": page,
         "rows": selectors.plan_rows(page),
-        "states": PlanState.choices,
-        "state": state,
-        "words": words,
-        "fault": fault,
+        "may_draft": role_of(request.user) is Role.ADMIN,
         "here": "plans",
     }
     return render(request, "results/plans.html", context)
@@ -83,6 +78,7 @@ def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
         context = pages.comparison_page(
             found, only, request.GET.get("first", ""), request.GET.get("second", "")
         )
+        context |= pages.pairs_shown(context, pages.pair_view(request.GET))
     except EvaError as fault:
         return _plan_page(request, found, fault)
     return render(request, "results/compare.html", {**context, **_common(request, found)})
@@ -101,27 +97,25 @@ def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 
 @require_GET
-def trials(request: HttpRequest, name: str, version: int) -> HttpResponse:
+def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
     """The trials that a number was made from."""
     found = _found(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
         return sealed
-    given = {
-        row.name: request.GET.get(row.name, "").strip() for row in fields(Question) if row.name in request.GET
-    }
+    listing = Listing(request.GET, listings.TRIAL_COLUMNS, listings.trial_filters(found))
     try:
-        question = Question(**given)
-        rows = selectors.trials_of_plan(found, question).prefetch_related("verdict__outcomes")
+        rows = selectors.trials_of_plan(found, listings.question_of(listing.chosen))
     except EvaError as fault:
         return _plan_page(request, found, fault)
-    page = Paginator(rows, PER_PAGE).get_page(request.GET.get("page"))
+    rows = rows.prefetch_related("verdict__outcomes")
+    if listing.wants_file:
+        return listing.file(request, f"{found.name}-v{found.version}-trials", rows)
+    page = listing.page(rows, PER_PAGE)
     context = {
+        "listing": listing,
         "page": page,
         "rows": [listings.trial_row(trial) for trial in page],
-        "question": question,
-        "statuses": TrialStatus.choices,
-        "choices": listings.trial_choices(found),
         **_common(request, found),
     }
     return render(request, "results/trials.html", context)
@@ -171,7 +165,7 @@ def cite(request: HttpRequest, name: str, version: int) -> HttpResponse:
     if found.at_reveal:
         return redirect("result-frozen", digest=found.at_reveal["digest"])
     try:
-        return _citation_page(request, citation(found, request.build_absolute_uri()))
+        return _citation_page(request, citation(found))
     except EvaError as fault:
         return _plan_page(request, found, fault)
 
@@ -181,7 +175,7 @@ def frozen(request: HttpRequest, digest: str) -> HttpResponse:
     """The result as its reveal kept it: whatever is corrected later, nothing here changes."""
     found = selectors.plan_at_reveal(digest)
     sealed = _sealed_page(request, found)
-    return sealed or _citation_page(request, citation(found, frozen_address(request, digest)))
+    return sealed or _citation_page(request, citation(found))
 
 
 @require_GET
@@ -191,7 +185,7 @@ def frozen_file(request: HttpRequest, digest: str, form: str) -> HttpResponse:
     require_seen(found, request.user)
     title = f"{found.name}-v{found.version}-{digest[:8]}.{form}"
     return HttpResponse(
-        citation(found, frozen_address(request, digest)).whole(form),
+        citation(found).whole(form),
         content_type=f"{_FORMS[form]}; charset=utf-8",
         headers={"Content-Disposition": f'attachment; filename="{title}"'},
     )
@@ -204,7 +198,7 @@ def act(request: HttpRequest, name: str, version: int, what: str) -> HttpRespons
     user: Any = request.user
     reason = request.POST.get("reason", "")
     acts: Mapping[str, Callable[[], object]] = {
-        "freeze": lambda: services.plan_freeze(user=user, plan=found),
+        "freeze": lambda: services.plan_freeze(user=user, plan=found, seen=request.POST.get("seen", "")),
         "amend": lambda: services.plan_amend(user=user, plan=found, reason=reason),
         "close": lambda: services.plan_close(user=user, plan=found, reason=reason),
         "reveal": lambda: services.plan_reveal(user=user, plan=found),

@@ -19,6 +19,12 @@ from evaweb.results.ratings.video_available import seen
 from evaweb.results.selectors import plan_get
 from evaweb.roles import Role, role_of
 from evaweb.trials import failures
+from runtime.core.sentences import Pattern
+
+_VERSION_ALLOWED_NUMBER = Pattern(
+    "results.pages.views_judging.version_allowed_number",
+    "version = {given!r:.20}; allowed: a number",
+)
 
 _ANSWERS = {"yes": True, "no": False}
 
@@ -116,7 +122,7 @@ def _preferred(request: HttpRequest) -> None:
 def _version(request: HttpRequest) -> int:
     given = request.POST.get("version", "")
     if not (given.isascii() and given.isdecimal() and len(given) < 7):
-        raise EvaError(f"version = {given!r:.20}; allowed: a number")
+        raise EvaError(_VERSION_ALLOWED_NUMBER(given=given))
     return int(given)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Any
+from urllib.parse import urlencode
 
 from django.http import HttpRequest, HttpResponse
 from django.shortcuts import render
@@ -10,10 +11,11 @@ from django.views.decorators.http import require_GET
 
 from evaweb.blinding import Sight, sight_for
 from evaweb.errors import EvaError
-from evaweb.plans.models import PlanState
+from evaweb.plans.models import Comparing, PlanState
 from evaweb.results import selectors
 from evaweb.results.analysis.planner import question_of, table_of
 from evaweb.results.ratings.unblinding import why_sealed
+from evaweb.roles import Role, role_of
 
 RUNNING = 12  # plans on one page; all of them are in the list
 RECENT = 12
@@ -43,7 +45,13 @@ def planner(request: HttpRequest) -> HttpResponse:
     except EvaError as error:
         fault, question = error, question_of({})
         table = table_of(question)
-    context = {"question": question, "table": table, "fault": fault, "here": "planner"}
+    context = {"question": question, "table": table, "fault": fault, "comparing": Comparing.choices}
+    carried = ("rate", "better", "alpha", "power", "cycle_s", "comparing")
+    context |= {
+        "here": "planner",
+        "may_draft": role_of(request.user) is Role.ADMIN,
+        "carried": urlencode({name: getattr(question, name) for name in carried}),
+    }
     return render(request, "results/planner.html", context, status=fault.status if fault else 200)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from urllib.parse import urlencode
 
-from django.http import HttpRequest
 from django.urls import reverse
 
 from evaweb.plans.models import Plan
@@ -29,11 +28,6 @@ def compare_address(plan: Plan, found: Comparison, only: Chosen) -> str:
     query = urlencode({"first": found.first, "second": found.second})
     address = reverse("result-compare", args=[plan.name, plan.version])
     return f"{address}?{query}" + (f"&{only.query}" if only.query else "")
-
-
-def frozen_address(request: HttpRequest, digest: str) -> str:
-    """The address, with its host, of a result as its reveal kept it."""
-    return request.build_absolute_uri(reverse("result-frozen", args=[digest]))
 
 
 def beside_address(episodes: Sequence[object]) -> str:

@@ -7,16 +7,28 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from django.urls import reverse
+
 from evaweb.errors import Conflict
-from evaweb.plans.design import at_the_reveal, frozen
+from evaweb.plans.design import arms_of, at_the_reveal, blocks_kept, compared, frozen, same_blocks
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.presentation.drawings import rates
 from evaweb.results.presentation.drawings.svg import Drawing, printable
-from evaweb.results.presentation.headline import rule_words, sentence_of
+from evaweb.results.presentation.headline import alpha_words, letters_of, rule_words, sentence_of
 from evaweb.results.presentation.latex import escaped, foreign
 from evaweb.results.presentation.wording import ends, rate_words
-from evaweb.statistics.designs import ANYTIME, FIXED, SUCCESS, Design
+from evaweb.statistics.designs import ANYTIME, FIXED, SUCCESS, Block, Design, looks_at
 from evaweb.statistics.proportions import Proportion, proportion
+from runtime.core.sentences import Pattern
+
+_HAS_NO_COMPARISON_THERE_NO = Pattern(
+    "results.presentation.citing.has_no_comparison_there_no",
+    "{plan} has no comparison: there is no one sentence to cite; its report has all figures",
+)
+_RESULT_CITED_ONCE_PLAN_CLOSED = Pattern(
+    "results.presentation.citing.result_cited_once_plan_closed",
+    "{plan} is {state}: a result is cited once the plan is closed",
+)
 
 HEAD = ("Checkpoint", "n", "Successes", "Rate, 95 % Wilson", "Mean score")
 _AXIS = 40  # letters of it, in text
@@ -54,36 +66,63 @@ class Cited:
 
 @dataclass(frozen=True)
 class Citation:
-    """The result of a plan: `kept` at its reveal, or as it is now; `digest` is empty without a reveal.
-
-    `address` is where it stands for good.
-    """
+    """The result of a plan: `kept` at its reveal, or as it is now; `digest` is empty without a reveal."""
 
     plan: Plan
     found: Design
     kept: Mapping[str, Any]
     digest: str
-    address: str
+
+    @property
+    def address(self) -> str:
+        """Path of its page, where it stands for good after a reveal; without a host, for a lab has several names."""
+        if self.digest:
+            return reverse("result-frozen", args=[self.digest])
+        return reverse("result-cite", args=[self.plan.name, self.plan.version])
+
+    @property
+    def commitment(self) -> str:
+        """That of the reveal; one from before it was kept has the plan's own, as it has its key and who revealed."""
+        return str(self.kept.get("commitment") or self.plan.commitment)
+
+    @property
+    def key(self) -> str:
+        """Of the commitment, in hex; "" before the reveal."""
+        own = bytes(self.plan.key or b"").hex()
+        return str(self.kept.get("key") or own) if self.digest else ""
+
+    @property
+    def revealed_by(self) -> str:
+        """The account, by the name that it had then."""
+        own = self.plan.revealed_by.get_username() if self.plan.revealed_by else ""
+        return str(self.kept.get("by") or own)
 
     @cached_property
     def sentence(self) -> str:
         """The headline."""
-        return sentence_of(self.plan, self.found, [(one, other) for one, other in self.kept["pairs"]]) + "."
+        letters = letters_of(self.plan, self.found, self.blocks)
+        said = ", ".join(f"{name} {of}" for name, of in letters)
+        told = f" No significant difference between checkpoints that share a letter: {said}." if said else ""
+        return sentence_of(self.plan, self.found, self.blocks) + "." + told
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """Those that count."""
+        return blocks_kept(self.kept)
 
     @cached_property
     def design(self) -> str:
         """What was foreseen: rule, looks, pairs, alpha, question, outcome."""
         document = self.plan.document or {}
-        first, second = document["comparison"]
         found = self.found
-        asks = f"whether {first} and {second} differ"
-        if found.margin is not None:
-            asks = f"whether {first} is not worse than {second} by {100 * found.margin:g} points or more"
+        asks = " and ".join(_question(found, *names) for names in compared(document))
         outcome = "success" if found.outcome == SUCCESS else "score (partial credit)"
         blind = "operators blind" if document["blind"] else "operators not blind"
+        drops = "; checkpoints dropped once they were found worse" if found.drops else ""
+        order = "" if found.counts is None else ", checkpoints in random order"
         return (
-            f"Design: {rule_words(self.plan)}, {_looks(found)}, {found.pairs} pairs foreseen, alpha {found.alpha:g}; "
-            f"asks {asks}, by {outcome}; {blind}."
+            f"Design: {rule_words(self.plan)}, {_looks(found)}, {found.blocks} {found.unit} foreseen{order}, "
+            f"{alpha_words(found)}; asks {asks}, by {outcome}{drops}; {blind}."
         )
 
     @cached_property
@@ -104,11 +143,11 @@ class Citation:
                 Cited(row["checkpoint"], row["n"], proportion(row["successes"], row["n"]), row["score"])
                 for row in self.kept["arms"]
             ]
-        return [self._of_pairs(i, name) for i, name in enumerate((self.plan.document or {})["comparison"])]
+        return [self._of_pairs(i, name) for i, name in enumerate(arms_of(compared(self.plan.document or {})))]
 
     def _of_pairs(self, i: int, name: str) -> Cited:
         """Of a reveal that kept the pairs alone."""
-        values = [pair[i] for pair in self.kept["pairs"]]
+        values = [value for block in self.blocks for arm, value in block if arm == i]
         n = len(values)
         if self.found.outcome != SUCCESS:
             return Cited(name, n, None, sum(values) / n if n else None)
@@ -123,7 +162,9 @@ class Citation:
     def corrected(self) -> bool:
         """Whether scores were corrected, or came, after the reveal."""
         now = at_the_reveal(self.plan) or {}
-        return any(now[name] != self.kept[name] for name in ("pairs", "arms") if name in self.kept)
+        return not same_blocks(blocks_kept(now), self.blocks) or now.get("arms") != self.kept.get(
+            "arms", now.get("arms")
+        )
 
     @cached_property
     def text(self) -> dict[str, str]:
@@ -144,7 +185,8 @@ class Citation:
     @cached_property
     def drawn(self) -> Drawing:
         """The figure as a page shows it."""
-        order = {name: i for i, (name, _) in enumerate(self.known)}
+        names = [row["name"] for row in (self.plan.document or {})["checkpoints"]]
+        order = {name: i for i, name in enumerate(names)}
         return rates.intervals("Success rates", [(name, found, "") for name, found in self.known], order)
 
     @cached_property
@@ -165,28 +207,30 @@ class Citation:
     @property
     def document(self) -> dict[str, Any]:
         """All of it as plain JSON."""
-        document, looks = self.plan.document or {}, self.found.boundary
+        document = self.plan.document or {}
         return {
             "plan": document["name"],
             "version": document["version"],
             "title": document["title"],
             "digest": self.digest,
             "plan_digest": self.plan.digest,
-            "commitment": self.plan.commitment,
-            "key": bytes(self.plan.key or b"").hex(),
+            "commitment": self.commitment,
+            "key": self.key,
             "revealed_at": self.kept["at"],
-            "revealed_by": self.plan.revealed_by.get_username() if self.plan.revealed_by else "",
-            "comparison": document["comparison"],
+            "revealed_by": self.revealed_by,
+            "comparisons": [list(names) for names in compared(document)],
             "design": {
                 "rule": self.found.rule,
-                "pairs": self.found.pairs,
+                "pairs": self.found.blocks,
+                "drops": self.found.drops,
+                "counts": self.found.counts,
                 "alpha": self.found.alpha,
                 "outcome": self.found.outcome,
                 "margin": self.found.margin,
-                "looks": [look.first for look in looks.looks] if looks else [],
+                "looks": looks_at(self.found),
                 "words": self.design,
             },
-            "pairs": self.kept["pairs"],
+            "blocks": self.blocks,
             "headline": self.sentence,
             "arms": [
                 {
@@ -208,30 +252,33 @@ class Citation:
         }
 
 
-def citation(plan: Plan, address: str) -> Citation:
+def citation(plan: Plan) -> Citation:
     """That of a revealed plan as its reveal kept it, else of one that is closed as it is now.
 
     Conflict where trials are still made, or no comparison was planned.
     """
     found = frozen(plan.document) if plan.document else None
     if found is None:
-        raise Conflict(
-            f"{plan} has no comparison: there is no one sentence to cite; its report has all figures"
-        )
+        raise Conflict(_HAS_NO_COMPARISON_THERE_NO(plan=plan))
     if plan.state not in (PlanState.CLOSED, PlanState.REVEALED):
-        raise Conflict(f"{plan} is {plan.get_state_display()}: a result is cited once the plan is closed")
+        raise Conflict(_RESULT_CITED_ONCE_PLAN_CLOSED(plan=plan, state=plan.get_state_display()))
     kept = plan.at_reveal or at_the_reveal(plan) or {}
-    return Citation(plan, found, kept, plan.at_reveal["digest"] if plan.at_reveal else "", address)
+    return Citation(plan, found, kept, plan.at_reveal["digest"] if plan.at_reveal else "")
+
+
+def _question(found: Design, first: str, second: str) -> str:
+    if found.margin is not None:
+        return f"whether {first} is not worse than {second} by {100 * found.margin:g} points or more"
+    return f"whether {first} and {second} differ"
 
 
 def _looks(found: Design) -> str:
     if found.rule == FIXED:
         return "one test at the end"
-    firsts = [look.first for look in found.boundary.looks] if found.boundary else []
-    every = len(firsts) > 2 and firsts == list(range(firsts[0], firsts[-1] + 1))
-    if found.rule == ANYTIME or every:
-        return "looked at after every pair"
-    return f"looked at after {', '.join(map(str, firsts))} pairs"
+    at = looks_at(found)
+    if found.rule == ANYTIME or (len(at) > 2 and at == list(range(at[0], at[-1] + 1))):
+        return f"looked at after every {found.unit[:-1]}"
+    return f"looked at after {', '.join(map(str, at))} {found.unit}"
 
 
 def _text_table(rows: list[tuple[str, ...]]) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from evaweb.plans.design import compared
 from evaweb.plans.models import Plan, StoppingRule
 from evaweb.results.analysis.analysis import Analysis, Comparison
 from evaweb.results.analysis.filters import Chosen
@@ -32,11 +33,10 @@ class Fact:
     answer: str
 
 
-def primary_of(plan: Plan, analysis: Analysis) -> Comparison | None:
-    """The comparison that the plan is about, as far as both have trials."""
-    if not plan.first or not plan.second:
-        return None
-    return analysis.compared(plan.first.name, plan.second.name)
+def primaries_of(plan: Plan, analysis: Analysis) -> list[Comparison]:
+    """The comparisons that the plan is about, as far as both have trials."""
+    found = (analysis.compared(*names) for names in compared(plan.document or {}))
+    return [one for one in found if one is not None]
 
 
 def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
@@ -47,10 +47,14 @@ def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
 
 def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[str, Any]:
     """The sentence, and each question that a comparison answers; of the planned one its design says the sentence."""
-    planned = headline(plan) if found is primary_of(plan, analysis) else None
+    names = compared(plan.document or {})
+    planned = headline(plan) if (found.first, found.second) in names else None
     return {
-        "sentence": planned.sentence if planned else comparison_sentence(analysis, found),
+        "sentence": planned.sentences[names.index((found.first, found.second))]
+        if planned
+        else comparison_sentence(analysis, found),
         "headline": planned,
+        "names": f"{found.first} and {found.second}",
         "facts": [*_of_the_rates(plan, analysis, found), *_of_the_evidence(found), *_beyond(found)],
         "notes": found.notes,
         "reversed": bool(found.stratified and found.stratified.reversed),
@@ -84,7 +88,7 @@ def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator
 
 def _of_the_evidence(found: Comparison) -> Iterator[Fact]:
     yield Fact(
-        "May one stop?", f"e-process, alpha {found.evidence.alpha:.2g}", evidence_words(found.evidence)
+        "May you stop?", f"e-process, alpha {found.evidence.alpha:.2g}", evidence_words(found.evidence)
     )
     yield Fact(
         "With partial credit, at any time?",
@@ -106,6 +110,13 @@ def _beyond(found: Comparison) -> Iterator[Fact]:
         points_over = f"{100 * found.stratified.stratified:+.0f} points".replace("-", "−")
         chance = probability(found.stratified.p)
         yield Fact("Over scenes?", "Mantel-Haenszel", f"{points_over}, odds ratio {ratio}, p = {chance}")
+    for name, within in found.within.items():
+        over = f"{p_words(within.p)} over {within.strata} {name}s"
+        yield Fact(f"The same within {name}s?", "exact, conditional", over)
+    if found.scenes:
+        by_scene = "; ".join(f"{name} {points(difference)}" for name, difference in found.scenes.items())
+        chance = "too many ways to count" if found.interaction is None else p_words(found.interaction)
+        yield Fact("Does it depend on the scene?", "interaction, Zelen, exact", f"{chance}: {by_scene}")
     if found.sooner:
         ahead = found.first if found.sooner.value < 0 else found.second
         by = f"{abs(found.sooner.value):.1f} s"
@@ -117,11 +128,12 @@ def _beyond(found: Comparison) -> Iterator[Fact]:
 
 
 def missed_words(analysis: Analysis, found: Comparison | None = None) -> str:
-    """What these trials could not have detected."""
+    """What these trials could not have detected, at a planned comparison's share of alpha."""
     arms = [arm for arm in analysis.arms if found is None or arm.checkpoint in (found.first, found.second)]
     n = min(arm.success.n for arm in arms)
     rate = min((arm.success.rate for arm in arms if arm.success.rate is not None), default=None)
-    return missed(n, rate, analysis.alpha)
+    compared = analysis.comparisons if found is None else (found,)
+    return missed(n, rate, max((one.evidence.alpha for one in compared), default=analysis.alpha))
 
 
 def _chance(p: float) -> str:

@@ -2,31 +2,50 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-from evaweb.plans.design import frozen, tried
+from evaweb.plans.design import (
+    Names,
+    Tried,
+    arms_of,
+    compared,
+    frozen,
+    kept_blocks,
+    same_blocks,
+    told_reason,
+    tried,
+)
 from evaweb.plans.models import Plan, PlanState
+from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.presentation.wording import p_words, points
-from evaweb.statistics.designs import SUCCESS, Conclusion, Design, conclude
+from evaweb.statistics.designs import SUCCESS, Block, Conclusion, Design, alone, conclude, findings
 from evaweb.statistics.difference import newcombe
+from evaweb.statistics.many import letters
 
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """One sentence, how it was decided, and what else it could be.
+    """A sentence of each planned comparison, how it was decided, and what else it could be.
 
     `corrected`: with the scores that were corrected after the reveal. `at_first`: as trials were first scored, had none
-    been voided.
-    `worst`: of a difference, had each attempt that was thrown away unscored been against it. Each is empty where it is
-    made of the same pairs.
+    been voided. `worst`: of differences, had each attempt that was thrown away unscored been against them. Each is
+    empty where it is made of the same blocks. `letters`, where all checkpoints were compared with each other: two
+    share one if they were not told apart.
     """
 
-    sentence: str
+    sentences: tuple[str, ...]
     method: str
     corrected: str = ""
     at_first: str = ""
     worst: str = ""
     versions: tuple[str, ...] = ()
+    letters: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """All of them."""
+        return ". ".join(self.sentences)
 
 
 def headline(plan: Plan) -> Headline | None:
@@ -34,18 +53,36 @@ def headline(plan: Plan) -> Headline | None:
     found = frozen(plan.document) if plan.document else None
     if found is None:
         return None
-    pairs = tried(plan)
-    now, whole = pairs.counted, pairs.at_first
-    at_reveal = [(one, other) for one, other in plan.at_reveal["pairs"]] if plan.at_reveal else now
-    sentence = sentence_of(plan, found, at_reveal)
-    later = sentence_of(plan, found, now) if now != at_reveal else ""
-    at_first = sentence_of(plan, found, whole) if whole != at_reveal else ""
-    winner = conclude(found, at_reveal).winner
-    least = pairs.against(winner) if winner else now
-    worst = sentence_of(plan, found, least) if least != now else ""
+    now = tried(plan)
+    kept = kept_blocks(plan)
+    at_reveal = now.counted if kept is None else kept
     return Headline(
-        sentence, f"{rule_words(plan)}, alpha {found.alpha:g}", later, at_first, worst, _versions(plan)
+        sentences_of(plan, found, at_reveal),
+        f"{rule_words(plan)}, {alpha_words(found)}",
+        _other(plan, found, now.counted, at_reveal),
+        _other(plan, found, now.at_first, at_reveal),
+        ". ".join(told.sentence for told in in_the_worst_case(plan, found, at_reveal, now)),
+        _versions(plan),
+        letters_of(plan, found, at_reveal),
     )
+
+
+def alpha_words(found: Design) -> str:
+    """Alpha, and how many comparisons share it."""
+    share = f" shared by {len(found.comparisons)} comparisons" if len(found.comparisons) > 1 else ""
+    return f"alpha {found.alpha:g}{share}"
+
+
+def with_planned_letters(plan: Plan, analysis: Analysis) -> Analysis:
+    """The analysis with the letters of the plan's own comparisons, where it compared all with each other.
+
+    Those of checkpoints whose trials were filtered out are left out.
+    """
+    said = headline(plan) if len(compared(plan.document or {})) > 2 else None
+    if said is None or not said.letters:
+        return analysis
+    there = {arm.checkpoint for arm in analysis.arms}
+    return replace(analysis, letters={name: letter for name, letter in said.letters if name in there})
 
 
 def rule_words(plan: Plan) -> str:
@@ -53,27 +90,131 @@ def rule_words(plan: Plan) -> str:
     return str(plan.get_stopping_display()).partition(":")[0]
 
 
-def sentence_of(plan: Plan, found: Design, pairs: list[tuple[float, float]]) -> str:
-    """What the design says of these pairs, in one sentence."""
-    conclusion = conclude(found, pairs)
-    first, second = (plan.document or {})["comparison"]
-    if not conclusion.ended:
-        made = f"{conclusion.pairs} of {found.pairs} pairs"
+def sentence_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
+    """What the design says of these blocks: a sentence of each comparison."""
+    return ". ".join(sentences_of(plan, found, blocks))
+
+
+def sentences_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[str, ...]:
+    """The same, one by one."""
+    names = compared(plan.document or {})
+    said = findings(found, blocks).each
+    return tuple(
+        _sentence(plan, found, one, pair, name, blocks)
+        for one, pair, name in zip(said, found.comparisons, names, strict=True)
+    )
+
+
+def letters_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[tuple[str, str], ...]:
+    """Of checkpoints that were all compared with each other, the best first; none where they were not, or not yet."""
+    names = compared(plan.document or {})
+    arms = arms_of(names)
+    said = findings(found, blocks)
+    if len(names) < 3 or len(names) != len(arms) * (len(arms) - 1) // 2 or not said.ended:
+        return ()
+    rates = {name: _mean(blocks, number) for number, name in enumerate(arms)}
+    ranked = sorted(arms, key=lambda name: (-rates[name], name))
+    apart = {frozenset(name) for name, one in zip(names, said.each, strict=True) if one.winner}
+    return tuple((name, letter) for name, letter in letters(ranked, apart).items())
+
+
+def _mean(blocks: Sequence[Block], arm: int) -> float:
+    values = [value for block in blocks for number, value in block if number == arm]
+    return sum(values) / len(values) if values else 0.0
+
+
+def _sentence(
+    plan: Plan, found: Design, one: Conclusion, pair: tuple[int, int], names: Names, blocks: Sequence[Block]
+) -> str:
+    first, second = names
+    if not one.ended:
+        made = f"{one.blocks} of {found.blocks} {found.unit}"
         if plan.state == PlanState.FROZEN:
             return f"{first} and {second} are not compared yet: {made} are made, and the design goes on"
+        if told_reason(plan, sealed=True):  # the design had ended, with other scores than these
+            return f"{first} and {second} would not be compared yet after {made}: the design would go on"
         return f"{first} and {second} were not compared: closed after {made}, before the design ended"
-    counted = pairs[: conclusion.at]
-    if conclusion.winner == "second":  # the better one is named first
-        counted = [(other, one) for one, other in counted]
-    counts = _counts(found, conclusion, counted)
+    sides = [[v for block in blocks[: one.at] for arm, v in block if arm == side] for side in pair]
+    if one.winner == "second":  # the better one is named first
+        sides.reverse()
+    counts = _counts(found, one, *sides)
     if found.margin is not None:
-        claim = f"{first} is {'' if conclusion.winner else 'not shown to be '}not worse than {second}"
+        claim = f"{first} is {'' if one.winner else 'not shown to be '}not worse than {second}"
         return f"{claim} by {100 * found.margin:g} points or more: {counts}"
-    if conclusion.winner is None:
-        return f"No significant difference between {first} and {second}: {counts}"
-    better, worse = (first, second) if conclusion.winner == "first" else (second, first)
+    if one.winner is None:
+        why = ", when one of them was dropped" if one.dropped else ""
+        return f"No significant difference between {first} and {second}: {counts}{why}"
+    better, worse = (first, second) if one.winner == "first" else (second, first)
     what = "succeeded more often" if found.outcome == SUCCESS else "reached higher scores"
     return f"{better} {what} than {worse}: {counts}"
+
+
+def _counts(found: Design, one: Conclusion, ours: Sequence[float], theirs: Sequence[float]) -> str:
+    n, m = len(ours), len(theirs)
+    if found.outcome != SUCCESS:
+        chance = "" if one.p is None else f", {p_words(one.p)},"
+        return f"mean scores {sum(ours) / n:.2f} and {sum(theirs) / m:.2f}{chance} after {n} pairs"
+    words = f"{sum(ours):.0f}/{n} against {sum(theirs):.0f}/{m}"
+    if one.p is not None:  # of a fixed number: an interval of the difference means what it says
+        if n and m:
+            words += f", difference {points(newcombe(int(sum(ours)), n, int(sum(theirs)), m))}"
+        words += f", {p_words(one.p)}"
+    return f"{words}, after {one.at} of {found.blocks} {found.unit}"
+
+
+def _other(plan: Plan, found: Design, blocks: Sequence[Block], at_reveal: Sequence[Block]) -> str:
+    """What it would be of these; empty where they are the same."""
+    return "" if same_blocks(blocks, at_reveal) else sentence_of(plan, found, blocks)
+
+
+@dataclass(frozen=True, slots=True)
+class WorstCase:
+    """A comparison with what was thrown away unscored counted against its winner; `same`: that is the winner still."""
+
+    sentence: str
+    same: bool
+
+
+def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: Tried) -> list[WorstCase]:
+    """Of each comparison that has a winner, and whose trials had attempts that were thrown away."""
+    told = []
+    now = _as_decided(now, decided)
+    for number, one in enumerate(findings(found, decided).each):
+        pair = found.comparisons[number]
+        blocks = now.against(*(pair if one.winner == "first" else pair[::-1])) if one.winner else now.counted
+        if blocks != now.counted:
+            # Other outcomes would have dropped others, of which there are no trials: by itself, as it was decided.
+            single, both = alone(found, pair, blocks[: one.at]) if found.drops else (found, blocks)
+            sentence, other = told_alone(plan, single, number, both)
+            told.append(WorstCase(sentence, other.winner == one.winner))
+    return told
+
+
+def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
+    """The trials that there are now with the outcomes that decided, where these are of the same trials."""
+    if len(now.counted) != len(decided):
+        return now
+    outcomes: list[Block] = []
+    for block, before in zip(now.counted, decided, strict=True):
+        left = [*before]
+        found = []
+        for arm, _ in block:
+            at = next((i for i, (other, _) in enumerate(left) if other == arm), None)
+            if at is None:
+                return now
+            found.append(left.pop(at))
+        if left:
+            return now
+        outcomes.append(tuple(found))
+    return replace(now, counted=outcomes)
+
+
+def told_alone(plan: Plan, single: Design, number: int, blocks: Sequence[Block]) -> tuple[str, Conclusion]:
+    """What the comparison of this number says by itself of these blocks, by the design `single`."""
+    names = compared(plan.document or {})[number]
+    pair = single.comparisons[number if len(single.comparisons) > 1 else 0]
+    one = conclude(single, blocks, pair)
+    return _sentence(plan, single, one, pair, names, blocks), one
 
 
 def _versions(plan: Plan) -> tuple[str, ...]:
@@ -82,8 +223,8 @@ def _versions(plan: Plan) -> tuple[str, ...]:
     while version is not None:
         found = frozen(version.document) if version.document else None
         if found is not None:
-            pairs = version.at_reveal["pairs"] if version.at_reveal else tried(version).counted
-            sentence = sentence_of(version, found, [(one, other) for one, other in pairs])
+            kept = kept_blocks(version)
+            sentence = sentence_of(version, found, tried(version).counted if kept is None else kept)
             told.append(f"Version {version.version}: {sentence}. Amended because: {_amended(version)}")
         version = version.amends
     return tuple(told)
@@ -91,17 +232,3 @@ def _versions(plan: Plan) -> tuple[str, ...]:
 
 def _amended(version: Plan) -> str:
     return version.amendment.amended_because
-
-
-def _counts(found: Design, conclusion: Conclusion, pairs: list[tuple[float, float]]) -> str:
-    n = len(pairs)
-    one, other = sum(a for a, _ in pairs), sum(b for _, b in pairs)
-    if found.outcome != SUCCESS:
-        chance = "" if conclusion.p is None else f", {p_words(conclusion.p)},"
-        return f"mean scores {one / n:.2f} and {other / n:.2f}{chance} after {n} pairs"
-    words = f"{one:.0f}/{n} against {other:.0f}/{n}"
-    if (
-        conclusion.p is not None
-    ):  # of a fixed number of pairs: an interval of the difference means what it says
-        words += f", difference {points(newcombe(int(one), n, int(other), n))}, {p_words(conclusion.p)}"
-    return f"{words}, after {n} of {found.pairs} pairs"

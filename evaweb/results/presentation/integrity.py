@@ -2,49 +2,60 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from evaweb.plans.models import Plan
-from evaweb.results.analysis.conduct import conduct_of, runs_of
+from evaweb.results.analysis.conduct import conduct_of, looks_of, runs_of
+from evaweb.results.analysis.integrity import CATEGORY, VERDICT
 from evaweb.results.presentation.wording import p_words
 from evaweb.results.presentation.would_be import would_be
 
 
 def integrity_document(plan: Plan) -> dict[str, Any]:
     """What the record says, what the headline would be under each doubt, and `remarks` that sum both up."""
-    runs = runs_of(plan)
+    looks = looks_of(plan)
+    runs = runs_of(plan, looks)
     matches = {run.trial: run.match for run in runs if run.match is not None}
-    found = {**conduct_of(plan, runs), "headline": would_be(plan, matches)}
+    found = {**conduct_of(plan, runs, looks), "headline": would_be(plan, matches)}
     return {**found, "remarks": list(_remarks(found))}
 
 
 def delays_banner(found: Mapping[str, Any]) -> str:
     """A sentence where delays of the compared checkpoints differ, "" where none does."""
     delays = found["delays"]
-    rows = [row for row in delays["rows"] if row["what"] in delays["differing"]]
-    if not rows:
+    differing: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for row in delays["rows"]:
+        for test in row["tests"]:
+            if test["corrected"] is not None and test["corrected"] <= delays["alpha"]:
+                said = f"{row['what']}, by {_seconds(test['difference'])} s, {p_words(test['corrected'])}"
+                differing[test["first"], test["second"]].append(said)
+    if not differing:
         return ""
-    first, second = delays["comparison"]
-    said = "; ".join(
-        f"{row['what']}, by {_seconds(row['difference'])} s, {p_words(row['corrected'])}" for row in rows
+    told = ". ".join(
+        f"Delays of {first} and {second} differ: {'; '.join(said)}"
+        for (first, second), said in differing.items()
     )
     return (
-        f"Delays of {first} and {second} differ: {said}. Were delays the same but for chance, a "
-        f"difference as wide would come about so rarely (sign flips within pairs, Holm over {delays['tested']})"
+        f"{told}. If delays differed by chance alone, a difference as large would be as rare as this (sign flips "
+        f"within pairs, Holm over {delays['tested']})"
     )
 
 
 def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
     other = [row["what"] for row in found["headline"] if row["same"] is False]
     if other:
-        yield f"The headline would be another one {'; '.join(other)}"
+        yield f"The headline would change: {'; '.join(other)}"
     looks = [row["by_name"] for row in found["looks"]]
     if looks:
         yield f"Looked behind the blind before the reveal: {', '.join(looks)}"
-    late = sum(row["late"] for row in found["corrections"])
-    if late:
-        yield f"{_of(late, 'score')} came after the reveal"
+    late = Counter(row["changed"] for row in found["corrections"] if row["late"])
+    if late[VERDICT]:
+        yield f"{_of(late[VERDICT], 'score')} came after the reveal"
+    if late[CATEGORY]:
+        categories = "1 failure category" if late[CATEGORY] == 1 else f"{late[CATEGORY]} failure categories"
+        yield f"{categories} corrected after the reveal"
     rows = found["checkpoints"]
     for what, words in (("voided", "voided"), ("repeated", "repeated"), ("interrupted", "interrupted")):
         if any(row[what] for row in rows):
@@ -58,7 +69,7 @@ def _departures(found: Mapping[str, Any]) -> Iterator[str]:
     kinds = (
         ("split_stations", "carried out on more than one station"),
         ("split_operators", "carried out by more than one operator"),
-        ("order", "not in the order that was drawn"),
+        ("order", "not in the order drawn"),
         ("over_a_day", "more than a day apart"),
     )
     for name, words in kinds:
@@ -68,9 +79,25 @@ def _departures(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"{_of(len(deviations['out_of_turn']), 'trial')} handed out of turn"
     for name in ("operators", "stations"):
         if found[name]["uneven"]:
-            yield f"{name.capitalize()} did not have all checkpoints equally often: up to {found[name]['uneven']} apart"
+            yield f"{name.capitalize()} did not share checkpoints evenly: up to {found[name]['uneven']:g} trials off"
     if found["cameras"]["unchecked"]:
         yield f"{_of(len(found['cameras']['unchecked']), 'trial')} without cameras confirmed in the 12 hours before"
+
+    yield from _of_the_bench(found["bench"])
+
+
+def _of_the_bench(bench: Mapping[str, Any]) -> Iterator[str]:
+    if bench["low"]:
+        by = Counter(row["checkpoint"] for row in bench["low"])
+        counts = ", ".join(f"{name} {count}" for name, count in sorted(by.items()))
+        yield f"Run although the bench matched less than {bench['gate']:g}, for a reason: {counts}"
+    if bench["unmatched"]:
+        yield f"{_of(len(bench['unmatched']), 'trial')} without a known match of the bench"
+    for row in bench["references"]:
+        yield (
+            f"{row['camera']} of {row['station']} had {row['used']} references at {row['scene']}, position "
+            f"{row['position']}, while trials were made"
+        )
 
 
 def _of(number: int, what: str) -> str:

@@ -8,20 +8,24 @@ from typing import Any
 
 from django.urls import reverse
 
-from evaweb.plans.models import Plan
+from evaweb.episodes.models import Episode
+from evaweb.lists import SEARCH, UNSEEN, Column, Filter
+from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.analysis import Analysis, Arm
 from evaweb.results.analysis.filters import Chosen, choices
-from evaweb.results.analysis.outcomes import Outcome, paired
+from evaweb.results.analysis.outcomes import Outcome, Pair
 from evaweb.results.presentation.addresses import beside_address, trials_address
 from evaweb.results.presentation.drawings import conditions
 from evaweb.results.presentation.wording import ends
+from evaweb.results.ratings.video_available import seen
+from evaweb.results.selectors import Question
 from evaweb.statistics.bounded import Mean
 from evaweb.statistics.proportions import Proportion
 from evaweb.trials.failure_words import NOT_SAID
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.figures import average_words
-from evaweb.trials.models import Trial
+from evaweb.trials.models import Trial, TrialStatus
 
 MOST_PAIRS = 200
 
@@ -86,11 +90,11 @@ def failure_tables(
     `order`: the lab's words by field; others follow, what was not said comes last. `address` of trials by their
     checkpoint, failure_phase and failure, of which any may be left out.
     """
-    return [_failure_table(i, arm, order, address) for i, arm in enumerate(analysis.arms) if arm.failures]
+    return [_failure_table(arm, order, address) for arm in analysis.arms if arm.failures]
 
 
 def _failure_table(
-    i: int, arm: Arm, order: Mapping[str, Sequence[str]], address: Callable[..., str]
+    arm: Arm, order: Mapping[str, Sequence[str]], address: Callable[..., str]
 ) -> dict[str, Any]:
     phases = _ordered({mode.phase for mode in arm.failures}, order["failure_phase"])
     causes = _ordered({mode.cause for mode in arm.failures}, order["failure"])
@@ -107,7 +111,7 @@ def _failure_table(
     return {
         "checkpoint": arm.checkpoint,
         "n": arm.success.n,
-        "pareto": conditions.pareto(i, arm, links),
+        "pareto": conditions.pareto(arm, links),
         "head": [phase or NOT_SAID for phase in phases],
         "rows": [*rows, ("all", [cell(phase, None) for phase in (*phases, None)])],
     }
@@ -118,19 +122,42 @@ def _ordered(found: set[str], order: Sequence[str]) -> list[str]:
     return sorted(found, key=lambda words: (not words, place.get(words, len(place)), words))
 
 
-def pair_rows(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """Both trials of each block, with where they are played side by side."""
-    pairs = paired(first, second)
-    episodes = dict(
-        Trial.objects.filter(
-            pk__in=[run.trial for pair in pairs[:MOST_PAIRS] for run in (pair.first, pair.second)],
-            episode__isnull=False,
-        ).values_list("pk", "episode_id")
-    )
+@dataclass(frozen=True, slots=True)
+class Side:
+    """One trial of a pair, with its recording where it has one."""
+
+    run: Outcome
+    episode: Episode | None
+
+    @property
+    def video(self) -> str:
+        """Address of the first camera's; "" where there are no pictures on this machine."""
+        if not seen(self.episode):
+            return ""
+        return reverse("episode-video", args=[self.episode.uuid, self.episode.cameras[0]])
+
+    @property
+    def still(self) -> float:
+        """When the last picture is shown [s]."""
+        if self.episode is None or not self.episode.fps:
+            return 0.0
+        return max(0.0, round((self.episode.frames - 0.5) / self.episode.fps, 3))
+
+
+def differs(pair: Pair) -> bool:
+    """True if they did not come equally far: one succeeded, or reached a milestone, that the other did not."""
+    return (pair.first.success, pair.first.milestones) != (pair.second.success, pair.second.milestones)
+
+
+def pair_rows(pairs: Sequence[tuple[int, Pair]]) -> list[dict[str, Any]]:
+    """Both trials of each numbered block with their recordings, and where they are played side by side."""
+    wanted = [run.trial for _, pair in pairs for run in (pair.first, pair.second)]
+    episodes = {row.trial.pk: row for row in Episode.objects.filter(trial__in=wanted).select_related("trial")}
     rows = []
-    for number, pair in enumerate(pairs, start=1):
-        played = [episodes[run.trial] for run in (pair.first, pair.second) if run.trial in episodes]
-        rows.append({"number": number, "pair": pair, "beside": beside_address(played)})
+    for number, pair in pairs:
+        sides = [Side(run, episodes.get(run.trial)) for run in (pair.first, pair.second)]
+        beside = beside_address([side.episode.uuid for side in sides if side.episode])
+        rows.append({"number": number, "pair": pair, "sides": sides, "beside": beside})
     return rows
 
 
@@ -150,15 +177,99 @@ def trial_row(trial: Trial) -> dict[str, Any]:
     }
 
 
-def trial_choices(plan: Plan) -> dict[str, list[str]]:
-    """Values that the list of trials can be narrowed to."""
+def trial_filters(plan: Plan) -> list[Filter]:
+    """What the list of its trials is narrowed by; Question says what it does not know."""
     runs = caching.runs_of(plan).outcomes
     failed = [run for run in runs if not run.success]
-    return {
+    values = {
         **choices(runs),
         "checkpoint": sorted({run.checkpoint for run in runs}),
+        "success": ["yes", "no"],
         **{field: sorted({getattr(run, field) or NOT_SAID for run in failed}) for field in FIELDS},
     }
+    labels = {"failure_phase": "Phase", "failure": "Failure"}
+    names = ("checkpoint", "scene", "position", "success", "failure_phase", "failure", "station", "operator")
+    return [
+        *(
+            Filter(
+                name, labels.get(name, name.capitalize()), [(one, one) for one in values[name]], strict=False
+            )
+            for name in names
+        ),
+        Filter(
+            "status",
+            "Status",
+            [(EVERY, "every attempt"), *TrialStatus.choices],
+            any="those that count",
+            strict=False,
+        ),
+        Filter("missed", "Without the milestone", kind=UNSEEN),
+        Filter("reached", "With the milestone", kind=UNSEEN),
+    ]
+
+
+def question_of(chosen: Mapping[str, str]) -> Question:
+    """The trials that are meant by what is chosen: those that count where no status is."""
+    status = chosen["status"] or TrialStatus.SCORED.value
+    return Question(**{**chosen, "status": "" if status == EVERY else status})
+
+
+EVERY = "every"
+TRIAL_COLUMNS = (
+    Column("trial", "Trial", ("pk",), lambda row: row.pk),
+    Column("code", "Code", ("handout__code",), lambda row: row.handout.code),
+    Column("checkpoint", "Checkpoint", ("checkpoint__name",), lambda row: row.checkpoint.name),
+    Column(
+        "condition",
+        "Condition",
+        ("scene__name", "position__number"),
+        lambda row: f"{row.scene.name}/{row.position.number}",
+    ),
+    Column(
+        "success",
+        "Success",
+        ("verdict__success",),
+        lambda row: row.verdict and row.verdict.success,
+        down=True,
+    ),
+    Column(
+        "milestones",
+        "Milestones",
+        ("verdict__score",),
+        lambda row: row.verdict and row.verdict.score,
+        down=True,
+    ),
+    Column("time", "Time", ("duration_s",), lambda row: row.duration_s, number=True),
+    Column(
+        "failure",
+        "Failure, note",
+        ("verdict__failure_phase", "verdict__failure"),
+        lambda row: row.verdict and row.verdict.why,
+    ),
+    Column(
+        "station", "Station, operator", ("station__name", "operator__username"), lambda row: row.station.name
+    ),
+    Column("operator", "Operator", cell=lambda row: row.operator.get_username(), hidden=True),
+    Column("status", "Status", cell=lambda row: row.status, hidden=True),
+    Column("video", "Video"),
+)
+PLAN_FILTERS = (
+    Filter("state", "State", PlanState.choices),
+    Filter("words", "Words", kind=SEARCH, hint="title or name"),
+)
+PLAN_COLUMNS = (
+    Column("title", "Evaluation", ("title", "version"), lambda row: row.plan.title),
+    Column("name", "Name", cell=lambda row: row.plan.name, hidden=True),
+    Column("version", "Version", cell=lambda row: row.plan.version, hidden=True),
+    Column("state", "State", ("state",), lambda row: row.plan.state),
+    Column("counted", "Trials that count", cell=lambda row: row.counted),
+    Column("foreseen", "Trials foreseen", cell=lambda row: row.foreseen, hidden=True),
+    Column("attempts", "Attempts", cell=lambda row: row.attempts, number=True),
+    Column("left", "Hours left", cell=lambda row: row.hours_left, number=True),
+    Column("blind", "Blind", ("blind",), lambda row: row.plan.blind),
+    Column("owner", "Owner", ("owner__username",), lambda row: row.plan.owner.get_username()),
+    Column("frozen", "Frozen", ("frozen_at",), lambda row: row.plan.frozen_at, down=True),
+)
 
 
 def _mean(found: Mean) -> str:

@@ -44,7 +44,7 @@ def verdict(found: Comparison, one: Proportion, other: Proportion, alpha: float)
         counts = (
             f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {points(difference)}"
         )
-        return f"{found.first} and {found.second} are not told apart: {counts}"
+        return f"No significant difference between {found.first} and {found.second}: {counts}"
     better, worse = found.first, found.second
     if difference.value < 0:
         better, worse, one, other, difference = worse, better, other, one, difference.reversed

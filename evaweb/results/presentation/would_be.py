@@ -2,33 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from evaweb.memo import Kept
-from evaweb.plans.design import Attempt, attempts_of, frozen, paired_up
+from evaweb.plans.design import Attempt, arms_of, attempts_of, blocks_of, compared, frozen, kept_blocks
 from evaweb.plans.models import Plan
-from evaweb.results.presentation.headline import sentence_of
-from evaweb.statistics.designs import Design, Values, conclude
+from evaweb.results.presentation.headline import in_the_worst_case, sentence_of, told_alone
+from evaweb.statistics.designs import (
+    FIXED,
+    Block,
+    Conclusion,
+    Design,
+    Findings,
+    alone,
+    design,
+    findings,
+    of_so_many,
+)
 
 _kept: Kept[list[dict[str, Any]]] = Kept()
 
 
 def would_be(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
-    """As it was decided, then each other way to count: what, the pairs that it leaves, the sentence, and whether the
-    same checkpoint is ahead by the design. None without a comparison.
+    """As it was decided, then each other way to count: what, the blocks that it leaves, the sentence, and whether the
+    same checkpoints are ahead by the design. None without a comparison.
 
-    A part is left out by whole pairs. What is left is judged by the rule of the design as if it had foreseen so many
-    pairs; where the design did not end nothing is left out, for nothing was concluded. `matches` is the lowest match
-    of each trial's bench, where one was measured.
+    A part is left out by whole blocks. What is left is judged by the rule of the design, each comparison by itself, as
+    if it had foreseen so many, or, of checkpoints in random order, by one test of all of it; where the design did not
+    end nothing is left out, for nothing was concluded. `matches` is the least match of each trial's bench, where known.
     """
     found = frozen(plan.document) if plan.document else None
     if found is None:
         return []
     attempts = attempts_of(plan)
-    kept = tuple((one, other) for one, other in plan.at_reveal["pairs"]) if plan.at_reveal else None
-    at = (tuple(attempts), kept, tuple(sorted(matches.items())), plan.state)
+    kept = kept_blocks(plan)
+    at = (tuple(attempts), None if kept is None else tuple(kept), tuple(sorted(matches.items())), plan.state)
     return _kept.get((plan.pk, plan.digest), at, lambda: list(_ways(plan, found, attempts, matches, kept)))
 
 
@@ -37,34 +48,54 @@ def _ways(
     found: Design,
     attempts: Sequence[Attempt],
     matches: Mapping[int, float],
-    kept: Sequence[Values] | None,
+    kept: Sequence[Block] | None,
 ) -> Iterator[dict[str, Any]]:
-    names = (plan.document or {})["comparison"]
-    pairs = paired_up(found, names, attempts)
-    base = list(pairs.counted if kept is None else kept)
-    decided = conclude(found, base)
+    now = blocks_of(found, arms_of(compared(plan.document or {})), attempts)
+    base = list(now.counted if kept is None else kept)
+    decided = findings(found, base)
 
-    def said(what: str, values: list[Values], by: Design = found) -> dict[str, Any]:
-        way = conclude(by, values)
-        sentence = sentence_of(plan, by, values) if values else "No pair is left"
-        same = (way.winner, bool(way.ended)) == (decided.winner, bool(decided.ended)) if values else None
-        return {"what": what, "pairs": len(values), "sentence": sentence, "same": same}
+    def said(what: str, blocks: list[Block]) -> dict[str, Any]:
+        way = findings(found, blocks)
+        same = _concluded(way.each) == _concluded(decided.each) if blocks else None
+        sentence = sentence_of(plan, found, blocks) if blocks else f"No {found.unit[:-1]} is left"
+        return {"what": what, "pairs": _made(way), "sentence": sentence, "same": same}
 
     yield said("as it was decided", base)
-    yield said("with the scores as they are now", pairs.counted)
-    yield said("as trials were first scored, none voided", pairs.at_first)
-    if decided.winner:
-        yield said("what was thrown away unscored counted against it", pairs.against(decided.winner))
+    yield said("with the scores as they are now", now.counted)
+    yield said("as trials were first scored, none voided", now.at_first)
+    worst = in_the_worst_case(plan, found, base, now)
+    if any(one.winner for one in decided.each):
+        yield {
+            "what": "attempts discarded unscored counted against it",
+            "pairs": _made(decided),
+            "sentence": ". ".join(told.sentence for told in worst) or sentence_of(plan, found, base),
+            "same": all(told.same for told in worst),
+        }
     if not decided.ended:
         return
-    counting: dict[int, list[Attempt]] = {}
+    counting: dict[int, list[Attempt]] = defaultdict(list)
     for each in attempts:
         if each.counts:
-            counting.setdefault(each.block, []).append(each)
+            counting[each.block].append(each)
 
     def without(what: str, part: Callable[[Attempt], bool]) -> dict[str, Any]:
-        left = [pair for block, pair in enumerate(base) if not any(map(part, counting.get(block, ())))]
-        return said(what, left, replace(found, pairs=max(len(left), 1)))
+        left = [at for at in range(len(base)) if not any(map(part, counting[at]))]
+        if not left:
+            return said(what, [])
+        told: list[str] = []
+        ways: list[Conclusion] = []
+        for number, pair in enumerate(found.comparisons):
+            by, blocks = _of_these(found, pair, left, base)
+            if not blocks:
+                first, second = compared(plan.document or {})[number]
+                told.append(f"No pair of {first} and {second} is left")
+                continue
+            sentence, way = told_alone(plan, by, number, blocks)
+            told.append(sentence)
+            ways.append(way)
+        same = _concluded(ways) == _concluded(decided.each) if len(ways) == len(told) else None
+        pairs = max((one.blocks for one in ways), default=0)
+        return {"what": what, "pairs": pairs, "sentence": ". ".join(told), "same": same}
 
     for field in ("operator", "station"):
         for name in sorted({getattr(each, field) for rows in counting.values() for each in rows}):
@@ -76,3 +107,32 @@ def _ways(
     if gate is not None:
         low = f"without trials whose bench matched less than {gate:g}"
         yield without(low, lambda each: matches.get(each.trial, 1.0) < gate)
+
+
+def _made(found: Findings) -> int:
+    return max(one.blocks for one in found.each)
+
+
+def _concluded(each: Iterable[Conclusion]) -> list[tuple[str | None, bool]]:
+    return [(one.winner, bool(one.ended)) for one in each]
+
+
+def _of_these(
+    found: Design, pair: tuple[int, int], left: Sequence[int], base: Sequence[Block]
+) -> tuple[Design, list[Block]]:
+    """The design of one comparison as if it had foreseen these blocks alone, and those of them that it is about."""
+    blocks = [base[at] for at in left]
+    if found.counts is None:
+        single, both = alone(found, pair, blocks)
+        return (of_so_many(single, len(both)) if both else single), both
+    counts, total = [], (0, 0)
+    for at in left:
+        before = found.counts[at - 1] if at else (0, 0)
+        total = tuple(
+            sum(each) for each in zip(total, found.counts[at], (-before[0], -before[1]), strict=True)
+        )
+        counts.append(total)
+    if not min(total):  # of one checkpoint alone nothing can be said
+        return replace(found, rule=FIXED, blocks=len(left), boundary=None, counts=tuple(counts)), blocks
+    made = design(rule=FIXED, blocks=len(left), alpha=found.alpha, margin=found.margin, counts=counts)
+    return made, blocks

@@ -30,9 +30,30 @@ from evaweb.results.ratings.video_available import seen
 from evaweb.roles import Role, require
 from evaweb.trials.models import Milestone, Trial, TrialStatus
 from evaweb.trials.record import file_of
+from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
 
 log = logging.getLogger(__name__)
+_JUDGE_HAS_NO_ADDRESS_THERE = Pattern(
+    "results.ratings.automatic.judge_has_no_address_there",
+    "judge {judge} has no address: there is nothing to allow",
+)
+_OWNER_ADMINISTRATOR_ASKS_JUDGE = Pattern(
+    "results.ratings.automatic.owner_administrator_asks_judge",
+    "{plan} is {user}'s: its owner or an administrator asks a judge",
+)
+_DRAFT_HAS_NO_TRIALS_JUDGED = Pattern(
+    "results.ratings.automatic.draft_has_no_trials_judged",
+    "{plan} is a draft: it has no trials to be judged",
+)
+_THERE_NO_JUDGE_THERE = Pattern(
+    "results.ratings.automatic.there_no_judge_there",
+    "there is no judge {name!r:.80}; there are: {there}",
+)
+_JUDGE_ADDRESS_NOT_ALLOWED_ADMINISTRATOR = Pattern(
+    "results.ratings.automatic.judge_address_not_allowed_administrator",
+    "judge {judge}: its address is not allowed: an administrator allows it under Administration, Judges",
+)
 
 KIND = "judge"  # of the job
 LONGEST_REASON, LONGEST_MODEL = 300, 200  # characters of what a server may have said
@@ -45,7 +66,7 @@ def judge_allow(*, user: User, judge: AutomaticJudge) -> None:
     """Let it be sent pictures at the address that it has now; who allowed it is kept."""
     require(user, Role.ADMIN)
     if not judge.address:
-        raise Conflict(f"judge {judge} has no address: there is nothing to allow")
+        raise Conflict(_JUDGE_HAS_NO_ADDRESS_THERE(judge=judge))
     built(judge.name, judge.kind, judge.setup)
     judge.allowed_address, judge.allowed_by, judge.allowed_at = judge.address, user, timezone.now()
     judge.save(update_fields=["allowed_address", "allowed_by", "allowed_at"])
@@ -82,11 +103,9 @@ def judge_ask(*, user: User, plan: Plan, name: str) -> Job:
     """
     role = require(user, Role.OPERATOR)
     if role is not Role.ADMIN and plan.owner_id != user.pk:
-        raise NotAllowed(
-            f"{plan} is {plan.owner.get_username()}'s: its owner or an administrator asks a judge"
-        )
+        raise NotAllowed(_OWNER_ADMINISTRATOR_ASKS_JUDGE(plan=plan, user=plan.owner.get_username()))
     if plan.state == PlanState.DRAFT:
-        raise Conflict(f"{plan} is a draft: it has no trials to be judged")
+        raise Conflict(_DRAFT_HAS_NO_TRIALS_JUDGED(plan=plan))
     judge = _judge(name)
     _ready(judge)
     with transaction.atomic():
@@ -105,9 +124,7 @@ def _judge(name: str) -> AutomaticJudge:
     found = AutomaticJudge.objects.filter(name=name).first()
     if found is None:
         there = ", ".join(AutomaticJudge.objects.values_list("name", flat=True))
-        raise NotFound(
-            f"there is no judge {name!r:.80}; there are: {there or 'none, an administrator adds them'}"
-        )
+        raise NotFound(_THERE_NO_JUDGE_THERE(name=name, there=there or "none, an administrator adds them"))
     return found
 
 
@@ -115,9 +132,7 @@ def _ready(judge: AutomaticJudge) -> Found:
     """The judge, to be asked; EvaError where it cannot be, or must not: its address was never allowed."""
     found = built(judge.name, judge.kind, judge.setup)
     if found.served and judge.allowed_address != judge.address:
-        raise NotAllowed(
-            f"judge {judge}: its address is not allowed: an administrator allows it under Administration, Judges"
-        )
+        raise NotAllowed(_JUDGE_ADDRESS_NOT_ALLOWED_ADMINISTRATOR(judge=judge))
     return found
 
 

@@ -26,7 +26,48 @@ from evaweb.roles import Role, require
 from evaweb.trials import failures
 from evaweb.trials.models import Score, Trial, TrialStatus
 from evaweb.trials.record import file_of
+from evaweb.trials.services import declare_check
 from evaweb.trials.verdicts import LONGEST_NOTE, verdict
+from runtime.core.sentences import Pattern, fixed
+
+_TRIAL_RATED_BY_SECOND_PERSON = Pattern(
+    "results.ratings.judging.trial_rated_by_second_person",
+    "trial {trial} is to be rated by a second person, and that may be you: rate it first (Result, Rate "
+    "again), then correct what is said of it",
+)
+_TRIAL_NOT_ONE_THOSE_RATED = Pattern(
+    "results.ratings.judging.trial_not_one_those_rated",
+    "trial {code} of {plan} is not one of those that are rated again",
+)
+_YOU_RAN_SCORED_TRIAL_SOMEONE = Pattern(
+    "results.ratings.judging.you_ran_scored_trial_someone",
+    "you ran or scored trial {code}: someone else rates it again",
+)
+_YOU_HAVE_SEEN_RESULTS_SECOND = Pattern(
+    "results.ratings.judging.you_have_seen_results_second",
+    "you have seen results of {plan}: a second rater must not know them",
+)
+_OUTCOME_ALLOWED = Pattern(
+    "results.ratings.judging.outcome_allowed",
+    "outcome = {outcome!r:.80}; allowed: {values}",
+)
+_WHY_EMPTY_SAY_SENTENCE_OTHERS = fixed(
+    "results.ratings.judging.why_empty_say_sentence_others",
+    "why is empty: say it in a sentence, others read it",
+)
+_WERE_NOT_RUN_ONE_AFTER = Pattern(
+    "results.ratings.judging.were_not_run_one_after",
+    "{first} and {second} were not run one after the other at the same initial condition",
+)
+_YOU_HAVE_SEEN_RESULTS_RATER = Pattern(
+    "results.ratings.judging.you_have_seen_results_rater",
+    "you have seen results of {plan}: a rater of preferences must not know them",
+)
+_HAS_NO_TRIAL = Pattern("results.ratings.judging.has_no_trial", "{plan} has no trial {code!r:.20}")
+_OTHERWISE_WHAT_SAID_STANDS = Pattern(
+    "results.ratings.judging.otherwise_what_said_stands",
+    "{twice}, and otherwise: what was said stands",
+)
 
 _STATES = (PlanState.FROZEN, PlanState.CLOSED, PlanState.REVEALED)
 
@@ -73,6 +114,24 @@ def to_rate(user: User) -> Offer[Handout]:
     return _offered(mine, lambda handout: (handout,))
 
 
+def _rated_first(what: str, trial: Trial, user: User) -> None:
+    """Before the words of a score alone are corrected: whoever may be asked to rate the trial again does so first.
+
+    They would be its rater no more, and it is failures that would lose theirs; nor has a rater to know what was said.
+    """
+    if what != "reworded":
+        return
+    for plan in Plan.objects.filter(handouts__trial=trial, state__in=_STATES, second_rater_share__gt=0):
+        handout = _unrated(plan, user).filter(trial=trial).first()
+        if handout is None or not handout.trial.episode.cameras or has_looked(plan, user):
+            continue  # nobody will ask this user
+        if handout.slot.index in sample_of(plan):
+            raise NotAllowed(_TRIAL_RATED_BY_SECOND_PERSON(trial=trial.pk))
+
+
+declare_check(_rated_first)
+
+
 def _offered(waiting: Sequence[T], of: Callable[[T], tuple[Handout, ...]]) -> Offer[T]:
     """The first of which all pictures are there, else the first of which they may come; what lies before is passed."""
     for there in (seen, coming):
@@ -111,9 +170,9 @@ def rate(
     handout = _handout(plan, code)
     trial = handout.trial
     if handout.slot.index not in sample_of(plan) or trial.status != TrialStatus.SCORED:
-        raise Conflict(f"trial {code} of {plan} is not one of those that are rated again")
+        raise Conflict(_TRIAL_NOT_ONE_THOSE_RATED(code=code, plan=plan))
     if trial.operator_id == user.pk or trial.scores.filter(rater=user).exists():
-        raise NotAllowed(f"you ran or scored trial {code}: somebody else rates it again")
+        raise NotAllowed(_YOU_RAN_SCORED_TRIAL_SOMEONE(code=code))
     twice = f"you have rated trial {code} already"
     found = verdict(list(trial.scene.milestones.order_by("order")), milestones, success)
     said = {
@@ -127,7 +186,7 @@ def rate(
     if before is not None:
         return _once_more(before, said, twice)
     if has_looked(plan, user):
-        raise NotAllowed(f"you have seen results of {plan}: a second rater must not know them")
+        raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_SECOND(plan=plan))
     failures.check_failure(trial.scene, said, success=found.success)
     require_seen_on_video(handout)
     rating = Rating(trial=trial, rater=user, blind=plan.sealed, **said)
@@ -175,20 +234,20 @@ def prefer(*, user: User, plan: Plan, first: str, second: str, outcome: str, why
     """
     require(user, Role.OPERATOR)
     if outcome not in Preference.Outcome.values:
-        raise EvaError(f"outcome = {outcome!r:.80}; allowed: {', '.join(Preference.Outcome.values)}")
+        raise EvaError(_OUTCOME_ALLOWED(outcome=outcome, values=", ".join(Preference.Outcome.values)))
     reason = text("why", why, LONGEST_NOTE)
     if not reason:
-        raise EvaError("why is empty: say it in a sentence, others read it")
+        raise EvaError(_WHY_EMPTY_SAY_SENTENCE_OTHERS)
     one, other = _handout(plan, first), _handout(plan, second)
     if (one.trial_id, other.trial_id) not in _pairs(plan):
-        raise Conflict(f"{first} and {second} were not run one after the other at the same initial condition")
+        raise Conflict(_WERE_NOT_RUN_ONE_AFTER(first=first, second=second))
     twice = f"you have compared {first} and {second} already"
     said = {"outcome": outcome, "why": reason}
     before = Preference.objects.filter(first=one.trial, second=other.trial, rater=user).first()
     if before is not None:
         return _once_more(before, said, twice)
     if has_looked(plan, user):
-        raise NotAllowed(f"you have seen results of {plan}: who prefers must not know them")
+        raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_RATER(plan=plan))
     require_seen_on_video(one, other)
     row = Preference(plan=plan, first=one.trial, second=other.trial, rater=user, blind=plan.sealed, **said)
     RATINGS.append(file_of(other.trial), PreferenceLine.written(row))
@@ -200,7 +259,7 @@ def _handout(plan: Plan, code: str) -> Handout:
     rows = plan.handouts.select_related("slot", "trial__scene", "trial__episode")
     found = rows.filter(code=code).first()
     if found is None:
-        raise NotFound(f"{plan} has no trial {code!r:.20}")
+        raise NotFound(_HAS_NO_TRIAL(plan=plan, code=code))
     found.trial.status = Trial.objects.select_for_update().get(pk=found.trial_id).status
     return found
 
@@ -208,7 +267,7 @@ def _handout(plan: Plan, code: str) -> Handout:
 def _once_more(before: T, said: Mapping[str, Any], twice: str) -> T:
     """The earlier answer, where it is given again word by word because the reply was lost; else Conflict."""
     if any(getattr(before, name) != value for name, value in said.items()):
-        raise Conflict(f"{twice}, and otherwise: what was said stands")
+        raise Conflict(_OTHERWISE_WHAT_SAID_STANDS(twice=twice))
     return before
 
 

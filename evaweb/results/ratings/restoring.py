@@ -13,8 +13,13 @@ from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.ratings.record import JudgementLine, PreferenceLine, RatingLine
 from evaweb.trials.models import Trial
 from evaweb.trials.record import TrialRecord
+from runtime.core.sentences import Pattern
 
 log = logging.getLogger(__name__)
+_JUDGEMENT_TRIAL_WHICH_NEITHER_DATABASE = Pattern(
+    "results.ratings.restoring.judgement_trial_which_neither_database",
+    "a judgement is of trial {uuid}, which is neither in the database nor on this disk",
+)
 
 
 @restores
@@ -73,7 +78,5 @@ def _judgement(line: JudgementLine) -> bool:
 def _trial(facts: TrialRecord) -> Trial:
     found = Trial.objects.filter(uuid=facts.uuid).first()
     if found is None:
-        raise EvaError(
-            f"a judgement is of trial {facts.uuid}, which is neither in the database nor on this disk"
-        )
+        raise EvaError(_JUDGEMENT_TRIAL_WHICH_NEITHER_DATABASE(uuid=facts.uuid))
     return found

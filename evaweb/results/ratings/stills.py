@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from evaweb.episodes.folders import preview_video
 from evaweb.episodes.models import Episode
 from evaweb.episodes.preview import jpeg_of
+from evaweb.episodes.videos import video_file
 from evaweb.results.judges.base import Still
 from runtime.datasets.pictures import Pictures
 
@@ -17,7 +17,7 @@ def stills_of(episode: Episode) -> tuple[Still, ...]:
     """Camera after camera in the order of time, of those that have a video; RecordingError where one is damaged."""
     found = []
     for number, camera in enumerate(episode.cameras[:CAMERAS], 1):
-        video = preview_video(episode.uuid, camera)
+        video = video_file(episode.uuid, camera)
         if not video.exists():  # lost before its first picture
             continue
         with Pictures(video) as pictures:

@@ -7,6 +7,12 @@ from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.selectors import stage_of
 from evaweb.errors import Conflict
 from evaweb.plans.models import Handout
+from runtime.core.sentences import Pattern
+
+_WITHOUT_PICTURES_NOBODY_CAN_JUDGE = Pattern(
+    "results.ratings.video_available.without_pictures_nobody_can_judge",
+    "without pictures nobody can judge {told}",
+)
 
 
 def seen(episode: Episode | None) -> bool:
@@ -20,11 +26,11 @@ def seen(episode: Episode | None) -> bool:
 
 
 def coming(episode: Episode | None) -> bool:
-    """True if pictures of it may be made yet: its folder is on this disk."""
+    """True if pictures of it may be made yet: its folder is on this disk, or on its way."""
     return (
         episode is not None
         and bool(episode.cameras and episode.frames)
-        and journal_folder(episode.uuid).is_dir()
+        and (episode.away_since is not None or journal_folder(episode.uuid).is_dir())
     )
 
 
@@ -33,7 +39,7 @@ def require_seen_on_video(*handouts: Handout) -> None:
     blind = [handout for handout in handouts if not seen(handout.trial.episode)]
     if blind:
         told = "; ".join(f"{handout.code}: {_why(handout.trial.episode)}" for handout in blind)
-        raise Conflict(f"without pictures nobody can judge {told}")
+        raise Conflict(_WITHOUT_PICTURES_NOBODY_CAN_JUDGE(told=told))
 
 
 def _why(episode: Episode | None) -> str:

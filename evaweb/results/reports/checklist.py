@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 from django.db.models import Count, F, Min
 
-from evaweb.plans.design import conclusion_of
-from evaweb.plans.models import Look, Plan
+from evaweb.plans.design import compared, findings_of
+from evaweb.plans.models import Allocation, Look, Plan
+from evaweb.plans.schedule import IMBALANCE
 from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.integrity import CATEGORY, VERDICT, with_changes
 from evaweb.results.models import Rating
 from evaweb.trials.models import Score, Trial, TrialStatus
 
@@ -54,16 +57,15 @@ def _yes(kept: bool) -> str:
 def _beforehand(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
     begun = trials.aggregate(first=Min("prepared_at"))["first"]
     before = bool(plan.frozen_at and (begun is None or plan.frozen_at <= begun))
-    said = bool(plan.question.strip() and plan.first and plan.second)
+    names = compared(plan.document or {})
+    said = bool(plan.question.strip() and names)
     kept = "yes" if before and said else "partly" if before else "no"
     words = plan.question.strip() or "no question was written down"
-    compared = (
-        f"compares {plan.first} and {plan.second}" if plan.first and plan.second else "names no comparison"
-    )
+    told = "; ".join(f"compares {first} and {second}" for first, second in names) or "names no comparison"
     return Item(
         "Question and comparison before the first trial",
         kept,
-        f"“{words}”; {compared}; frozen {plan.frozen_at:%Y-%m-%d %H:%M} UTC",
+        f"“{words}”; {told}; frozen {plan.frozen_at:%Y-%m-%d %H:%M} UTC",
     )
 
 
@@ -80,10 +82,15 @@ def _criteria(plan: Plan) -> Item:
 
 
 def _order(plan: Plan) -> Item:
+    order = (
+        "blocks of one initial condition with every checkpoint"
+        if plan.allocation == Allocation.PAIRED
+        else f"two checkpoints by a fair coin, at each initial condition at most {IMBALANCE} trials apart"
+    )
     return Item(
         "Randomised, interleaved, balanced",
         "yes",
-        f"blocks of one initial condition with every checkpoint; commitment {plan.commitment[:16]}…"
+        f"{order}; commitment {plan.commitment[:16]}…"
         + (", verified at the reveal" if plan.revealed_at else ", not yet revealed"),
     )
 
@@ -103,7 +110,7 @@ def _blind(plan: Plan) -> Item:
 def _complete(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
     foreseen, counted = plan.slots.count(), trials.filter(status=TrialStatus.SCORED).count()
     rule = plan.get_stopping_display()
-    conclusion = conclusion_of(plan)
+    conclusion = findings_of(plan)
     kept = "yes" if counted == foreseen or (conclusion is not None and conclusion.ended) else "partly"
     closed = f"; closed because: {plan.closed_because}" if plan.closed_because else ""
     return Item(
@@ -122,13 +129,18 @@ def _voids(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
 
 def _corrections(plan: Plan) -> Item:
     scores = Score.objects.filter(trial__evaluation=plan.evaluation_id)
-    corrected = scores.exclude(reason="").count()
-    late = scores.filter(scored_at__gte=plan.revealed_at).count() if plan.revealed_at else 0
-    return Item(
-        "Scores kept as they were given",
-        "no" if late else "partly" if corrected else "yes",
-        f"{corrected} corrections, each a row of its own with author and reason, {late} scores after the reveal",
+    rows = with_changes(scores, why=F("reason"), at=F("scored_at"))
+    corrected = sum(bool(row["why"]) for row in rows if row["changed"] == VERDICT)
+    late = Counter(row["changed"] for row in rows if plan.revealed_at and row["at"] >= plan.revealed_at)
+    categories = sum(row["changed"] == CATEGORY for row in rows)
+    words = (
+        f"{corrected} corrections, each a row of its own with author and reason, {late[VERDICT]} scores after the "
+        "reveal"
     )
+    if categories:
+        words += f"; failure categories alone corrected {categories} times, {late[CATEGORY]} of them after the reveal"
+    kept = "no" if late[VERDICT] else "partly" if corrected else "yes"
+    return Item("Scores kept as they were given", kept, words)
 
 
 def _versions(plan: Plan) -> Item:

@@ -101,6 +101,14 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
             "stratified": found.stratified.stratified,
             "reversed": found.stratified.reversed,
         },
+        "within": {name: {"p": one.p, "strata": one.strata} for name, one in found.within.items()},
+        "by_scene": {
+            "differences": {
+                name: {"value": one.value, "newcombe": _ends(one.interval)}
+                for name, one in found.scenes.items()
+            },
+            "interaction_p": found.interaction,
+        },
         "evidence": _evidence(found.evidence),
         "score_evidence": _evidence(found.score_evidence),
         "anytime": {

@@ -15,7 +15,7 @@ from django.template.loader import render_to_string
 from django.utils import timezone
 
 from evaweb.errors import EvaError
-from evaweb.plans.design import conclusion_of
+from evaweb.plans.design import compared, findings_of
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
@@ -25,6 +25,7 @@ from evaweb.results.analysis.integrity import changes_of
 from evaweb.results.models import Judgement, Rating
 from evaweb.results.presentation import facts, listings
 from evaweb.results.presentation.drawings import conditions, courses, rates
+from evaweb.results.presentation.headline import headline, with_planned_letters
 from evaweb.results.presentation.integrity import delays_banner, integrity_document
 from evaweb.results.reports import bench_photos as laid_out
 from evaweb.results.reports.checklist import checklist
@@ -33,6 +34,20 @@ from evaweb.results.reports.tables import COLUMNS, milestones_of, outcome_pages
 from evaweb.tabular_export import csv_lines, in_pages
 from evaweb.trials.failures import in_order
 from evaweb.trials.models import Score
+from runtime.core.sentences import Pattern
+
+_NOT_EMPTY_NAME_NEW_FOLDER = Pattern(
+    "results.reports.reporting.not_empty_name_new_folder",
+    "{out} is not empty: name a new folder, so that reports are not mixed",
+)
+_DRAFT_THERE_NOTHING_REPORT_BEFORE = Pattern(
+    "results.reports.reporting.draft_there_nothing_report_before",
+    "{plan} is a draft: there is nothing to report before it is frozen",
+)
+_STYLE_SHEET_NOT_WHERE_INSTALLED = Pattern(
+    "results.reports.reporting.style_sheet_not_where_installed",
+    "the style sheet {name} is not where it was installed",
+)
 
 _STYLES = (
     *("css/tokens.css", "css/base.css", "css/card.css", "css/table.css", "css/chip.css"),
@@ -67,10 +82,10 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     `most_pictures`: bytes of pictures of benches, None for all that there are.
     """
     if out.exists() and any(out.iterdir()):
-        raise EvaError(f"{out} is not empty: name a new folder, so that reports are not mixed")
+        raise EvaError(_NOT_EMPTY_NAME_NEW_FOLDER(out=out))
     if plan.state == PlanState.DRAFT:
-        raise EvaError(f"{plan} is a draft: there is nothing to report before it is frozen")
-    analysis = caching.analysis_of(plan)
+        raise EvaError(_DRAFT_THERE_NOTHING_REPORT_BEFORE(plan=plan))
+    analysis = with_planned_letters(plan, caching.analysis_of(plan))
     data = out / "data"
     data.mkdir(parents=True, exist_ok=True)
     _json(data / "plan.json", plan.document or {})
@@ -104,20 +119,29 @@ def numbers_of(plan: Plan, analysis: Analysis) -> dict[str, Any]:
     words = ("reason", "groups")
     return {
         **analysis_document(analysis),
-        "primary": _primary(plan),
+        "planned": _planned(plan),
         "agreement": agreement_of(plan),
         "judges": judges_of(plan),
         "preferences": preferred and {name: value for name, value in preferred.items() if name not in words},
     }
 
 
-def _primary(plan: Plan) -> dict[str, Any] | None:
-    """What the plan's design says."""
-    found, names = conclusion_of(plan), (plan.document or {})["comparison"]
+def _planned(plan: Plan) -> list[dict[str, Any]]:
+    """What the plan's design says of each of its comparisons."""
+    found = findings_of(plan)
     if found is None:
-        return None
-    winner = {"first": names[0], "second": names[1], None: None}[found.winner]
-    return {"pairs": found.pairs, "at": found.at, "winner": winner, "p": found.p}
+        return []
+    return [
+        {
+            "first": names[0],
+            "second": names[1],
+            "blocks": one.blocks,
+            "at": one.at,
+            "winner": {"first": names[0], "second": names[1], None: None}[one.winner],
+            "p": one.p,
+        }
+        for names, one in zip(compared(plan.document or {}), found.each, strict=True)
+    ]
 
 
 def seal_of(plan: Plan) -> dict[str, Any]:
@@ -134,8 +158,8 @@ def seal_of(plan: Plan) -> dict[str, Any]:
 def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
     """Context of the report's page; its figures lead nowhere, because there is nothing behind them."""
     arms = analysis.arms
-    order = {arm.checkpoint: i for i, arm in enumerate(arms)}
-    primary = facts.primary_of(plan, analysis)
+    order = {arm.checkpoint: arm.series for arm in arms}
+    primaries = facts.primaries_of(plan, analysis)
     scenes = sorted({name for arm in arms for name in arm.scenes})
     runs = caching.runs_of(plan)
     return {
@@ -146,12 +170,13 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         "styles": "\n".join(_style(name) for name in _STYLES),
         "made": timezone.now(),
         "changes": changes_of(plan),
-        "primary": primary and facts.comparison_facts(plan, analysis, primary),
+        "headline": headline(plan) if primaries else None,
+        "primaries": [facts.comparison_facts(plan, analysis, found) for found in primaries],
         "table": listings.arm_rows(plan, analysis, Chosen()),
         "others": [
             (found, facts.comparison_sentence(analysis, found))
             for found in analysis.comparisons
-            if found is not primary
+            if found not in primaries
         ],
         "intervals": rates.intervals("Success rates", [(a.checkpoint, a.success, "") for a in arms], order)
         if arms
@@ -160,7 +185,7 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         "funnels": [
             courses.funnel(
                 scene,
-                [(i, a.checkpoint, f) for i, a in enumerate(arms) for f in a.funnels if f.scene == scene],
+                [(a.series, a.checkpoint, f) for a in arms for f in a.funnels if f.scene == scene],
                 {},
             )
             for scene in scenes
@@ -169,7 +194,16 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         "success_times": courses.success_times(arms),
         "grid": conditions.grid(arms, {}),
         "failures": listings.failure_tables(analysis, in_order(), lambda **named: ""),
-        "evidence": primary and courses.evidence(primary.evidence, primary.first, primary.second),
+        "evidence": [
+            courses.evidence(
+                found.evidence,
+                found.first,
+                found.second,
+                drawn=(order[found.first], order[found.second]),
+            )
+            for found in primaries
+            if found.pairs
+        ],
         "agreement": agreement_of(plan),
         "judges": judges_of(plan),
         "preferences": preferences_of(plan),
@@ -192,7 +226,7 @@ def _benches(plan: Plan, folder: Path) -> dict[int, list[dict[str, Any]]]:
 def _style(name: str) -> str:
     found = finders.find(name)
     if not isinstance(found, str):
-        raise EvaError(f"the style sheet {name} is not where it was installed")
+        raise EvaError(_STYLE_SHEET_NOT_WHERE_INSTALLED(name=name))
     return Path(found).read_text("utf-8")
 
 

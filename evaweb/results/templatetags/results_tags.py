@@ -83,12 +83,6 @@ def of_trial(rows: Mapping[int, list[Any]], trial: int) -> list[Any]:
     return rows.get(trial, [])
 
 
-@register.filter
-def words(text: str) -> list[str]:
-    """The words of a text."""
-    return text.split()
-
-
 @register.simple_tag
 def closed_because(plan: Plan, sealed: bool) -> str:
     """Why it was closed, as far as the reader may know."""
@@ -122,6 +116,46 @@ def listed(found: list[Any], what: str) -> str:
 def points(share: float) -> str:
     """A difference of shares as whole points."""
     return f"{100 * share:.0f}"
+
+
+@register.filter
+def percent(share: float, digits: int = 3) -> str:
+    """A share as a number of percent, without zeros at its end."""
+    return f"{100 * share:.{digits}f}".rstrip("0").rstrip(".") if digits else f"{100 * share:.0f}"
+
+
+@register.filter
+def shared(total: float, among: int) -> float:
+    """A part of what is shared evenly."""
+    return total / among
+
+
+@register.filter
+def minus(count: int, shown: list[Any]) -> int:
+    """How many are not shown."""
+    return count - len(shown)
+
+
+@register.filter
+def field_words(name: str) -> str:
+    """A field of a draft, as its page calls it."""
+    return _FIELD_WORDS.get(name, name.replace("_", " ").capitalize())
+
+
+_FIELD_WORDS = {
+    "checkpoints": "Arms",
+    "challenger": "Compared with the control",
+    "comparing": "Compared",
+    "stopping": "Design",
+    "repetitions": "Trials at each position",
+    "look_after": "Looks",
+    "drop_arms": "Drop checkpoints",
+    "allocation": "Order in a block",
+    "outcome": "Primary outcome",
+    "second_rater_share": "Second rater",
+    "match_gate": "Minimum match",
+    "title": "Name",
+}
 
 
 @register.filter

@@ -70,6 +70,12 @@ def spaced(name: str) -> str:
 
 
 @register.filter
+def words(text: str) -> list[str]:
+    """The words of a text."""
+    return text.split()
+
+
+@register.filter
 def tone(status: str) -> str:
     """The colour of a trial's status, by the name the style sheets have for it."""
     return TrialStatus(status).tone

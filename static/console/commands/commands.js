@@ -98,7 +98,7 @@ export class Commands {
   #deskReason() {
     const { role, fresh, lease } = this.#store;
     if (role === "viewer") return "a viewer watches; an administrator can make you an operator";
-    return fresh && lease === "other" ? "somebody else commands the station; ask for it" : "";
+    return fresh && lease === "other" ? "someone else commands the station; ask for it" : "";
   }
 
   /** Why `kind` cannot be given now, "" where it can. */

@@ -1,4 +1,5 @@
-// The software e-stop: a button that never moves, Escape, and space outside text fields. Waits for nothing: it goes
+// The software e-stop: a button that never moves, Escape, and space but on a control that has the focus, which it is for.
+// Escape first closes what is open, unless the robot may move: then it does both. The e-stop waits for nothing: it goes
 // over the socket and to the process for stops at once, under one uuid, which the station carries out once. What is
 // left, plain HTTP to the web, where these say nothing; and red letters where nobody does. estop_state.js has what is true.
 
@@ -9,14 +10,14 @@ import { EStopState } from "./estop_state.js";
 
 const ACK_MS = 500;
 const ASK_MS = 5000;
-const TEXT_FIELDS = 'textarea, [contenteditable="true"], input:not([type]), input[type="text"], input[type="search"], input[type="number"], input[type="password"], input[type="email"], input[type="url"]';
+const CONTROLS = 'input, textarea, select, button, summary, [contenteditable="true"]'; // what was clicked gives the focus back: keys.js
+const OPEN = "dialog[open], details[open]:has(> .float)";
 const WORDS = {
   pressed: { kind: "pressed", text: "E-stop pressed …" },
   failed: { kind: "failed", text: "USE THE HARDWARE STOP" },
   held: { kind: "stopped", text: "E-stop acknowledged: the robot is held." },
   latched: { kind: "stopped", text: "E-stop is latched." },
 };
-const SPACE_IS_TAKEN = config.page === "collect"; // there it stops and saves whatever moves, and starts
 
 const now = () => performance.now() / 1000;
 
@@ -165,18 +166,33 @@ export class EStop {
   #isStop(event) {
     if (event.ctrlKey || event.altKey || event.metaKey) return "";
     if (event.key === "Escape") return "Escape";
-    if (event.code === "Space" && !SPACE_IS_TAKEN && !event.target.closest?.(TEXT_FIELDS)) return "space";
+    if (event.code === "Space" && !event.target.closest?.(CONTROLS)?.checkVisibility()) return "space";
     return "";
   }
 
   #key(event) {
     const why = this.#isStop(event);
     if (!why) return;
-    if (why === "space") event.preventDefault(); // else it would also press the focused button
-    if (!event.repeat) this.press(why);
+    if (why === "space") event.preventDefault(); // else the page would scroll
+    if (event.repeat) return;
+    const closed = why === "Escape" && closeTop();
+    if (!closed || !this.#atRestForSure()) this.press(why);
+  }
+
+  /** Nothing moves by what this page knows, and it knows it now. */
+  #atRestForSure() {
+    return this.#store.fresh && !this.#store.snapshot.state_is.moving;
   }
 
   #keyUp(event) {
     if (this.#isStop(event) === "space") event.preventDefault();
   }
+}
+
+/** Close what was opened last; whether there was anything. */
+function closeTop() {
+  const top = [...document.querySelectorAll(OPEN)].filter((each) => each.checkVisibility()).at(-1);
+  if (top instanceof HTMLDialogElement) top.close();
+  else if (top) top.open = false;
+  return Boolean(top);
 }

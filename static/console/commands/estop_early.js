@@ -6,7 +6,6 @@
   const area = document.getElementById("estop-area");
   const note = document.getElementById("estop-note");
   note.dataset.rest = note.innerHTML;
-  const keys = document.querySelector('.station[data-page="collect"]') ? ["Escape"] : ["Escape", "Space"];
   const alone = () => !("ready" in area.dataset); // estop.js says when it is there
 
   function say(kind, text) {
@@ -48,8 +47,8 @@
 
   document.getElementById("estop").addEventListener("click", () => alone() && press("button"));
   window.addEventListener("keydown", (event) => {
-    const typing = event.code === "Space" && event.target.closest?.("input, textarea, select");
-    if (!alone() || event.repeat || typing || !keys.includes(event.code)) return;
+    const taken = event.code === "Space" && event.target.closest?.("input, textarea, select, button, summary");
+    if (!alone() || event.repeat || taken || !["Escape", "Space"].includes(event.code)) return;
     event.preventDefault();
     press(event.code);
   });

@@ -1,9 +1,9 @@
-// Who commands: taken, renewed each second while this page is visible, requested, handed over, given up.
+// Who commands: taken, renewed each second, requested, handed over, given up. A page that is hidden says so: it keeps the
+// station while nothing moves and nobody else asks; a run that goes on is held, after a countdown with tones.
 
 import { post } from "../../site/api.js";
 import { config } from "../live/config.js";
 
-const RENEW_MS = 1000;
 const NAMES = {
   claim: "Take the station",
   give_up: "Give up",
@@ -13,13 +13,15 @@ const NAMES = {
   decline: "Decline",
   move: "Take it here",
 };
-const AWAY_S = 5; // the lease's time to live
 
 export class LeaseControls {
   #store;
   #socket;
   #commands;
   #hiddenAt = 0;
+  #yields = false; // somebody asks for the station while nobody sees this page
+  #away = ""; // what to say if the lease has ended while this page was hidden; not known yet
+  #tones = null;
   #title = document.title;
   #awake = null;
   #refused = 0;
@@ -31,19 +33,20 @@ export class LeaseControls {
     this.#commands = commands;
     store.on(["snapshot", "link", "open"], () => this.#draw());
     store.on("renewed", (answer) => this.#renewed(answer));
-    store.on("changed", (what) => what.includes("lease") && window.htmx.trigger("#lease", "eva:lease"));
+    store.on("changed", (what) => what.includes("lease") && this.#changed());
     document.body.addEventListener("htmx:afterSettle", () => this.#draw());
     document.addEventListener("click", (event) => this.#clicked(event));
     document.addEventListener("submit", (event) => this.#taken(event));
     document.addEventListener("visibilitychange", () => this.#visibility());
     window.addEventListener("beforeunload", (event) => this.#leaving(event));
-    setInterval(() => this.#renew(), RENEW_MS);
+    new Worker(config.beat).addEventListener("message", () => this.#beat());
     this.#draw();
   }
 
   /** The server answered a renewal; the station's own state says the rest. */
   #renewed({ ok, reason }) {
     this.#refused = ok || this.#store.lease !== "mine" ? 0 : this.#refused + 1;
+    if (ok) this.#away = "";
     if (this.#refused > 1) this.#commands.say(`Lease not renewed: ${reason}`, "refused"); // once: it was just handed over
   }
 
@@ -54,14 +57,44 @@ export class LeaseControls {
       name.textContent = this.#store.commander;
     }
     document.body.dataset.lease = lease;
+    if (this.#away && !["mine", "unknown"].includes(lease)) this.#ended();
     if (lease === this.#before) return;
     if (lease === "mine") this.#stayAwake();
     else if (this.#before === "mine") this.#letSleep();
     this.#before = lease;
   }
 
+  #beat() {
+    if (document.hidden) this.#countDown();
+    this.#renew();
+  }
+
+  /** The runtime takes that of a hidden page only while nothing moves. */
   #renew() {
-    if (this.#store.lease === "mine" && !document.hidden) this.#socket.send({ type: "renew", epoch: this.#store.epoch });
+    if (this.#store.lease !== "mine" || (document.hidden && this.#yields)) return;
+    this.#socket.send({ type: "renew", epoch: this.#store.epoch, ...(document.hidden && { hidden: true }) });
+  }
+
+  #changed() {
+    this.#yields ||= document.hidden;
+    window.htmx.trigger("#lease", "eva:lease");
+  }
+
+  /** How long until a run is held, in the tab's title, with a tone each second. */
+  #countDown() {
+    const { facts, state_is } = this.#store.snapshot;
+    const left = Math.ceil(facts.lease_ttl_s - (performance.now() - this.#hiddenAt) / 1000);
+    if (!this.#hiddenAt || !state_is.moving || left < -1) return;
+    document.title = left > 0 ? `COME BACK: holds in ${left} s` : "the robot is held";
+    if (left > 0) this.#tone();
+  }
+
+  #tone() {
+    this.#tones ??= new AudioContext();
+    const tone = new OscillatorNode(this.#tones, { frequency: 880 });
+    tone.connect(this.#tones.destination);
+    tone.start();
+    tone.stop(this.#tones.currentTime + 0.15);
   }
 
   async #clicked(event) {
@@ -93,21 +126,29 @@ export class LeaseControls {
     }
   }
 
-  /** A page nobody sees does not command: said beforehand on the page, and here in the tab's title. */
+  /** A page nobody sees commands no robot that moves: said beforehand on the page, and here in the tab's title. */
   #visibility() {
     if (document.hidden) {
       if (this.#store.lease !== "mine") return;
       this.#hiddenAt = performance.now();
-      document.title = "COME BACK: the robot will hold";
+      this.#beat();
       return;
     }
     if (!this.#hiddenAt) return;
     const away = (performance.now() - this.#hiddenAt) / 1000;
+    const held = this.#yields || document.title !== this.#title;
+    if (held) this.#away = `This page was hidden for ${away.toFixed(0)} s: its lease has ended, and a run in progress is held.`;
     this.#hiddenAt = 0;
+    this.#yields = false;
     document.title = this.#title;
     this.#stayAwake();
     this.#renew();
-    if (away > AWAY_S) this.#commands.say(`This page was hidden for ${away.toFixed(0)} s: its lease has ended, and a run that was going on is held.`, "refused");
+    this.#draw();
+  }
+
+  #ended() {
+    this.#commands.say(this.#away, "refused");
+    this.#away = "";
   }
 
   #leaving(event) {
@@ -120,7 +161,7 @@ export class LeaseControls {
     try {
       this.#awake = await navigator.wakeLock.request("screen");
     } catch (error) {
-      console.info(`the screen may go dark by itself: ${error.message}`);
+      console.info(`the screen may turn off by itself: ${error.message}`);
     }
   }
 

@@ -33,7 +33,7 @@ export async function curvePane(store) {
   pauseButton(curves);
   const tags = new Tags(document.querySelector(".curves-pane"), "curves-tags");
   store.on("second", () => {
-    tags.show("paused", curves.paused && `paused ${duration(curves.pausedFor)} ago; the data goes on`);
+    tags.show("paused", curves.paused && `paused ${duration(curves.pausedFor)} ago; data keeps arriving`);
     tags.show("simulated", curves.simulated && "under the bar: executed by the simulated robot", GHOSTS.simulated.colour);
   });
   return {
@@ -67,6 +67,6 @@ function pauseButton(curves) {
   button.addEventListener("click", () => {
     curves.pause(!curves.paused);
     button.setAttribute("aria-pressed", String(curves.paused));
-    button.textContent = curves.paused ? "Go on" : "Pause";
+    button.textContent = curves.paused ? "Continue" : "Pause";
   });
 }

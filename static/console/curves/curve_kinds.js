@@ -3,7 +3,7 @@
 /** `colour` is a custom property; `means` is what a legend says of it. */
 export const KINDS = [
   { name: "raw", colour: "--curve-4", width: 1.5, means: "What the newest chunk of the policy wants" },
-  { name: "smoothed", colour: "--curve-3", width: 1.5, dash: [4, 4], means: "What was made of all chunks, before safety" },
+  { name: "smoothed", colour: "--curve-3", width: 1.5, dash: [4, 4], means: "What the strategy made of all chunks, before safety" },
   { name: "state", colour: "--curve-1", width: 2, means: "Where the joint was measured" },
   { name: "executed", colour: "--curve-2", width: 1.5, means: "What was sent to the robot, after safety" },
 ];

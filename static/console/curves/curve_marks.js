@@ -4,7 +4,7 @@
 /** The kinds of marks, in their order in the legend; `colour` is a custom property, `shape` that of the swatch. */
 export const MARKS = [
   { name: "chunk", colour: "--mark-chunk", shape: "hairline", means: "A hairline where another chunk takes over; beside it the chunk at the cursor, 0 for the held target" },
-  { name: "overlap", colour: "--mark-overlap", shape: "patch", means: "A band where an action is made of more than one chunk; beside it of how many at the cursor" },
+  { name: "overlap", colour: "--mark-overlap", shape: "patch", means: "A band where an action combines more than one chunk; beside it, how many at the cursor" },
   { name: "safety", colour: "--warn", shape: "tick", means: "A tick where safety changed or refused the action" },
 ];
 

@@ -22,7 +22,7 @@ const TEXTS = [
   ["Received", ({ link: l }) => received(l)],
   ["Own cameras", ({ link: l, clock }) => (troubled(l) ? "" : summary(l.cameras, clock))],
   ["Camera", ({ link: l, clock }) => (troubled(l) ? summary(l.cameras, clock) : ""), "warn"],
-  ["Commands", ({ link: l }) => Object.entries(l.unheard ?? {}).map(([topic, why]) => why || `nobody listens to ${topic}`).join("; "), "warn"],
+  ["Commands", ({ link: l }) => Object.entries(l.unheard ?? {}).map(([topic, why]) => why || `no listener on ${topic}`).join("; "), "warn"],
   ["Faults seen", ({ link: l }) => Object.entries(l.faults).filter(([, count]) => count).map(([name, count]) => `${name} ${count}`).join(", ") || "none"],
   ["Task", (snapshot) => snapshot.task || "–"],
   ["Last episode", ({ episode }) => episode?.uuid || "–"],

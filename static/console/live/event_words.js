@@ -1,5 +1,6 @@
 // Events in words: the runtime's kinds and sentences as a person reads them, and how much they weigh.
 
+import { sentence as translated } from "../../site/sentences.js";
 import { verb, words } from "./words.js";
 
 const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "video_lost", "displaced", "moved_away", "implausible", "corrected", "too_far", "node_silent", "leader_lost"]);
@@ -84,10 +85,12 @@ export function kindWords(kind) {
 }
 
 /** The sentence, with arrows as arrows and people by their names, commands as their buttons say them. */
-export function sentence({ kind, text }) {
-  if (kind === "setup" && text === "idle") return "the set-up is over";
-  const plain = PLAIN[kind] ?? (kind.startsWith("source_") ? PLAIN.source : (said) => said);
-  return plain(text).replaceAll(" -> ", " → ").replace(HOLDER, "$1 (page $2)").replace(UUID, "$1");
+export function sentence(event) {
+  const { kind, text } = event;
+  const said = translated(event);
+  if (kind === "setup" && said === "idle") return "the set-up is over";
+  const english = PLAIN[kind] ?? (kind.startsWith("source_") ? PLAIN.source : (given) => given);
+  return (said === text ? english(said) : said).replaceAll(" -> ", " → ").replace(HOLDER, "$1 (page $2)").replace(UUID, "$1");
 }
 
 /** "bad" for what endangers robot or record, "warn" for what a person should have seen, "good" where that is over, else "". */

@@ -14,9 +14,11 @@ export class Events {
   #count = document.getElementById("events-count");
   #boot = "";
   #newest = 0;
+  #rows = new WeakMap(); // row -> its event
 
   constructor() {
     this.#filter.addEventListener("input", () => this.#show());
+    document.addEventListener("eva:language", () => this.#translate());
     this.#show();
   }
 
@@ -66,7 +68,17 @@ export class Events {
     words.textContent = text;
     words.title = event.text;
     row.append(time, name, words);
+    this.#rows.set(row, event);
     return row;
+  }
+
+  /** Another language was chosen, or its words have come. */
+  #translate() {
+    for (const row of this.#list.querySelectorAll(".event")) {
+      const event = this.#rows.get(row);
+      if (event) row.replaceWith(this.#row(event));
+    }
+    this.#show();
   }
 
   #divide(text) {
@@ -85,7 +97,7 @@ export class Events {
       if (!row.hidden) shown += 1;
     }
     this.#list.toggleAttribute("data-empty", shown === 0);
-    this.#list.dataset.note = wanted.length ? "No event has these words." : "What happens at the station is written here.";
+    this.#list.dataset.note = wanted.length ? "No events match." : "Events at the station appear here.";
     this.#count.textContent = wanted.length ? `${shown} shown` : "";
   }
 }

@@ -48,7 +48,7 @@ function drawSituation(store) {
   const box = document.getElementById("situation");
   const asked = store.fresh ? advice(store.snapshot.state_is) : null;
   const lost = !store.fresh && store.snapshotAt !== -Infinity;
-  const dead = !store.fresh && store.open && !store.link.ok;
+  const dead = !store.fresh && store.open && !store.link.ok && store.link.told;
   box.hidden = !(asked || lost || dead);
   if (box.hidden) return;
   const { word, reason } = store.fresh ? { word: "", reason: store.snapshot.reason } : trouble(store);

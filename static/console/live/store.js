@@ -1,5 +1,7 @@
 // What this page knows of its station: the newest of everything, and who wants to hear of it.
 
+import { localized } from "../../site/sentences.js";
+
 /** Names told: "snapshot", "joints", "poses", "camera", "link", "events", "open", "hello", "second"; answers of the web: "ack", "renewed", "aimed"; "changed", with the names of what has in the database. */
 export class Store {
   #listeners = new Map();
@@ -36,9 +38,9 @@ export class Store {
   }
 
   setSnapshot(snapshot) {
-    this.snapshot = snapshot;
+    this.snapshot = localized(snapshot);
     this.snapshotAt = performance.now();
-    this.tell("snapshot", snapshot);
+    this.tell("snapshot", this.snapshot);
   }
 
   setJoints(joints) {

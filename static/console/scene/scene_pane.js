@@ -98,9 +98,9 @@ async function patiently(ask, say) {
 /** Say in the corner which robots are drawn beside the real one. */
 function nameGhosts(tags, scene, shown) {
   const words = {
-    simulated: "simulated robot; the solid one is real and is sent nothing of it",
+    simulated: "simulated robot; the solid one is the real robot, which receives none of this",
     chunk: shown.proposal,
-    aim: "target; nothing moves before it is sent",
+    aim: "target; nothing moves until it is sent",
     commanded: "commanded pose",
   };
   for (const [ghost, { colour }] of Object.entries(GHOSTS)) tags.show(ghost, scene.draws(ghost) && words[ghost], colour);

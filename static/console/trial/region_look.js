@@ -61,8 +61,8 @@ function line(region, images) {
   const pictures = document.createElement("span");
   pictures.className = "row line aid-crops";
   const live = document.querySelector(`[data-camera="${CSS.escape(region.camera)}"] canvas`);
-  pictures.append(crop(imageOf(images, region.reference), region.at, "as it should lie"));
-  if (live) pictures.append(crop(live, region.at, "as it lies"));
+  pictures.append(crop(imageOf(images, region.reference), region.at, "as it should be"));
+  if (live) pictures.append(crop(live, region.at, "as it is"));
   item.append(pictures);
   return item;
 }

@@ -158,7 +158,7 @@ function whyOf(form) {
 function unexplained(form) {
   const levels = [...form.querySelectorAll('#why[data-explained="yes"]:not([hidden]) fieldset')];
   const open = levels.filter((level) => !level.querySelector(":checked")).map((level) => level.querySelector("legend").textContent.toLowerCase());
-  return open.length ? `say of the failure its ${open.join(" and its ")}` : "";
+  return open.length ? `choose the ${open.join(" and the ")} of the failure` : "";
 }
 
 function saveButton() {

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from typing import Any
 
 from django.core.management.base import BaseCommand, CommandError, CommandParser
+from django.db import DatabaseError
+
+log = logging.getLogger(__name__)
 
 
 class Command(BaseCommand):
@@ -26,10 +30,17 @@ class Command(BaseCommand):
         from evaweb.asgi import application  # not before models are there
         from evaweb.console import server
         from evaweb.console.event_ingest import Chronicle
+        from evaweb.errors import EvaError
+        from evaweb.jobs.workers import lab_folder_named
         from evaweb.listening import PortTaken, listen
 
         try:
             listener = listen(host, port)
-        except PortTaken as error:
+            lab_folder_named()
+        except DatabaseError as error:
+            log.warning(
+                "the database does not answer; workers know the lab's data folder as it was: %s", error
+            )
+        except (PortTaken, EvaError) as error:
             raise CommandError(str(error)) from None
         server.serve(application, listener, beside=Chronicle(), lifeline=lifeline, nice=nice)

@@ -8,7 +8,10 @@ from typing import Any
 from django.core.checks import Tags
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
+from evaweb.errors import EvaError
 from evaweb.jobs import worker
+from evaweb.jobs.kinds import Queue
+from evaweb.jobs.workers import queue_names
 
 
 class Command(BaseCommand):
@@ -19,14 +22,14 @@ class Command(BaseCommand):
 
     def add_arguments(self, parser: CommandParser) -> None:
         parser.formatter_class = argparse.ArgumentDefaultsHelpFormatter
-        parser.add_argument("--queues", default="lab", help="names with commas between them")
+        parser.add_argument(
+            "--queues", default=",".join(Queue), help="what this machine has, with commas between"
+        )
         parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")
 
     def handle(self, *args: Any, queues: str, lifeline: bool, **options: Any) -> None:
-        names = [name.strip() for name in queues.split(",") if name.strip()]
-        wrong = [name for name in names if not name.replace("-", "").replace("_", "").isalnum()]
-        if not names or wrong:
-            raise CommandError(
-                f"--queues {queues!r}: allowed are names of letters, digits, '-' and '_', with commas between"
-            )
+        try:
+            names = queue_names(queues)
+        except EvaError as error:
+            raise CommandError(str(error)) from None
         worker.run(names, lifeline=lifeline)

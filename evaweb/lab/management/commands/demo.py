@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from django.conf import settings
 from django.core.management.base import BaseCommand, CommandError
@@ -18,32 +17,26 @@ from django.core.management.base import BaseCommand, CommandError
 import robots
 from evaweb.binary_frames import plain
 from evaweb.errors import EvaError
-from evaweb.lab import evaluate, lifetime, programs, seed
-from evaweb.lab.lab import Bench, Lab, a_lab
+from evaweb.lab import evaluate, programs, seed
+from evaweb.lab.benches import Bench
+from evaweb.lab.lab import Lab, a_lab
 from evaweb.lab.lifetime import Ended
 from evaweb.lab.once import Choice, perform, report
+from evaweb.lab.progress import on_terminal
 from evaweb.lab.seed import Login
+from evaweb.lab.simulated import CLUMSY, POLICIES, SKILLED, benches_of, known_port, simulated_options
 from evaweb.lab.visitor import Visitor
-from evaweb.plans.models import Plan
-from evaweb.results.analysis.analysis import Analysis, Comparison, analyse
+from evaweb.plans.models import Allocation, Plan, StoppingRule
+from evaweb.results.analysis.analysis import Analysis, analyse
 from evaweb.results.analysis.load_outcomes import outcomes_of_plan
+from evaweb.results.presentation.headline import headline
 from evaweb.roles import Role
 from evaweb.trials.models import Checkpoint
 
 _DEPLOYMENTS = settings.BASE_DIR / "deployments"
 _MOST = 2000  # trials of --evaluate: a day and more
 _STATION, _ROBOT = "bench-1", "agilex_piper"
-_SKILLED, _CLUMSY = "pick-place-40k", "pick-place-8k"
-_POLICIES = {
-    _SKILLED: (
-        "Scripted; sees the block within a millimetre or two, answers in 80 ms.",
-        ("--noise", "1", "--latency-ms", "80"),
-    ),
-    _CLUMSY: (
-        "Scripted; misjudges the block by centimetres, often lets go early or grasps short, answers in 250 ms.",
-        ("--noise", "14", "--failure-rate", "0.4", "--latency-ms", "250"),
-    ),
-}
+_STEPS = 3  # beside those of any lab: bench, station, plan
 
 
 class Command(BaseCommand):
@@ -65,6 +58,18 @@ class Command(BaseCommand):
             help="carry out N trials of a blind plan without a human, in lockstep, reveal it, compare, then end",
         )
         parser.add_argument(
+            "--design",
+            choices=StoppingRule.values,
+            default=StoppingRule.EVIDENCE.value,
+            help="of --evaluate: what ends its comparison (none: a fixed number; evidence: anytime)",
+        )
+        parser.add_argument(
+            "--order",
+            choices=Allocation.values,
+            default=Allocation.PAIRED.value,
+            help="of --evaluate: each checkpoint once in a block, or whichever is drawn",
+        )
+        parser.add_argument(
             "--json", type=Path, metavar="FILE", help="with --once or --evaluate: write the result there"
         )
         parser.add_argument(
@@ -75,23 +80,18 @@ class Command(BaseCommand):
             "--collect", action="store_true", help="the bench collects too, led by a simulated leader"
         )
         parser.add_argument("--seed", type=int, default=1, help="of the bench and of the policies")
-        parser.add_argument(
-            "--set",
-            action="append",
-            default=[],
-            metavar="KEY=VALUE",
-            help="on top of the station's deployment, as with python -m runtime",
-        )
+        simulated_options(parser)
         parser.add_argument("--position", type=int, default=1, help="with --once: the position of the scene")
         parser.add_argument(
-            "--checkpoint", default=_SKILLED, choices=list(_POLICIES), help="with --once: which policy"
+            "--checkpoint", default=SKILLED, choices=list(POLICIES), help="with --once: which policy"
         )
 
     def handle(self, *args: Any, **options: Any) -> None:
         _check(options)
         deployment = _deployment(options["robot"])
+        progress = on_terminal(Lab.STEPS + _STEPS)
         try:
-            with a_lab(options["host"], options["port"], options["stop_port"]) as lab:
+            with a_lab(options["host"], options["port"], options["stop_port"], progress) as lab:
                 url, logins = self._up(lab, deployment, options)
                 if options["ready_file"]:
                     _announce(options["ready_file"], url, logins, lab.processes.pids())
@@ -101,7 +101,7 @@ class Command(BaseCommand):
                     self._evaluate(url, logins, options)
                 else:
                     self._welcome(url, logins)
-                    lab.watch()
+                    lab.watch(benches_of(options))
         except Ended:
             self.stdout.write("ended; the data stays in " + str(settings.DATA_DIR))
         except EvaError as error:
@@ -110,45 +110,47 @@ class Command(BaseCommand):
             raise CommandError(str(error)) from None
 
     def _up(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> tuple[str, list[Login]]:
-        seed.demo_scene()
-        bench = (self._lockstep if options["evaluate"] else self._bench)(lab, deployment, options)
+        with lab.progress.step("the simulated bench and its policies"):
+            seed.demo_scene()
+            bench = (self._lockstep if options["evaluate"] else self._bench)(lab, deployment, options)
         url = lab.up([bench])
-        roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
-        logins = [seed.demo_login(username=name, role=role) for name, role in roles.items()]
-        try:
-            self._plan("block-on-plate-blind", "Block on plate", "evaluated", repetitions=3)
-        except EvaError as error:
-            self.stderr.write(f"The demo's plan is left as it is: {error}")
+        with lab.progress.step("accounts and a plan"):
+            roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
+            logins = [seed.demo_login(username=name, role=role) for name, role in roles.items()]
+            try:
+                self._plan("block-on-plate-blind", "Block on plate", "evaluated", repetitions=3)
+            except EvaError as error:
+                self.stderr.write(f"The demo's plan is left as it is: {error}")
         return url, logins
 
     def _lockstep(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> Bench:
         """Bench, policies and station in one process on a virtual clock."""
-        robot = options["robot"]
-        policies = {name: (_skill(name, options), _known_port(name)) for name in _POLICIES}
+        robot, how = options["robot"], benches_of(options)
+        policies = {name: (how.skill(name), known_port(name)) for name in POLICIES}
         assignments = [f'robot="{robot}"', f'data_dir="{settings.DATA_DIR}"', *options["set"]]
-        program = programs.lockstep(str(deployment), assignments, robot, policies, options["seed"])
+        program = programs.lockstep(str(deployment), assignments, robot, policies, how.options)
         for name, url in lab.processes.start(program)["policies"].items():
-            seed.demo_checkpoint(name=name, description=_POLICIES[name][0], policy={"url": url})
+            seed.demo_checkpoint(name=name, description=POLICIES[name][0], policy={"url": url})
         return Bench(deployment, assignments, runs=True)
 
     def _bench(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> Bench:
         """Bench, policies and station in processes of their own."""
-        robot, seed_number = options["robot"], options["seed"]
-        node = lab.processes.start(programs.tabletop(robot, seed_number))
+        robot, how = options["robot"], benches_of(options)
+        node = lab.processes.start(programs.tabletop(robot, how.options))
         served = {}
-        for name, (description, _) in _POLICIES.items():
-            serving = programs.policy(name, robot, _skill(name, options), _known_port(name))
+        for name, (description, _) in POLICIES.items():
+            serving = programs.policy(name, robot, how.skill(name), known_port(name))
             served[name] = lab.processes.start(serving)["url"]
             seed.demo_checkpoint(name=name, description=description, policy={"url": served[name]})
         assignments = [
             f'robot="{robot}"',
             f'transport.sub_endpoint="{node["obs_endpoint"]}"',
             f'transport.pub_endpoint="{node["action_endpoint"]}"',
-            f'policy.url="{served[_SKILLED]}"',
+            f'policy.url="{served[SKILLED]}"',
             *options["set"],
         ]
         if options["collect"]:
-            leader = lab.processes.start(programs.leader(robot, node["obs_endpoint"], seed_number))
+            leader = lab.processes.start(programs.leader(robot, node["obs_endpoint"], how.seed))
             assignments += [
                 'collection.source="relay"',
                 'collection.dataset="tabletop_demonstrations"',
@@ -157,15 +159,15 @@ class Command(BaseCommand):
             ]
         return Bench(deployment, assignments)
 
-    def _plan(self, name: str, title: str, use: str, repetitions: int) -> Plan:
+    def _plan(self, name: str, title: str, use: str, repetitions: int, **design: str) -> Plan:
         # What a blind plan hands out is hidden from operators: single trials keep theirs.
-        served = [Checkpoint.objects.get(name=policy) for policy in (_SKILLED, _CLUMSY)]
+        served = [Checkpoint.objects.get(name=policy) for policy in (SKILLED, CLUMSY)]
         checkpoints = [
             seed.demo_checkpoint(name=f"{row.name}-{use}", description=row.description, policy=row.policy)
             for row in served
         ]
         given = {"owner": "admin", "scene": seed.demo_scene(), "checkpoints": checkpoints}
-        return seed.demo_plan(name=name, title=title, repetitions=repetitions, **given)
+        return seed.demo_plan(name=name, title=title, repetitions=repetitions, **given, **design)
 
     def _welcome(self, url: str, logins: list[Login]) -> None:
         self.stdout.write(f"\nEVA Web is at {url}\n")
@@ -180,7 +182,12 @@ class Command(BaseCommand):
         name = f"evaluate-{time.strftime('%Y%m%d-%H%M%S')}"
         positions = seed.demo_scene().positions.count()
         plan = self._plan(
-            name, f"{count} trials by the script", "by-script", repetitions=-(-count // (2 * positions))
+            name,
+            f"{count} trials by the script",
+            "by-script",
+            repetitions=-(-count // (2 * positions)),
+            design=options["design"],
+            order=options["order"],
         )
         self.stderr.write(f"{plan}: commitment {plan.commitment}")
         visitors = [Visitor(url) for _ in logins]
@@ -189,11 +196,17 @@ class Command(BaseCommand):
         made = evaluate.carry_out(visitors[0], _STATION, name, count, self.stderr.write)
         result = evaluate.revealed(visitors[1], name, made)
         plan.refresh_from_db()
-        found = analyse(outcomes_of_plan(plan), primary=(f"{_SKILLED}-by-script", f"{_CLUMSY}-by-script"))
+        found = analyse(
+            outcomes_of_plan(plan),
+            planned=[(f"{SKILLED}-by-script", f"{CLUMSY}-by-script")],
+            in_pairs=options["order"] == Allocation.PAIRED,
+        )
+        said = headline(plan)
+        result["headline"] = said.sentence if said else ""
         result |= {"lockstep": True, "analysis": asdict(found), "wall_s": time.monotonic() - begun}
         if options["json"]:
             options["json"].write_text(json.dumps(plain(result), indent=1), "utf-8")
-        for line in told(found):
+        for line in (*told(found), result["headline"]):
             self.stdout.write(line)
 
     def _once(self, url: str, operator: Login, options: dict[str, Any]) -> None:
@@ -210,27 +223,16 @@ class Command(BaseCommand):
 
 
 def told(found: Analysis) -> Iterator[str]:
-    """The comparison in a few lines: each rate with n and interval, the difference with its interval and evidence."""
+    """Each rate with n and interval, and the difference with its interval: what is found is the headline's to say."""
     for arm in found.arms:
         yield f"{arm.checkpoint}: {arm.success.successes}/{arm.success.n} {_percent(arm.success.interval)}"
     for one in found.comparisons:
         yield (
             f"{one.first} against {one.second}: difference {100 * one.difference.value:.0f} points "
-            f"{_percent(one.difference.interval)}, Barnard p = {one.test.p:.4f}, {one.pairs} pairs"
+            f"{_percent(one.difference.interval)}, {one.pairs} pairs"
         )
-        yield f"  {_evidence(one)}"
     for note in found.notes:
         yield f"  {note}"
-
-
-def _evidence(one: Comparison) -> str:
-    """Sentence of the test that holds however often one looks."""
-    found = one.evidence
-    if found.winner is not None:
-        winner = one.first if found.winner == "first" else one.second
-        return f"evidence sufficed after {found.stop} pairs: {winner} is better (alpha = {found.alpha:g})"
-    least = min([*found.p_first[-1:], *found.p_second[-1:]], default=1.0)
-    return f"evidence does not suffice yet: anytime-valid p = {least:.3f}, wanted {found.alpha / 2:g} for a direction"
 
 
 def _percent(interval: Any) -> str:
@@ -249,27 +251,6 @@ def _check(options: Mapping[str, Any]) -> None:
         raise CommandError(
             "--evaluate with --collect: its bench is in lockstep, a leader is not; leave one out"
         )
-
-
-def _skill(name: str, options: Mapping[str, Any]) -> tuple[str, ...]:
-    return (*_POLICIES[name][1], "--seed", str(options["seed"]))
-
-
-def _known_port(name: str) -> int:
-    """Port of the checkpoint's earlier policy server, if it is free: a plan that is frozen names it."""
-    return free_port_of(Checkpoint.objects.filter(name=name).values_list("policy__url", flat=True).first())
-
-
-def free_port_of(url: str | None) -> int:
-    """The port of that address if it is free now, else 0."""
-    port = urlsplit(url).port if url else None
-    if not port:
-        return 0
-    try:
-        lifetime.require_free("127.0.0.1", port)
-    except EvaError:
-        return 0
-    return port
 
 
 def _deployment(robot: str) -> Path:

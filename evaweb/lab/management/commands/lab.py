@@ -1,8 +1,7 @@
-"""`manage.py lab DEPLOYMENT...`: web, worker and the stations of this machine; all end with it."""
+"""`manage.py lab [DEPLOYMENT...]`: web, worker and the stations of this machine; all end with it."""
 
 from __future__ import annotations
 
-import sys
 from argparse import ArgumentParser
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,15 @@ from django.conf import settings
 from django.core.management.base import BaseCommand, CommandError
 
 from evaweb.errors import EvaError
-from evaweb.lab.lab import Bench, a_lab
+from evaweb.lab import first_account
+from evaweb.lab.benches import Bench
+from evaweb.lab.lab import Lab, a_lab
 from evaweb.lab.lifetime import Ended
+from evaweb.lab.progress import on_terminal
 from evaweb.lab.seed import nobody_can_log_in
+from evaweb.lab.simulated import benches_of, simulated_options
 
-_FIRST_ACCOUNT = (
-    "Nobody can log in yet. In another terminal, make an administrator:\n"
-    "  EVA_DATA_DIR={data} {python} manage.py createsuperuser"
-)
+_FIRST_ACCOUNT = "Nobody can log in yet. Open {url}/first-account/ and type this code:  {code}"
 
 
 class Command(BaseCommand):
@@ -35,19 +35,21 @@ class Command(BaseCommand):
         parser.add_argument(
             "--stop-port", type=int, help="port of the process for stops; the one after that of the web"
         )
+        simulated_options(parser)
 
     def handle(self, *args: Any, **options: Any) -> None:
         benches = [Bench(path.absolute()) for path in options["deployments"]]
+        progress = on_terminal(Lab.STEPS + len(benches))
         try:
-            with a_lab(options["host"], options["port"], options["stop_port"]) as lab:
+            with a_lab(options["host"], options["port"], options["stop_port"], progress) as lab:
                 url = lab.up(benches)
                 self.stdout.write(
                     f"EVA Web is at {url}   (data in {settings.DATA_DIR})\nCtrl-C ends everything."
                 )
                 if nobody_can_log_in():
-                    self.stdout.write(_FIRST_ACCOUNT.format(data=settings.DATA_DIR, python=sys.executable))
+                    self.stdout.write(_FIRST_ACCOUNT.format(url=url.rstrip("/"), code=first_account.offer()))
                 self.stdout.flush()
-                lab.watch()
+                lab.watch(benches_of(options))
         except Ended:
             self.stdout.write("ended")
         except EvaError as error:

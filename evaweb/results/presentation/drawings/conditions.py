@@ -8,8 +8,10 @@ from collections.abc import Mapping, Sequence
 from evaweb.results.analysis.analysis import Arm
 from evaweb.results.presentation.drawings.svg import (
     LINE,
+    PROPORTION,
     Drawing,
     Scale,
+    counted,
     drawing,
     element,
     label,
@@ -63,12 +65,17 @@ def grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Drawing |
             said.append(title)
     height = top + _CELL * len(conditions) + 6
     return drawing(
-        width, height, "Successes by initial condition", "; ".join(said), *parts, kind="grid-figure"
-    )
+        width, height, "Successes by initial condition", "; ".join(said), *parts, kind="grid-figure",
+        columns=("checkpoint", "condition", *PROPORTION),
+        rows=[
+            (arm.checkpoint, condition, *counted(arm.cells[condition]))
+            for arm in arms for condition in conditions if condition in arm.cells
+        ],
+    )  # fmt: skip
 
 
-def pareto(i: int, arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
-    """Failures of one checkpoint, the i-th series, by phase and cause, the most frequent first.
+def pareto(arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
+    """Failures of one checkpoint by phase and cause, the most frequent first.
 
     Bars are shares of all its trials, with their intervals as lines. `links` by phase and cause lead to those trials.
     """
@@ -85,7 +92,7 @@ def pareto(i: int, arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
         bar = label(_LABELS - 12, y + 18, mode.words, _LETTERS, "end")
         bar += element(
             "rect", x=scale(0), y=y + 4, width=scale(mode.count / mode.n) - scale(0), height=18.0,
-            class_=f"beam {series(i)}",
+            class_=f"beam {series(arm.series)}",
         )  # fmt: skip
         bar += line([(scale(mode.interval.low), y + 13), (scale(mode.interval.high), y + 13)], "error")
         bar += words(width - 155, y + 18, share, class_="value small")
@@ -93,8 +100,13 @@ def pareto(i: int, arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
         parts.append(link(links.get((mode.phase, mode.cause), ""), title, bar))
         said.append(title)
     return drawing(
-        width, height, f"Why trials of {arm.checkpoint} failed", "; ".join(said), *parts, kind="pareto"
-    )
+        width, height, f"Why trials of {arm.checkpoint} failed", "; ".join(said), *parts, kind="pareto",
+        columns=("checkpoint", "phase", "cause", "failures", "trials", "low", "high"),
+        rows=[
+            (arm.checkpoint, mode.phase, mode.cause, mode.count, mode.n, mode.interval.low, mode.interval.high)
+            for mode in arm.failures
+        ],
+    )  # fmt: skip
 
 
 def _percents(scale: Scale, y: float) -> str:

@@ -8,8 +8,10 @@ from collections.abc import Mapping, Sequence
 from evaweb.results.analysis.analysis import Arm, Funnel
 from evaweb.results.presentation.drawings.svg import (
     LINE,
+    PROPORTION,
     Drawing,
     Scale,
+    counted,
     drawing,
     element,
     label,
@@ -41,6 +43,7 @@ def funnel(
 
     `links` by checkpoint and place of the milestone lead to the trials that did not reach it.
     """
+    found = sorted(found, key=lambda one: one[0])  # as every other legend has them
     steps = len(found[0][2].steps) if found else 0
     bar, gap = 16, 16
     whose, y = legend([(i, name) for i, name, _ in found], WIDTH)
@@ -77,12 +80,20 @@ def funnel(
         + ", ".join(f"{t} {rate_words(s.of_all)}" for t, s in zip(rows.labels, rows.steps, strict=True))
         for _, name, rows in found
     )
-    return drawing(WIDTH, height, f"Milestones of {scene}, share of all trials", said, *parts, kind="funnel")
+    return drawing(
+        WIDTH, height, f"Milestones of {scene}, share of all trials", said, *parts, kind="funnel",
+        columns=("checkpoint", "order", "milestone", *PROPORTION),
+        rows=[
+            (name, at, text, *counted(step.of_all))
+            for _, name, rows in found
+            for at, (text, step) in enumerate(zip(rows.labels, rows.steps, strict=True), 1)
+        ],
+    )  # fmt: skip
 
 
 def success_times(arms: Sequence[Arm]) -> Drawing | None:
     """Share that has succeeded over time, up to the horizon, with pointwise bands."""
-    drawn = [(i, arm, arm.curve) for i, arm in enumerate(arms) if arm.curve is not None]
+    drawn = [(arm.series, arm, arm.curve) for arm in arms if arm.curve is not None]
     if not drawn:
         return None
     end = drawn[0][2].until
@@ -115,13 +126,24 @@ def success_times(arms: Sequence[Arm]) -> Drawing | None:
         said.append(f"{arm.checkpoint}: {median}, {curve.successes} of {curve.n} within {end:.1f} s")
     parts += _names(labels, x(end), bottom)
     return drawing(
-        WIDTH, height, "Time to success: share in percent that has succeeded", "; ".join(said), *parts,
+        WIDTH, height, "Time to success: percentage of trials that have succeeded", "; ".join(said), *parts,
         kind="success-times",
+        columns=("checkpoint", "time_s", "share", "low", "high"),
+        rows=[
+            (arm.checkpoint, *at)
+            for _, arm, curve in drawn
+            for at in zip(curve.times, curve.share, curve.low, curve.high, strict=True)
+        ],
     )  # fmt: skip
 
 
-def evidence(found: Evidence, first: str, second: str, foreseen: int | None = None) -> Drawing:
-    """The e-processes of both directions pair by pair, on a scale of powers, with the line at which they suffice."""
+def evidence(
+    found: Evidence, first: str, second: str, foreseen: int | None = None, drawn: tuple[int, int] = (0, 1)
+) -> Drawing:
+    """The e-processes of both directions pair by pair, on a scale of powers, with the line at which they suffice.
+
+    `drawn`: as which series the first and the second are.
+    """
     wanted = math.log10(2 / found.alpha)
     paths = [[value / math.log(10) for value in path] for path in (found.first, found.second)]
     end = max(found.pairs, foreseen or 0, 1)
@@ -144,7 +166,7 @@ def evidence(found: Evidence, first: str, second: str, foreseen: int | None = No
     parts.append(line([(x(0), y(wanted)), (x(end), y(wanted))], "wanted"))
     parts.append(words(x(end) + 8, y(wanted) + 5, f"suffices: {2 / found.alpha:g}", class_="tick"))
     labels = []
-    for i, (path, name) in enumerate(zip(paths, (first, second), strict=True)):
+    for i, path, name in zip(drawn, paths, (first, second), strict=True):
         parts.append(
             line([(x(0), y(0)), *((x(k), y(v)) for k, v in enumerate(path, 1))], f"curve {series(i)}")
         )
@@ -154,7 +176,51 @@ def evidence(found: Evidence, first: str, second: str, foreseen: int | None = No
         parts.append(words(x(found.stop) + 5, 24, f"pair {found.stop}", class_="tick"))
     parts += _names([*labels, (y(wanted), -1, "")], x(end), 262)
     said = f"Evidence {evidence_words(found)}"
-    return drawing(WIDTH, 276, "Evidence (e-value) after each pair of trials", said, *parts, kind="evidence")
+    return drawing(
+        WIDTH, 276, "Evidence (e-value) after each pair of trials", said, *parts, kind="evidence",
+        columns=("pair", "better", "e_value_log10"),
+        rows=[
+            (pair, name, value)
+            for name, path in zip((first, second), paths, strict=True)
+            for pair, value in enumerate(path, 1)
+        ],
+    )  # fmt: skip
+
+
+def power(
+    curves: Sequence[tuple[int, str, Sequence[tuple[int, float]]]], planned: int, wanted: float, end: int
+) -> Drawing:
+    """Power by trials of each checkpoint: each (series, design, its points), lines at what is planned and wanted."""
+    bottom = 230
+    x, y = Scale(0, max(end, planned), 60, WIDTH - _LEGEND), Scale(0, 1, bottom, 14)
+    parts = []
+    for share in range(0, 101, 25):
+        parts.append(line([(x(0), y(share / 100)), (x(x.high), y(share / 100))], "grid"))
+        parts.append(words(52, y(share / 100) + 5, f"{share}", "end", "tick"))
+    parts += [words(x(n), bottom + 18, number(n, 6), "middle", "tick") for n in ticks(0, x.high, 6)]
+    parts.append(words(x(x.high / 2), bottom + 38, "trials of each checkpoint", "middle", "tick"))
+    parts.append(line([(x(0), y(wanted)), (x(x.high), y(wanted))], "wanted"))
+    parts.append(line([(x(planned), 14), (x(planned), bottom)], "stop"))
+    parts.append(words(x(planned) + 5, 24, f"planned: {planned}", class_="tick"))
+    labels, said = [], []
+    for i, name, points in curves:
+        parts.append(line([(x(n), y(found)) for n, found in points], f"curve {series(i)}"))
+        labels.append((y(points[-1][1]), i, name))
+        at = [f"{100 * found:.0f} % with {n}" for n, found in points if n == planned or n == points[-1][0]]
+        said.append(f"{name}: {', '.join(at)}")
+    if labels:
+        parts += _names(labels, x(x.high), bottom)
+    title = "Power in percent, by trials of each checkpoint"
+    return drawing(
+        WIDTH,
+        276,
+        title,
+        "; ".join(said) or "not computed yet",
+        *parts,
+        kind="power",
+        columns=("design", "trials", "power"),
+        rows=[(name, n, found) for _, name, points in curves for n, found in points],
+    )
 
 
 def _steps(

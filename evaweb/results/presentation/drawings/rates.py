@@ -8,8 +8,10 @@ from collections.abc import Mapping, Sequence
 from evaweb.results.analysis.analysis import Arm, Comparison
 from evaweb.results.presentation.drawings.svg import (
     LINE,
+    PROPORTION,
     Drawing,
     Scale,
+    counted,
     drawing,
     element,
     label,
@@ -51,7 +53,10 @@ def intervals(title: str, rows: Sequence[tuple[str, Proportion, str]], order: Ma
         row += words(WIDTH - 158, y + 5, rate_words(found), class_="value")
         parts.append(link(address, f"{name}: {rate_words(found)}", row))
     said = "; ".join(f"{name} {rate_words(found)}" for name, found, _ in rows)
-    return drawing(WIDTH, height, title, said, *parts, kind="intervals")
+    return drawing(
+        WIDTH, height, title, said, *parts, kind="intervals",
+        columns=("checkpoint", *PROPORTION), rows=[(name, *counted(found)) for name, found, _ in rows],
+    )  # fmt: skip
 
 
 def violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
@@ -62,7 +67,7 @@ def violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
     shares = [i / _POINTS for i in range(_POINTS + 1)]
     densities = [arm.posterior.density(shares) for arm in arms]
     highest = max((max(d) for d in densities), default=1.0)
-    parts = [percent_axis(scale, height - 26, 6)]
+    parts, rows = [percent_axis(scale, height - 26, 6)], []
     for i, (arm, density) in enumerate(zip(arms, densities, strict=True)):
         y = 8 + row * (i + 0.5)
         half = Scale(
@@ -71,14 +76,18 @@ def violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
         dense = [(p, d) for p, d in zip(shares, density, strict=True) if d > 1e-3 * highest]
         upper = [(scale(p), y - half(math.sqrt(d))) for p, d in dense]
         lower = [(x, 2 * y - top) for x, top in reversed(upper)]
-        interval = arm.posterior.interval()
+        interval, n = arm.posterior.interval(), arm.success
+        rows.append(
+            (arm.checkpoint, n.successes, n.n, arm.posterior.mean, interval.low, interval.high,
+             letters.get(arm.checkpoint, ""))
+        )  # fmt: skip
         lines = [(row, "") for row in wrapped(arm.checkpoint, _LETTERS)]
         lines.append((f"{arm.success.successes}/{arm.success.n}", "tick"))
         top = y + 5 - LINE * (len(lines) - 1) / 2
         parts.append(
-            element("path", d=_outline([*upper, *lower]), class_=f"violin {series(i)}")
-            + line([(scale(interval.low), y), (scale(interval.high), y)], f"whisker {series(i)}")
-            + mark(i, scale(arm.posterior.mean), y, 4)
+            element("path", d=_outline([*upper, *lower]), class_=f"violin {series(arm.series)}")
+            + line([(scale(interval.low), y), (scale(interval.high), y)], f"whisker {series(arm.series)}")
+            + mark(arm.series, scale(arm.posterior.mean), y, 4)
             + "".join(
                 words(_NAMES - 12, top + LINE * at, row, "end", class_)
                 for at, (row, class_) in enumerate(lines)
@@ -90,7 +99,11 @@ def violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
         f"{arm.posterior.interval().high:.0%}, letters {letters.get(arm.checkpoint, '')}"
         for arm in arms
     )
-    return drawing(WIDTH, height, "Posterior of the success rates", said, *parts, kind="violins")
+    return drawing(
+        WIDTH, height, "Posterior of the success rates", said, *parts, kind="violins",
+        columns=("checkpoint", "successes", "trials", "posterior_mean", "low", "high", "letters"),
+        rows=rows,
+    )  # fmt: skip
 
 
 def difference(found: Comparison) -> Drawing:
@@ -104,12 +117,14 @@ def difference(found: Comparison) -> Drawing:
         parts.append(line([(x, 8), (x, 46)], "zero" if at == 0 else "grid"))
         parts.append(words(x, 62, f"{at:+d}".replace("-", "−") if at else "0", "middle", "tick"))
     low, high = scale(interval.low), scale(interval.high)
-    parts.append(element("rect", x=low, y=20.0, width=high - low, height=12.0, class_="band series-1"))
-    parts.append(mark(0, scale(found.difference.value), 26))
+    parts.append(element("rect", x=low, y=20.0, width=high - low, height=12.0, class_=f"band {series(None)}"))
+    parts.append(mark(None, scale(found.difference.value), 26))
     said = f"{found.first} minus {found.second}: {points(found.difference)}"
     return drawing(
-        WIDTH, height, "Difference of the success rates in points", said, *parts, kind="difference"
-    )
+        WIDTH, height, "Difference of the success rates in points", said, *parts, kind="difference",
+        columns=("first", "second", "difference", "low", "high"),
+        rows=[(found.first, found.second, found.difference.value, interval.low, interval.high)],
+    )  # fmt: skip
 
 
 def _outline(dots: Sequence[tuple[float, float]]) -> str:

@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from html import escape
+from html import escape as html_escape
 from itertools import count
+
+from evaweb.statistics.proportions import Proportion
+from evaweb.tabular_export import csv_lines
 
 SERIES = 8  # how many the style sheet tells apart; further ones begin again
 LINE = 15.0  # from one line of a label to the next
 _LETTER = 7.6  # about as wide as one letter of a label is
+PROPORTION = ("successes", "trials", "rate", "low", "high")  # columns of x of n with its interval
 _numbers = count(1)
+_NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
+
+
+def escape(text: str) -> str:
+    """A text as XML has it; U+FFFD stands for what it has no character for, which names of before may have."""
+    return html_escape(_NOT_XML.sub("\ufffd", text))
 
 
 class Drawing(str):
-    """A finished figure as markup; templates put it into the page as it is."""
+    """A finished figure as markup, its data in it as CSV; templates put it into the page as it is."""
 
     heading: str
     words: str
@@ -26,14 +36,30 @@ class Drawing(str):
         return self
 
 
-def drawing(width: float, height: float, title: str, words: str, *parts: str, kind: str = "") -> Drawing:
-    """A figure of `width` x `height` user units that shrinks with its page; `words` say what it shows."""
+def drawing(
+    width: float,
+    height: float,
+    title: str,
+    words: str,
+    *parts: str,
+    kind: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[object]],
+) -> Drawing:
+    """A figure of `width` x `height` user units that shrinks with its page; `words` say what it shows.
+
+    `rows` of `columns` are the numbers that it was drawn from.
+    """
     name = f"drawing-{next(_numbers)}"
     inner = "".join(parts)
+    role = "group" if "<a " in inner else "img"  # what is one picture has nothing to press in it
+    data = "".join(csv_lines(columns, [[dict(zip(columns, row, strict=True)) for row in rows]]))
+    role = "group" if "<a " in inner else "img"  # what is in a picture cannot be pressed
     text = (
         f'<svg class="drawing {escape(kind)}" viewBox="0 0 {_n(width)} {_n(height)}" width="{_n(width)}" '
-        f'role="img" aria-labelledby="{name}-t {name}-d">'
-        f'<title id="{name}-t">{escape(title)}</title><desc id="{name}-d">{escape(words)}</desc>{inner}</svg>'
+        f'role="{role}" aria-labelledby="{name}-t {name}-d">'
+        f'<title id="{name}-t">{escape(title)}</title><desc id="{name}-d">{escape(words)}</desc>'
+        f"<metadata>{escape(data)}</metadata>{inner}</svg>"
     )
     found = Drawing(text)
     found.heading, found.words = title, words
@@ -54,7 +80,7 @@ def printable(figure: Drawing, above: Sequence[str], below: Sequence[str]) -> st
     above and below it. The same figure gives the same bytes.
     """
     size = re.search(r'viewBox="0 0 (\S+) (\S+)"', figure)
-    inner = re.search(r"</desc>(.*)</svg>", figure, re.DOTALL)
+    inner = re.search(r"</metadata>(.*)</svg>", figure, re.DOTALL)
     if size is None or inner is None:
         raise ValueError(f"{figure!r:.80} is no drawing")
     width, height = float(size[1]), float(size[2])
@@ -80,6 +106,12 @@ def printable(figure: Drawing, above: Sequence[str], below: Sequence[str]) -> st
         font_size=14.0,
         fill="#000000",
     )
+
+
+def counted(found: Proportion) -> tuple[object, ...]:
+    """The cells of PROPORTION."""
+    interval = found.interval
+    return (found.successes, found.n, found.rate, interval and interval.low, interval and interval.high)
 
 
 def element(tag: str, content: str = "", /, **attributes: object) -> str:
@@ -113,12 +145,12 @@ def link(address: str, title: str, content: str) -> str:
     return element("a", inner, href=address) if address else element("g", inner)
 
 
-def series(i: int) -> str:
-    """The class of the i-th series."""
-    return f"series-{i % SERIES + 1}"
+def series(i: int | None) -> str:
+    """The class of the i-th series; None: of no checkpoint."""
+    return "series-none" if i is None else f"series-{i % SERIES + 1}"
 
 
-def mark(i: int, x: float, y: float, r: float = 5) -> str:
+def mark(i: int | None, x: float, y: float, r: float = 5) -> str:
     """The mark of the i-th series: a shape of its own, because colour alone does not reach every reader."""
     shapes = (
         f"M{_n(x - r)} {_n(y)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0Z",
@@ -126,7 +158,8 @@ def mark(i: int, x: float, y: float, r: float = 5) -> str:
         path([(x, y - r * 1.2), (x + r * 1.2, y + r), (x - r * 1.2, y + r)]) + "Z",
         path([(x, y - r * 1.3), (x + r * 1.3, y), (x, y + r * 1.3), (x - r * 1.3, y)]) + "Z",
     )
-    return element("path", d=shapes[i % len(shapes)], class_=f"mark {series(i)}")
+    shape = shapes[((i or 0) + (i or 0) // SERIES) % len(shapes)]
+    return element("path", d=shape, class_=f"mark {series(i)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from .designs import error, kept_faults, primary
-from .judged import agreement, calibration, on_milestone, preferences, score_alpha
+from .designs import error, kept_faults, planned, planned_letters, share_of
+from .judged import agreement, by_words, calibration, on_milestone, preferences, score_alpha
 from .numbers import Drawn, Trial, numbers
 from .sealed import faults
 
@@ -22,7 +22,9 @@ _SHOWN = 40
 _CLOSE = 1e-6  # relative: both ways to a number end in the last bits of different sums
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 Rows = list[dict[str, str]]
-_BROKEN = (ArithmeticError, LookupError, TypeError, ValueError)  # of what a cell or a number should not be
+_BROKEN = (  # of what a cell or a number should not be
+    *(ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError, csv.Error),
+)
 _TAIL = 0.015  # of what was drawn anew, how much more or less than 2.5 % may lie beyond an end: six standard errors
 
 
@@ -40,9 +42,10 @@ def main() -> int:
     try:
         trials = [_trial(row) for row in rows]
         people = Counter(map(_of, preferred))
-        found = {
-            **numbers(trials, plan),
-            "primary": primary(trials, plan, seal["at_reveal"]),
+        found = numbers(trials, plan)
+        found |= {
+            "letters": planned_letters(trials, plan, seal["at_reveal"]) or found["letters"],
+            "planned": planned(trials, plan, seal["at_reveal"]),
             "agreement": _agreement(rows, scores, ratings),
             "judges": _judges(rows, scores, judgements),
             "preferences": preferences(
@@ -70,17 +73,22 @@ def main() -> int:
 
 def _boundary(plan: dict[str, Any]) -> list[str]:
     """What is wrong with the boundary of the plan's design, if it has one."""
-    said = plan["stopping"]
-    if not said.get("boundary"):
+    if not plan["stopping"].get("boundary"):
         return []
-    found = error(plan)
-    print(f"the boundary stops wrongly with probability at most {found:.5f}; alpha is {said['alpha']:g}")
-    return [] if found <= said["alpha"] else [f"boundary: {found:.5f} is more than alpha, {said['alpha']:g}"]
+    found, alpha = error(plan), share_of(plan)
+    print(
+        f"the boundary stops wrongly with probability at most {found:.5f}; alpha of each comparison is {alpha:g}"
+    )
+    return [] if found <= alpha else [f"boundary: {found:.5f} is more than alpha, {alpha:g}"]
 
 
 def _rows(path: Path) -> Rows:
     with path.open(encoding="utf-8", newline="") as file:
-        return [{name: _text(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        rows = list(csv.DictReader(file))
+    for number, row in enumerate(rows, start=1):
+        if None in row or None in row.values():
+            raise ValueError(f"{path.name}: row {number} has another number of cells than the head")
+    return [{name: _text(value) for name, value in row.items()} for row in rows]
 
 
 def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None:
@@ -91,8 +99,8 @@ def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None
         return None
     milestones: dict[str, list[tuple[bool, bool]]] = {}
     for one, other in pairs:
-        again = dict(json.loads(other["milestones"]))
-        for text, reached in json.loads(one["milestones"]):
+        again = by_words(json.loads(other["milestones"]))
+        for text, reached in by_words(json.loads(one["milestones"])).items():
             if text in again:
                 milestones.setdefault(text, []).append((reached, again[text]))
     return {
@@ -124,8 +132,9 @@ def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] 
     for (judge, version), said in sorted(judges.items()):
         words: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
         for row in said:
-            own = {text: (reached, p) for text, reached, p in json.loads(row["milestones"])}
-            for text, scored in json.loads(_stood(given[row["trial"]], row["at"])["milestones"]):
+            own = by_words((text, word) for text, *word in json.loads(row["milestones"]))
+            stood = _stood(given[row["trial"]], row["at"])
+            for text, scored in by_words(json.loads(stood["milestones"])).items():
                 if text in own:
                     words.setdefault(text, []).append((scored, *own[text]))
         reasons = [row["reason"] for row in said if row["reason"]]
@@ -164,6 +173,7 @@ def _trial(row: dict[str, str]) -> Trial:
     return Trial(
         order=int(row["order"]),
         block=row["block"],
+        slot=int(row["slot"]),
         checkpoint=row["checkpoint"],
         scene=row["scene"],
         position=int(row["position"]),
@@ -176,6 +186,8 @@ def _trial(row: dict[str, str]) -> Trial:
         smoothness=_float(row["smoothness"]),
         commanded=_float(row["smoothness_commanded"]),
         failure_phase=row["failure_phase"],
+        operator=row["operator"],
+        station=row["station"],
     )
 
 
@@ -235,4 +247,7 @@ if __name__ == "__main__":
     except BrokenPipeError:  # `... | head -1`; this program stands alone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 141
+    except OSError as fault:
+        print(f"a file of data/ cannot be read: {fault}")
+        code = 1
     sys.exit(code)

@@ -8,12 +8,12 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import takewhile
 from typing import Any, Protocol
 
 from . import methods
 
 Pair = tuple[float, float]
+Block = Sequence[tuple[int, float]]  # arm and outcome of each of its trials that count
 _TIE = 1e-9  # relative: a p that is alpha in other last bits
 
 
@@ -21,30 +21,71 @@ class Row(Protocol):
     """What is needed of a trial."""
 
     block: str
+    slot: int
     checkpoint: str
     status: str
     success: bool
     score: float
 
 
-def primary(
+def planned(
     trials: Sequence[Row], plan: Mapping[str, Any], at_reveal: Mapping[str, Any] | None
-) -> dict[str, Any] | None:
-    """What the design says: of the pairs as the reveal kept them, where there was one; None without a comparison."""
-    if not plan["comparison"]:
+) -> list[dict[str, Any]]:
+    """What the design says of each of its comparisons: of the blocks as the reveal kept them, where there was one."""
+    return conclusions(kept_blocks(at_reveal) if at_reveal else blocks_of(trials, plan), plan)
+
+
+def planned_letters(
+    trials: Sequence[Row], plan: Mapping[str, Any], at_reveal: Mapping[str, Any] | None
+) -> dict[str, str] | None:
+    """Letters by the plan's own comparisons, where it compared all checkpoints with each other and has ended."""
+    names, arms = comparisons_of(plan), arms_of(plan)
+    said = planned(trials, plan, at_reveal)
+    if (
+        len(names) < 3
+        or 2 * len(names) != len(arms) * (len(arms) - 1)
+        or any(one["at"] is None for one in said)
+    ):
         return None
-    return conclusion(at_reveal["pairs"] if at_reveal else pairs_of(trials, plan), plan)
+    blocks = kept_blocks(at_reveal) if at_reveal else blocks_of(trials, plan)
+    rates = {}
+    for number, name in enumerate(arms):
+        values = [value for block in blocks for arm, value in block if arm == number]
+        rates[name] = sum(values) / len(values) if values else 0.0
+    ranked = sorted(arms, key=lambda name: (-rates[name], name))
+    apart = {frozenset((one["first"], one["second"])) for one in said if one["winner"] is not None}
+    return methods.letters(ranked, apart)
 
 
-def pairs_of(trials: Sequence[Row], plan: Mapping[str, Any]) -> list[Pair]:
-    """Outcomes of the compared checkpoints by block, in the schedule's order, up to the first that is not made."""
-    names, by_score = plan["comparison"], plan["stopping"].get("outcome") == "score"
-    blocks: dict[int, dict[str, float]] = defaultdict(dict)
+def comparisons_of(plan: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The planned comparisons; a plan of before there were several has one or none."""
+    before = [plan["comparison"]] if plan.get("comparison") else []
+    return [(first, second) for first, second in plan.get("comparisons", before)]
+
+
+def arms_of(plan: Mapping[str, Any]) -> list[str]:
+    """The compared checkpoints in the order in which comparisons name them."""
+    return list(dict.fromkeys(name for names in comparisons_of(plan) for name in names))
+
+
+def kept_blocks(at_reveal: Mapping[str, Any]) -> list[Block]:
+    """Those of a reveal; one of before there were several comparisons kept pairs."""
+    if "blocks" in at_reveal:
+        return [[(arm, float(value)) for arm, value in block] for block in at_reveal["blocks"]]
+    return [[(0, float(one)), (1, float(other))] for one, other in at_reveal["pairs"]]
+
+
+def blocks_of(trials: Sequence[Row], plan: Mapping[str, Any]) -> list[Block]:
+    """Outcomes of the compared checkpoints by block, in the schedule's order, up to the last one that is used."""
+    arms, by_score = arms_of(plan), plan["stopping"].get("outcome") == "score"
+    blocks: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
     for trial in trials:
-        if trial.status == "scored" and trial.checkpoint in names:
-            blocks[int(trial.block)][trial.checkpoint] = trial.score if by_score else float(trial.success)
-    made = takewhile(lambda block: len(blocks.get(block, ())) == 2, range(_foreseen(plan)))
-    return [(blocks[block][names[0]], blocks[block][names[1]]) for block in made]
+        if trial.status == "scored" and trial.checkpoint in arms:
+            value = trial.score if by_score else float(trial.success)
+            blocks[int(trial.block)][int(trial.slot)] = (arms.index(trial.checkpoint), value)
+    whole = [[of for _, of in sorted(blocks.get(at, {}).items())] for at in range(_foreseen(plan))]
+    used = max((said["blocks"] for said in conclusions(whole, plan)), default=0)
+    return list(whole[:used])
 
 
 def kept_faults(
@@ -72,9 +113,10 @@ def kept_faults(
             found.append(f"trial {row['trial']} is said to be {said}, its newest score is {kept}")
     if at_reveal is not None and not found:
         stood = [_stood(row, given, at_reveal["at"]) for row in rows]
-        pairs = [list(pair) for pair in pairs_of(stood, plan)]
-        if pairs != [[float(one), float(other)] for one, other in at_reveal["pairs"]]:
-            found.append("the pairs of the reveal are not those of the scores that stood then")
+        kept, given_then = kept_blocks(at_reveal), blocks_of(stood, plan)
+        # Not in which order a block's trials are listed: reveals that kept pairs did not say it.
+        if [sorted(block) for block in kept] != [sorted(block) for block in given_then]:
+            found.append("the blocks of the reveal are not those of the scores that stood then")
         found += [
             f"the sums of {arm['checkpoint']} at the reveal are not those of the scores that stood then"
             for arm in at_reveal.get("arms", ())  # which came later than the pairs
@@ -92,6 +134,7 @@ def _adds_up(arm: Mapping[str, Any], rows: Sequence[_Stood]) -> bool:
 @dataclass(frozen=True)
 class _Stood:
     block: str
+    slot: int
     checkpoint: str
     status: str
     success: bool
@@ -104,7 +147,8 @@ def _stood(row: Mapping[str, str], given: Mapping[str, Sequence[Mapping[str, str
     before = [score for score in given[row["trial"]] if datetime.fromisoformat(score["scored_at"]) <= then]
     counts = row["status"] == "scored" and bool(before)
     success, score = (before[-1]["success"] == "true", float(before[-1]["score"])) if counts else (False, 0.0)
-    return _Stood(row["block"], row["checkpoint"], "scored" if counts else "", success, score)
+    slot = int(row["slot"])
+    return _Stood(row["block"], slot, row["checkpoint"], "scored" if counts else "", success, score)
 
 
 def _plain(cell: str) -> Any:
@@ -115,30 +159,103 @@ def _plain(cell: str) -> Any:
         return cell
 
 
-def conclusion(pairs: Sequence[Pair], plan: Mapping[str, Any]) -> dict[str, Any]:
-    """After how many pairs the design ended, for which checkpoint, and the p of a fixed number's one test."""
-    said, names = plan["stopping"], plan["comparison"]
+def conclusions(blocks: Sequence[Block], plan: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Of each comparison after how many blocks it ended, for which checkpoint, and the p of a fixed number's test.
+
+    Where checkpoints are dropped, block by block: what ends first in the schedule's order decides who is left.
+    """
+    names, arms = comparisons_of(plan), arms_of(plan)
+    sides = [(arms.index(first), arms.index(second)) for first, second in names]
     foreseen = _foreseen(plan)
-    given = list(pairs[:foreseen])
-    at, winner, p = len(given) if len(given) == foreseen else None, "", None
-    if said.get("boundary"):
-        for look in said["boundary"]:
-            if look[0] > len(given):
+    given = blocks[:foreseen]
+    found: dict[int, dict[str, Any]] = {}
+    if not plan["stopping"].get("drops"):
+        found = {n: _conclusion(given, plan, pair) for n, pair in enumerate(sides)}
+    dropped: dict[int, int] = {}
+    # With a margin none is found worse; a control, which all comparisons have, stays whatever was found.
+    margin = plan["stopping"].get("margin") is not None
+    spared = {arm for arm in range(len(arms)) if margin or all(arm in pair for pair in sides)}
+    while len(found) < len(sides):
+        made = list(given)
+        for number, block in enumerate(given):
+            wanted = {arm for arm in range(len(arms)) if dropped.get(arm, foreseen) > number}
+            if not wanted <= {arm for arm, _ in block}:
+                made = list(given[:number])
                 break
-            side = _side(look, *_sums(given[: look[0]]), said.get("margin"))
+        left = {n: _conclusion(made, plan, pair) for n, pair in enumerate(sides) if n not in found}
+        ends = [said["at"] for said in left.values() if said["winner"] is not None]
+        if not ends:
+            found |= left
+            break
+        at = min(ends)
+        for n, said in left.items():
+            if said["winner"] is not None and said["at"] == at:
+                found[n] = {**said, "blocks": at}
+        worse = {
+            sides[n][1 - said["winner"]] for n, said in found.items() if n in left and said["at"] == at
+        } - spared
+        for n in left:
+            if n not in found and worse & {*sides[n]}:
+                found[n] = {"blocks": at, "at": at, "winner": None, "p": None}
+        still = {arm for n, pair in enumerate(sides) if n not in found for arm in pair}
+        dropped |= {arm: at for arm in range(len(arms)) if arm not in still and arm not in dropped}
+    return [
+        {
+            "first": first,
+            "second": second,
+            **found[n],
+            "winner": None if found[n]["winner"] is None else (first, second)[found[n]["winner"]],
+        }
+        for n, (first, second) in enumerate(names)
+    ]
+
+
+def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[int, int]) -> dict[str, Any]:
+    """Of one comparison; `winner` is 0 or 1."""
+    said = plan["stopping"]
+    foreseen, alpha, margin = _foreseen(plan), share_of(plan), said.get("margin")
+    given = _made(blocks, said.get("counts"), sides)
+    at, winner, p = len(given) if len(given) == foreseen else None, None, None
+    if said.get("boundary"):
+        looks = {(look[0], look[1]): look for look in said["boundary"]}
+        for number in range(1, len(given) + 1):
+            (first, n), (second, m) = (_sum(given[:number], side) for side in (0, 1))
+            look = looks.get((n, m) if margin is None else (m, n))
+            side = None if look is None else _side(look, first, second, margin)
             if side is not None:
-                at, winner = look[0], names[side]
+                at, winner = number, side
                 break
     elif said["rule"] == "evidence":
-        at, winner = _evidence(given, said, names, at)
+        at, winner = _evidence([(one[0], other[0]) for one, other in given], said, alpha, at)
     elif at is not None:
-        first, second = _sums(given)
+        (first, n), (second, m) = (_sum(given, side) for side in (0, 1))
         if said.get("outcome") == "score":
-            p = methods.sign_flips([one - other for one, other in given])
+            p = methods.sign_flips([one[0] - other[0] for one, other in given])
         else:
-            p = methods.barnard(int(first), at, int(second), at)[1]
-        winner = names[0 if first > second else 1] if p <= said["alpha"] * (1 + _TIE) else ""
-    return {"pairs": len(given), "at": at, "winner": winner or None, "p": p}
+            p = methods.barnard(int(first), n, int(second), m)[1] if n and m else 1.0
+        winner = int(first * m <= second * n) if p <= alpha * (1 + _TIE) else None
+    return {"blocks": len(given), "at": at, "winner": winner, "p": p}
+
+
+def _made(
+    blocks: Sequence[Block], counts: Sequence[Sequence[int]] | None, sides: tuple[int, int]
+) -> list[tuple[list[float], list[float]]]:
+    """Outcomes of both sides, block by block, up to the first that is not made."""
+    made: list[tuple[list[float], list[float]]] = []
+    before = [0, 0]
+    for number, block in enumerate(blocks):
+        one, other = ([value for arm, value in block if arm == side] for side in sides)
+        after = list(counts[number]) if counts else [number + 1, number + 1]
+        if [before[0] + len(one), before[1] + len(other)] != after:
+            break
+        before = after
+        made.append((one, other))
+    return made
+
+
+def _sum(given: Sequence[tuple[list[float], list[float]]], side: int) -> tuple[float, int]:
+    values = [value for block in given for value in block[side]]
+    return sum(values), len(values)
 
 
 def error(plan: Mapping[str, Any]) -> float:
@@ -147,7 +264,7 @@ def error(plan: Mapping[str, Any]) -> float:
     Every order of outcomes that leads to a table is as likely as any other: their number is counted exactly.
     """
     said = plan["stopping"]
-    margin = said.get("margin")
+    margin, alpha = said.get("margin"), share_of(plan)
     if margin is not None:
         return _with_margin(list(_stopped(said["boundary"], margin)), margin)
     gone, trials = [0], 0  # orders that have stopped, by their successes
@@ -158,7 +275,12 @@ def error(plan: Mapping[str, Any]) -> float:
         for (a, b), ways in tables.items():
             gone[a + b] += ways
     share = [ways / math.comb(trials, x) for x, ways in enumerate(gone)]
-    return _bound(share, said["alpha"])
+    return _bound(share, alpha)
+
+
+def share_of(plan: Mapping[str, Any]) -> float:
+    """Alpha of each comparison."""
+    return float(plan["stopping"]["alpha"]) / max(1, len(comparisons_of(plan)))
 
 
 def _bound(share: Sequence[float], alpha: float) -> float:
@@ -190,10 +312,6 @@ def _bound(share: Sequence[float], alpha: float) -> float:
 
 def _foreseen(plan: Mapping[str, Any]) -> int:
     return int(sum(len(scene["positions"]) for scene in plan["scenes"]) * plan["repetitions"])
-
-
-def _sums(pairs: Sequence[Pair]) -> tuple[float, float]:
-    return sum(one for one, _ in pairs), sum(other for _, other in pairs)
 
 
 def _side(look: Sequence[int], first: float, second: float, margin: float | None) -> int | None:
@@ -288,8 +406,8 @@ def _with_margin(stopped: Sequence[tuple[int, int, dict[tuple[int, int], int]]],
 
 
 def _evidence(
-    pairs: Sequence[Pair], said: Mapping[str, Any], names: Sequence[str], full: int | None
-) -> tuple[int | None, str]:
+    pairs: Sequence[Pair], said: Mapping[str, Any], alpha: float, full: int | None
+) -> tuple[int | None, int | None]:
     if said.get("outcome") == "score":
         paths = [methods.score_bets([sign * (a - b) for a, b in pairs]) for sign in (1, -1)]
     else:
@@ -297,8 +415,8 @@ def _evidence(
             methods.success_bets([(bool(pair[1 - side]), bool(pair[side])) for pair in pairs])
             for side in (0, 1)
         ]
-    wanted = math.log(2 / said["alpha"])
+    wanted = math.log(2 / alpha)
     for number, worth in enumerate(zip(*paths, strict=True), start=1):
         if max(worth) >= wanted:
-            return number, names[worth.index(max(worth))]
-    return full, ""
+            return number, worth.index(max(worth))
+    return full, None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -24,13 +24,14 @@ def agreement(pairs: Sequence[tuple[bool, bool]]) -> dict[str, Any]:
     ones, m = n * sum(yes), 2 * n
     # Krippendorff: disagreement expected of all values together, drawn without replacement.
     expected = 2 * ones * (m - ones) / (m * (m - 1))
+    one_word = sum(yes) in (0.0, 2.0)  # of all ratings: what chance would do is then not defined
     return {
         "n": n,
         "same": same,
         "wilson": methods.wilson(same, n),
-        "kappa": 1.0 if same == n else (observed - by_chance) / (1 - by_chance),
+        "kappa": None if one_word else 1.0 if same == n else (observed - by_chance) / (1 - by_chance),
         "ac1": 1.0 if same == n else (observed - gwet) / (1 - gwet),
-        "alpha": 1.0 if same == n else 1 - (1 - observed) / expected,
+        "alpha": None if one_word else 1.0 if same == n else 1 - (1 - observed) / expected,
     }
 
 
@@ -62,17 +63,30 @@ def on_milestone(said: Sequence[tuple[bool, bool | None, float | None]]) -> dict
     }
 
 
-def score_alpha(pairs: Sequence[tuple[float, float]]) -> float:
-    """Krippendorff's alpha of scores, by squared differences."""
+def score_alpha(pairs: Sequence[tuple[float, float]]) -> float | None:
+    """Krippendorff's alpha of scores, by squared differences; None where all are the same."""
     observed = sum((a - b) ** 2 for a, b in pairs) / len(pairs)
     values = [value for pair in pairs for value in pair]
     n = len(values)
     expected = sum((a - b) ** 2 for a in values for b in values) / (n * (n - 1))
-    return 1.0 if observed == 0 else 1 - observed / expected
+    return 1 - observed / expected if expected else None
+
+
+def by_words(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """What was said of each; of several with the same words the second is "held (2)", in their order."""
+    found: dict[str, Any] = {}
+    for text, said in milestones:
+        label, n = text, 1
+        while label in found:
+            n += 1
+            label = f"{text} ({n})"
+        found[label] = said
+    return found
 
 
 def preferences(rows: Sequence[tuple[str, str, str, float]]) -> dict[str, Any] | None:
     """Of (first, second, outcome, its share of one comparison); no ranking where the likelihood has no maximum."""
+    rows = [row for row in rows if row[0] != row[1]]
     if not rows:
         return None
     counted = {"n": len(rows), "ties": sum(row[2] == "tie" for row in rows)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from itertools import combinations
+from itertools import combinations, product
 from statistics import NormalDist
 
 Z = NormalDist().inv_cdf(0.975)
@@ -183,6 +183,54 @@ def letters(names: Sequence[str], apart: set[frozenset[str]]) -> dict[str, str]:
     return {
         name: "".join(s for s, column in zip(signs, columns, strict=True) if name in column) for name in names
     }
+
+
+def exact_within(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
+    """Exact conditional test of equal arms within strata, two-sided; by floating sums of hypergeometric masses."""
+    telling = [(x1, n1, x2, n2) for x1, n1, x2, n2 in tables if n1 and n2 and 0 < x1 + x2 < n1 + n2]
+    if len(telling) < 2:
+        return None
+    masses, lowest = [1.0], 0
+    for x1, n1, x2, n2 in telling:
+        least, own = _hypergeometric(n1, n2, x1 + x2)
+        lowest += least
+        masses = [
+            math.fsum(masses[i - j] * own[j] for j in range(len(own)) if 0 <= i - j < len(masses))
+            for i in range(len(masses) + len(own) - 1)
+        ]
+    seen = masses[sum(table[0] for table in telling) - lowest]
+    return min(1.0, math.fsum(mass for mass in masses if mass <= seen * (1 + 1e-9)))
+
+
+def interaction(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
+    """Zelen's exact test of one odds ratio in all strata; None where there is nothing, or too much, to count."""
+    telling = [(x1, n1, x2, n2) for x1, n1, x2, n2 in tables if n1 and n2 and 0 < x1 + x2 < n1 + n2]
+    sizes = sorted(len(_hypergeometric(n1, n2, x1 + x2)[1]) for x1, n1, x2, n2 in telling)
+    if len(telling) < 2 or math.prod(sizes[:-1]) > 20_000:
+        return None
+    wide = max(telling, key=lambda t: len(_hypergeometric(t[1], t[3], t[0] + t[2])[1]))
+    telling.remove(wide)
+    own = [_hypergeometric(n1, n2, x1 + x2) for x1, n1, x2, n2 in telling]
+    least, last = _hypergeometric(wide[1], wide[3], wide[0] + wide[2])
+    total = wide[0] + sum(table[0] for table in telling)
+    seen = last[wide[0] - least] * math.prod(
+        masses[table[0] - low] for table, (low, masses) in zip(telling, own, strict=True)
+    )
+    found = []
+    for chosen in product(*(range(len(masses)) for _, masses in own)):
+        rest = total - sum(low + at for (low, _), at in zip(own, chosen, strict=True)) - least
+        if 0 <= rest < len(last):
+            found.append(
+                last[rest] * math.prod(masses[at] for (_, masses), at in zip(own, chosen, strict=True))
+            )
+    return math.fsum(mass for mass in found if mass <= seen * (1 + 1e-9)) / math.fsum(found)
+
+
+def _hypergeometric(n1: int, n2: int, successes: int) -> tuple[int, list[float]]:
+    """The least number of the first's successes with these margins, and the probability of each from there."""
+    least, most = max(0, successes - n2), min(n1, successes)
+    whole = math.comb(n1 + n2, successes)
+    return least, [math.comb(n1, x) * math.comb(n2, successes - x) / whole for x in range(least, most + 1)]
 
 
 def mantel_haenszel(tables: Sequence[tuple[int, int, int, int]]) -> dict[str, object]:

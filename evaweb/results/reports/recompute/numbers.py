@@ -11,6 +11,7 @@ from itertools import combinations
 from typing import Any
 
 from . import methods
+from .designs import comparisons_of
 from .means import student
 
 DRAWS = 4000
@@ -22,6 +23,7 @@ class Trial:
 
     order: int
     block: str
+    slot: int
     checkpoint: str
     scene: str
     position: int
@@ -34,6 +36,8 @@ class Trial:
     smoothness: float | None = None
     commanded: float | None = None
     failure_phase: str = ""
+    operator: str = ""
+    station: str = ""
 
     @property
     def condition(self) -> str:
@@ -89,14 +93,19 @@ def numbers(trials: Trials, plan: Mapping[str, Any]) -> dict[str, Any]:
     limits = {s["name"]: s["time_limit_s"] for s in plan["scenes"] if s["time_limit_s"] is not None}
     longest = max((t.duration or 0.0 for arm in arms.values() for t in arm), default=0.0)
     timing = Timing(min(limits.values()) if limits else longest, limits)
-    wanted = plan["comparison"]
+    wanted = comparisons_of(plan)
     couples = [
-        tuple(wanted) if wanted and set(wanted) == set(couple) else couple
+        next((pair for pair in wanted if set(pair) == set(couple)), couple)
         for couple in combinations(names, 2)
     ]
-    planned = tuple(wanted or ())
+    in_pairs = plan.get("allocation", "paired") == "paired"
     compared = [
-        _comparison(a, b, arms[a], arms[b], alpha if (a, b) == planned else alpha / len(couples), timing)
+        _comparison(
+            *(a, b, arms[a], arms[b]),
+            alpha / (len(wanted) if (a, b) in wanted else len(couples)),
+            timing,
+            in_pairs,
+        )
         for a, b in couples
     ]
     for comparison, p in zip(compared, methods.holm([c["barnard"]["p"] for c in compared]), strict=True):
@@ -254,10 +263,16 @@ def _per_hour(events: int, exposure: float) -> dict[str, Any] | None:
 
 
 def _comparison(
-    one: str, other: str, first: Trials, second: Trials, alpha: float, timing: Timing
+    one: str,
+    other: str,
+    first: Trials,
+    second: Trials,
+    alpha: float,
+    timing: Timing,
+    in_pairs: bool,
 ) -> dict[str, Any]:
     counts = (*_counts(first), *_counts(second))
-    pairs = _pairs(first, second)
+    pairs = _pairs(first, second) if in_pairs else []
     statistic, p = methods.barnard(*counts)
     only = (
         sum(a.success and not b.success for a, b in pairs),
@@ -281,6 +296,8 @@ def _comparison(
         "scores": _scores([a.score - b.score for a, b in pairs]) if pairs else None,
         "over_conditions": _clustered(first, second),
         "over_scenes": _stratified(first, second),
+        "within": _within(first, second),
+        "by_scene": _by_scene(first, second),
         "evidence": _evidence(
             methods.success_bets([(b.success, a.success) for a, b in pairs]),
             methods.success_bets([(a.success, b.success) for a, b in pairs]),
@@ -326,6 +343,38 @@ def _stratified(first: Trials, second: Trials) -> dict[str, Any] | None:
     if len({*ours, *theirs}) < 2 or not shared:
         return None
     return methods.mantel_haenszel([(*_counts(ours[key]), *_counts(theirs[key])) for key in shared])
+
+
+def _tables(first: Trials, second: Trials, key: str) -> dict[str, tuple[int, int, int, int]]:
+    """Successes and trials of both in each stratum in which both were tried."""
+    ours, theirs = ({getattr(t, key): [] for t in arm} for arm in (first, second))
+    for arm, found in ((first, ours), (second, theirs)):
+        for trial in arm:
+            found[getattr(trial, key)].append(trial)
+    return {
+        name: (*_counts(ours[name]), *_counts(theirs[name])) for name in sorted(ours.keys() & theirs.keys())
+    }
+
+
+def _within(first: Trials, second: Trials) -> dict[str, Any]:
+    found = {}
+    for key in ("condition", "scene", "operator", "station"):
+        tables = _tables(first, second, key)
+        p = methods.exact_within(list(tables.values()))
+        if p is not None:
+            found[key] = {"p": p, "strata": len(tables)}
+    return found
+
+
+def _by_scene(first: Trials, second: Trials) -> dict[str, Any]:
+    tables = _tables(first, second, "scene")
+    if len(tables) < 2:
+        return {"differences": {}, "interaction_p": None}
+    differences = {
+        name: {"value": x1 / n1 - x2 / n2, "newcombe": methods.newcombe(x1, n1, x2, n2)}
+        for name, (x1, n1, x2, n2) in tables.items()
+    }
+    return {"differences": differences, "interaction_p": methods.interaction(list(tables.values()))}
 
 
 def _sooner(pairs: Sequence[tuple[Trial, Trial]], timing: Timing) -> dict[str, Any] | None:

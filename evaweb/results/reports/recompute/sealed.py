@@ -8,6 +8,9 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from .designs import arms_of
+
+_IMBALANCE = 3  # trials by which one of two checkpoints in random order may be ahead at a condition
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
 
 
@@ -50,12 +53,22 @@ def schedule(plan: Mapping[str, Any], key: bytes) -> list[list[Any]]:
     """[index, block, checkpoint, scene, position, repetition] of every trial that the plan foresaw."""
     names = [row["name"] for row in plan["checkpoints"]]
     conditions = [(scene["name"], p["number"]) for scene in plan["scenes"] for p in scene["positions"]]
-    draws, k = _draws(key, "orders"), len(names)
+    draws, coins, k = _draws(key, "orders"), _draws(key, "allocation"), len(names)
     orders: list[list[str]] = []
+    ahead: dict[tuple[str, int], int] = {}  # trials of the first checkpoint less those of the second
+    random_order = plan.get("allocation") == "random"
     units: list[list[Any]] = []
     block = 0
     for repetition in range(1, plan["repetitions"] + 1):
         for scene, position in _shuffled(_draws(key, f"conditions/{repetition}"), conditions):
+            if random_order:
+                for number in (2 * repetition - 1, 2 * repetition):
+                    now = ahead.get((scene, position), 0)
+                    at = int(now > 0) if abs(now) == _IMBALANCE else _below(coins, 2)
+                    ahead[scene, position] = now + (1 - 2 * at)
+                    units.append([len(units), block, names[at], scene, position, number])
+                block += 1
+                continue
             if not orders:
                 rows, columns = _shuffled(draws, names), _shuffled(draws, range(k))
                 orders = _shuffled(draws, [[rows[(i + c) % k] for c in columns] for i in range(k)])
@@ -63,6 +76,12 @@ def schedule(plan: Mapping[str, Any], key: bytes) -> list[list[Any]]:
                 units.append([len(units), block, checkpoint, scene, position, repetition])
             block += 1
     return units
+
+
+def counts(units: Sequence[Sequence[Any]], names: Sequence[str]) -> list[list[int]]:
+    """Trials of two checkpoints after each block."""
+    blocks = 1 + max(unit[1] for unit in units)
+    return [[sum(u[2] == name for u in units if u[1] <= at) for name in names] for at in range(blocks)]
 
 
 def codes(key: bytes, count: int) -> list[str]:
@@ -79,16 +98,27 @@ def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapp
     if digest(plan) != seal["digest"]:
         found.append(f"plan.json has the digest {digest(plan)}, the plan that was frozen {seal['digest']}")
     kept = seal["at_reveal"]
-    said = {name: kept[name] for name in ("pairs", "arms") if name in kept} if kept else {}  # arms came later
+    said = (
+        {name: kept[name] for name in ("pairs", "blocks", "arms") if name in kept} if kept else {}
+    )  # as it was then
     if kept and digest({"plan": seal["digest"], **said}) != kept["digest"]:
         found.append(f"the pairs of the reveal have not the digest {kept['digest']}")
     if not seal["key"]:
         return found
+    version = plan.get("format", 1)  # from 3 on a reveal kept what counts, from 4 on blocks and sums
+    wanted = {3: ("digest",), 4: ("digest", "blocks", "arms")}.get(version, ()) if arms_of(plan) else ()
+    found += [f"the reveal kept no {name}" for name in wanted if name not in (kept or {})]
     key = bytes.fromhex(seal["key"])
     units = schedule(plan, key)
     committed = hmac.new(key, f"{seal['digest']}\n{digest({'units': units})}".encode(), hashlib.sha256)
     if committed.hexdigest() != seal["commitment"]:
         found.append(f"the key makes the commitment {committed.hexdigest()}, shown was {seal['commitment']}")
+    shown, names = (
+        plan["stopping"].get("counts"),
+        arms_of(plan) or [row["name"] for row in plan["checkpoints"]],
+    )
+    if shown and shown != counts(units, names):
+        found.append("the boundary is for other numbers of trials than those of the schedule")
     known = codes(key, max((int(row["order"]) for row in rows), default=0))
     for row in rows:
         unit = units[int(row["slot"])]

@@ -1,0 +1,46 @@
+"""Find anything: what there is, by a few letters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.http import HttpRequest
+from ninja import Router, Schema
+
+from evaweb.api.answers import FAILURES
+from evaweb.blinding import sight_for
+from evaweb.find import selectors
+
+router = Router(tags=["find"])
+
+
+class FoundOut(Schema):
+    """One thing: its name, a few words on it, and the address of its page."""
+
+    title: str
+    detail: str
+    address: str
+
+
+class GroupOut(Schema):
+    """Things of one kind, the best fitting first, at most eight; `more` where there are others."""
+
+    name: str
+    items: list[FoundOut]
+    more: bool
+
+
+class AllFoundOut(Schema):
+    """What fits, by kind."""
+
+    groups: list[GroupOut]
+
+
+@router.get("", response={200: AllFoundOut, **FAILURES}, summary="Find anything", url_name="find")
+def find(request: HttpRequest, q: str) -> Any:
+    """Stations, trials by number and code, episodes by uuid, plans, checkpoints, scenes, datasets and pages.
+
+    All words of `q`, 1 to 200 characters, have to fit. What is hidden from the caller is not found.
+    """
+    user: Any = request.auth  # type: ignore[attr-defined]
+    return {"groups": selectors.find(query=q, user=user, sight=sight_for(request))}

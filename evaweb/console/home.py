@@ -1,0 +1,171 @@
+"""What matters now: work that waits for one user, what goes on in the lab, and what somebody has to see to."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+from urllib.parse import urlencode
+
+from django.conf import settings
+from django.db.models import Q
+from django.urls import reverse
+from django.utils import timezone
+
+from evaweb.blinding import Sight
+from evaweb.console.feed import feeds
+from evaweb.console.views_jobs import Row, row_of
+from evaweb.episodes.verifying import unverified
+from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.selectors import jobs_failed
+from evaweb.jobs.workers import served
+from evaweb.plans.models import PlanState
+from evaweb.results import selectors as results
+from evaweb.results.ratings.unblinding import why_sealed
+from evaweb.results.selectors import PlanRow
+from evaweb.reviews.selectors import unreviewed
+from evaweb.roles import Role, role_of
+from evaweb.stations.models import LeaseRequest, Station
+from evaweb.trials.models import Trial, TrialStatus, VoidRequest
+from evaweb.trials.selectors import UNFINISHED
+from evaweb.trials.voids import may_answer
+
+MOST = 5  # of each kind
+FULL = 0.10  # share of the disk that is free, below which it is said
+WAITED = timedelta(minutes=2)  # a job that waits for so long, while none runs
+_VOIDS = 20  # that are looked at, for each is asked whether this user may answer
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One thing to do or to see to: a sentence, where that is done, and what the link says. `grave`: it is a fault."""
+
+    text: str
+    address: str
+    go: str
+    grave: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class PlanNow:
+    """A plan that runs; `evidence` is its address where this user may see it, `sealed` why not."""
+
+    row: PlanRow
+    evidence: str
+    sealed: str
+
+
+@dataclass(frozen=True, slots=True)
+class Now:
+    """All of it, for one user."""
+
+    work: list[Item]
+    alarms: list[Item]
+    plans: list[PlanNow]
+    jobs: list[Row]
+
+
+def now(*, user: Any, sight: Sight) -> Now:
+    """As of now, in a number of questions that does not grow with the lab."""
+    under_way = Job.objects.filter(status__in=(JobStatus.RUNNING, JobStatus.QUEUED)).select_related(
+        "cancelled_by"
+    )
+    jobs = under_way.order_by("-status", "created_at")[:MOST]  # running, then queued
+    having = served()
+    running = results.plan_rows(results.plan_list(PlanState.FROZEN)[:MOST])
+    return Now(
+        work=[] if role_of(user) is Role.VIEWER else list(_work(user)),
+        alarms=list(_alarms()),
+        plans=[_plan(row, user, sight) for row in running],
+        jobs=[row_of(job, sight, having) for job in jobs],
+    )
+
+
+def _plan(row: PlanRow, user: Any, sight: Sight) -> PlanNow:
+    sealed = why_sealed(row.plan, user, sight)
+    address = reverse("result-evidence", args=[row.plan.name, row.plan.version])
+    return PlanNow(row, "" if sealed or not row.counted else address, sealed)
+
+
+# --- of this user --------------------------------------------------------------------------------------------
+
+
+def _work(user: Any) -> Iterator[Item]:
+    waiting = Q(status__in=(*UNFINISHED, TrialStatus.INTERRUPTED))
+    begun = Trial.objects.filter(waiting, operator=user).select_related("scene", "position", "station")
+    for trial in begun.order_by("-pk")[:MOST]:
+        what = f"Trial {trial.pk}, {trial.scene.title}, position {trial.position.number}: {trial.get_status_display()}"
+        if trial.status in (TrialStatus.ENDED, TrialStatus.INTERRUPTED):
+            yield Item(what, reverse("result-trial", args=[trial.pk]), "Score it")
+        else:
+            yield Item(what, reverse("station-eval", args=[trial.station.name]), f"At {trial.station}")
+    asked = VoidRequest.objects.filter(answer="").select_related("trial", "by").order_by("at")[:_VOIDS]
+    for one in [one for one in asked if may_answer(one.trial, user)][:MOST]:
+        words = f"{one.by.get_username()} asks for the void of trial {one.trial_id}: {one.reason:.80}"
+        yield Item(words, reverse("result-trial", args=[one.trial_id]), "Answer")
+    for one in _requests(user):
+        words = f"{one.user.get_username()} asks for {one.station}, which you command"
+        yield Item(words, reverse("station-eval", args=[one.station.name]), "Answer")
+    count = unreviewed().order_by().count()
+    if count:
+        words = f"{count} episode{'s are' if count > 1 else ' is'} waiting for a review"
+        yield Item(words, f"{reverse('replay-list')}?{urlencode({'review': 'unreviewed'})}", "Review")
+
+
+def _requests(user: Any) -> list[LeaseRequest]:
+    mine = LeaseRequest.objects.filter(
+        answer=LeaseRequest.Answer.OPEN, station__leases__ended_at=None, station__leases__user=user
+    )
+    return list(mine.select_related("station", "user").distinct()[:MOST])
+
+
+# --- of the lab ----------------------------------------------------------------------------------------------
+
+
+def _alarms() -> Iterator[Item]:
+    for station in Station.objects.filter(active=True).order_by("name"):
+        feed = feeds.of(station.name)
+        stands = feed.state.get("state_is", {}) if feed.link.ok else {}
+        if not feed.link.ok:
+            yield Item(
+                feed.link.reason, reverse("station-debug", args=[station.name]), "Its page", grave=True
+            )
+        elif stands.get("tone") == "danger":  # why may tell what it is set up for: its own page says it
+            words = f"{station} is {stands['label']}"
+            yield Item(words, reverse("station-eval", args=[station.name]), "Its page", grave=True)
+    yield from _disk()
+    yield from _recordings()
+    failed = jobs_failed().count()
+    if failed:
+        words = f"{failed} job{'s' if failed > 1 else ''} failed"
+        yield Item(words, f"{reverse('jobs')}?status=failed", "Look at them", grave=True)
+    waits = Job.objects.filter(
+        status=JobStatus.QUEUED, created_at__lt=timezone.now() - WAITED, not_before=None
+    )
+    having, asked = served(), waits.order_by("kind").values_list("kind", "queue").distinct()
+    lacking = list(dict.fromkeys(filter(None, (having.lacks_for(kind, queue) for kind, queue in asked))))
+    for words in lacking:
+        yield Item(words, reverse("jobs"), "Jobs", grave=True)
+    if not lacking and asked and not Job.objects.filter(status=JobStatus.RUNNING).exists():
+        words = "Jobs are waiting, but no worker takes them: does one hang?"
+        yield Item(words, reverse("jobs"), "Jobs", grave=True)
+
+
+def _disk() -> Iterator[Item]:
+    total, _, free = shutil.disk_usage(settings.DATA_DIR)
+    if free < FULL * total:
+        words = f"The disk of the lab is nearly full: {free / 1e9:.1f} GB of {total / 1e9:.0f} GB free"
+        yield Item(words, reverse("replay-list"), "Recordings", grave=True)
+
+
+def _recordings() -> Iterator[Item]:
+    damaged, late = unverified()
+    listed = reverse("replay-list")
+    if damaged:
+        words = f"{damaged} recording{'s are' if damaged > 1 else ' is'} damaged"
+        yield Item(words, f"{listed}?quality=damaged", "Look at them", grave=True)
+    if late:
+        words = f"{late} recording{'s were' if late > 1 else ' was'} not verified in time"
+        yield Item(words, reverse("jobs"), "Jobs")

@@ -1,0 +1,47 @@
+"""The newest picture of a station's first camera, for pages that show many stations: one question for all viewers."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import defaultdict
+
+from evaweb.console.feed import feeds
+from evaweb.errors import Conflict, NotFound
+from evaweb.plans import pictures
+from evaweb.plans.bench_checks import cameras_of
+from evaweb.stations.models import Station
+from runtime.core.sentences import Pattern
+
+_HAS_NO_CAMERA = Pattern("console.stills.has_no_camera", "{name} has no camera")
+_SENDS_NO_PICTURE = Pattern("console.stills.sends_no_picture", "{name} sends no picture of {cameras}")
+
+KEPT_S = 4.0  # nobody is shown an older one as new
+_PATIENCE_S = 0.8
+
+_stills: dict[str, tuple[float, bytes]] = {}
+_turns: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+
+
+def still_of(station: Station) -> bytes:
+    """A JPEG, at most KEPT_S old; NotFound where the station does not run or shows nothing."""
+    link = feeds.of(station.name).link
+    cameras = cameras_of(station)[:1]
+    if not link.ok or not cameras:
+        raise NotFound(link.reason if cameras else _HAS_NO_CAMERA(name=station.name))
+    with _turns[station.name]:
+        at, jpeg = _stills.get(station.name, (0.0, b""))
+        if not at or time.monotonic() - at > KEPT_S:
+            jpeg = _asked(station, cameras)
+            _stills[station.name] = (time.monotonic(), jpeg)
+    if not jpeg:  # known as well: nobody else waits for it meanwhile
+        raise NotFound(_SENDS_NO_PICTURE(name=station.name, cameras=cameras[0]))
+    return jpeg
+
+
+def _asked(station: Station, cameras: list[str]) -> bytes:
+    """Empty where none came in time."""
+    try:
+        return pictures.now(station, cameras, _PATIENCE_S)[cameras[0]]
+    except Conflict:
+        return b""

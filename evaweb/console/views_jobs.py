@@ -1,0 +1,157 @@
+"""The page of jobs: what the worker does, has to do, and could not do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from django.contrib import messages
+from django.http import HttpRequest, HttpResponse
+from django.http.response import HttpResponseBase
+from django.shortcuts import redirect, render
+from django.urls import reverse
+from django.views.decorators.http import require_GET, require_POST
+
+from evaweb.blinding import HIDDEN, Sight, sight_for
+from evaweb.datasets import dataset_jobs
+from evaweb.datasets.orders import KIND as DATASET
+from evaweb.errors import EvaError
+from evaweb.jobs import services
+from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.selectors import Pace, job_get, jobs_listed, pace_of
+from evaweb.jobs.workers import Served, served
+from evaweb.lists import Column, Filter, Listing
+from evaweb.names import is_name
+from evaweb.plans.models import Plan
+from evaweb.roles import Role, require, role_of
+
+PER_PAGE = 50
+# What people call the kinds.
+KINDS = {
+    "preview": "Preview",
+    "quality": "Checks",
+    "publish": "Publication",
+    "export": "Table",
+    "store": "Videos into the store",
+    "smoothness": "Smoothness",
+    "sides": "Reviews of a published episode",
+    "dataset": "Dataset",
+    "judge": "Automatic judge",
+    "preflight": "Preflight",
+    "scrub": "Verification of recordings",
+    "reconcile": "Reading the disk",
+    "diagnose": "Diagnostic bundle",
+}
+_ACTS = {"cancel": "cancelled", "repeat": "asked for again"}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A job in words: what it is about, where that is, how far it is, and what may be done with it."""
+
+    job: Job
+    title: str
+    about: str
+    address: str
+    pace: Pace
+    said: str
+    lacks: str  # why no running worker can take it
+
+    @property
+    def may_cancel(self) -> bool:
+        """True if it has not ended, and nobody has cancelled it."""
+        return self.job.cancelled_by_id is None and self.job.status in (JobStatus.QUEUED, JobStatus.RUNNING)
+
+    @property
+    def may_repeat(self) -> bool:
+        """True if it has failed."""
+        return self.job.status == JobStatus.FAILED
+
+    @property
+    def minutes_left(self) -> str:
+        """Time that is left, in words."""
+        left = self.pace.left_s
+        if left is None:
+            return ""
+        return f"about {left:.0f} s left" if left < 90 else f"about {left / 60:.0f} min left"
+
+
+@require_GET
+def jobs(request: HttpRequest) -> HttpResponseBase:
+    """What runs, waits and failed; done ones where they are asked for."""
+    sight = sight_for(request)
+    listing = Listing(request.GET, _COLUMNS, _FILTERS)
+    found = jobs_listed(**listing.chosen)
+    if listing.wants_file:
+        return listing.file(request, "jobs", found)
+    page = listing.page(found, PER_PAGE)
+    having = served()
+    rows = [row_of(job, sight, having) for job in page]
+    context = {
+        "listing": listing,
+        "page": page,
+        "rows": rows,
+        "passing": any(row.job.status in (JobStatus.QUEUED, JobStatus.RUNNING) for row in rows),
+        "may_act": role_of(request.user) is not Role.VIEWER,
+    }
+    return render(request, "console/jobs.html", context)
+
+
+@require_POST
+def job_act(request: HttpRequest, what: str) -> HttpResponse:
+    """Cancel a job, or ask for one again that failed; operators."""
+    user: Any = request.user
+    try:
+        require(user, Role.OPERATOR)
+        given = request.POST.get("job", "")
+        job = job_get(id=int(given) if given.isascii() and given.isdecimal() and len(given) < 16 else 0)
+        if what == "cancel":
+            services.cancel(user=user, job=job)
+        else:
+            services.try_again(user=user, job=job)
+        messages.success(request, f"job {job.pk}: {_ACTS[what]}")
+    except EvaError as fault:
+        messages.error(request, str(fault))
+    return redirect(f"{reverse('jobs')}?{request.POST.get('query', '')}")
+
+
+def row_of(job: Job, sight: Sight, having: Served) -> Row:
+    """In words; of one that may tell which checkpoint it is about nothing but that it is there."""
+    about, address = _about(job)
+    lacks = having.lacks(job)
+    said = job.error or job.progress
+    if not sight.clear:
+        return Row(job, KINDS.get(job.kind, job.kind), about, address, Pace(), HIDDEN if said else "", lacks)
+    return Row(job, KINDS.get(job.kind, job.kind), about, address, pace_of(job), said, lacks)
+
+
+def _about(job: Job) -> tuple[str, str]:
+    """What it is about, and the address of that."""
+    if "uuid" in job.args:
+        uuid = str(job.args["uuid"])
+        return f"episode {uuid[:8]}", reverse("replay", args=[uuid])
+    if job.kind == DATASET:
+        name = str(job.args.get("dataset") or job.args.get("to", "")).removeprefix("datasets/")
+        return dataset_jobs.told(job).title, reverse("dataset", args=[name]) if name and is_name(name) else ""
+    if "plan" in job.args:
+        plan = Plan.objects.filter(pk=job.args["plan"]).first()
+        return (str(plan), reverse("result-plan", args=[plan.name, plan.version])) if plan else ("", "")
+    if "preflight" in job.args:
+        return "a checkpoint's server", reverse("preflight", args=[job.args["preflight"]])
+    return "", ""
+
+
+_FILTERS = (
+    Filter("status", "State", JobStatus.choices, any="not done"),
+    Filter("kind", "Kind", tuple(KINDS.items())),
+)
+_COLUMNS = (
+    Column("kind", "Job", ("kind", "key"), lambda job: job.kind),
+    Column("key", "Key", cell=lambda job: job.key, hidden=True),
+    Column("about", "About"),
+    Column("state", "State", ("status",), lambda job: job.status),
+    Column("progress", "Progress"),
+    Column("asked", "Asked for", ("created_at",), lambda job: job.created_at, down=True),
+    Column("finished", "Ended", ("finished_at",), lambda job: job.finished_at, down=True),
+    Column("acts", "What can be done", quiet=True),
+)

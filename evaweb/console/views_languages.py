@@ -1,0 +1,22 @@
+"""Catalogues of the languages that sentences are shown in."""
+
+from __future__ import annotations
+
+from django.http import HttpRequest, HttpResponse, JsonResponse
+
+from evaweb.errors import NotFound
+from evaweb.languages import language, offered
+from runtime.core.sentences import Pattern
+
+_NO_LANGUAGE = Pattern("console.languages.none", "language {code!r:.20} is not there; there are: {known}")
+
+
+def catalogue(request: HttpRequest, code: str) -> HttpResponse:
+    """The patterns of a language by id, as static/site/sentences.js reads them."""
+    found = language(code)
+    if found is None:
+        known = ", ".join(one.code for one in offered()) or "none but English"
+        raise NotFound(_NO_LANGUAGE(code=code, known=known))
+    answer = JsonResponse({"name": found.name, "sentences": dict(found.patterns)})
+    answer["Cache-Control"] = "no-cache"
+    return answer

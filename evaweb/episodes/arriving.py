@@ -1,0 +1,68 @@
+"""Episodes of stations on other computers: whose they are, how far they have come, their rows when they are here."""
+
+from __future__ import annotations
+
+import logging
+from uuid import UUID
+
+from django.db import Error, close_old_connections
+
+from evaweb.episodes import services
+from evaweb.episodes.folders import data_dir, journal_folder
+from evaweb.episodes.models import Episode
+from evaweb.episodes.reconcile import taken_in
+from evaweb.jobs.selectors import job_newest
+from runtime.core.sentences import Pattern
+from runtime.link.incoming import arrivals, progress_of
+
+log = logging.getLogger(__name__)
+_NOT_HERE = Pattern("episodes.arriving.not_here", "It is on the computer of station {station}, not here yet.")
+_PARTLY_HERE = Pattern(
+    "episodes.arriving.partly_here",
+    "It is on the computer of station {station}, not here yet: {here} of {size} MB.",
+)
+_DECLINED = Pattern(
+    "episodes.arriving.declined",
+    "It is on the computer of station {station}, not here yet: {why}.",
+)
+
+
+def owner_of(uuid: str) -> str:
+    """The name of the station that an episode is known to be of, "" for none; OSError while the database is away."""
+    try:
+        return Episode.objects.filter(uuid=uuid).values_list("station__name", flat=True).first() or ""
+    except Error as error:
+        raise OSError(str(error)) from error
+    finally:
+        close_old_connections()
+
+
+def whereabouts(episode: Episode) -> str:
+    """Where an episode is that is not here yet, and how much of it is here, for people."""
+    name = episode.station.name
+    found = progress_of(data_dir(), name, str(episode.uuid))
+    if found is None:
+        return _NOT_HERE(station=name)
+    if found.why:
+        return _DECLINED(station=name, why=found.why.rstrip("."))
+    return _PARTLY_HERE(station=name, here=_megabytes(found.here), size=_megabytes(found.size))
+
+
+def take_in_arrived() -> int:
+    """Make rows of episodes that have arrived since the last look, and of labels; how many."""
+    marks = {UUID(uuid): mark for uuid, mark in arrivals(data_dir())}
+    waited_for = Episode.objects.filter(away_since__isnull=False).values_list("uuid", flat=True)
+    here = {uuid for uuid in waited_for if journal_folder(uuid).is_dir()}
+    for uuid in here.union(marks):
+        for problem in taken_in(uuid):
+            log.warning("episode %s has arrived: %s", uuid, problem)
+        episode = Episode.objects.filter(uuid=uuid, away_since=None).first()
+        if episode is not None and job_newest(key=f"publish:{uuid}") is not None:
+            services.publish_asked(episode=episode)  # it was asked for when there was nothing to publish yet
+        if uuid in marks:
+            marks[uuid].unlink(missing_ok=True)
+    return len(here.union(marks))
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 1e6:.1f}" if count < 10e6 else f"{count / 1e6:.0f}"

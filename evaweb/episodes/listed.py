@@ -1,0 +1,66 @@
+"""Columns and filters of the list of episodes, as far as a user may see them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from evaweb.blinding import Sight
+from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
+from evaweb.episodes.selectors import QUALITY, REVIEW, tag_counts
+from evaweb.lists import SEARCH, Column, Filter
+from evaweb.stations.models import Station
+
+
+def filters(sight: Sight) -> list[Filter]:
+    """What it is narrowed by; none is about a checkpoint, whose names are looked for by words."""
+    stations = [(station.name, str(station)) for station in Station.objects.all()]
+    return [
+        Filter("words", "Words", kind=SEARCH, hint="task, scene, checkpoint, operator, code"),
+        Filter("station", "Station", stations),
+        Filter("mode", "Mode", EpisodeMode.choices),
+        Filter("status", "Recording", EpisodeStatus.choices),
+        Filter("quality", "Quality", [(key, words) for key, (words, _) in QUALITY.items()]),
+        Filter("review", "Review", [(key, words) for key, (words, _) in REVIEW.items()]),
+        Filter("tag", "Tag", [(words, words) for words in tag_counts(sight=sight)]),
+    ]
+
+
+def columns(sight: Sight) -> list[Column]:
+    """By checkpoint it is sorted only where none is hidden: the order of codes would tell which are of one."""
+    checkpoint = ("trial__checkpoint__name", "checkpoint") if sight.clear else ()
+    return [
+        Column("picture", "Picture", quiet=True),
+        Column("recorded", "Recorded", ("started_at",), lambda row: row.started_at, down=True),
+        Column("task", "Scene or task", ("trial__scene__title", "trial__position__number", "task"), _task),
+        Column("checkpoint", "Checkpoint", checkpoint, sight.policy_of),
+        Column("mode", "Mode", ("mode",), lambda row: row.mode),
+        Column("station", "Station", ("station__name",), lambda row: row.station.name),
+        Column("result", "Result", ("trial__verdict__success", "demonstration__result"), _result),
+        Column("time", "Time", ("duration_s",), lambda row: row.duration_s, number=True),
+        Column("recording", "Recording and review", ("status",), lambda row: row.status),
+        Column("dataset", "Dataset", ("dataset", "dataset_index"), lambda row: row.dataset),
+        Column("index", "Index in the dataset", cell=lambda row: row.dataset_index, hidden=True),
+        Column("review", "Review", cell=_review, hidden=True),
+        Column("tags", "Tags", cell=lambda row: ", ".join(sight.tags_of(row)), hidden=True),
+        Column("operator", "Operator", cell=lambda row: row.operator, hidden=True),
+        Column("uuid", "UUID", cell=lambda row: row.uuid, hidden=True),
+    ]
+
+
+def _task(row: Episode) -> str:
+    trial: Any = getattr(row, "trial", None)
+    return f"{trial.scene.title}, position {trial.position.number}" if trial else row.task
+
+
+def _result(row: Episode) -> str:
+    trial: Any = getattr(row, "trial", None)
+    if trial is not None and trial.status != "scored":
+        return str(trial.status)
+    if trial is not None:
+        return "success" if trial.verdict.success else "failure"
+    return str(getattr(getattr(row, "demonstration", None), "result", ""))
+
+
+def _review(row: Episode) -> str:
+    review = getattr(getattr(row, "standing", None), "review", None)
+    return str(review.verdict) if review else ""

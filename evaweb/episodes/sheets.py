@@ -1,0 +1,56 @@
+"""Small pictures of a whole episode, one sheet per camera: pages show where a pointer on the time axis leads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+
+import numpy as np
+import simplejpeg
+from PIL import Image
+
+from runtime.datasets.pictures import Pictures
+from runtime.recording.files import RecordingError
+
+MOST = 100  # tiles
+ACROSS = 10
+WIDTH = 160  # of a tile [px]
+QUALITY = 70
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Tile k, row by row, shows the rows from k * `every` on; `across` and `down` tiles."""
+
+    every: int
+    across: int
+    down: int
+
+    @classmethod
+    def of(cls, frames: int) -> Grid:
+        """Grid of an episode with so many rows."""
+        every = max(1, ceil(frames / MOST))
+        tiles = ceil(frames / every)
+        return cls(every, min(tiles, ACROSS), ceil(tiles / ACROSS))
+
+
+def sheet(video: Path, frames: int, shown: int) -> bytes:
+    """The sheet of a camera as a JPEG; `shown` of the `frames` rows have a picture, tiles of the others are black.
+
+    So is one whose picture does not decode: the video is played all the same. RecordingError where none of it can be.
+    """
+    grid = Grid.of(frames)
+    with Pictures(video) as pictures:
+        height = max(1, round(pictures.size[0] * WIDTH / pictures.size[1]))
+        made = np.zeros((grid.down * height, grid.across * WIDTH, 3), np.uint8)
+        for tile, first in enumerate(range(0, shown, grid.every)):
+            row, column = divmod(tile, grid.across)
+            try:
+                picture = Image.fromarray(pictures[min(first + grid.every // 2, shown - 1)])
+            except RecordingError:
+                continue
+            small = np.asarray(picture.resize((WIDTH, height), Image.Resampling.BILINEAR, reducing_gap=2.0))
+            made[row * height : (row + 1) * height, column * WIDTH : (column + 1) * WIDTH] = small
+    jpeg: bytes = simplejpeg.encode_jpeg(made, quality=QUALITY)
+    return jpeg

@@ -1,0 +1,79 @@
+"""Videos of Replay in their two places: the folder of the preview, or the lab's store, by their digests."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from uuid import UUID
+
+from evaweb.episodes.folders import data_dir, preview_folder, preview_video
+from evaweb.object_stores import StoreError, compared, required_store, the_cache, the_store
+from runtime.core.sentences import Pattern
+from runtime.recording.files import write_whole
+
+INDEX = "stored.json"  # in the folder of a preview: the digest of each camera's video
+TYPE = "video/mp4"
+_NO_INDEX = Pattern(
+    "episodes.videos.no_index",
+    "{path} does not say which videos are in the store: remove the folder of this preview, and it is made again",
+)
+
+
+def video_address(uuid: UUID, camera: str) -> str:
+    """A signed address of a video that is in the store, good for five minutes; "" where we send it ourselves."""
+    digest = "" if preview_video(uuid, camera).is_file() else _stored(uuid).get(camera, "")
+    return required_store().address(digest) if digest else ""
+
+
+def video_file(uuid: UUID, camera: str) -> Path:
+    """The video as a file, brought from the store where it is there; a path of no file where there is none.
+
+    StoreError where the store does not give it.
+    """
+    path = preview_video(uuid, camera)
+    digest = "" if path.is_file() else _stored(uuid).get(camera, "")
+    return the_cache().get(required_store(), digest) if digest else path
+
+
+def put_videos(uuid: UUID) -> int:
+    """Put the videos of a preview into the store, read them back, then remove them here; how many. StoreError."""
+    store = required_store()
+    videos = sorted(preview_folder(uuid).glob("*.mp4"))
+    found = {path.stem: store.put(path, TYPE) for path in videos}
+    if not found:
+        return 0
+    for digest in found.values():
+        compared(store, digest)
+    told = json.dumps(_stored(uuid) | found, indent=1, ensure_ascii=False)
+    write_whole(preview_folder(uuid) / INDEX, told.encode())
+    for path in videos:
+        path.unlink(missing_ok=True)
+    return len(found)
+
+
+def unstored() -> list[UUID]:
+    """Previews with videos that are not in the store; none where there is no store."""
+    if the_store() is None:
+        return []
+    found = []
+    for path in sorted((data_dir() / "previews").glob("*/*.mp4")):
+        try:
+            uuid = UUID(path.parent.name)
+        except ValueError:
+            continue
+        if uuid not in found[-1:]:
+            found.append(uuid)
+    return found
+
+
+def _stored(uuid: UUID) -> dict[str, str]:
+    path = preview_folder(uuid) / INDEX
+    try:
+        told = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return {}
+    except ValueError:
+        told = None
+    if not isinstance(told, dict) or not all(isinstance(digest, str) for digest in told.values()):
+        raise StoreError(_NO_INDEX(path=path))
+    return told

@@ -1,0 +1,245 @@
+"""What a few letters find: each kind of thing by its own index, and of checkpoints only those that may be known."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
+from uuid import UUID
+
+from django.db.models import Case, IntegerField, Q, QuerySet, Value, When
+from django.urls import reverse
+from django.utils.timezone import localtime
+
+from evaweb.blinding import Sight
+from evaweb.datasets.finding import dataset_names
+from evaweb.episodes.models import Episode
+from evaweb.episodes.selectors import tag_counts
+from evaweb.errors import EvaError
+from evaweb.find.pages import pages_of
+from evaweb.find.ranking import rank, words_of
+from evaweb.plans.models import Handout
+from evaweb.plans.selectors import plan_list
+from evaweb.roles import Role, role_of
+from evaweb.stations.models import Station
+from evaweb.trials.models import Trial
+from evaweb.trials.selectors import checkpoint_list, scene_list
+from runtime.core.sentences import Pattern
+
+_Q_HAS_CHARACTERS_ALLOWED_1 = Pattern(
+    "find.selectors.q_has_characters_allowed_1",
+    "q has {count} characters; allowed: 1 to {longest}",
+)
+
+LONGEST = 200  # characters
+MOST = 8  # of a group
+_LOOKED_AT = 200  # rows of one kind, the best fitting first
+_COMPARED = 3  # words that the database looks for, the longest: the others are looked for in what it finds
+_DIGITS = 9  # of the largest number of a trial
+_CODE = re.compile(r"[A-Za-z0-9]{2,8}")
+_UUID = re.compile(r"[0-9a-f]{4,32}")
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One thing: its name, a few words on it, and where it is."""
+
+    title: str
+    detail: str
+    address: str
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Things of one kind, the best fitting first; `more` where there are others."""
+
+    name: str
+    items: tuple[Found, ...]
+    more: bool
+
+
+Candidate = tuple[Found, str]  # with what else it is known by
+
+
+def find(*, query: str, user: Any, sight: Sight) -> list[Group]:
+    """Groups of what fits, without empty ones. EvaError unless the query has 1 to LONGEST characters."""
+    query = " ".join(query.split())
+    if not 0 < len(query) <= LONGEST:
+        raise EvaError(_Q_HAS_CHARACTERS_ALLOWED_1(count=len(query), longest=LONGEST))
+    role = role_of(user)
+    kinds: dict[str, Callable[[], Iterable[Found]]] = {
+        "Stations": lambda: _ranked(query, _stations(query)),
+        "Trials": lambda: _trials(query),
+        "Episodes": lambda: _episodes(query),
+        "Tags": lambda: _ranked(query, _tags(sight)),
+        "Plans": lambda: _ranked(query, _plans(query, user)),
+        "Checkpoints": lambda: _ranked(query, _checkpoints(query, role, sight)),
+        "Scenes": lambda: _ranked(query, _scenes(query, role)),
+        "Datasets": lambda: _ranked(query, _datasets()),
+        "Pages": lambda: _ranked(query, _pages(role)),
+    }
+    groups = []
+    for name, look in kinds.items():
+        items = list(look())
+        if items:
+            groups.append(Group(name, tuple(items[:MOST]), len(items) > MOST))
+    return groups
+
+
+def _ranked(query: str, candidates: Iterable[Candidate]) -> list[Found]:
+    """Those that fit, the best first; of equals in the order in which they came."""
+    fits = [(rank(query, found.title, more), found) for found, more in candidates]
+    known = [(fit, found) for fit, found in fits if fit is not None]
+    return [found for _, found in sorted(known, key=lambda one: one[0])]
+
+
+def _narrowed(rows: QuerySet[Any], query: str, *fields: str) -> QuerySet[Any]:
+    """Rows with the longest words of the query in some of the fields, those that begin with it first."""
+    for word in sorted(words_of(query), key=len, reverse=True)[:_COMPARED]:
+        rows = rows.filter(_any_of(fields, "icontains", word))
+    nearness = Case(
+        When(_any_of(fields, "iexact", query), then=Value(0)),
+        When(_any_of(fields, "istartswith", query), then=Value(1)),
+        default=Value(2),
+        output_field=IntegerField(),
+    )
+    return rows.order_by(nearness, "pk")[:_LOOKED_AT]
+
+
+def _any_of(fields: Iterable[str], lookup: str, value: str) -> Q:
+    found = Q()
+    for field in fields:
+        found |= Q(**{f"{field}__{lookup}": value})
+    return found
+
+
+# --- what has few rows ---------------------------------------------------------------------------------------
+
+
+def _stations(query: str) -> Iterator[Candidate]:
+    """Each with its Eval page; its other pages where they are asked for by name."""
+    words = words_of(query)
+    for station in Station.objects.order_by("-active", "name"):
+        detail = " · ".join((station.name, station.robot, *(() if station.active else ("switched off",))))
+        pages = {"Debug": "station-debug", **({"Collect": "station-collect"} if station.collects else {})}
+        yield (
+            Found(str(station), detail, reverse("station-eval", args=[station.name])),
+            f"{detail} station eval",
+        )
+        for page, route in pages.items():
+            if any(len(word) > 1 and page.casefold().startswith(word) for word in words):
+                found = Found(f"{station} · {page}", detail, reverse(route, args=[station.name]))
+                yield found, f"{detail} station"
+
+
+def _plans(query: str, user: Any) -> Iterator[Candidate]:
+    rows = (
+        plan_list(user=user)
+        .select_related(None)
+        .prefetch_related(None)
+        .only("name", "version", "title", "state")
+    )
+    for plan in _narrowed(rows, _without(query, "plan"), "title", "name"):
+        detail = f"{plan.name} v{plan.version} · {plan.get_state_display()}"
+        yield (
+            Found(plan.title, detail, reverse("result-plan", args=[plan.name, plan.version])),
+            f"{detail} plan",
+        )
+
+
+def _checkpoints(query: str, role: Role, sight: Sight) -> Iterator[Candidate]:
+    rows = checkpoint_list(all_of_them=True, sight=sight).prefetch_related(None).only("name", "active")
+    for row in _narrowed(rows, _without(query, "checkpoint"), "name"):
+        detail = "" if row.active else "not offered"
+        yield Found(row.name, detail, _administered("checkpoint", row.pk, row.name, role)), "checkpoint"
+
+
+def _scenes(query: str, role: Role) -> Iterator[Candidate]:
+    rows = scene_list(all_of_them=True).prefetch_related(None)
+    for row in _narrowed(rows, _without(query, "scene"), "title", "name"):
+        detail = row.name if row.active else f"{row.name} · not offered"
+        yield Found(row.title, detail, _administered("scene", row.pk, row.title, role)), f"{detail} scene"
+
+
+def _administered(kind: str, key: int, name: str, role: Role) -> str:
+    """Where it is edited by those who may; for all others what was recorded of it."""
+    if role is Role.ADMIN:
+        return reverse(f"admin:trials_{kind}_change", args=[key])
+    return f"{reverse('replay-list')}?{urlencode({'words': name})}"
+
+
+def _tags(sight: Sight) -> Iterator[Candidate]:
+    """Each leads to the episodes that have it."""
+    for words, n in tag_counts(sight=sight).items():
+        detail = f"{n} episode{'' if n == 1 else 's'}"
+        yield Found(words, detail, f"{reverse('replay-list')}?{urlencode({'tag': words})}"), "tag tagged"
+
+
+def _datasets() -> Iterator[Candidate]:
+    for name in dataset_names():
+        short = name.removeprefix("datasets/")
+        yield Found(short, "", reverse("dataset", args=[short])), "dataset"
+
+
+def _pages(role: Role) -> Iterator[Candidate]:
+    for page, address in pages_of(role):
+        yield Found(page.title, "", address), page.more
+
+
+def _without(query: str, kind: str) -> str:
+    """The query without the name of the kind, which is in no row."""
+    left = [word for word in query.split() if word.casefold() not in (kind, f"{kind}s")]
+    return " ".join(left)
+
+
+# --- what has many, each by an index -------------------------------------------------------------------------
+
+
+def _trials(query: str) -> list[Found]:
+    """By number, then by code, each exactly and then as a beginning."""
+    asked = _without(query, "trial").removeprefix("#")
+    rows = Trial.objects.select_related("scene", "position", "station", "handout")
+    found: dict[int, Trial] = {}
+    if re.fullmatch(rf"[1-9][0-9]{{0,{_DIGITS - 1}}}", asked, re.ASCII):
+        for first, last in _numbers(asked):
+            if len(found) <= MOST:
+                near = rows.filter(pk__range=(first, last)).order_by("pk")[: MOST + 1]
+                found |= {trial.pk: trial for trial in near}
+    if _CODE.fullmatch(asked) and len(found) <= MOST:
+        code = asked.upper()
+        coded = Handout.objects.filter(code__gte=code, code__lte=f"{code}{'Z' * 8}").order_by("code", "-pk")
+        wanted = list(coded.values_list("trial", flat=True)[: MOST + 1])
+        by_key = rows.in_bulk(wanted)
+        found |= {key: by_key[key] for key in wanted}
+    return [_trial(trial) for trial in list(found.values())[: MOST + 1]]
+
+
+def _numbers(digits: str) -> Iterator[tuple[int, int]]:
+    """The numbers that begin with these digits: a span for each length."""
+    for more in range(_DIGITS - len(digits) + 1):
+        yield int(digits) * 10**more, (int(digits) + 1) * 10**more - 1
+
+
+def _trial(trial: Trial) -> Found:
+    handout = getattr(trial, "handout", None)
+    title = f"Trial {trial.pk}" + (f" · {handout.code}" if handout else "")
+    where = f"{trial.scene.title}, position {trial.position.number} · {trial.station.name}"
+    return Found(title, where, reverse("result-trial", args=[trial.pk]))
+
+
+def _episodes(query: str) -> list[Found]:
+    """By the beginning of their uuid, of at least four characters."""
+    asked = _without(query, "episode").casefold().replace("-", "")
+    if not _UUID.fullmatch(asked):
+        return []
+    first, last = UUID(asked.ljust(32, "0")), UUID(asked.ljust(32, "f"))
+    rows = Episode.objects.select_related("station").filter(uuid__range=(first, last)).order_by("uuid")
+    return [_episode(episode) for episode in rows[: MOST + 1]]
+
+
+def _episode(episode: Episode) -> Found:
+    began = f"{localtime(episode.started_at):%Y-%m-%d %H:%M}" if episode.started_at else "unknown time"
+    detail = " · ".join(filter(None, (began, episode.station.name, episode.task[:80])))
+    return Found(str(episode.uuid), detail, reverse("replay", args=[episode.uuid]))

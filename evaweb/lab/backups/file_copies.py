@@ -1,0 +1,222 @@
+"""Copies of the files of a data folder that is in use, each listed with its digest."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from evaweb.lab.backups.errors import BackupError
+
+SEALS = ("outcome.json", "sealed.json")
+_LEFT_OUT = {  # of the top of the data folder: made anew at the next start, or of one machine and moment alone
+    "broker",
+    "cache",
+    "diagnosis",
+    "jobs",
+    "lab.lock",
+    "logs",
+    "stops.json",
+}
+_LEFT_OUT_ANYWHERE = {
+    "bus.key",
+    "endpoints",
+    "panel.pin",
+}  # of a station: new ones are made, docs/administrator.md
+_TRIES = 3
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """A file of a backup: `path` in the data folder, size [bytes], SHA-256 of its content, mode, time of change [ns].
+
+    A symbolic link has `link`, where it leads, and no content.
+    """
+
+    path: str
+    bytes: int
+    sha256: str
+    mode: int
+    mtime_ns: int
+    link: str = ""
+
+
+class FileCopies:
+    """Copies a data folder to `target`; what has not changed since the backup in `before` is linked to its copy there.
+
+    `changing` are the folders that went on changing while they were copied: their files are of different moments.
+    """
+
+    def __init__(
+        self,
+        data: Path,
+        target: Path,
+        before: tuple[Path, Mapping[str, Listed]] | None,
+        without: Iterable[Path],
+    ) -> None:
+        self._data = data
+        self._target = target
+        self._before = before
+        self._without = {path.absolute() for path in without}
+        self.changing: list[str] = []
+        self.linked = 0
+
+    def made(self) -> Iterator[Listed]:
+        """Copy everything and list it; an unreadable file or a full disk is a BackupError with its name."""
+        for top in sorted(os.scandir(self._data), key=lambda entry: entry.name):
+            if top.name in _LEFT_OUT or Path(top.path).absolute() in self._without:
+                continue
+            if not top.is_dir(follow_symlinks=False):
+                yield from self._copied([top.name])
+                continue
+            inside = sorted(os.scandir(top.path), key=lambda entry: entry.name)
+            yield from self._copied(
+                [f"{top.name}/{entry.name}" for entry in inside if not entry.is_dir(follow_symlinks=False)]
+            )
+            for entry in inside:
+                if entry.is_dir(follow_symlinks=False):
+                    yield from self._steady(f"{top.name}/{entry.name}")
+
+    def _steady(self, unit: str) -> list[Listed]:
+        """The files of a folder as they were at one moment, if it rests for one."""
+        for _ in range(_TRIES):
+            names = list(self._walk(unit))
+            signs = self._signs(names)
+            listed = list(self._copied(names))
+            if signs == self._signs(list(self._walk(unit))):
+                return listed
+        self.changing.append(unit)
+        return listed
+
+    def _walk(self, unit: str) -> Iterator[str]:
+        """Its files, what seals a recording first: where that is there, the others do not change any more."""
+        found = []
+        for folder, folders, files in os.walk(self._data / unit, onerror=_unless_gone):
+            folders[:] = [name for name in folders if name not in _LEFT_OUT_ANYWHERE]
+            links = [name for name in folders if os.path.islink(os.path.join(folder, name))]
+            at = os.path.relpath(folder, self._data)
+            found += [f"{at}/{name}" for name in [*files, *links] if name not in _LEFT_OUT_ANYWHERE]
+        return iter(sorted(found, key=lambda path: (os.path.basename(path) not in SEALS, path)))
+
+    def _signs(self, names: Iterable[str]) -> list[tuple[str, int, int, int]]:
+        signs = []
+        for name in names:
+            with suppress(FileNotFoundError):
+                seen = os.lstat(self._data / name)
+                signs.append((name, seen.st_ino, seen.st_size, seen.st_mtime_ns))
+        return signs
+
+    def _copied(self, names: Iterable[str]) -> Iterator[Listed]:
+        for name in names:
+            with suppress(
+                FileNotFoundError
+            ):  # a draft that has got its name, a stop that was written into the database
+                if (listed := self._copy(name)) is not None:
+                    yield listed
+
+    def _copy(self, name: str) -> Listed | None:
+        source, target = self._data / name, self._target / name
+        seen = os.lstat(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.unlink(missing_ok=True)  # of the try before
+        if stat.S_ISLNK(seen.st_mode):
+            link = os.readlink(source)
+            os.symlink(link, target)
+            return Listed(name, 0, "", 0o777, seen.st_mtime_ns, link)
+        if not stat.S_ISREG(seen.st_mode):
+            return None  # a socket, a pipe
+        if (same := self._unchanged(name, seen)) is not None:
+            os.link(self._before[0] / name, target)  # type: ignore[index]
+            self.linked += 1
+            return same
+        return copied(source, target, name)
+
+    def _unchanged(self, name: str, seen: os.stat_result) -> Listed | None:
+        before = self._before[1].get(name) if self._before else None
+        if before is None or (before.bytes, before.mtime_ns, before.mode) != _signature(seen):
+            return None
+        return before
+
+
+def copied(source: Path, target: Path, name: str) -> Listed:
+    """Copy one regular file as far as it reaches now; what is written behind that meanwhile is not in it."""
+    try:
+        with source.open("rb") as read, target.open("xb") as written:
+            seen = os.fstat(read.fileno())
+            digest, size = _through(read, written, seen.st_size)
+            written.flush()
+            os.fsync(written.fileno())
+        os.utime(target, ns=(seen.st_mtime_ns, seen.st_mtime_ns))
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise BackupError(
+            f"{error.filename or source}: {error.strerror}; nothing was kept of this backup"
+        ) from error
+    return Listed(name, size, digest, stat.S_IMODE(seen.st_mode), seen.st_mtime_ns)
+
+
+def digest_of(path: Path) -> tuple[str, int]:
+    """SHA-256 of a file's content, and its size [bytes]."""
+    with path.open("rb") as file:
+        return _through(file, None, None)
+
+
+def write_list(path: Path, files: Iterable[Listed]) -> tuple[int, int]:
+    """Write a line for each file; returns how many files and bytes those are."""
+    count = size = 0
+    with path.open("x", encoding="ascii") as lines:
+        for each in files:
+            lines.write(json.dumps(asdict(each)) + "\n")
+            count, size = count + 1, size + each.bytes
+        lines.flush()
+        os.fsync(lines.fileno())
+    return count, size
+
+
+def read_list(path: Path) -> Iterator[Listed]:
+    """What `write_list` wrote; a BackupError names a line that is not ours."""
+    with path.open(encoding="ascii") as lines:
+        for number, line in enumerate(lines, 1):
+            try:
+                listed = Listed(**json.loads(line))
+                inside = Path(listed.path)
+            except (ValueError, TypeError) as error:
+                raise BackupError(f"{path}, line {number}: {error}") from None
+            if inside.is_absolute() or ".." in inside.parts:
+                raise BackupError(f"{path}, line {number}: {listed.path} is not in a data folder")
+            yield listed
+
+
+def _through(read: BinaryIO, written: BinaryIO | None, most: int | None) -> tuple[str, int]:
+    digest, size = hashlib.sha256(), 0
+    while block := read.read(_BLOCK if most is None else min(_BLOCK, most - size)):
+        digest.update(block)
+        if written is not None:
+            written.write(block)
+        size += len(block)
+    return digest.hexdigest(), size
+
+
+def _signature(seen: os.stat_result) -> tuple[int, int, int]:
+    return seen.st_size, seen.st_mtime_ns, stat.S_IMODE(seen.st_mode)
+
+
+def _unless_gone(error: OSError) -> None:
+    if not isinstance(error, FileNotFoundError):
+        raise BackupError(f"{error.filename}: {error.strerror}; nothing was kept of this backup") from error
+
+
+def room_for(folder: Path, wanted: int) -> None:
+    """A BackupError where the disk of `folder` has less than `wanted` bytes left."""
+    free = shutil.disk_usage(folder).free
+    if free < wanted:
+        raise BackupError(f"{folder}: {free:,} bytes free, {wanted:,} wanted")

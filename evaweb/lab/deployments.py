@@ -1,0 +1,343 @@
+"""Deployment files of the data folder: written from choices on a page, started by the lab where they are simulated.
+
+A file is DATA/deployments/STATION.toml. One that was made by choosing a simulated station is started with its bench and
+its policies by the lab of that data folder; any other is a draft that a person starts. What the lab is doing
+about a file stands beside it, in STATION.json.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from django.conf import settings
+from django.db import transaction
+from django.db.models import ProtectedError
+from django.utils import timezone
+
+import robots
+from evaweb.errors import Conflict, EvaError, NotFound, StationGone
+from evaweb.lab.processes import LabError
+from evaweb.plans.models import Plan
+from evaweb.stations.models import STATION_NAME, Station
+from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.selectors import lease_open
+from evaweb.trials import lifecycle
+from evaweb.trials.models import Trial
+from runtime.config import draft
+from runtime.config.loader import ConfigurationError, Resolved, load, tree_of
+from runtime.core.environment import without_secrets
+from runtime.recording.files import write_whole
+
+_TABLETOP = settings.BASE_DIR / "deployments" / "tabletop.toml"
+_BASE = settings.BASE_DIR / "deployments" / "base.toml"
+_CHECK_S = 60.0
+_CHOSEN = "A simulated bench: the lab of this data folder starts it, with its policies."
+_ASK_S = 1.0  # how long a station is waited for that is to be removed
+# Keys of a part that no page writes, each with who does: with them this machine would run something.
+BY_HAND = {
+    ("transport", "simulated"): "a simulated station is made with a choice of its own",
+    ("transport", "python"): "another program is written into the file by hand",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A deployment file of the data folder, by the name of its station."""
+
+    name: str
+    path: Path
+
+    @property
+    def changed_ns(self) -> int:
+        """When the file was last changed or touched, 0 for one that is gone."""
+        try:
+            return self.path.stat().st_mtime_ns
+        except FileNotFoundError:
+            return 0
+
+    @property
+    def chosen(self) -> bool:
+        """True if the file was written by the choice of a simulated station: the lab starts no other.
+
+        It says so among the comments at its head, which nothing that is typed on a page gets into.
+        """
+        try:
+            lines = self.path.read_text("utf-8", "replace").split("\n")
+        except OSError:
+            return False
+        return f"# {_CHOSEN}" in takewhile(lambda line: line.startswith("#"), lines)
+
+    def resolved(self) -> Resolved:
+        """The deployment; LabError says what is wrong with it."""
+        try:
+            return load(self.path)
+        except ConfigurationError as fault:
+            raise LabError(str(fault)) from None
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What the lab does about a deployment: what it is starting, that it is up, or why it is not."""
+
+    doing: str = ""
+    up: bool = False
+    failed: str = ""
+
+
+def is_simulated(resolved: Resolved) -> bool:
+    """True if the deployment's transport is a simulated node: the lab brings it along."""
+    transport = resolved.deployment.transport
+    return transport.kind == "zmq" and bool(getattr(transport, "simulated", False))
+
+
+def kept() -> list[Kept]:
+    """All of them, the oldest first."""
+    found = [Kept(path.stem, path) for path in _folder().glob("*.toml")]
+    return sorted(
+        (one for one in found if re.fullmatch(STATION_NAME, one.name)), key=lambda one: one.changed_ns
+    )
+
+
+def kept_of(name: str) -> Kept | None:
+    """That of a station, None where it is none of the data folder's."""
+    path = _folder() / f"{name}.toml"
+    return Kept(name, path) if re.fullmatch(STATION_NAME, name) and path.is_file() else None
+
+
+def write_simulated(*, name: str, robot: str) -> Kept:
+    """The deployment of a simulated bench with that robot; the lab starts it."""
+    if robot not in robots.names():
+        raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(robots.names())}")
+    tree = {**tree_of(_TABLETOP), "station": name, "robot": robot}
+    return _write(name, tree, _CHOSEN)
+
+
+def write_draft(*, name: str, robot: str, task: str, parts: Mapping[str, Mapping[str, str]]) -> Kept:
+    """A draft for a real robot, which the runtime can load; `parts`: transport, policy, and cameras.KEY, as typed."""
+    if robot not in robots.names():
+        raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(robots.names())}")
+    tree = {**tree_of(_BASE), "station": name, "robot": robot, "task": task}
+    try:
+        for place, typed in parts.items():
+            part, _, key = place.partition(".")
+            _require_no_program(part, typed)
+            found = draft.table(part, typed.get("kind", ""), typed)
+            if key:
+                tree.setdefault(part, {})[key] = found
+            else:
+                tree[part] = found
+    except ConfigurationError as fault:
+        raise EvaError(str(fault)) from None
+    return _write(name, tree, f"Start it on the robot's computer: {command_of(_folder() / f'{name}.toml')}")
+
+
+def cameras_exchanged(*, name: str, shown: Mapping[str, str]) -> None:
+    """Give the deployment's cameras the names of what they show; `shown`: name -> whose picture that is.
+
+    EvaError where a picture is named twice, or where the robot's node names one of the cameras that are exchanged.
+    """
+    found = kept_of(name)
+    tree = tree_of(found.path) if found else {}
+    own: dict[str, Any] = tree.get("cameras", {})
+    if sorted(shown.values()) != sorted(shown):
+        raise EvaError(f"each camera once: {', '.join(sorted(shown))}; given: {', '.join(shown.values())}")
+    moved = {camera: right for camera, right in shown.items() if camera != right}
+    foreign = sorted({*moved, *moved.values()} - set(own))
+    if foreign or found is None:
+        raise EvaError(
+            f"{', '.join(foreign or moved)}: the robot's own node names these pictures: exchange them there, then look "
+            "again"
+        )
+    tree["cameras"] = own | {right: own[camera] for camera, right in moved.items()}
+    about = "Its cameras were exchanged on the page of first steps."
+    _put(found.path, tree, *([_CHOSEN] if found.chosen else []), about)
+
+
+def command_of(path: Path) -> str:
+    """The command that starts the station of a deployment file on this machine."""
+    return shlex.join([sys.executable, "-m", "runtime", str(path), "--set", f"data_dir={settings.DATA_DIR}"])
+
+
+def faults_of(path: Path) -> str:
+    """What the runtime's own check says against a deployment, "" where it would start."""
+    try:
+        done = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "runtime",
+                str(path),
+                "--check",
+                "--set",
+                f'data_dir="{settings.DATA_DIR}"',
+            ],
+            cwd=settings.BASE_DIR,
+            env=without_secrets(os.environ),
+            capture_output=True,
+            text=True,
+            timeout=_CHECK_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"the check of {path.name} was not done within {_CHECK_S:g} s: check it with {command_of(path)} --check"
+    return "" if done.returncode == 0 else done.stderr.strip()
+
+
+def lab_runs() -> bool:
+    """True if a lab (manage.py lab, or demo) watches this data folder."""
+    try:
+        with (Path(settings.DATA_DIR) / "lab.lock").open("rb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
+
+
+def standing_of(name: str) -> Standing:
+    """What the lab last said about a deployment."""
+    try:
+        told = json.loads((_folder() / f"{name}.json").read_bytes())
+        return Standing(str(told["doing"]), bool(told["up"]), str(told["failed"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return Standing()
+
+
+def tell(name: str, standing: Standing) -> None:
+    """Say what is being done about a deployment; the lab does. OSError where that cannot be written."""
+    written = _folder() / f".{name}.json"
+    written.write_text(json.dumps(asdict(standing)), "utf-8")
+    written.replace(_folder() / f"{name}.json")
+
+
+def try_again(*, name: str) -> None:
+    """Have the lab start a deployment anew that it could not start; NotFound."""
+    found = kept_of(name)
+    if found is None:
+        raise NotFound(f"{name!r:.80} has no deployment in the data folder")
+    found.path.touch()
+
+
+def remove(*, name: str) -> None:
+    """Remove a deployment: the lab ends what it brought with it. NotFound; Conflict while somebody works with it.
+
+    A station that nothing happened at and no plan names goes with it; any other is switched off.
+    """
+    found = kept_of(name)
+    if found is None:
+        raise NotFound(f"{name!r:.80} has no deployment in the data folder")
+    station = Station.objects.filter(name=name).first()
+    if station is not None:
+        _require_no_holder(station)
+        with transaction.atomic():
+            _require_no_trial(station)
+            if not _deleted(station):
+                Station.objects.filter(name=name).update(
+                    active=False, deployment="", message="removed under First steps"
+                )
+    found.path.unlink()
+    (_folder() / f"{name}.json").unlink(missing_ok=True)
+
+
+def _deleted(station: Station) -> bool:
+    """Delete it where nothing refers to it."""
+    if Plan.objects.filter(stations=station).exists():
+        return False
+    try:
+        station.delete()
+    except ProtectedError:
+        return False
+    return True
+
+
+def _require_no_trial(station: Station) -> None:
+    trial = Trial.objects.filter(station=station, status__in=lifecycle.OPEN).order_by("pk").first()
+    if trial is not None:
+        raise Conflict(
+            f"trial {trial.pk} of {station} is {trial.get_status_display()}: end or abandon it first (one that was cut "
+            f"off is interrupted once {station} is started again), then remove {station}"
+        )
+
+
+def _require_no_holder(station: Station) -> None:
+    """Nobody commands it; a lease of a station that does not answer is over, whatever was last heard of it."""
+    lease = lease_open(station=station)
+    if lease is None:
+        return
+    try:
+        holder = wire_to(station.name).status(timeout=_ASK_S)["lease"]["holder"]
+    except StationGone:
+        return
+    if holder:
+        raise Conflict(f"{holder} has {station}: it is given back first, or taken, then removed")
+
+
+def _require_no_program(part: str, typed: Mapping[str, str]) -> None:
+    """EvaError where a key of BY_HAND is given anything but its default; ConfigurationError of a kind there is not."""
+    for entry in draft.entries(part, typed.get("kind", "")):
+        given = typed.get(entry.key, "").strip()
+        who = BY_HAND.get((part, entry.key))
+        if who and given not in ("", entry.default):
+            raise EvaError(f"{part}.{entry.key} = {given!r:.80}; allowed here: {entry.default}; {who}")
+
+
+def _write(name: str, tree: dict[str, Any], about: str) -> Kept:
+    if not re.fullmatch(STATION_NAME, name):
+        raise EvaError(
+            f"station = {name!r:.80}; allowed: letters, digits, '.', '_' and '-', the first a letter or digit"
+        )
+    path = _folder() / f"{name}.toml"
+    if path.exists() or Station.objects.filter(name=name).exists():
+        raise _taken(name)
+    for station in Station.objects.filter(active=True).exclude(deployment=""):
+        if Path(station.deployment).stem == name:
+            raise Conflict(
+                f"the lab calls the program of {station} {name}, after {station.deployment}: give this one another name"
+            )
+    try:
+        _put(
+            path, tree, about, place=os.link
+        )  # which never replaces: another page may write the same name just now
+    except FileExistsError:
+        raise _taken(name) from None
+    return Kept(name, path)
+
+
+def _taken(name: str) -> Conflict:
+    return Conflict(f"there is a station {name} already: give this one another name")
+
+
+def _put(
+    path: Path, tree: Mapping[str, Any], *about: str, place: Callable[[Path, Path], object] = os.replace
+) -> None:
+    """Write the file and `place` it once the runtime can load it; EvaError says what it could not."""
+    written = (
+        f"Written by First steps, {timezone.localtime():%Y-%m-%d %H:%M}. Every key: docs/configuration.md."
+    )
+    path.parent.mkdir(mode=0o700, exist_ok=True)
+    draft_path = path.with_name(f"{path.stem}.{uuid4().hex}.draft")
+    try:
+        write_whole(draft_path, draft.text_of(tree, [written, *about]).encode())
+        load(draft_path)
+        place(draft_path, path)
+    except ConfigurationError as fault:
+        raise EvaError(str(fault).replace(f"{draft_path}: ", "")) from None
+    finally:
+        draft_path.unlink(missing_ok=True)
+
+
+def _folder() -> Path:
+    return Path(settings.DATA_DIR) / "deployments"

@@ -1,0 +1,147 @@
+"""Writes a bundle: every part through the scrubber, logs by their ends, and a summary of what is in it and what not."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from django.conf import settings
+from django.db import Error
+from django.utils import timezone
+
+from evaweb.blinding import Sight, sight_of
+from evaweb.errors import EvaError
+from evaweb.lab.diagnosis import contents, summary
+from evaweb.lab.diagnosis.scrubbing import Scrubber, known_secrets
+from evaweb.stations.models import Station
+
+LONGEST_LOG = 2_000_000  # bytes of its end
+LONGEST_LOGS = 24_000_000  # of all together
+LONGEST_PART = 8_000_000  # characters of any other file
+Tell = Callable[[str], None]
+Named = tuple[str, Any]
+
+
+def write(path: Path, sight: Sight, tell: Tell) -> list[str]:
+    """Write the bundle at `path`, for its user alone, as `sight` may see it; returns what is not in it.
+
+    `tell` hears which part is being gathered. It is whole, or not there.
+    """
+    scrubber = Scrubber(known_secrets(), sight.names)
+    notes: list[str] = []
+    draft = path.with_name(
+        f".{path.name}"
+    )  # of one that was cut off: the job that is done again writes over it
+    try:
+        made = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with os.fdopen(made, "wb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+            _fill(packed, scrubber, sight, notes, tell)
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+    return notes
+
+
+def _fill(packed: zipfile.ZipFile, scrubber: Scrubber, sight: Sight, notes: list[str], tell: Tell) -> None:
+    parts: dict[str, Any] = {}
+    written: list[tuple[str, int]] = []
+
+    def put(name: str, text: str) -> None:
+        if len(text) > LONGEST_PART:
+            notes.append(f"{name}: cut after {LONGEST_PART:,} of {len(text):,} characters")
+            text = text[:LONGEST_PART]
+        packed.writestr(name, text)
+        written.append((name, len(text.encode())))
+
+    for name, content in _parts(sight, notes, tell):
+        parts[name] = scrubber.tree(content)
+        put(name, json.dumps(parts[name], indent=1, default=str, ensure_ascii=False) + "\n")
+    tell("logs")
+    for name, text in _logs(sight, notes):
+        put(name, scrubber.text(text))
+    title = f"EVA Web, diagnostic bundle of {timezone.localtime():%Y-%m-%d %H:%M %Z}"
+    told = scrubber.tree(notes) or ["nothing was left out or cut"]
+    found = summary.sections(parts, written, [*told, "secrets: keys, passwords and tokens read (removed)"])
+    put("summary.txt", summary.as_text(title, found))
+    put("summary.html", summary.as_html(title, found))
+
+
+def _parts(sight: Sight, notes: list[str], tell: Tell) -> Iterator[Named]:
+    if not sight.clear:
+        notes.append(f"logs, policies of deployments, and what tells of checkpoints: {sight.plans}")
+    tell("versions and settings")
+    yield "versions.json", contents.versions()
+    yield "settings.json", contents.lab_settings()
+    tell("the machine")
+    yield "machine.json", contents.machine()
+    tell("database and jobs")
+    yield from _guarded("the database", _of_database(sight), notes)
+    yield "programs.json", contents.programs(sight)
+    yield from _guarded("deployments", _deployments(sight), notes)
+    yield from _guarded("stations", _stations(sight, notes, tell), notes)
+
+
+def _of_database(sight: Sight) -> Iterator[Named]:
+    yield "database.json", contents.database()
+    yield "jobs.json", contents.jobs(sight)
+
+
+def _deployments(sight: Sight) -> Iterator[Named]:
+    for name, tree in contents.deployment_files(sight):
+        yield f"deployments/{name}.json", tree
+
+
+def _stations(sight: Sight, notes: list[str], tell: Tell) -> Iterator[Named]:
+    for station in Station.objects.order_by("name"):
+        tell(f"the station {station.name}")
+        found = contents.station_parts(station, sight)
+        named = ((f"stations/{station.name}/{part}.json", content) for part, content in found)
+        yield from _guarded(f"station {station.name}", named, notes)
+
+
+def _guarded(what: str, parts: Iterator[Named], notes: list[str]) -> Iterator[Named]:
+    """The parts as far as they can be gathered: a lab is looked into because something of it is broken."""
+    try:
+        yield from parts
+    except (Error, OSError, EvaError) as error:
+        notes.append(f"{what} as far as it could not be read: {error}")
+
+
+def _logs(sight: Sight, notes: list[str]) -> Iterator[tuple[str, str]]:
+    """Names and ends of logs; they name checkpoints and servers, so that who is blind gets none."""
+    if not sight.clear:
+        return
+    room = LONGEST_LOGS
+    for path in contents.logs():
+        size = path.stat().st_size
+        length = min(size, LONGEST_LOG, room)
+        room -= length
+        if length < size:
+            notes.append(f"logs/{path.name}: its last {length:,} of {size:,} bytes")
+        if length == 0 and size:
+            continue
+        with path.open("rb") as file:
+            file.seek(size - length)
+            end = file.read(length)
+        if length < size:  # not from within a line: half a secret is not known as one
+            end = end.partition(b"\n")[2]
+        yield f"logs/{path.name}", end.decode("utf-8", "replace")
+
+
+def sight_for(user: Any) -> Sight:
+    """What the user may see; of a database that does not say, nothing that a plan could hide."""
+    try:
+        return sight_of(user)
+    except Error as error:
+        return Sight(checkpoints=frozenset({0}), plans=f"who is blind cannot be read ({error})")
+
+
+def folder(user: Any) -> Path:
+    """Folder of the bundles that a user had made; nobody else is given them."""
+    made = Path(settings.DATA_DIR) / "diagnosis" / str(user.pk)
+    made.mkdir(mode=0o700, parents=True, exist_ok=True)
+    return made

@@ -1,0 +1,180 @@
+"""Parts of a bundle: versions, the machine, settings, deployments, stations, jobs, the database.
+
+Everything is shown as the reader may see it; logs are read where the reader is blind for nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import Any
+
+from django.apps import apps
+from django.conf import settings
+from django.db import connection
+from django.db.migrations.executor import MigrationExecutor
+from django.utils import timezone
+
+from evaweb.binary_frames import plain
+from evaweb.blinding import HIDDEN, Sight
+from evaweb.errors import StationGone
+from evaweb.jobs.models import Job
+from evaweb.lab import deployments, machine_check
+from evaweb.stations import redaction
+from evaweb.stations.models import Command, Station
+from evaweb.stations.runtime_client import wire_to
+from runtime.config.loader import ConfigurationError, tree_of
+from runtime.core.git_revision import revision
+
+_ASK_S = 2.0
+_COMMANDS, _JOBS = 200, 100  # the newest of them
+# Settings of the environment whose values are shown; of all others only that they are set.
+_SHOWN = (
+    *(
+        "EVA_DATA_DIR",
+        "EVA_ROBOTS",
+        "EVA_ROBOT_MESHES",
+        "EVA_ALLOWED_HOSTS",
+        "EVA_TRUSTED_ORIGINS",
+        "EVA_HTTPS",
+    ),
+    *(
+        "EVA_HSTS_S",
+        "EVA_GATE",
+        "EVA_GATE_NAME",
+        "EVA_PROXIES",
+        "EVA_TIME_ZONE",
+        "EVA_LOG_LEVEL",
+        "EVA_COMMAND_TIMEOUT_S",
+        "EVA_JOB_STALE_S",
+    ),
+    *("EVA_WORKER_GRACE_S", "EVA_WORKER_NICE", "EVA_DEBUG", "TZ", "LANG", "XDG_RUNTIME_DIR"),
+)
+
+
+def versions() -> dict[str, Any]:
+    """Program, Python, kernel and packages."""
+    release = Path("/etc/os-release")
+    lines = release.read_text("utf-8").splitlines() if release.is_file() else []
+    system = next(
+        (line.partition("=")[2].strip('"') for line in lines if line.startswith("PRETTY_NAME=")), ""
+    )
+    return {
+        "revision": dict(revision()) or "no checkout of git",
+        "python": platform.python_version(),
+        "kernel": " ".join((platform.system(), platform.release(), platform.machine())),
+        "system": system,
+        "packages": dict(sorted({one.name: one.version for one in distributions()}.items())),
+    }
+
+
+def machine() -> list[dict[str, Any]]:
+    """The set-up check of this machine, as it is now."""
+    return [asdict(line) for line in machine_check.lines()]
+
+
+def lab_settings() -> dict[str, Any]:
+    """Settings by an allow list, and which of the others are set."""
+    ours = sorted(
+        name for name in os.environ if name.startswith("EVA_") or name in ("DATABASE_URL", "REDIS_URL")
+    )
+    return {
+        "environment": {name: os.environ[name] for name in _SHOWN if name in os.environ},
+        "set_and_not_shown": [name for name in ours if name not in _SHOWN],
+        "database": settings.DATABASES["default"]["ENGINE"].rpartition(".")[2],
+        "time_zone": settings.TIME_ZONE,
+        "now": timezone.localtime().isoformat(),
+    }
+
+
+def database() -> dict[str, Any]:
+    """Migrations that are not applied, and how many rows each table has."""
+    executor = MigrationExecutor(connection)
+    plan = executor.migration_plan(executor.loader.graph.leaf_nodes())
+    models = [model for model in apps.get_models() if model.__module__.startswith("evaweb.")]
+    return {
+        "migrations_to_apply": [f"{migration.app_label}.{migration.name}" for migration, _ in plan],
+        "migrations_applied": sorted(".".join(key) for key in executor.loader.applied_migrations),
+        "rows": {model._meta.label: model.objects.count() for model in models},
+    }
+
+
+def jobs(sight: Sight) -> list[dict[str, Any]]:
+    """The newest jobs; what may tell which checkpoint was worked on is covered for who is blind."""
+    names = ("id", "kind", "key", "queue", "status", "attempts", "deaths", "progress", "error")
+    rows = []
+    for job in Job.objects.order_by("-created_at", "-pk")[:_JOBS]:
+        row = {name: getattr(job, name) for name in names} | {"result": job.result}
+        if not sight.clear:
+            row |= {name: HIDDEN if row[name] else "" for name in ("progress", "error")} | {"result": {}}
+        times = {name: getattr(job, name) for name in ("created_at", "claimed_at", "finished_at")}
+        rows.append(row | {name: at and at.isoformat() for name, at in times.items()})
+    return rows
+
+
+def deployment_files(sight: Sight) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Name and table of each deployment that a station or the data folder has, as it is written, without comments."""
+    known = {one.name: one.path for one in deployments.kept()}
+    for station in Station.objects.exclude(deployment=""):
+        known.setdefault(station.name, Path(station.deployment))
+    for name, path in sorted(known.items()):
+        try:
+            tree = tree_of(path)
+        except ConfigurationError as fault:
+            tree = {"unreadable": str(fault)}
+        if not sight.clear and "policy" in tree:
+            tree["policy"] = HIDDEN
+        yield name, tree
+
+
+def station_parts(station: Station, sight: Sight) -> Iterator[tuple[str, Any]]:
+    """(part, contents) of one station: its state now, its newest events, the newest commands."""
+    wire = wire_to(station.name)
+    about = {name: getattr(station, name) for name in ("name", "robot", "simulated", "active", "message")}
+    try:
+        snapshot: Mapping[str, Any] = wire.status(timeout=_ASK_S)
+        _, events = wire.events_since(0, timeout=_ASK_S)
+    except StationGone as gone:
+        yield "state", {"station": about, "gone": str(gone)}
+    else:
+        veiled = not sight.clear and (sight.veils(station.name, snapshot) or sight.veils_events(station.name))
+        yield (
+            "state",
+            {"station": about, "snapshot": redaction.state(snapshot, sight) if veiled else snapshot},
+        )
+        yield "events", redaction.events(events, sight) if veiled else events
+    yield "commands", [_command(row, sight) for row in station.commands.select_related("user")[:_COMMANDS]]
+
+
+def logs() -> list[Path]:
+    """The logs of this lab's programs, the newest first."""
+    found = [path for path in (Path(settings.DATA_DIR) / "logs").glob("*.log*") if path.is_file()]
+    return sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
+
+
+def programs(sight: Sight) -> list[dict[str, Any]]:
+    """Whether the lab runs and, of each program that has a log, how long it has said nothing [s].
+
+    Which policy was asked last tells which checkpoint ran: who is blind is told of the lab alone.
+    """
+    now = time.time()
+    rows: list[dict[str, Any]] = [{"program": "lab", "runs": deployments.lab_runs()}]
+    seen = logs() if sight.clear else []
+    return rows + [{"program": path.stem, "silent_s": round(now - path.stat().st_mtime, 1)} for path in seen]
+
+
+def _command(row: Command, sight: Sight) -> dict[str, Any]:
+    hidden = not sight.clear and sight.veils_events(row.station.name)
+    return {
+        "at": row.issued_at.isoformat(),
+        "kind": row.kind,
+        "user": row.user.get_username() if row.user else "",
+        "status": row.status,
+        "reason": sight.told(row.reason) if hidden else row.reason,
+        "args": {} if hidden else plain(row.args),
+    }

@@ -1,0 +1,107 @@
+"""The form of a draft: what a deployment of a real robot may be told, with what was typed so far."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import robots
+from evaweb.errors import EvaError
+from evaweb.lab.deployments import BY_HAND
+from runtime.config import draft
+from runtime.config.draft import Entry
+from runtime.config.loader import ConfigurationError
+
+FROM_TRANSPORT = ""  # a camera whose pictures the robot's own node sends
+_USUAL = {"transport": "zmq", "policy": "openpi", "cameras": FROM_TRANSPORT}
+_TITLES = {"transport": "Way to the robot", "policy": "Policy server"}
+
+
+@dataclass(frozen=True, slots=True)
+class Typed:
+    """A key of a table with what is in its field."""
+
+    name: str
+    entry: Entry
+    value: str
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A table of the deployment: its kind, the kinds there are with what each is, and its keys.
+
+    `hidden` are keys that have no field, with what was sent for them all the same.
+    """
+
+    place: str
+    title: str
+    kind: str
+    kinds: Mapping[str, str]
+    keys: tuple[Typed, ...]
+    hidden: tuple[Typed, ...]
+
+    @property
+    def asked(self) -> list[Typed]:
+        """Keys that say where something is."""
+        return [one for one in self.keys if one.entry.address]
+
+    @property
+    def further(self) -> list[Typed]:
+        """All other keys."""
+        return [one for one in self.keys if not one.entry.address]
+
+
+@dataclass(frozen=True, slots=True)
+class DraftForm:
+    """The whole form."""
+
+    name: str
+    robot: str
+    robots: tuple[str, ...]
+    task: str
+    parts: tuple[Part, ...]
+
+    @property
+    def tables(self) -> dict[str, dict[str, str]]:
+        """What was typed, by the place of each table that there is to be."""
+        return {
+            part.place: {
+                "kind": part.kind,
+                **{one.entry.key: one.value for one in (*part.keys, *part.hidden)},
+            }
+            for part in self.parts
+            if part.kind
+        }
+
+
+def form_of(given: Mapping[str, str]) -> DraftForm:
+    """The form with what is in its fields; EvaError names a robot or a kind that there is not, and those there are."""
+    known = tuple(robots.names())
+    robot = given.get("robot", known[0])
+    if robot not in known:
+        raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(known)}")
+    try:
+        cameras = [f"cameras.{camera.key}" for camera in robots.load(robot).cameras]
+    except robots.RobotError as fault:  # of a folder of the lab's own
+        raise EvaError(str(fault)) from None
+    parts = tuple(_part(place, given) for place in ("transport", "policy", *cameras))
+    return DraftForm(given.get("station", ""), robot, known, given.get("task", ""), parts)
+
+
+def _part(place: str, given: Mapping[str, str]) -> Part:
+    part, _, camera = place.partition(".")
+    known = {kind: what for kind, what in draft.kinds(part).items() if kind != "none"}
+    kind = given.get(f"{place}.kind", _USUAL[part])
+    if kind not in known and not (camera and kind == FROM_TRANSPORT):
+        raise EvaError(f"{place}.kind = {kind!r:.40}; allowed: {', '.join(known)}")
+    try:
+        found = draft.entries(part, kind) if kind else ()
+    except ConfigurationError as fault:  # of a plug-in that cannot be imported here
+        raise EvaError(str(fault)) from None
+    typed = tuple(
+        Typed(f"{place}.{entry.key}", entry, given.get(f"{place}.{entry.key}", entry.default))
+        for entry in found
+    )
+    keys = tuple(one for one in typed if (part, one.entry.key) not in BY_HAND)
+    hidden = tuple(one for one in typed if (part, one.entry.key) in BY_HAND)
+    return Part(place, _TITLES.get(part, camera), kind, known, keys, hidden)

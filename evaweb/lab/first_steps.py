@@ -1,0 +1,208 @@
+"""The way of a new lab to its first scored trial: six steps, each done, now or later by what the lab has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from hashlib import sha256
+from typing import Any
+
+from django.db import transaction
+from django.urls import NoReverseMatch, reverse
+
+from evaweb.errors import StationGone
+from evaweb.lab import deployments
+from evaweb.lab.deployments import Kept, Standing, is_simulated, kept_of, standing_of
+from evaweb.lab.processes import LabError
+from evaweb.lab.seed import demo_scene
+from evaweb.plans.bench_checks import cameras_of
+from evaweb.plans.models import CameraCheck
+from evaweb.stations.models import CARRIED_OUT, Station
+from evaweb.stations.runtime_client import wire_to
+from evaweb.trials.models import Checkpoint, Scene, Trial, TrialStatus
+
+_ASK_S = 1.0  # how long a page waits for a station
+
+
+class Progress(StrEnum):
+    """Where a step stands."""
+
+    DONE = "done"
+    NOW = "now"
+    LATER = "later"
+
+    @property
+    def tone(self) -> str:
+        """The tone of its chip."""
+        return {"done": "ok", "now": "active"}.get(self.value, "neutral")
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step: its name, which is also that of its template, a title and where it stands."""
+
+    name: str
+    title: str
+    progress: Progress
+
+    @property
+    def template(self) -> str:
+        """What is shown of it while it is the one to do."""
+        return f"lab/step_{self.name}.html"
+
+
+@dataclass(frozen=True)
+class Walk:
+    """The steps of one station; without one the first is to be done.
+
+    `snapshot` is its state, {} where it does not answer; `standing` what the lab does about its deployment, `kept`.
+    """
+
+    station: Station | None
+    kept: Kept | None
+    standing: Standing
+    simulated: bool
+    snapshot: dict[str, Any]
+    cameras: tuple[str, ...]
+    steps: tuple[Step, ...]
+    checkpoints: bool
+    scored: Trial | None
+    others: tuple[Station, ...] = field(default=())
+
+    @property
+    def name(self) -> str:
+        """The name of the station, "" before there is one."""
+        return self.station.name if self.station else self.kept.name if self.kept else ""
+
+    @property
+    def now(self) -> Step | None:
+        """The step that is to be done; None where all are."""
+        return next((step for step in self.steps if step.progress is Progress.NOW), None)
+
+    @property
+    def mark(self) -> str:
+        """Another one whenever something went on."""
+        told = (self.name, self.standing, bool(self.snapshot), self.checkpoints, *self.steps)
+        return sha256(repr(told).encode()).hexdigest()[:16]
+
+    @property
+    def waits(self) -> bool:
+        """True if the page has to look again by itself: something is expected of the lab or of another page."""
+        return self.now is not None and self.now.name != "deployment"
+
+
+_TITLES = {
+    "deployment": "Describe a station",
+    "station": "Start the station",
+    "cameras": "Check the cameras",
+    "home": "Home the robot",
+    "scene": "Create a first scene",
+    "trial": "Run and score the first trial",
+}
+
+
+def walk(*, name: str = "") -> Walk:
+    """The steps of the station of that name, else of the newest; a database row is not needed for it yet."""
+    stations = tuple(Station.objects.filter(active=True).order_by("-created_at"))
+    kept = kept_of(name) if name else None
+    station = next((one for one in stations if one.name == name), None)
+    if station is None and kept is None:
+        station, kept = _newest(stations)
+    elif station is not None:
+        kept = kept_of(station.name)
+    snapshot = _snapshot(station)
+    cameras = tuple(cameras_of(station)) if station else ()
+    scored = _scored(station)
+    checkpoints = Checkpoint.objects.filter(active=True).exists()
+    done = {
+        "deployment": station is not None or kept is not None,
+        "station": bool(snapshot) or scored is not None,
+        "cameras": scored is not None or _looked_at(station) or (bool(snapshot) and not cameras),
+        "home": scored is not None or _homed(station),
+        "scene": Scene.objects.filter(
+            active=True, positions__isnull=False, milestones__isnull=False
+        ).exists(),
+        "trial": scored is not None,
+    }
+    return Walk(
+        station=station,
+        kept=kept,
+        standing=standing_of(kept.name) if kept else Standing(),
+        simulated=_simulated(station, kept),
+        snapshot=snapshot,
+        cameras=cameras,
+        steps=_steps(done),
+        checkpoints=checkpoints,
+        scored=scored,
+        others=tuple(one for one in stations if one != station),
+    )
+
+
+@transaction.atomic
+def starter_scene() -> Scene:
+    """A scene that the simulated bench can lay out, with positions and milestones; made once."""
+    return demo_scene()
+
+
+def scenes_address() -> str:
+    """Where scenes are made: the scene editor, else the administration."""
+    try:
+        return reverse("setup-scenes")
+    except NoReverseMatch:
+        return reverse("admin:trials_scene_changelist")
+
+
+def _newest(stations: tuple[Station, ...]) -> tuple[Station | None, Kept | None]:
+    """The deployment that was written last, as long as it has no station yet; else the newest station."""
+    written = deployments.kept()
+    if written and written[-1].name not in set(Station.objects.values_list("name", flat=True)):
+        return None, written[-1]
+    station = stations[0] if stations else None
+    return station, kept_of(station.name) if station else None
+
+
+def _steps(done: dict[str, bool]) -> tuple[Step, ...]:
+    open_ones = [name for name in _TITLES if not done[name]]
+    return tuple(
+        Step(
+            name,
+            title,
+            Progress.DONE if done[name] else Progress.NOW if name == open_ones[0] else Progress.LATER,
+        )
+        for name, title in _TITLES.items()
+    )
+
+
+def _snapshot(station: Station | None) -> dict[str, Any]:
+    if station is None:
+        return {}
+    try:
+        return wire_to(station.name).status(timeout=_ASK_S)
+    except StationGone:
+        return {}
+
+
+def _simulated(station: Station | None, kept: Kept | None) -> bool:
+    if station is not None:
+        return station.simulated
+    try:
+        return kept is not None and kept.chosen and is_simulated(kept.resolved())
+    except LabError:  # the step says what is wrong with it
+        return False
+
+
+def _looked_at(station: Station | None) -> bool:
+    return station is not None and CameraCheck.objects.filter(station=station).exists()
+
+
+def _homed(station: Station | None) -> bool:
+    """A set-up drives home too."""
+    if station is None:
+        return False
+    return station.commands.filter(kind__in=("home", "setup"), status__in=CARRIED_OUT).exists()
+
+
+def _scored(station: Station | None) -> Trial | None:
+    if station is None:
+        return None
+    return Trial.objects.filter(station=station, status=TrialStatus.SCORED).order_by("pk").first()

@@ -1,0 +1,40 @@
+"""`manage.py diagnose --out FILE.zip`: the diagnostic bundle, without a web or a worker."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+from pathlib import Path
+from typing import Any
+
+from django.contrib.auth.models import AnonymousUser
+from django.core.management.base import BaseCommand, CommandError
+
+from evaweb.blinding import EVERYTHING
+from evaweb.lab.diagnosis import bundle
+
+
+class Command(BaseCommand):
+    """Write the bundle; who reads it may be blind, so that it tells nothing of blind plans unless it is to."""
+
+    help = "Versions, settings, machine, deployments, stations, jobs and logs of this lab in one file, without secrets."
+
+    def add_arguments(self, parser: ArgumentParser) -> None:
+        parser.add_argument("--out", type=Path, required=True, metavar="FILE.zip", help="where to write it")
+        parser.add_argument(
+            "--unblinded",
+            action="store_true",
+            help="with logs and all, also while a plan is blind: for a reader who may know",
+        )
+
+    def handle(self, *args: Any, **options: Any) -> None:
+        path = options["out"].expanduser().absolute()
+        sight = EVERYTHING if options["unblinded"] else bundle.sight_for(AnonymousUser())
+        try:
+            notes = bundle.write(path, sight, lambda part: self.stderr.write(f"gathering {part}"))
+        except OSError as error:
+            raise CommandError(
+                f"{path}: {error.strerror}; name a file in a folder that can be written"
+            ) from None
+        for note in notes:
+            self.stdout.write(f"not in it: {note}")
+        self.stdout.write(f"{path}, {path.stat().st_size:,} bytes: open summary.html in it, or summary.txt")

@@ -1,0 +1,42 @@
+"""manage.py sentences [FILE]: the catalogue for a translator, or what a language lacks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from django.core.management.base import BaseCommand, CommandError, CommandParser
+
+from evaweb.lab import sentences
+from evaweb.languages import parse
+
+
+class Command(BaseCommand):
+    """Prints JSON."""
+
+    help = (
+        "Prints id, English pattern and arguments of every sentence as JSON. With the FILE of a language it prints "
+        "which ids are missing, unknown, or have other arguments, and fails for the last two."
+    )
+
+    def add_arguments(self, parser: CommandParser) -> None:
+        """The file of a language, where one is to be looked at."""
+        parser.add_argument(
+            "file", nargs="?", type=Path, help="of a language, such as static/languages/de.json"
+        )
+
+    def handle(self, *args: Any, file: Path | None = None, **options: Any) -> None:
+        """Print the one or the other."""
+        patterns = sentences.declared()
+        if file is None:
+            self.stdout.write(json.dumps(sentences.catalogue(patterns), indent=1, ensure_ascii=False))
+            return
+        try:
+            _, translated = parse(file.read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise CommandError(f"{file}: {error}") from None
+        found = sentences.compared(patterns, translated)
+        self.stdout.write(json.dumps(found, indent=1))
+        if found["unknown"] or found["other_arguments"]:
+            raise CommandError(f"{file}: sentences that are unknown, or have other arguments")

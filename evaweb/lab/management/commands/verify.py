@@ -1,0 +1,24 @@
+"""`manage.py verify BACKUP`: whether a backup is as it was written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from evaweb.lab.backups import backup
+from evaweb.lab.backups.command import BackupCommand
+from evaweb.lab.backups.errors import BackupError
+
+
+class Command(BackupCommand):
+    """Read every byte of it; the exit code is 1 where something is amiss, each on a line."""
+
+    help = "Compares a backup's database and files with their digests; needs no lab."
+
+    def work_on(self, path: Path) -> None:
+        found, problems = backup.verify(path, self.stderr.write)
+        for problem in problems:
+            self.stdout.write(problem)
+        if problems:
+            raise BackupError(f"{found.path}: {len(problems)} of its files are not as they were written")
+        made, version = found.about["made"], found.about["version"]
+        self.stdout.write(f"{found.path}, made {made} by version {version}: as it was written")

@@ -1,0 +1,143 @@
+"""Starts what is written into the folder of deployments while the lab runs, and holds up the watch of nothing."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Generator
+
+from django.db import Error, close_old_connections
+
+from evaweb.errors import EvaError
+from evaweb.lab import deployments, simulated
+from evaweb.lab.benches import Bench, program_of, registered
+from evaweb.lab.deployments import Kept, Standing, is_simulated
+from evaweb.lab.processes import LabError, Processes
+
+log = logging.getLogger(__name__)
+Coming = Generator[
+    str, None, bool
+]  # yields what is being started; returns whether there was anything to start
+
+
+class Pickup:
+    """The simulated stations of the data folder, one after the other; `look` is called every now and then."""
+
+    def __init__(self, processes: Processes, how: simulated.Benches) -> None:
+        self._processes, self._how = processes, how
+        self._tried: dict[str, int] = {}  # by name, when the file that was last tried had been changed
+        self._up: set[str] = set()
+        self._brought: set[str] = set()  # stations whose programs are of our making: no others are ended
+        self._fault = ""  # of the last look
+        self._coming: tuple[str, Coming] | None = None
+        self._told: dict[str, Standing] = {}
+
+    def look(self) -> None:
+        """One look: at what is getting ready, else for the next file that is new, or was touched to be tried again.
+
+        Whatever is wrong with it, the lab and its other stations go on.
+        """
+        try:
+            self._look()
+        except Exception as fault:  # of the folder itself: the next look is near, and it is said once
+            if self._fault != repr(fault):
+                log.exception("the folder of deployments cannot be looked at")
+            self._fault = repr(fault)
+        else:
+            self._fault = ""
+
+    def _look(self) -> None:
+        if self._coming is None:
+            self._end_removed()
+            self._coming = self._next()
+        if self._coming is None:
+            return
+        name, coming = self._coming
+        try:
+            self._tell(name, Standing(doing=next(coming)))
+        except StopIteration as done:
+            self._coming = None
+            self._up.add(name)
+            if done.value:
+                self._tell(name, Standing(up=True))
+        except (EvaError, Error, OSError) as fault:
+            self._give_up(name, str(fault))
+        except Exception as fault:  # a file and the rows that it leads to may hold anything
+            log.exception("%s cannot be started", name)
+            self._give_up(name, f"{type(fault).__name__}: {fault} (see the terminal of the lab)")
+
+    def _give_up(self, name: str, why: str) -> None:
+        self._coming = None
+        self._end(name)
+        self._tell(name, Standing(failed=why))
+
+    def _end(self, name: str) -> None:
+        """End what we brought for a station."""
+        if name in self._brought:
+            self._brought.discard(name)
+            for program in _programs_of(name):
+                self._processes.drop(program)
+            log.info("what was started for %s is ended", name)
+
+    def _end_removed(self) -> None:
+        for name in [name for name in self._up if deployments.kept_of(name) is None]:
+            self._up.discard(name)
+            self._tried.pop(name, None)
+            self._told.pop(name, None)
+            log.info("%s is removed from the folder of deployments", name)
+            self._end(name)
+
+    def _next(self) -> tuple[str, Coming] | None:
+        ending = self._processes.ending()
+        for one in deployments.kept():
+            if ending.intersection(_programs_of(one.name)):
+                continue  # of an earlier file of this name
+            if one.name not in self._up and self._tried.get(one.name) != one.changed_ns:
+                self._tried[one.name] = one.changed_ns
+                return one.name, self._starting(one)
+        return None
+
+    def _starting(self, one: Kept) -> Coming:
+        resolved = one.resolved()
+        if not (one.chosen and is_simulated(resolved)):
+            return False  # a draft, or written by hand: a person starts it
+        if resolved.deployment.station != one.name:
+            raise LabError(
+                f"{one.path} is of station {resolved.deployment.station!r}: name the file after it"
+            )
+        running = self._processes.pids()
+        for program in _programs_of(one.name):
+            if program in running:
+                raise LabError(
+                    f"{program} is a program of this lab already: remove this station, and give it another name"
+                )
+        self._brought.add(one.name)
+        close_old_connections()
+        yield "the simulated bench"
+        assignments = yield from simulated.bring(
+            self._processes, one.name, resolved.deployment.robot, self._how
+        )
+        yield "the station"
+        bench = Bench(one.path, assignments)
+        registered(bench)  # LabError for a file that was removed meanwhile
+        self._processes.start(program_of(bench))
+        return True
+
+    def _tell(self, name: str, standing: Standing) -> None:
+        if self._told.get(name) == standing:
+            return
+        self._told[name] = standing
+        if standing.failed:
+            log.error("%s is not started: %s", name, standing.failed)
+        elif standing.up:
+            log.info("%s is started from the folder of deployments", name)
+        if deployments.kept_of(name) is None:
+            return
+        try:
+            deployments.tell(name, standing)
+        except OSError as error:  # the page does not hear of it; the lab goes on
+            log.error("what becomes of %s cannot be written down: %s", name, error)
+
+
+def _programs_of(name: str) -> tuple[str, str]:
+    """Names of the programs that a simulated station has to itself."""
+    return f"station-{name}", f"bench-{name}"

@@ -1,0 +1,148 @@
+"""A simulated bench with its policies of different skill: what the demo has, and what First steps brings."""
+
+from __future__ import annotations
+
+import json
+import re
+from argparse import ArgumentParser, ArgumentTypeError
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlsplit
+
+from evaweb.errors import EvaError
+from evaweb.lab import lifetime, programs, seed
+from evaweb.lab.processes import LabError, Processes, Program
+from evaweb.trials.models import Checkpoint
+
+SKILLED, CLUMSY = "pick-place-40k", "pick-place-8k"
+POLICIES = {
+    SKILLED: (
+        "Scripted; sees the block within a millimetre or two, answers in 80 ms.",
+        ("--noise", "1", "--latency-ms", "80"),
+    ),
+    CLUMSY: (
+        "Scripted; misjudges the block by centimetres, often lets go early or grasps short, answers in 250 ms.",
+        ("--noise", "14", "--failure-rate", "0.4", "--latency-ms", "250"),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Benches:
+    """How this lab's simulated benches are: first layout, pixels of their pictures, and settings of their stations."""
+
+    seed: int = 1
+    pictures: tuple[int, int] = (640, 480)
+    assignments: Sequence[str] = ()
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Options of the bench."""
+        return programs.bench(self.seed, *self.pictures)
+
+    def skill(self, policy: str) -> tuple[str, ...]:
+        """Options of a policy's server."""
+        return (*POLICIES[policy][1], "--seed", str(self.seed))
+
+
+def simulated_options(parser: ArgumentParser) -> None:
+    """Options of a command that starts simulated benches."""
+    parser.add_argument(
+        "--pictures",
+        type=_pixels,
+        default=Benches.pictures,
+        metavar="WxH",
+        help="of the simulated cameras; 400x300, the least in which the policies see the block, spares work",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="on top of the deployment of a simulated station, as with python -m runtime",
+    )
+
+
+def benches_of(options: Mapping[str, Any]) -> Benches:
+    """What was said with these options, and with --seed where there is one."""
+    return Benches(options.get("seed", Benches.seed), options["pictures"], options["set"])
+
+
+def bring(processes: Processes, station: str, robot: str, how: Benches) -> Generator[str, None, list[str]]:
+    """Start the bench and the policies of a station, a look at a time; yields what is being started.
+
+    Returns what its deployment is to be given besides. A policy serves all stations with this robot; its checkpoint is
+    led to where it listens.
+    """
+    program = programs.tabletop(robot, how.options, f"bench-{station}")
+    node = yield from _starting(processes, program, "the simulated bench")
+    for policy, (description, _) in POLICIES.items():
+        name = f"{policy}-{robot}"
+        serving = programs.policy(name, robot, how.skill(policy), known_port(name))
+        if serving.name not in processes.pids():
+            found = yield from _starting(processes, serving, f"the policy {name}")
+            seed.demo_checkpoint(name=name, description=description, policy={"url": found["url"]})
+    url = _url_of(f"{SKILLED}-{robot}")
+    return [
+        f'transport.sub_endpoint="{node["obs_endpoint"]}"',
+        f'transport.pub_endpoint="{node["action_endpoint"]}"',
+        f"policy.url={json.dumps(url)}",
+        *how.assignments,
+    ]
+
+
+def _starting(processes: Processes, program: Program, what: str) -> Generator[str, None, Mapping[str, Any]]:
+    begun = processes.starting(program)
+    while True:
+        try:
+            next(begun)
+        except StopIteration as ready:
+            found: Mapping[str, Any] = ready.value
+            return found
+        yield what
+
+
+def known_port(name: str) -> int:
+    """Port of the checkpoint's earlier policy server, if it is free: a plan that is frozen names it."""
+    return free_port_of(Checkpoint.objects.filter(name=name).values_list("policy__url", flat=True).first())
+
+
+def _url_of(name: str) -> str:
+    """Where the policy of a checkpoint listens; LabError."""
+    checkpoint = Checkpoint.objects.filter(name=name).first()
+    if checkpoint is None:
+        raise LabError(
+            f"the checkpoint {name} was deleted while its policy runs: start the lab anew, and it is made again"
+        )
+    url = checkpoint.policy.get("url")
+    if not url or not isinstance(url, str):
+        raise LabError(
+            f"the checkpoint {name} has no url in its policy: give it one, or start the lab anew, and it has that of "
+            "its policy again"
+        )
+    return url
+
+
+def _pixels(text: str) -> tuple[int, int]:
+    """Width and height of "400x300", the least in which the scripted policies see the block everywhere."""
+    found = re.fullmatch(r"(\d{3,4})x(\d{3,4})", text)
+    width, height = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not (400 <= width <= 4096 and 300 <= height <= 4096):
+        raise ArgumentTypeError(f"{text!r}; allowed: width x height in pixels, 400x300 to 4096x4096")
+    return width, height
+
+
+def free_port_of(url: str | None) -> int:
+    """The port of that address if it is one and free now, else 0."""
+    try:
+        port = urlsplit(url).port if isinstance(url, str) else None
+    except ValueError:  # a person may have written anything
+        return 0
+    if not port:
+        return 0
+    try:
+        lifetime.require_free("127.0.0.1", port)
+    except EvaError:
+        return 0
+    return port

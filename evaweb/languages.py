@@ -1,0 +1,102 @@
+"""Languages of the lab's sentences: a JSON file each, which says the patterns of other words by the sentences' ids.
+
+English is what the sentences are written in, and what is shown wherever a language has no words for one.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from string import Formatter
+from typing import Any
+
+from django.conf import settings
+
+from runtime.core import bounded_documents as bounded
+from runtime.core.sentences import Sentence, names_of
+
+log = logging.getLogger(__name__)
+COOKIE = "eva_language"
+_CODE = re.compile(r"[a-z]{2,3}(-[A-Z][A-Za-z]{1,3})?")
+_LARGEST, _MOST = 4 << 20, 20_000  # bytes and values of a file
+
+
+@dataclass(frozen=True, slots=True)
+class Language:
+    """A language: its code (`de`), its own name for itself, and its patterns by id."""
+
+    code: str
+    name: str
+    patterns: Mapping[str, str]
+
+
+def offered() -> list[Language]:
+    """The languages that are there, in the order of their codes; a file that cannot be used is none, and logged."""
+    files = sorted(Path(settings.LANGUAGES_DIR).glob("*.json"))
+    read = (_read(path, path.stat().st_mtime_ns) for path in files if _CODE.fullmatch(path.stem))
+    return [language for language in read if language is not None]
+
+
+def language(code: str) -> Language | None:
+    """The language of that code, None where it is not there."""
+    return next((one for one in offered() if one.code == code), None)
+
+
+def chosen(request: Any) -> Language | None:
+    """The language that this browser has chosen, None for English."""
+    code = request.COOKIES.get(COOKIE, "")
+    return language(code) if _CODE.fullmatch(code) else None
+
+
+def parse(content: str) -> tuple[str, dict[str, str]]:
+    """Name and patterns in a file of a language; ValueError where it is none."""
+    said = bounded.from_json(content, "the language", _LARGEST, _MOST)
+    name, patterns = (said.get("name"), said.get("sentences")) if isinstance(said, dict) else (None, None)
+    if not isinstance(name, str) or not isinstance(patterns, dict):
+        raise ValueError('expected {"name": its own name, "sentences": {id: pattern}}')
+    wrong = [key for key, pattern in patterns.items() if not isinstance(pattern, str)]
+    if wrong:
+        raise ValueError(f"{', '.join(wrong[:5])}: expected a text")
+    return name, patterns
+
+
+def translated(text: str, spoken: Language | None) -> str:
+    """The sentence in that language; its English where it has no id, or the language no words for it."""
+    pattern = spoken.patterns.get(text.id) if spoken is not None and isinstance(text, Sentence) else None
+    if pattern is None:
+        return text
+    assert isinstance(text, Sentence)
+    try:
+        return _filled(pattern, text.arguments, spoken)
+    except (ValueError, KeyError, IndexError):
+        return text
+
+
+def _filled(pattern: str, arguments: Mapping[str, Any], spoken: Language | None) -> str:
+    names_of(pattern)  # ValueError for what asks for more than names
+    return "".join(
+        before + ("" if name is None else _shown(arguments[name], spec or "", conversion, spoken))
+        for before, name, spec, conversion in Formatter().parse(pattern)
+    )
+
+
+def _shown(value: Any, spec: str, conversion: str | None, spoken: Language | None) -> str:
+    shown = translated(value, spoken) if isinstance(value, str) else value
+    shown = repr(str.__str__(shown) if isinstance(shown, str) else shown) if conversion else shown
+    of_texts = spec.startswith(".") and spec[1:].isdigit()
+    return format(shown, spec if of_texts is isinstance(shown, str) else "")
+
+
+@lru_cache(maxsize=32)  # cache: of each file as it was last written
+def _read(path: Path, written: int) -> Language | None:
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise ValueError(f"more than {_LARGEST} bytes")
+        return Language(path.stem, *parse(path.read_text("utf-8")))
+    except (OSError, ValueError) as error:
+        log.error("the language %s is not offered: %s", path, error)
+        return None

@@ -1,0 +1,133 @@
+"""What stands in the way of freezing a draft, and what should be thought of, each with the step that mends it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from evaweb.blinding import Sight
+from evaweb.errors import EvaError
+from evaweb.plans.design import check_drafted, planned
+from evaweb.plans.models import Allocation, Comparing, Plan, PrimaryOutcome, StoppingRule
+from evaweb.plans.schedule import Condition, check_schedule
+from evaweb.trials.models import Scene
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """A sentence about a draft, and the step of its page at which that is changed."""
+
+    step: str
+    text: str
+
+
+def problems(plan: Plan) -> Iterator[Remark]:
+    """What a freeze refuses; only the order of a random schedule, which the freeze draws, is not known before."""
+    chosen = set(plan.checkpoints.values_list("pk", flat=True))
+    if not plan.positions.exists():
+        yield Remark("conditions", f"{plan} has no position: choose initial conditions")
+    if not chosen:
+        yield Remark("arms", f"{plan} has no checkpoint: choose at least one")
+    for off in plan.checkpoints.filter(active=False):
+        yield Remark("arms", f"checkpoint {off} is switched off")
+    compared = list(_comparisons(plan, chosen))
+    yield from compared
+    if chosen and plan.positions.exists() and not compared:
+        yield from _designed(plan)
+
+
+def covered(plan: Plan, sight: Sight) -> Callable[[str], str]:
+    """Sentences about a draft as they are said to somebody, without the names of checkpoints hidden from them."""
+    rows = [*plan.checkpoints.filter(pk__in=sight.checkpoints), *filter(None, (plan.first, plan.second))]
+    names = sorted({row.name for row in rows if row.pk in sight.checkpoints}, key=len, reverse=True)
+
+    def told(text: str) -> str:
+        for name in names:
+            text = text.replace(name, "a hidden checkpoint")
+        return text
+
+    return told
+
+
+def _designed(plan: Plan) -> Iterator[Remark]:
+    names = [row.name for row in plan.checkpoints.all()]
+    conditions = [
+        Condition(scene, number) for scene, number in plan.positions.values_list("scene__name", "number")
+    ]
+    try:
+        check_schedule(names, conditions, plan.repetitions, plan.allocation)
+        check_drafted(plan)
+    except EvaError as error:
+        yield Remark("design", str(error))
+
+
+def _comparisons(plan: Plan, chosen: set[int]) -> Iterator[Remark]:
+    named = [row for row in (plan.first, plan.second) if row]
+    wanted = {Comparing.CONTROL: (1, "the first one alone"), Comparing.ALL: (0, "none by name")}
+    if plan.comparing in wanted:
+        number, words = wanted[Comparing(plan.comparing)]
+        if number and not named:
+            yield Remark("arms", "no control is chosen (first), with which each checkpoint is compared")
+        elif len(named) != number or (number and plan.first is None):
+            yield Remark("arms", f"comparisons of {plan.get_comparing_display()} name {words}")
+        if len(chosen) < 2:
+            yield Remark(
+                "arms", f"comparisons of {plan.get_comparing_display()} need two checkpoints or more"
+            )
+    elif len(named) == 1 or (named and named[0] == named[1]):
+        yield Remark("arms", "the comparison needs two checkpoints, or none")
+    for row in named:
+        if row.pk not in chosen:
+            yield Remark("arms", f"the comparison is about {row}, which is not one of the plan's checkpoints")
+    if plan.comparing == Comparing.ALL and plan.margin is not None:
+        yield Remark(
+            "arms",
+            "margin with comparisons of all checkpoints with each other: it asks of one whether it is not worse than "
+            "another; allowed with: first and second, each checkpoint with the first",
+        )
+    asked = (
+        plan.stopping != StoppingRule.NONE
+        or plan.margin is not None
+        or plan.outcome != PrimaryOutcome.SUCCESS
+        or plan.allocation != Allocation.PAIRED
+        or plan.drop_arms
+    )
+    if asked and not planned(plan):
+        yield Remark(
+            "arms",
+            "a design with looks, a margin, a score, random order or dropped checkpoints needs the comparison that it "
+            "is about",
+        )
+
+
+def thoughts(plan: Plan) -> Iterator[Remark]:
+    """What is allowed, and what a reader of the result will ask about."""
+    if not plan.question.strip():
+        yield Remark(
+            "question", "No question is written down: a result is then an answer to whatever is asked later."
+        )
+    if plan.checkpoints.exists() and not planned(plan):
+        yield Remark(
+            "arms", "No comparison is planned: the result describes each checkpoint and decides nothing."
+        )
+    unnamed = list(plan.checkpoints.filter(digest=""))
+    if unnamed:
+        names = ", ".join(map(str, unnamed))
+        yield Remark(
+            "arms", f"No digest of the weights: {names}. Other weights under the same name go unnoticed."
+        )
+    for scene in Scene.objects.filter(positions__plan=plan).distinct():
+        if not scene.criterion.strip():
+            yield Remark("conditions", f"Scene {scene} has no written criterion of success.")
+        if not scene.milestones.exists():
+            yield Remark("conditions", f"Scene {scene} has no milestones: every score is 0 or 1.")
+        if not scene.active:
+            yield Remark("conditions", f"Scene {scene} is switched off.")
+    if plan.positions.count() == 1:
+        yield Remark("conditions", "Only one position: the result says nothing about any other.")
+    for station in plan.stations.filter(active=False):
+        yield Remark("conditions", f"Station {station} is switched off.")
+    if not plan.blind:
+        yield Remark("design", "The plan is open: operators see which checkpoint runs, and may favour one.")
+    if not plan.second_rater_share:
+        yield Remark("design", "No trial is scored a second time: how well raters agree is not known.")

@@ -1,0 +1,125 @@
+"""A draft as it is typed: fields of text as values, and a sentence for each that is none."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+from django import forms
+from django.contrib.auth.models import User
+from django.http import QueryDict
+
+from evaweb.errors import EvaError
+from evaweb.plans.design import looks_of
+from evaweb.plans.drafting import HIDDEN, Values
+from evaweb.plans.models import Comparing, Plan, Position
+from evaweb.stations.models import Station
+from evaweb.trials.models import Checkpoint
+
+_POINTS = 100
+
+
+def read(
+    given: QueryDict, *, hidden: Collection[int], unseen: int, owners: bool
+) -> tuple[Values, dict[str, str]]:
+    """Values of a form, and what is wrong with the other fields, by their names.
+
+    `hidden` checkpoints, by id, cannot be chosen; the draft has `unseen` of them. `owners`: the owner can be chosen.
+    """
+    form = _Draft(given)
+    form.unseen = unseen
+    form.fields["checkpoints"].queryset = Checkpoint.objects.exclude(pk__in=hidden)  # type: ignore[attr-defined]
+    if not owners:
+        del form.fields["owner"]
+    form.is_valid()
+    faults = {str(name): _sentence(name, said[0], given) for name, said in form.errors.items()}
+    return {name: _plain(value) for name, value in form.cleaned_data.items() if name != "kind"}, faults
+
+
+def _sentence(name: str, said: Any, given: QueryDict) -> str:
+    typed = given.get(name, "").strip()
+    return f"{typed!r:.40} is not saved. {said}" if typed else f"Not saved. {said}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, User):
+        return value.pk
+    return sorted(row.pk for row in value) if hasattr(value, "model") else value
+
+
+def _of(name: str, **more: Any) -> Any:
+    """The field that a form of the model has."""
+    field: Any = Plan._meta.get_field(name)
+    return field.formfield(validators=field.validators, **more)
+
+
+def _several(rows: Any) -> forms.ModelMultipleChoiceField:
+    return forms.ModelMultipleChoiceField(rows, required=False)
+
+
+def _is_number(word: str) -> bool:
+    return word.isascii() and word.isdecimal() and len(word) < 10
+
+
+class _Draft(forms.Form):
+    unseen = 0
+    title = _of("title")
+    question = _of("question")
+    owner = _of("owner")
+    kind = forms.ChoiceField(choices=(("difference", "difference"), ("margin", "margin")))
+    margin = forms.FloatField(required=False, min_value=0.1, max_value=99.9)
+    outcome = _of("outcome")
+    checkpoints = _several(Checkpoint.objects.all())
+    control = forms.CharField(required=False)
+    challenger = forms.CharField(required=False)
+    comparing = _of("comparing")
+    positions = _several(Position.objects.all())
+    stations = _several(Station.objects.all())
+    stopping = _of("stopping")
+    repetitions = _of("repetitions")
+    alpha = _of("alpha")
+    look_after = forms.CharField(required=False)
+    drop_arms = _of("drop_arms")
+    allocation = _of("allocation")
+    blind = _of("blind")
+    second_rater_share = forms.FloatField(min_value=0, max_value=100)
+    match_gate = _of("match_gate")
+
+    def clean_question(self) -> str:
+        """Lines end as they do in files of plans, whatever a browser makes of them."""
+        return str(self.cleaned_data["question"]).replace("\r\n", "\n")
+
+    def clean_second_rater_share(self) -> float:
+        """Percent, as a share."""
+        return round(float(self.cleaned_data["second_rater_share"]) / _POINTS, 6)
+
+    def clean_margin(self) -> float | None:
+        """Points, as a share; none where the question is whether two differ."""
+        given = self.cleaned_data["margin"]
+        if self.cleaned_data.get("kind") != "margin":
+            return None
+        if given is None:
+            raise forms.ValidationError("Say by how many points it may be worse: 0.1 to 99.9.")
+        return round(float(given) / _POINTS, 6)
+
+    def clean_look_after(self) -> list[int]:
+        """Whole numbers with commas between them; none: a look after every pair."""
+        words = self.cleaned_data["look_after"].replace(",", " ").split()
+        try:
+            return looks_of([int(word) if _is_number(word) else word for word in words])
+        except EvaError:
+            raise forms.ValidationError("Allowed: rising numbers of pairs, such as 20, 40, 60.") from None
+
+    def clean(self) -> dict[str, Any]:
+        """Control and challenger are checkpoints of the plan that the comparisons name, or nothing."""
+        found = self.cleaned_data
+        named = {Comparing.ALL: (), Comparing.CONTROL: ("control",)}.get(
+            found.get("comparing"), ("control", "challenger")
+        )
+        chosen = {str(row.pk) for row in found.get("checkpoints", ())} | {HIDDEN}
+        for name in ("control", "challenger"):
+            if found.get(name) not in chosen or name not in named:
+                found[name] = ""
+        if found.get("challenger") == found.get("control") or len(chosen) - 1 + self.unseen == 2:
+            found["challenger"] = ""  # of two checkpoints it is the other one
+        return found

@@ -1,0 +1,193 @@
+"""Power of a draft's design at assumed rates, computed beside the page: what there is so far, until all is there.
+
+One thread of each process computes, one number after the other. What nobody asks for any more is given up between two
+of them, and what was computed is known afterwards.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from threading import Condition
+from typing import Any
+
+from evaweb.results.analysis.planner import Question, needed, told
+from evaweb.statistics import score_courses
+from evaweb.statistics.base import StatisticsError
+from evaweb.statistics.boundaries import MOST
+from evaweb.statistics.courses import Course, course
+from evaweb.statistics.designs import ANYTIME, RULES
+from evaweb.statistics.score_courses import Scores, score_course, score_pairs_needed
+
+log = logging.getLogger(__name__)
+_STEPS = 12  # points of a curve
+_LEAST = 40  # trials of each to which a curve goes at least
+_GIVEN_UP_S = 10.0  # after it was last asked for
+_KEPT = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A design of so many pairs, at each comparison's share of alpha, and the rates that are assumed.
+
+    `question` has rates, wanted power and times; its weaker rate is that of the control. `alone`: the plan has one
+    comparison. With `scores` these are compared, and the rates are their means.
+    """
+
+    rule: str
+    pairs: int
+    alpha: float
+    margin: float | None
+    looks: tuple[int, ...]
+    question: Question
+    alone: bool
+    scores: Scores | None = None
+
+    @property
+    def rules(self) -> tuple[str, ...]:
+        """The designs that may be chosen for this question, the chosen one first."""
+        if self.scores is not None:
+            return (self.rule, *(rule for rule in score_courses.RULES if rule != self.rule))
+        others = (rule for rule in RULES if rule != self.rule and (self.margin is None or rule != ANYTIME))
+        return (self.rule, *others)
+
+    @property
+    def numbers(self) -> list[int]:
+        """Trials of each at which curves are computed, the planned number among them."""
+        end = min(MOST, max(_LEAST, round(1.6 * self.pairs)))
+        found = {max(2, round(end * step / _STEPS)) for step in range(1, _STEPS + 1)}
+        return sorted(found | ({self.pairs} if 2 <= self.pairs <= MOST else set()))
+
+    def at(self, rule: str, pairs: int) -> Course:
+        """Course of a design of so many pairs, its looks at the same shares of the trials."""
+        if self.scores is not None:
+            return score_course(rule, pairs, self.scores, self.alpha)
+        looks = self.looks if rule == self.rule else ()
+        scaled = tuple(sorted({max(1, round(look * pairs / self.pairs)) for look in looks}))
+        new, control = self.question.better, self.question.rate
+        return course(rule, pairs, new, control, self.alpha, self.margin, scaled)
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What is computed so far: courses by design in ascending numbers, and what each design needs."""
+
+    curves: dict[str, tuple[Course, ...]] = field(default_factory=dict)
+    needs: dict[str, dict[str, Any]] = field(default_factory=dict)
+    done: int = 0
+    of: int = 1
+    fault: str = ""
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing more comes."""
+        return bool(self.fault) or self.done == self.of
+
+    def planned(self, asked: Asked) -> dict[str, Course]:
+        """The courses at the planned number of trials, by design."""
+        found = ((rule, one) for rule, curve in self.curves.items() for one in curve)
+        return {rule: one for rule, one in found if one.pairs == asked.pairs}
+
+
+_Step = Callable[[Figures], Figures]
+
+
+def _steps(asked: Asked) -> Iterator[_Step]:
+    """In the order in which they are shown: the chosen design, the planned number of all, what is needed, the rest."""
+    planned = [asked.pairs] if asked.pairs in asked.numbers else []
+    yield from (_point(asked, asked.rule, number) for number in [*planned, *asked.numbers])
+    others = asked.rules[1:]
+    yield from (_point(asked, rule, number) for rule in others for number in planned)
+    if asked.margin is None:
+        yield from (_need(asked, rule) for rule in asked.rules)
+    yield from (_point(asked, rule, number) for rule in others for number in asked.numbers)
+
+
+def _point(asked: Asked, rule: str, number: int) -> _Step:
+    def step(so_far: Figures) -> Figures:
+        found = {one.pairs: one for one in so_far.curves.get(rule, ())} | {number: asked.at(rule, number)}
+        curve = tuple(found[pairs] for pairs in sorted(found))
+        return replace(so_far, curves={**so_far.curves, rule: curve})
+
+    return step
+
+
+def _need(asked: Asked, rule: str) -> _Step:
+    def step(so_far: Figures) -> Figures:
+        question = asked.question
+        if asked.scores is None:
+            row = needed(question, rule, asked.alpha, alone=asked.alone)
+        else:
+            found = score_pairs_needed(rule, asked.scores, question.power, asked.alpha)
+            row = told(question, rule, found, alone=asked.alone)
+        return replace(so_far, needs={**so_far.needs, rule: row})
+
+    return step
+
+
+class _Desk:
+    """Work that is asked for; the newest of each person is done, and what they asked for before is given up."""
+
+    def __init__(self) -> None:
+        self._changed = Condition()
+        self._found: OrderedDict[Asked, Figures] = OrderedDict()
+        self._newest: dict[Hashable, tuple[Asked, float]] = {}
+        self._under_way: set[Asked] = set()
+        self._thread = ThreadPoolExecutor(1, "power")
+
+    def ask(self, person: Hashable, asked: Asked, patience_s: float) -> Figures:
+        """What there is after `patience_s` at most, or as soon as all of it is there."""
+        with self._changed:
+            self._newest[person] = (asked, time.monotonic())
+            if asked not in self._found:
+                self._found[asked] = Figures()
+            self._found.move_to_end(asked)
+            if asked not in self._under_way and not self._found[asked].whole:
+                self._under_way.add(asked)
+                self._thread.submit(self._compute, asked)
+            self._changed.wait_for(lambda: self._found[asked].whole, patience_s)
+            while len(self._found) > _KEPT:
+                self._found.popitem(last=False)
+            return self._found.get(asked, Figures())
+
+    def _wanted(self, asked: Asked) -> bool:
+        since = time.monotonic() - _GIVEN_UP_S
+        self._newest = {who: row for who, row in self._newest.items() if row[1] > since}
+        return any(newest == asked for newest, _ in self._newest.values())
+
+    def _compute(self, asked: Asked) -> None:
+        steps = list(_steps(asked))
+        for number, step in enumerate(steps, start=1):
+            with self._changed:
+                so_far = self._found.get(asked)
+                if so_far is None or not self._wanted(asked):
+                    self._under_way.discard(asked)
+                    return
+            if number <= so_far.done:  # known from before it was given up
+                continue
+            try:
+                found = replace(step(so_far), done=number, of=len(steps))
+            except StatisticsError as error:
+                found = replace(so_far, fault=str(error))
+            except Exception:
+                log.exception("power of %s", asked)
+                found = replace(so_far, fault="it could not be computed: the log of the web says why")
+            with self._changed:
+                self._found[asked] = found
+                self._changed.notify_all()
+                if found.whole:
+                    self._under_way.discard(asked)
+            if found.fault:
+                return
+
+
+_desk = _Desk()
+
+
+def figures(person: Hashable, asked: Asked, patience_s: float = 0.5) -> Figures:
+    """What there is so far of this design's power; it goes on being computed as long as the person asks."""
+    return _desk.ask(person, asked, patience_s)

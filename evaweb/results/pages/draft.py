@@ -1,0 +1,320 @@
+"""Contents of the page of a draft: its steps, what is missing at each, the schedule's shape, and its power."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+from django.contrib.auth.models import User
+
+from evaweb.blinding import Sight
+from evaweb.plans.design import planned
+from evaweb.plans.draft_checks import Remark, covered, problems, thoughts
+from evaweb.plans.drafting import HIDDEN, Values
+from evaweb.plans.models import Allocation, Comparing, Plan, PrimaryOutcome, Reference, StoppingRule
+from evaweb.plans.schedule import IMBALANCE, Condition, schedule
+from evaweb.plans.seeded_draws import KEY_BYTES
+from evaweb.results.analysis.planner import Question
+from evaweb.results.analysis.power import Asked, Figures
+from evaweb.results.presentation.drawings import courses
+from evaweb.results.templatetags.results_tags import design_words
+from evaweb.roles import Role
+from evaweb.stations.models import Station
+from evaweb.statistics.designs import RULES
+from evaweb.statistics.score_courses import LARGEST, Scores
+from evaweb.trials.models import Position, Scene
+from evaweb.trials.selectors import checkpoint_list
+
+STEPS = {
+    "question": "Question",
+    "arms": "Arms",
+    "conditions": "Conditions",
+    "design": "Design",
+    "schedule": "Schedule",
+    "checks": "Checks",
+    "freeze": "Freeze",
+}
+_BLOCKS = 6  # of a schedule that are shown
+_EXAMPLE = bytes(KEY_BYTES)  # draws the same example each time; the freeze draws a key of its own
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step of the page; `done` where nothing of it is missing, else `words` say what is, and `blocks` whether a
+    freeze is refused for it.
+    """
+
+    name: str
+    title: str
+    done: bool
+    words: str
+    blocks: bool
+
+    @property
+    def tone(self) -> str:
+        """The colour of its state, by the name the style sheets have for it."""
+        return "warn" if self.blocks else "ok" if self.done else "neutral"
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How large a plan is: positions, checkpoints, trials of each at all positions, trials together."""
+
+    positions: int
+    checkpoints: int
+    each: int
+    total: int
+
+    @classmethod
+    def of(cls, plan: Plan) -> Size:
+        """Of a draft."""
+        positions, checkpoints = plan.positions.count(), plan.checkpoints.count()
+        each = positions * plan.repetitions
+        return cls(positions, checkpoints, each, each * checkpoints)
+
+
+def state_page(
+    plan: Plan, sight: Sight, *, faults: Mapping[str, str], agreed: bool, cycle_s: float
+) -> dict[str, Any]:
+    """What of the page follows from the draft: steps, schedule, checks, and whether it can be frozen.
+
+    `faults` of what was typed and is not saved; `agreed`: the person has before them what is saved; `cycle_s`: the time
+    that a trial is assumed to take [s].
+    """
+    said = covered(plan, sight)
+    inway = [Remark(row.step, said(row.text)) for row in problems(plan)]
+    considered = [Remark(row.step, said(row.text)) for row in thoughts(plan)]
+    size = Size.of(plan)
+    return {
+        "plan": plan,
+        "steps": _steps(plan, inway, considered, faults, agreed),
+        "problems": inway,
+        "thoughts": considered,
+        "size": size,
+        "cycle_s": cycle_s,
+        "hours": size.total * cycle_s / 3600,
+        "preview": _preview(plan, size) if not inway else None,
+        "freezable": not inway and not faults and agreed,
+    }
+
+
+def _steps(
+    plan: Plan, inway: list[Remark], considered: list[Remark], faults: Mapping[str, str], agreed: bool
+) -> list[Step]:
+    missing = Counter(row.step for row in inway)
+    missing.update(_step_of(name) for name in faults)
+    first = {row.step: row.text for row in reversed(inway)}
+
+    def own(name: str) -> tuple[bool, str]:
+        if name == "question":
+            return bool(plan.question.strip()), "no question yet"
+        if name == "arms":
+            return bool(planned(plan)), "no comparison yet"
+        if name == "schedule":
+            return not inway, "not yet known"
+        if name == "checks":
+            n = len(inway)
+            words = f"{n} to fix" if n else f"{len(considered)} to consider"
+            return not inway and not considered, words
+        if name == "freeze":
+            return False, "ready to freeze" if not inway and not faults and agreed else "not yet"
+        return True, ""
+
+    rows = []
+    for name, title in STEPS.items():
+        done, words = own(name)
+        if missing[name]:
+            done, words = False, f"{missing[name]} to fix" if name not in first else _short(first[name])
+        blocks = bool(missing[name]) or (name in ("schedule", "checks") and bool(inway))
+        rows.append(Step(name, title, done, "" if done else words, blocks))
+    return rows
+
+
+_SHORT = {"has no position": "no position yet", "has no checkpoint": "no checkpoint yet"}
+
+
+def _short(text: str) -> str:
+    return next((words for part, words in _SHORT.items() if part in text), "to mend")
+
+
+_FIELDS = {
+    "question": ("title", "question", "owner", "kind", "margin", "outcome"),
+    "arms": ("checkpoints", "control", "challenger", "comparing"),
+    "conditions": ("positions", "stations"),
+}
+
+
+def _step_of(field: str) -> str:
+    return next((step for step, fields in _FIELDS.items() if field in fields), "design")
+
+
+def _preview(plan: Plan, size: Size) -> dict[str, Any]:
+    """The first blocks as they might come: which position comes when, and what runs in a block, the freeze draws."""
+    conditions = [
+        Condition(scene, number)
+        for scene, number in plan.positions.order_by("scene__name", "number").values_list(
+            "scene__title", "number"
+        )
+    ]
+    names = [
+        str(number) for number in range(size.checkpoints)
+    ]  # a block's shape is the same whatever they are
+    rounds = min(plan.repetitions, -(-_BLOCKS // len(conditions)))
+    units = schedule(
+        checkpoints=names, conditions=conditions, repetitions=rounds, key=_EXAMPLE, allocation=plan.allocation
+    )
+    blocks = [(number, list(block)) for number, block in groupby(units, key=lambda unit: unit.block)]
+    stations = plan.stations.count()
+    paired = plan.allocation == Allocation.PAIRED
+    return {
+        "blocks": [(number + 1, block[0].condition, len(block)) for number, block in blocks[:_BLOCKS]],
+        "count": size.each,
+        "paired": paired,
+        "ahead": IMBALANCE,
+        "per_position": plan.repetitions if paired else 2 * plan.repetitions,
+        "stations": stations,
+        "per_station": size.each // stations if stations else None,
+    }
+
+
+def choices_page(plan: Plan, sight: Sight, values: Values) -> dict[str, Any]:
+    """What can be chosen, and what of it is."""
+    chosen = set(values["checkpoints"])
+    offered = list(checkpoint_list(all_of_them=True, sight=sight))
+    positions = Position.objects.select_related("scene").order_by("scene__title", "number")
+    wanted = [row for row in positions if row.scene.active or row.pk in values["positions"]]
+    pictures = _pictures(wanted)
+    scenes = groupby(wanted, key=lambda row: row.scene)
+    stations = Station.objects.order_by("name")
+    return {
+        "values": values,
+        "checkpoints": [row for row in offered if row.active or row.pk in chosen],
+        "hidden": plan.checkpoints.filter(pk__in=sight.checkpoints).count(),
+        "hidden_word": HIDDEN,
+        "scenes": [(scene, [(row, pictures.get(row.pk, "")) for row in rows]) for scene, rows in scenes],
+        "stations": [row for row in stations if row.active or row.pk in values["stations"]],
+        "owners": User.objects.filter(is_active=True, groups__name__in=(Role.OPERATOR, Role.ADMIN))
+        .union(User.objects.filter(pk=plan.owner_id), User.objects.filter(is_superuser=True, is_active=True))
+        .order_by("username"),
+        "designs": [
+            (rule, design_words(rule), str(StoppingRule(rule).label).partition(": ")[2]) for rule in RULES
+        ],
+        "comparings": (
+            (Comparing.PAIR, "Two: one checkpoint with the control"),
+            (Comparing.CONTROL, "Each checkpoint with the control"),
+            (Comparing.ALL, "All checkpoints with each other"),
+        ),
+        "outcomes": PrimaryOutcome.choices,
+    }
+
+
+def told(name: str, value: Any, sight: Sight) -> str:
+    """A value of a draft in words."""
+    if value in (None, "", []):
+        return "nothing"
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) if name == "look_after" else f"{len(value)} chosen"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if name in ("control", "challenger"):
+        row = (
+            checkpoint_list(all_of_them=True, sight=sight).filter(pk=value).first()
+            if value != HIDDEN
+            else None
+        )
+        return row.name if row else "a hidden checkpoint"
+    if name == "owner":
+        return User.objects.get(pk=value).get_username()
+    return str(value)[:80]
+
+
+def _pictures(positions: Iterable[Position]) -> dict[int, str]:
+    """Of each position the newest reference picture of the first camera that has one."""
+    rows = Reference.objects.filter(position__in=list(positions)).order_by("camera", "-pk")
+    found: dict[int, str] = {}
+    for position, picture in rows.values_list("position", "picture"):
+        found.setdefault(position, picture)
+    return found
+
+
+def asked_of(plan: Plan, question: Question, spread: float) -> Asked | None:
+    """What is computed of a draft's power; None where it compares nothing, or no trial is planned.
+
+    `spread` is the standard deviation that is assumed of scores, where these are compared.
+    """
+    comparisons, size = len(planned(plan)), Size.of(plan)
+    if not comparisons or not size.each:
+        return None
+    looks = tuple(plan.look_after)
+    share = plan.alpha / comparisons
+    scores = None
+    if plan.outcome == PrimaryOutcome.SCORE:
+        scores = Scores(question.better, question.rate, spread, _points(plan))
+    return Asked(plan.stopping, size.each, share, plan.margin, looks, question, comparisons == 1, scores)
+
+
+def _points(plan: Plan) -> int:
+    """Of how many points a score is a share, at the scene of the draft that has fewest; 1: success or failure."""
+    scenes = Scene.objects.filter(positions__in=plan.positions.all()).distinct()
+    found = [sum(scene.milestones.values_list("points", flat=True)) or 1 for scene in scenes]
+    return min([LARGEST, *found])
+
+
+def question_for(plan: Plan, given: Question) -> Question:
+    """The planner's question with what the draft says itself."""
+    size, stations = Size.of(plan), max(1, plan.stations.count())
+    return Question(
+        given.rate,
+        given.better,
+        plan.alpha,
+        given.power,
+        given.cycle_s,
+        max(2, size.checkpoints),
+        plan.comparing,
+        stations,
+        given.hours,
+    )
+
+
+def power_page(plan: Plan, asked: Asked, found: Figures) -> dict[str, Any]:
+    """The figure and the table of designs, as far as they are computed."""
+    size, question = Size.of(plan), asked.question
+    at = found.planned(asked)
+    curves = [
+        (RULES.index(rule), design_words(rule), [(one.pairs, one.power) for one in found.curves[rule]])
+        for rule in RULES
+        if rule in found.curves and (len(found.curves[rule]) > 1 or rule in at)
+    ]
+    hours = question.cycle_s / 3600
+    return {
+        "asked": asked,
+        "found": found,
+        "percent": round(100 * found.done / found.of),
+        "figure": courses.power(curves, asked.pairs, question.power, asked.numbers[-1]),
+        "planned": at.get(asked.rule),
+        "most_hours": size.total * hours,
+        "mean_hours": at[asked.rule].mean * size.checkpoints * hours
+        if asked.rule in at and asked.alone
+        else None,
+        "table": [
+            {
+                "rule": rule,
+                "at": at.get(rule),
+                "need": need,
+                "repetitions": -(-need["pairs"] // size.positions) if need and need["pairs"] else None,
+            }
+            for rule in asked.rules
+            for need in (found.needs.get(rule),)
+        ],
+        "size": size,
+        "question": question,
+        "stations": question.stations,
+        "scores": asked.scores,
+        "narrowed": asked.scores is not None
+        and any(abs(one - asked.scores.spread) > 0.005 for one in asked.scores.spreads()),
+        "random": plan.allocation == Allocation.RANDOM,
+        "comparisons": len(planned(plan)),
+    }

@@ -1,0 +1,213 @@
+"""The page on which a plan is drafted, step by step, and frozen."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from django.http import HttpRequest, HttpResponse, QueryDict
+from django.shortcuts import redirect, render
+from django.urls import reverse
+from django.utils import timezone
+from django.views.decorators.http import require_GET, require_http_methods
+
+from evaweb.blinding import sight_for
+from evaweb.errors import EvaError
+from evaweb.plans.draft_form import read
+from evaweb.plans.drafting import Values, digest_of, values_of
+from evaweb.plans.models import Comparing, Plan, PlanState, PrimaryOutcome, StoppingRule
+from evaweb.plans.selectors import plan_get
+from evaweb.plans.services import plan_change, plan_draft, require_drafter, require_editor
+from evaweb.results.analysis.planner import Question, question_of
+from evaweb.results.analysis.power import figures
+from evaweb.results.pages import draft
+from evaweb.roles import Role, role_of
+from runtime.core import bounded_documents as bounded
+from runtime.core.sentences import Pattern, fixed
+
+_STOPPING_ALLOWED = Pattern(
+    "results.pages.views_draft.stopping_allowed",
+    "stopping = {stopping!r:.80}; allowed: {values}",
+)
+_ALLOWED_WHAT_PAGE_SHOWN_BY = fixed(
+    "results.pages.views_draft.allowed_what_page_shown_by",
+    "was: allowed is what the page was shown, by field",
+)
+
+_SPREAD = 0.35  # of scores, until somebody says another one: between points reached alone and all or none
+_LARGEST = 64 * 1024  # of what a page was shown
+_FAULTY = (  # fields whose faults the page has a place for
+    *(
+        "title",
+        "question",
+        "owner",
+        "margin",
+        "checkpoints",
+        "positions",
+        "repetitions",
+        "alpha",
+        "look_after",
+    ),
+    *("second_rater_share", "match_gate"),
+)
+_CARRIED = ("rate", "better", "power", "cycle_s")  # of the planner's question: assumptions, no part of a plan
+
+
+@require_http_methods(["GET", "HEAD", "POST"])
+def new(request: HttpRequest) -> HttpResponse:
+    """A title and a question, of which a draft is made; an address of the planner brings its numbers."""
+    user: Any = request.user
+    require_drafter(user)
+    given = request.POST if request.method == "POST" else request.GET
+    title, question, fault = given.get("title", ""), given.get("question", ""), None
+    numbers = {
+        name: given[name]
+        for name in (*_CARRIED, "alpha", "comparing", "stopping")
+        if given.get(name, "").strip()
+    }
+    try:
+        assumed = question_of(numbers)
+        design = _design(numbers, assumed)
+        if request.method == "POST":
+            made = plan_draft(user=user, title=title, question=question, **design)
+            query = "&".join(f"{name}={getattr(assumed, name):g}" for name in _CARRIED if name in numbers)
+            return redirect(_address(made) + (f"?{query}" if query else "") + "#arms")
+    except EvaError as error:
+        fault = error
+    context = {"title": title, "question": question, "numbers": numbers, "fault": fault, "here": "plans"}
+    return render(request, "results/draft/new.html", context, status=fault.status if fault else 200)
+
+
+def _design(numbers: dict[str, str], assumed: Question) -> dict[str, Any]:
+    """The fields of a plan that the planner's numbers say."""
+    found: dict[str, Any] = {"alpha": assumed.alpha} if "alpha" in numbers else {}
+    if "comparing" in numbers:
+        found["comparing"] = Comparing(assumed.comparing)
+    if "stopping" in numbers:
+        if numbers["stopping"] not in StoppingRule.values:
+            raise EvaError(
+                _STOPPING_ALLOWED(stopping=numbers["stopping"], values=", ".join(StoppingRule.values))
+            )
+        found["stopping"] = numbers["stopping"]
+    return found
+
+
+@require_http_methods(["GET", "HEAD", "POST"])
+def edit(request: HttpRequest, name: str, version: int) -> HttpResponse:
+    """All steps of a draft; what is posted is saved as far as it can be, and answered with what follows from it."""
+    plan = plan_get(name=name, version=version, user=request.user)
+    if request.method == "POST":
+        return _saved(request, plan)
+    if plan.state != PlanState.DRAFT:
+        return redirect("result-plan", name=plan.name, version=plan.version)
+    require_editor(plan, request.user)  # type: ignore[arg-type]
+    sight = sight_for(request)
+    values, assumed = values_of(plan, sight), _assumed(request.GET)
+    context = {
+        **draft.choices_page(plan, sight, values),
+        **draft.state_page(plan, sight, faults={}, agreed=True, cycle_s=assumed.cycle_s),
+        **_shown(values, values, {}),
+        "assumed": assumed,
+        "spread": _SPREAD,
+        "is_admin": role_of(request.user) is Role.ADMIN,
+        "here": "plans",
+    }
+    return render(request, "results/draft/page.html", context)
+
+
+def _saved(request: HttpRequest, plan: Plan) -> HttpResponse:
+    user: Any = request.user
+    sight = sight_for(request)
+    before = values_of(plan, sight)
+    wanted, faults = read(
+        request.POST,
+        hidden=sight.checkpoints,
+        unseen=plan.checkpoints.filter(pk__in=sight.checkpoints).count(),
+        owners=role_of(user) is Role.ADMIN and "owner" in request.POST,
+    )
+    was = _was(request)
+    keep = request.POST.get("keep", "").split()
+    changed = plan_change(user=user, plan=plan, was=was, wanted=wanted, keep=keep)
+    plan.refresh_from_db()
+    seen = {
+        name: changed.now[name] if wanted.get(name) == changed.now[name] else was.get(name) for name in before
+    }
+    others = [name for name, value in wanted.items() if name in before and value != changed.now[name]]
+    context = {
+        **draft.state_page(
+            plan, sight, faults=faults, agreed=not others, cycle_s=_assumed(request.POST).cycle_s
+        ),
+        **_shown(changed.now, seen, faults),
+        "others": [(name, draft.told(name, changed.now[name], sight)) for name in others],
+        "keep": " ".join(others),
+        "fault_rows": [
+            (name, faults.get(name, ""))
+            for name in _FAULTY
+            if name in before and (name in wanted or name in faults)
+        ],
+        "saved_at": timezone.localtime(),
+        "fragment": True,
+    }
+    answer = render(request, "results/draft/saved.html", context)
+    if changed.now != before:
+        answer.headers["HX-Trigger"] = "draft-saved"  # figures are computed anew
+    return answer
+
+
+def _was(request: HttpRequest) -> dict[str, Any]:
+    try:
+        found = bounded.from_json(request.POST.get("was", "{}"), "was", _LARGEST)
+    except bounded.Unreadable as error:
+        raise EvaError(str(error)) from None
+    if not isinstance(found, dict):
+        raise EvaError(_ALLOWED_WHAT_PAGE_SHOWN_BY)
+    return found
+
+
+def _shown(now: Values, seen: Values, faults: dict[str, str]) -> dict[str, Any]:
+    """What the next change is held against, and by which digest the draft is frozen."""
+    return {"was": json.dumps(seen), "seen": digest_of(now), "faults": faults}
+
+
+def _assumed(given: QueryDict) -> Question:
+    """The planner's question as far as it is given with a page; the usual one where that says what is not allowed."""
+    try:
+        return question_of({name: given.get(name, "") for name in _CARRIED}, alike=True)
+    except EvaError:
+        return Question()
+
+
+def _spread(given: QueryDict) -> float:
+    """The standard deviation that is assumed of a score; EvaError."""
+    text = given.get("spread", "").strip() or str(_SPREAD)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.01 <= value <= 0.5:
+        raise EvaError(f"spread = {text!r:.80}; allowed: 0.01 to 0.5")
+    return value
+
+
+@require_GET
+def power(request: HttpRequest, name: str, version: int) -> HttpResponse:
+    """The power of the draft as it is saved, at the rates of the address, as far as it is computed."""
+    plan = plan_get(name=name, version=version, user=request.user)
+    if plan.state != PlanState.DRAFT:  # frozen while its page was still asking: it asks no more
+        return HttpResponse(status=204)
+    require_editor(plan, request.user)  # type: ignore[arg-type]
+    context: dict[str, Any] = {"plan": plan, "size": draft.Size.of(plan)}
+    try:
+        given = question_of(request.GET, alike=plan.margin is not None)
+        spread = _spread(request.GET) if plan.outcome == PrimaryOutcome.SCORE else _SPREAD
+        asked = draft.asked_of(plan, draft.question_for(plan, given), spread)
+        if asked is not None:
+            context |= draft.power_page(plan, asked, figures(request.user.pk, asked))
+    except EvaError as error:
+        context["fault"] = error
+    return render(request, "results/draft/power.html", context)
+
+
+def _address(plan: Plan) -> str:
+    return reverse("result-draft", args=[plan.name, plan.version])

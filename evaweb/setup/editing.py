@@ -1,0 +1,154 @@
+"""What the scene editor is given: the scene in plain values, its bench, and how the operator will see it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+from django.http import HttpRequest
+from django.template.loader import render_to_string
+from django.urls import reverse
+
+from evaweb.plans.bench_checks import cameras_of
+from evaweb.plans.models import Reference
+from evaweb.stations.models import Station
+from evaweb.stations.selectors import station_list
+from evaweb.stations.surroundings import AREA, BENCH
+from evaweb.trials.failures import offered
+from evaweb.trials.models import Milestone, Position, Scene
+from evaweb.trials.scene_reading import (
+    MilestoneTable,
+    PositionTable,
+    SceneTable,
+    kept_positions,
+    running_plans,
+    scene_table,
+    seen_of,
+)
+from evaweb.trials.scene_writing import APART_M, table_of
+
+# Sizes of the simulated bench [m], where its arms stand and how far they reach; a test compares.
+SIZES = {
+    "area": list(AREA),
+    "apart": APART_M,
+    "sides": [[-0.25, 0.0], [0.25, 0.0]],
+    "reach": 0.42,
+    "block": BENCH["block_edge"],
+    "plate": BENCH["plate_radius"],
+    "first": {"block": [-0.12, 0.28, 0], "plate": [0.1, 0.32]},
+}
+
+# Corners of the area in pictures of 4:3 of the simulated bench's camera from above, as shares of width and height: left
+# and right near, right and left far. A test compares.
+OVERHEAD = [[0.2454, 0.6381], [0.7546, 0.6381], [0.7616, 0.2951], [0.2384, 0.2951]]
+
+
+def shown(scene: Scene) -> dict[str, Any]:
+    """What drawings of its positions are made of; one in words alone has a reference picture, if there is one."""
+    pictures = _references(scene)
+    positions = [
+        {
+            "number": row.number,
+            "label": row.label,
+            "bench": row.bench,
+            "picture": next((one["picture"] for one in pictures.get(row.pk, ())), ""),
+        }
+        for row in scene.positions.all()
+    ]
+    return {"title": scene.title, "bench": SIZES, "positions": positions}
+
+
+def state_of(scene: Scene) -> dict[str, Any]:
+    """The scene as it is saved, and which of its positions stay as they are, by id, and why."""
+    return {"scene": scene_table(scene), "seen": seen_of(scene), "kept": kept_positions(scene)}
+
+
+def existing(scene: Scene) -> dict[str, Any]:
+    """Context of the editor of a scene that there is."""
+    state = {**state_of(scene), "references": _references(scene), **_around()}
+    return {
+        "scene": scene,
+        "state": state,
+        "trials": scene.trials.count(),
+        "plans": running_plans(scene),
+    }
+
+
+def new(source: Scene | None) -> dict[str, Any]:
+    """Context of the editor of a scene that is not there yet, a copy of `source` where there is one."""
+    table = scene_table(source) if source else SceneTable().model_dump()
+    table["name"] = ""
+    table["title"] = f"{source.title} (copy)" if source else ""
+    for row in (*table["positions"], *table["milestones"]):
+        row["id"] = None
+    if source is None:
+        laid = SIZES["first"] if station_list().filter(simulated=True).exists() else None
+        table["positions"] = [PositionTable(number=1, bench=laid).model_dump()]
+    state = {"scene": table, "seen": "", "kept": {}, "references": {}, **_around()}
+    return {"scene": None, "source": source, "state": state, "trials": 0, "plans": []}
+
+
+def _around() -> dict[str, Any]:
+    stations = [
+        {"name": row.name, "title": str(row), "cameras": cameras_of(row), "corners": _corners(row)}
+        for row in station_list()
+    ]
+    addresses = {
+        "preview": reverse("setup-preview"),
+        "live": reverse("setup-live", args=["STATION", "CAMERA"]),
+    }
+    return {"bench": SIZES, "stations": stations, "addresses": addresses}
+
+
+def _corners(station: Station) -> dict[str, Any]:
+    """Of each camera that is known to look from above."""
+    above = [camera for camera in cameras_of(station) if station.simulated and "wrist" not in camera]
+    return dict.fromkeys(above, OVERHEAD)
+
+
+def _references(scene: Scene) -> dict[int, list[dict[str, str]]]:
+    """Of each position, by id, the newest picture of each camera of each station."""
+    newest = {
+        (row.position_id, row.station.name, row.camera): row
+        for row in Reference.objects.filter(position__scene=scene).select_related("station").order_by("pk")
+    }
+    found: dict[int, list[dict[str, str]]] = defaultdict(list)
+    for (position, station, camera), row in sorted(newest.items()):
+        picture, page = reverse("picture", args=[row.picture]), reverse("reference", args=[row.pk])
+        found[position].append({"station": station, "camera": camera, "picture": picture, "page": page})
+    return dict(found)
+
+
+# --- the operator's view -------------------------------------------------------------------------------------
+
+
+def operators_view(request: HttpRequest, given: Any, position: Any) -> str:
+    """The cards of set-up and score, of the position in that place, by the Eval page's own templates."""
+    wanted = table_of(given)
+    scene = Scene(**wanted.model_dump(exclude={"positions", "milestones"}))
+    milestones = [
+        Milestone(pk=place, order=place, **_fields(row))
+        for place, row in enumerate(wanted.milestones, start=1)
+    ]
+    rows = [Position(scene=scene, **_fields(row)) for row in wanted.positions]
+    chosen = rows[position] if isinstance(position, int) and 0 <= position < len(rows) else Position()
+    trial = {"scene": scene, "position": chosen, "pk": 0}
+    panel = {
+        "milestones": milestones,
+        "implied": any(row.required for row in milestones),
+        "failures": offered(),
+        "layout": scene.layout,
+        "hidden": True,
+    }
+    common = {"panel": panel, "station": {"simulated": False}}
+    parts = (("setup", "prepared"), ("score", "ended"))
+    return "".join(
+        render_to_string(
+            f"console/step_{step}.html", {**common, "trial": {**trial, "status": status}}, request
+        )
+        for step, status in parts
+    )
+
+
+def _fields(row: PositionTable | MilestoneTable) -> dict[str, Any]:
+    return row.model_dump(exclude={"id"})

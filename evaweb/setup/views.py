@@ -1,0 +1,137 @@
+"""The pages on which a lab is set up by sight: the hub, scenes, and the editor of one scene."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from django.http import Http404, HttpRequest, HttpResponse, JsonResponse
+from django.shortcuts import redirect, render
+from django.urls import reverse
+from django.views.decorators.http import require_GET, require_http_methods, require_POST
+
+from evaweb.blinding import sight_for
+from evaweb.errors import EvaError, NotFound
+from evaweb.plans import pictures
+from evaweb.roles import Role, require, role_of
+from evaweb.setup import editing, selectors
+from evaweb.stations.selectors import station_get
+from evaweb.trials.scene_writing import ChangedMeanwhile, SceneRefused, scene_write
+from evaweb.trials.selectors import scene_get
+from runtime.core import bounded_documents as bounded
+from runtime.core.sentences import Pattern
+
+_SENT_ALLOWED_APPLICATION_JSON = Pattern(
+    "setup.views.sent_allowed_application_json",
+    "{content_type!r:.60} was sent; allowed: application/json",
+)
+_SENT_ALLOWED_TABLE_WITH_SCENE = Pattern(
+    "setup.views.sent_allowed_table_with_scene",
+    "{given!r:.60} was sent; allowed: a table with the scene",
+)
+
+LONGEST_SCENE = 512 * 1024  # characters
+_PATIENCE_S = 1.5  # for a picture of a camera
+
+
+@require_GET
+def hub(request: HttpRequest) -> HttpResponse:
+    """What is there, and what is missing next."""
+    require(request.user, Role.OPERATOR)
+    cards = selectors.cards(user=request.user, sight=sight_for(request))
+    return render(request, "setup/hub.html", {"cards": cards, "may_write": _may_write(request)})
+
+
+@require_GET
+def scenes(request: HttpRequest) -> HttpResponse:
+    """All scenes with their positions."""
+    rows = [(scene, editing.shown(scene)) for scene in selectors.scene_rows()]
+    return render(request, "setup/scenes.html", {"rows": rows, "may_write": _may_write(request)})
+
+
+@require_http_methods(["GET", "POST"])
+def new_scene(request: HttpRequest) -> HttpResponse:
+    """The editor with a scene that is not there yet, or with a copy of the one that ?from= names."""
+    require(request.user, Role.ADMIN)
+    if request.method == "POST":
+        return _written(request, None)
+    source = request.GET.get("from", "")
+    return _editor(request, editing.new(scene_get(name=source) if source else None))
+
+
+@require_http_methods(["GET", "POST"])
+def scene(request: HttpRequest, name: str) -> HttpResponse:
+    """The editor of a scene; everybody may read it there."""
+    if request.method == "POST":
+        return _written(request, name)
+    found = _scene(name)
+    if found.name != name:  # asked for by its id: its page saves under its name
+        return redirect("setup-scene", name=found.name)
+    return _editor(request, editing.existing(found))
+
+
+@require_GET
+def sheet(request: HttpRequest, name: str) -> HttpResponse:
+    """Its positions on paper, in true millimetres."""
+    found = _scene(name)
+    return render(request, "setup/sheet.html", {"scene": found, "drawn": editing.shown(found)})
+
+
+@require_POST
+def preview(request: HttpRequest) -> JsonResponse:
+    """The cards of set-up and score as the operator of a scene will see them that need not be saved."""
+    given = _posted(request)
+    return JsonResponse({"html": editing.operators_view(request, given.get("scene"), given.get("position"))})
+
+
+@require_GET
+def live(request: HttpRequest, name: str, camera: str) -> HttpResponse:
+    """What a camera of a station shows now."""
+    found = pictures.now(station_get(name=name), [camera], _PATIENCE_S)
+    return HttpResponse(found[camera], content_type="image/jpeg")
+
+
+def _scene(name: str) -> Any:
+    try:
+        return scene_get(name=name)
+    except NotFound as error:
+        raise Http404(str(error)) from None
+
+
+def _may_write(request: HttpRequest) -> bool:
+    return role_of(request.user) is Role.ADMIN
+
+
+def _editor(request: HttpRequest, context: dict[str, Any]) -> HttpResponse:
+    return render(request, "setup/scene.html", {**context, "may_write": _may_write(request)})
+
+
+def _posted(request: HttpRequest) -> dict[str, Any]:
+    if request.content_type != "application/json":
+        raise EvaError(_SENT_ALLOWED_APPLICATION_JSON(content_type=request.content_type))
+    try:
+        given = bounded.from_json(request.body, "the scene", LONGEST_SCENE)
+    except bounded.Unreadable as error:
+        raise EvaError(str(error)) from None
+    if not isinstance(given, dict):
+        raise EvaError(_SENT_ALLOWED_TABLE_WITH_SCENE(given=given))
+    return given
+
+
+def _written(request: HttpRequest, name: str | None) -> JsonResponse:
+    """Where it stands now and what has to be said of it; else each place that is wrong."""
+    given = _posted(request)
+    wanted = given.get("scene")
+    try:
+        found, remarks = scene_write(
+            user=request.user,  # type: ignore[arg-type]
+            name=name,
+            given=wanted if isinstance(wanted, dict) else {},
+            seen=str(given.get("seen", "")),
+        )
+    except SceneRefused as refused:
+        faults = [{"place": fault.place, "text": fault.text} for fault in refused.faults]
+        return JsonResponse({"error": str(refused), "faults": faults}, status=refused.status)
+    except ChangedMeanwhile as changed:
+        return JsonResponse({"error": str(changed), "seen": changed.seen}, status=changed.status)
+    address = reverse("setup-scene", args=[found.name])
+    return JsonResponse({"address": address, "remarks": remarks, **editing.state_of(found)})

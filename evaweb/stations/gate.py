@@ -1,0 +1,171 @@
+"""The process to which stations on other computers connect: who may is the database's to say."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import MappingProxyType
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from django.conf import settings
+from django.db import Error, close_old_connections
+
+from evaweb.errors import EvaError
+from evaweb.stations.enrolment import key_enrol, keys_allowed
+from runtime.core import file_limits, logs
+from runtime.ipc.bus import TransportError
+from runtime.link import key_files
+from runtime.link.admission import Allowed, AllowList
+from runtime.link.gate import Gate
+from runtime.link.incoming import Incoming, Owner
+from runtime.link.key_files import ConfigurationError
+from runtime.link.wire import Enrolled
+from runtime.recording.files import write_whole
+
+log = logging.getLogger(__name__)
+_LOOK_S = 0.5
+_TURN_S = 0.001  # of the interpreter: a stop waits for no more of what other threads do
+
+
+class GateError(EvaError):
+    """The gate cannot start or go on; the message says why."""
+
+
+class Keys:
+    """Who may connect, asked of the database twice a second; what it last said counts as long as it says nothing.
+
+    It is kept in a file too: stations that are linked can be stopped though the gate is started while the database is
+    away.
+    """
+
+    def __init__(self, data: Path) -> None:
+        self._path = key_files.folder(data) / "allowed.json"
+        self._failing = False
+        self.list = AllowList(self._kept())
+        self.look()
+
+    def look(self) -> None:
+        """Ask once; from any thread."""
+        try:
+            found = keys_allowed()
+            self._failing = False
+        except Error as error:
+            if not self._failing:
+                log.warning("who may connect is as it was, the database does not say: %s", error)
+            self._failing = True
+            return
+        finally:
+            close_old_connections()
+        if found != self.list.now:
+            self.list.now = found
+            self._keep(found)
+
+    def follow(self, ended: threading.Event) -> None:
+        """Ask until it has ended."""
+        while not ended.wait(_LOOK_S):
+            try:
+                self.look()
+            except (
+                Exception
+            ):  # else a key that is withdrawn would be let in for as long as this process lives
+                log.exception("who may connect is as it was")
+
+    def _keep(self, found: Allowed) -> None:
+        content = {key: sorted(names) for key, names in found.stations.items()}
+        try:
+            write_whole(self._path, json.dumps(content).encode())
+        except OSError as error:
+            log.error("who may connect is not kept in %s: %s", self._path, error)
+
+    def _kept(self) -> Allowed:
+        with suppress(OSError, ValueError, AttributeError, TypeError):
+            found = json.loads(self._path.read_text("utf-8"))
+            return Allowed(MappingProxyType({key: frozenset(names) for key, names in found.items()}))
+        return Allowed()
+
+
+def serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
+    """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; prints where as JSON. GateError.
+
+    `owner` says whose an episode is that a station offers.
+    """
+    try:
+        with _only_one(key_files.folder(settings.DATA_DIR) / "gate.lock"):
+            _serve(where, lifeline, owner)
+    except (TransportError, ConfigurationError) as fault:
+        raise GateError(str(fault)) from None
+
+
+@contextmanager
+def _only_one(path: Path) -> Iterator[None]:
+    """Hold the lab's folders of stations elsewhere: two gates would both take in what these send."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with path.open("a+", encoding="utf-8") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.seek(0)
+            raise GateError(
+                f"a gate of {settings.DATA_DIR} is already running (process {lock.read().strip() or '?'}): end it first"
+            ) from None
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        yield
+
+
+def _serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
+    logs.start("gate")
+    file_limits.allow_all()
+    sys.setswitchinterval(_TURN_S)
+    data = settings.DATA_DIR
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, frame: ended.set())
+    keys = Keys(data)
+    tokens = key_files.tokens_key(data)
+    incoming = Incoming(data, owner, settings.EVA_RESERVE_BYTES)
+    enrol = _enroller(keys, tokens)
+    gate = Gate(data, key_files.lab_key(data), tokens, keys.list, enrol, where, incoming=incoming)
+    threading.Thread(target=keys.follow, args=(ended,), name="keys", daemon=True).start()
+    if lifeline:
+        threading.Thread(target=_watch, args=(ended,), name="lifeline", daemon=True).start()
+    url = f"tcp://{where[0]}:{gate.port}"
+    print(json.dumps({"url": url, "port": gate.port, "second_port": gate.second_port}), flush=True)
+    try:
+        while not ended.is_set():
+            gate.turn()
+    finally:
+        gate.close()
+
+
+def _enroller(keys: Keys, tokens: bytes) -> Callable[[str, str, str], Enrolled | str]:
+    public = Ed25519PrivateKey.from_private_bytes(tokens).public_key().public_bytes_raw()
+
+    def enrol(digest: str, key: str, computer: str) -> Enrolled | str:
+        try:
+            station = key_enrol(digest=digest, key=key, computer=computer)
+        except EvaError as fault:
+            return str(fault)
+        finally:
+            close_old_connections()
+        keys.look()  # before the computer connects as what it is now
+        return Enrolled(station.name, socket.gethostname(), public, 0)
+
+    return enrol
+
+
+def _watch(ended: threading.Event) -> None:
+    """The process that started us holds the other end of our standard input."""
+    while os.read(0, 4096):
+        pass
+    ended.set()

@@ -1,0 +1,61 @@
+"""The part of a failed trial's recording that shows what went wrong: when it begins and ends, and what was missed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from urllib.parse import urlencode
+
+from django.urls import reverse
+
+from evaweb.trials.models import Trial
+
+BEFORE_S = 1.0  # shown of what still went well
+LASTS_S = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """From `begin` to `end` [s of the recording] of the first camera; `missed` is the first milestone not reached.
+
+    `after` is the last one reached before it of which the time is known; "": the recording's end is shown.
+    """
+
+    video: str
+    share: str
+    begin: float
+    end: float
+    missed: str
+    after: str
+
+    @property
+    def words(self) -> str:
+        """Which part it is."""
+        return f"after “{self.after}”" if self.after else f"the last {self.end - self.begin:.0f} s"
+
+
+def clip_of(trial: Trial) -> Clip | None:
+    """The clip of a scored trial; None where it has no recording with pictures.
+
+    A milestone that was missed has no time: the clip begins just before the last one in front of it was reached.
+    """
+    episode = trial.episode
+    if episode is None or trial.verdict is None or not (episode.cameras and episode.frames and episode.fps):
+        return None
+    whole, missed, after, begin = episode.frames / episode.fps, "", "", None
+    for row in trial.verdict.outcomes.all():
+        if not row.reached:
+            missed = row.text
+            break
+        if row.at_s is not None and row.at_s < whole:
+            after, begin = row.text, max(0.0, row.at_s - BEFORE_S)
+    begin = max(0.0, whole - LASTS_S) if begin is None else begin
+    end = min(whole, begin + LASTS_S)
+    query = urlencode({"t": f"{begin:.2f}", "from": f"{begin:.2f}", "to": f"{end:.2f}", "loop": 1})
+    return Clip(
+        video=reverse("episode-video", args=[episode.uuid, episode.cameras[0]]),
+        share=f"{reverse('result-trial', args=[trial.pk])}?{query}",
+        begin=round(begin, 2),
+        end=round(end, 2),
+        missed=missed,
+        after=after,
+    )

@@ -1,0 +1,103 @@
+"""Corrections of one thing that a score says, which leave all else as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from uuid import UUID
+
+from django.contrib.auth.models import User
+from django.db import transaction
+
+from evaweb.errors import Conflict
+from evaweb.journal import text
+from evaweb.roles import Role, require
+from evaweb.stations.commands import identity_of
+from evaweb.trials import failures
+from evaweb.trials.failure_words import NOT_SAID, why_words
+from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
+from evaweb.trials.services import checked, counts_now, locked, require_scorable
+from evaweb.trials.verdicts import LONGEST_NOTE
+from runtime.core.sentences import Pattern
+
+_TRIAL_ONLY_SCORE_COUNTS_HAS = Pattern(
+    "trials.corrections.trial_only_score_counts_has",
+    "trial {trial} is {status}: only a score that counts has a failure",
+)
+_TRIAL_SCORED_ANEW_BY_MEANWHILE = Pattern(
+    "trials.corrections.trial_scored_anew_by_meanwhile",
+    "trial {trial} was scored anew by {user} meanwhile ({why}): look at it again",
+)
+
+
+def trial_failure(
+    *,
+    user: User,
+    trial: Trial,
+    failure: str | None = None,
+    failure_phase: str | None = None,
+    score: UUID | str | None = None,
+    reason: str = "",
+) -> Score:
+    """Correct why a trial failed, and nothing else of its score: None leaves that level as it is.
+
+    Success, points and milestones are copied from the score that stood, not judged by the scene as it is now.
+
+    `score` is the one that the user saw: Conflict where another counts by now. Without a `reason` it says what was
+    changed into what. The same again adds nothing.
+    """
+    require(user, Role.OPERATOR)
+    with transaction.atomic():
+        held = locked(trial)
+        seen = held.verdict
+        if seen is None or held.status != TrialStatus.SCORED:
+            raise Conflict(_TRIAL_ONLY_SCORE_COUNTS_HAS(trial=held.pk, status=held.get_status_display()))
+        given = {"failure": failure, "failure_phase": failure_phase}
+        words = {
+            field: seen_words if (new := given[field]) is None else new.strip()
+            for field, seen_words in failures.said_of(seen).items()
+        }
+        if words == failures.said_of(seen):
+            return seen
+        if score is not None and identity_of(score) != seen.uuid:
+            raise Conflict(
+                _TRIAL_SCORED_ANEW_BY_MEANWHILE(
+                    trial=held.pk, user=seen.rater.get_username(), why=seen.why or "failure not said"
+                )
+            )
+        after = why_words(words["failure_phase"], words["failure"])
+        why = reason or f"failure was {seen.why or NOT_SAID}, now {after or NOT_SAID}"
+        found = _reworded(user, held, seen, failures.stripped(**words), text("reason", why, LONGEST_NOTE))
+    trial.refresh_from_db()
+    return found
+
+
+def _reworded(user: User, held: Trial, seen: Score, words: Mapping[str, str], reason: str) -> Score:
+    """Another score like the one `seen`, but for its failure, whatever became of the scene's milestones since."""
+    for what in ("scored", "reworded"):
+        checked(what, held, user)
+    require_scorable(held, reason)
+    failures.check_failure(held.scene, words, success=seen.success, said=failures.said_of(seen))
+    found = Score(
+        trial=held,
+        rater=user,
+        success=seen.success,
+        score=seen.score,
+        note=seen.note,
+        reason=reason,
+        **words,
+    )
+    outcomes = [
+        MilestoneOutcome(
+            score=found,
+            milestone_id=row.milestone_id,
+            order=row.order,
+            text=row.text,
+            points=row.points,
+            required=row.required,
+            reached=row.reached,
+            at_s=row.at_s,
+        )
+        for row in seen.outcomes.all()
+    ]
+    counts_now(held, found, outcomes, user)
+    return found

@@ -1,0 +1,96 @@
+"""The failure gallery: clips of what went wrong, side by side, and their table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from django.core.paginator import Paginator
+from django.http import HttpRequest, HttpResponse, StreamingHttpResponse
+from django.shortcuts import render
+from django.urls import reverse
+from django.views.decorators.http import require_GET
+
+from evaweb.blinding import sight_for
+from evaweb.downloads import CSV, download
+from evaweb.episodes.selectors import stage_of
+from evaweb.errors import EvaError
+from evaweb.roles import Role, role_of
+from evaweb.tabular_export import csv_lines
+from evaweb.trials import clip_export, failures, gallery
+from evaweb.trials.clips import clip_of
+from evaweb.trials.gallery import FailureFilters
+from evaweb.trials.selectors import TrialFilters, checkpoint_list, evaluation_list, scene_list
+
+PER_PAGE = 24
+_TRIALS = ("evaluation", "checkpoint", "scene", "station", "since")
+
+
+@require_GET
+def failure_gallery(request: HttpRequest) -> HttpResponse:
+    """Failed trials as clips, group by group; the filters are in the address."""
+    seen, filters, fault = sight_for(request), _filters(request.GET), None
+    try:
+        groups = gallery.failure_groups(filters, seen)
+    except EvaError as problem:
+        fault, filters = problem, FailureFilters()
+        groups = gallery.failure_groups(filters, seen)
+    paginator = Paginator(gallery.failed_list(filters, seen).values_list("pk", flat=True), PER_PAGE)
+    paginator.count = sum(group.count for group in groups)  # type: ignore[misc]  # no second pass over all trials
+    page = paginator.get_page(request.GET.get("page"))
+    counts = {group.name: group.count for group in groups}
+    context = {
+        "page": page,
+        "clips": [
+            {
+                "trial": trial,
+                "group": (name := gallery.shown_group(trial, filters)),
+                "count": counts.get(name, 0),
+                "checkpoint": seen.label(trial),
+                "clip": (clip := clip_of(trial)),
+                "address": clip.share if clip else reverse("result-trial", args=[trial.pk]),
+                "stage": stage_of(episode=trial.episode) if trial.episode else None,
+            }
+            for trial in gallery.failures_of(list(page), filters, seen)
+        ],
+        "groups": groups,
+        "evaluations": evaluation_list(),
+        "scenes": scene_list(all_of_them=True).prefetch_related(None),
+        "checkpoints": checkpoint_list(all_of_them=True, sight=seen),
+        "by": gallery.GROUPS,
+        "filters": filters,
+        "most_clips": clip_export.MOST,
+        "levels": failures.offered(),
+        "may_change": role_of(request.user) is not Role.VIEWER,
+        "fault": fault,
+        "here": "failures",
+    }
+    return render(request, "trials/gallery.html", context, status=fault.status if fault else 200)
+
+
+@require_GET
+def failure_table(request: HttpRequest) -> StreamingHttpResponse:
+    """The same, all of them, as CSV with the address of each clip."""
+    seen, filters = sight_for(request), _filters(request.GET)
+    gallery.failed_list(filters, seen)  # what is wrong with the filters is said before anything is sent
+    root = request.build_absolute_uri("/").rstrip("/")
+    pieces = csv_lines(gallery.COLUMNS, gallery.failure_rows(filters, seen, root))
+    return download(request, pieces, "failures.csv", CSV)
+
+
+@require_GET
+def failure_clips(request: HttpRequest) -> StreamingHttpResponse:
+    """The clips themselves with their table, as an archive that is made while it is sent."""
+    seen, filters = sight_for(request), _filters(request.GET)
+    clip_export.require_few(filters, seen)
+    root = request.build_absolute_uri("/").rstrip("/")
+    pieces = clip_export.clip_archive(filters, seen, root)
+    return download(request, pieces, "failures.zip", "application/zip")
+
+
+def _filters(given: Mapping[str, str]) -> FailureFilters:
+    said = {name: given.get(name, "").strip() for name in (*_TRIALS, "position", *failures.FIELDS)}
+    return FailureFilters(
+        trials=TrialFilters(**{name: said.pop(name) for name in _TRIALS}),
+        group=given.get("group", "").strip() or "failure",
+        **said,
+    )

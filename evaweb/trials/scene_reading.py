@@ -1,0 +1,112 @@
+"""A scene as one table, with its positions and milestones, and what refers to them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+from django.db import models
+from django.db.models import Count, Q
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from evaweb.refusals import is_text
+from evaweb.trials.models import Scene
+
+_FROZEN = ("frozen", "closed", "revealed")  # states of plans, which are bound to positions by evaweb.plans
+FIELDS = (
+    *("title", "instruction", "criterion", "layout"),
+    *("time_limit_s", "ordered", "failure_required", "active"),
+)
+POSITION = ("number", "label", "description", "bench")
+MILESTONE = ("text", "points", "required", "time_limit_s", "truth")
+
+
+def _kept(text: str) -> str:
+    if not is_text(text):
+        raise ValueError("allowed: text without NUL and half characters")
+    return text
+
+
+_Text = Annotated[str, AfterValidator(_kept)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, str_strip_whitespace=True)
+
+
+class PositionTable(_Table):
+    """A position; `id` of one that there is."""
+
+    id: int | None = None
+    number: int = Field(ge=0, lt=2**15)
+    label: _Text = ""
+    description: _Text = ""
+    bench: dict[str, Any] | None = None
+
+
+class MilestoneTable(_Table):
+    """A milestone, in its place; `id` of one that there is."""
+
+    id: int | None = None
+    text: _Text = ""
+    points: int = 1
+    required: bool = False
+    time_limit_s: float | None = None
+    truth: _Text = ""
+
+
+class SceneTable(_Table):
+    """A scene as it shall be."""
+
+    name: _Text = ""
+    title: _Text = ""
+    instruction: _Text = ""
+    criterion: _Text = ""
+    layout: _Text = ""
+    time_limit_s: float | None = None
+    ordered: bool = False
+    failure_required: bool = False
+    active: bool = True
+    positions: Annotated[list[PositionTable], Field(max_length=500)] = []
+    milestones: Annotated[list[MilestoneTable], Field(max_length=100)] = []
+
+
+def scene_table(scene: Scene) -> dict[str, Any]:
+    """The scene in plain values, as `scene_write` takes it."""
+    return {
+        "name": scene.name,
+        **{name: getattr(scene, name) for name in FIELDS},
+        "positions": [values_of(row, ("id", *POSITION)) for row in scene.positions.order_by("number")],
+        "milestones": [values_of(row, ("id", *MILESTONE)) for row in scene.milestones.order_by("order")],
+    }
+
+
+def seen_of(scene: Scene) -> str:
+    """Another text whenever anything of the scene, as the database has it, is another."""
+    kept = scene_table(Scene.objects.get(pk=scene.pk))
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def kept_positions(scene: Scene) -> dict[int, str]:
+    """Positions that trials or frozen plans refer to, by id, with the reason in words."""
+    referred = Q(trials__isnull=False) | Q(plan__state__in=_FROZEN)
+    rows = scene.positions.filter(referred).annotate(n=Count("trials", distinct=True)).distinct()
+    found = {}
+    for row in rows.prefetch_related("plan_set"):
+        plans = [str(plan) for plan in row.plan_set.all() if plan.state in _FROZEN]  # type: ignore[attr-defined]
+        trials = [f"{row.n} trial{'s' if row.n > 1 else ''}"] if row.n else []
+        found[row.pk] = " and ".join([*trials, *(f"plan {plan}" for plan in plans)])
+    return found
+
+
+def running_plans(scene: Scene) -> list[str]:
+    """Plans whose trials are being made with the scene, by title."""
+    rows = scene.positions.filter(plan__state="frozen").order_by("plan__title", "plan__version")
+    found = rows.values_list("plan__title", "plan__version").distinct()
+    return [f"{title} v{version}" for title, version in found]
+
+
+def values_of(row: models.Model, names: Iterable[str]) -> dict[str, Any]:
+    return {name: getattr(row, name) for name in names}

@@ -1,0 +1,320 @@
+"""A scene written as a whole, with its positions and milestones, as the scene editor sends it.
+
+What trials or frozen plans refer to is not changed under them; nobody overwrites what another wrote meanwhile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import Any
+
+from django.contrib.admin.models import ADDITION, CHANGE, LogEntry
+from django.contrib.auth.models import User
+from django.core.exceptions import ValidationError as Invalid
+from django.db import models, transaction
+from pydantic import ValidationError
+
+from evaweb.errors import Conflict, EvaError
+from evaweb.races import once_more
+from evaweb.roles import Role, require
+from evaweb.stations.surroundings import AREA
+from evaweb.trials.models import Milestone, Position, Scene
+from evaweb.trials.scene_reading import (
+    FIELDS,
+    MILESTONE,
+    POSITION,
+    MilestoneTable,
+    PositionTable,
+    SceneTable,
+    kept_positions,
+    running_plans,
+    scene_table,
+    seen_of,
+    values_of,
+)
+from evaweb.trials.tables import check_milestones
+from runtime.core.sentences import Pattern
+
+_SCENE_DOES_NOT_EXIST_ANY = Pattern(
+    "trials.scene_writing.scene_does_not_exist_any",
+    "scene {name!r:.80} does not exist any more: nothing was saved",
+)
+
+APART_M = (
+    0.15  # block and plate of a simulated bench, centre to centre, at least: runtime.sim.layout refuses less
+)
+
+
+_IDS = {
+    "positions": {"__all__": {"id"}},
+    "milestones": {"__all__": {"id"}},
+}  # of rows, which only the database gives
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What is wrong at one place, such as "positions.2.bench": which thing, what was given, what is allowed."""
+
+    place: str
+    text: str
+
+
+class SceneRefused(EvaError):
+    """A scene that cannot be written; `faults` has each place."""
+
+    def __init__(self, faults: Sequence[Fault]) -> None:
+        super().__init__("; ".join(fault.text for fault in faults))
+        self.faults = tuple(faults)
+
+
+class ChangedMeanwhile(Conflict):
+    """The scene is not what the writer has seen; `seen` is what it is now, for one who writes over it knowingly."""
+
+    def __init__(self, scene: Scene, seen: str) -> None:
+        last = LogEntry.objects.filter(object_id=str(scene.pk), content_type__model="scene").first()
+        by = f" by {last.user.get_username()}, {last.action_time:%Y-%m-%d %H:%M} UTC" if last else ""
+        super().__init__(f"scene {scene.name} was changed meanwhile{by}; nothing of yours was saved or lost")
+        self.seen = seen
+
+
+@once_more
+@transaction.atomic
+def scene_write(
+    *, user: User, name: str | None, given: Mapping[str, Any], seen: str = ""
+) -> tuple[Scene, list[str]]:
+    """Write the scene of that name, None for a new one; the scene, and what has to be said of the change.
+
+    `seen`: what `seen_of` said when the writer read it. What is there word by word already was written before, and its
+    answer lost: nothing is written again. Raises NotAllowed, SceneRefused with every place that is wrong,
+    ChangedMeanwhile. Nothing is written then.
+    """
+    require(user, Role.ADMIN)
+    wanted = table_of(given)
+    scene = Scene.objects.select_for_update().filter(name=name).first() if name is not None else Scene()
+    if scene is None:
+        raise Conflict(_SCENE_DOES_NOT_EXIST_ANY(name=name))
+    there = scene if name is not None else Scene.objects.filter(name=wanted.name).first()
+    if there is not None and _says(there, wanted):
+        return there, []
+    if name is None:
+        scene.name = wanted.name
+    elif seen_of(scene) != seen:
+        raise ChangedMeanwhile(scene, seen_of(scene))
+    before = scene_table(scene) if scene.pk else None
+    faults = _assigned(scene, wanted)
+    if faults:
+        raise SceneRefused(faults)
+    scene.save()
+    faults = [*_write_positions(scene, wanted.positions), *_write_milestones(scene, wanted.milestones)]
+    if faults:
+        raise SceneRefused(faults)
+    after = scene_table(scene)
+    if after != before:
+        flag, what = (CHANGE, _changed(before, after)) if before else (ADDITION, "made in the scene editor")
+        LogEntry.objects.log_actions(user.pk, [scene], flag, what, single_object=True)
+    return scene, _remarks(scene, before, after)
+
+
+def _says(scene: Scene, wanted: SceneTable) -> bool:
+    """True if the scene is word by word what is wanted now; rows that were new then have no id."""
+    there = SceneTable.model_validate(scene_table(scene))
+    pairs = (
+        zip(there.positions, wanted.positions, strict=False),
+        zip(there.milestones, wanted.milestones, strict=False),
+    )
+    same = all(asked.id in (None, row.id) for pair in pairs for row, asked in pair)
+    return same and there.model_dump(exclude=_IDS) == wanted.model_dump(exclude=_IDS)
+
+
+def table_of(given: object) -> SceneTable:
+    """The table in plain values; SceneRefused with every place that is none."""
+    try:
+        return SceneTable.model_validate(given)
+    except ValidationError as error:
+        faults = [
+            Fault(
+                place := ".".join(map(str, one["loc"])) or "scene",
+                f"{place} = {one['input']!r:.60}: {one['msg']}",
+            )
+            for one in error.errors()
+        ]
+        raise SceneRefused(faults) from None
+
+
+def _assigned(scene: Scene, wanted: SceneTable) -> list[Fault]:
+    for name in FIELDS:
+        setattr(scene, name, getattr(wanted, name))
+    faults = _faults(scene, "", "")
+    if not wanted.positions:
+        faults.append(Fault("positions", "positions: none; allowed: at least one, from which a trial begins"))
+    return faults
+
+
+def _write_positions(scene: Scene, wanted: Sequence[PositionTable]) -> list[Fault]:
+    rows = {row.pk: row for row in scene.positions.all()}
+    kept = kept_positions(scene)
+    faults = [*_strangers(wanted, rows, "positions"), *_twice(wanted)]
+    faults += [
+        Fault("positions", f"position {row.number} is not removed, because of {why}")
+        for row in rows.values()
+        if row.pk not in {one.id for one in wanted} and (why := kept.get(row.pk) or _pictured(row))
+    ]
+    if faults:
+        return faults
+    scene.positions.exclude(pk__in=[one.id for one in wanted if one.id]).delete()
+    for index, one in enumerate(wanted):
+        row = rows[one.id] if one.id else Position(scene=scene)
+        asked = one.model_dump(include=set(POSITION))
+        if not one.id or _plain(values_of(row, POSITION)) != _plain(asked):
+            faults += _position_written(row, asked, f"positions.{index}", kept.get(row.pk, ""))
+    return faults
+
+
+def _position_written(row: Position, asked: Mapping[str, Any], place: str, kept: str) -> list[Fault]:
+    what = f"position {asked['number']}"
+    if kept:
+        told = f"position {row.number} is not changed, because of {kept}: add another position instead"
+        return [Fault(place, told)]
+    if row.pk and row.number != asked["number"]:
+        return [Fault(place, f"position {row.number}: its number stays, for seeds and exports have it")]
+    for name, value in asked.items():
+        setattr(row, name, value)
+    faults = _faults(row, f"{place}.", what)
+    if not faults and (problem := _bench_problem(row.bench or {})):
+        faults = [Fault(f"{place}.bench", f"{what}: {problem}")]
+    if not faults:
+        row.save()
+    return faults
+
+
+def _bench_problem(bench: Mapping[str, Any]) -> str:
+    """Why a simulated bench would refuse to lay it, "" where it would not."""
+    x_from, x_to, y_from, y_to = AREA
+    for name in ("block", "plate"):
+        x, y = bench[name][:2] if name in bench else (x_from, y_from)
+        if not (x_from <= x <= x_to and y_from <= y <= y_to):
+            return (
+                f"{name} at x {1000 * x:.0f}, y {1000 * y:.0f} mm; allowed on a simulated bench: "
+                f"x {1000 * x_from:.0f} to {1000 * x_to:.0f}, y {1000 * y_from:.0f} to {1000 * y_to:.0f} mm"
+            )
+    if {"block", "plate"} <= bench.keys():
+        apart = math.dist(bench["block"][:2], bench["plate"][:2])
+        if apart < APART_M:
+            return (
+                f"block and plate are {1000 * apart:.0f} mm apart; allowed: {1000 * APART_M:.0f} mm or more"
+            )
+    return ""
+
+
+def _write_milestones(scene: Scene, wanted: Sequence[MilestoneTable]) -> list[Fault]:
+    rows = {row.pk: row for row in scene.milestones.all()}
+    faults = _strangers(wanted, rows, "milestones")
+    texts = [one.text for one in wanted if one.text]
+    if any(not one.id or (one.id in rows and rows[one.id].text != one.text) for one in wanted):
+        try:
+            check_milestones(texts)
+        except Invalid as invalid:
+            faults.append(Fault("milestones", f"milestones: {'; '.join(invalid.messages)}"))
+    if faults:
+        return faults
+    scene.milestones.exclude(pk__in=[one.id for one in wanted if one.id]).delete()
+    _make_room(scene, len(wanted))
+    for index, one in enumerate(wanted):
+        row = rows[one.id] if one.id else Milestone(scene=scene)
+        row.order = index + 1
+        for name in MILESTONE:
+            setattr(row, name, getattr(one, name))
+        problems = _faults(row, f"milestones.{index}.", f"milestone {index + 1}")
+        faults += problems
+        if not problems:
+            row.save()
+    return faults
+
+
+def _make_room(scene: Scene, n: int) -> None:
+    """Move those that stay where none of the first `n` places is theirs: no two have one place at any moment."""
+    taken = set(scene.milestones.values_list("order", flat=True))
+    free = (place for place in count(n + 1) if place not in taken)
+    for row in scene.milestones.all():
+        scene.milestones.filter(pk=row.pk).update(order=next(free))
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Texts as every form leaves them: one kind of line end, no blanks around."""
+    texts = {
+        name: value.replace("\r\n", "\n").strip() for name, value in values.items() if isinstance(value, str)
+    }
+    return {**values, **texts}
+
+
+def _strangers(wanted: Sequence[Any], rows: Mapping[int, Any], kind: str) -> list[Fault]:
+    """Rows that are written but were never read here, or twice."""
+    ids = [one.id for one in wanted if one.id is not None]
+    wrong = [id for id in ids if id not in rows or ids.count(id) > 1]
+    return [
+        Fault(kind, f"{kind}: id {id} is not one of this scene, or there twice")
+        for id in dict.fromkeys(wrong)
+    ]
+
+
+def _twice(wanted: Sequence[PositionTable]) -> list[Fault]:
+    numbers = [one.number for one in wanted]
+    twice = sorted({number for number in numbers if numbers.count(number) > 1})
+    return [
+        Fault("positions", f"two positions have the number {number}; allowed: each once") for number in twice
+    ]
+
+
+def _pictured(row: Position) -> str:
+    """Reference pictures are bound to positions by evaweb.plans."""
+    return "reference pictures" if row.references.exists() else ""  # type: ignore[attr-defined]
+
+
+def _faults(row: models.Model, place: str, what: str) -> list[Fault]:
+    try:
+        row.full_clean()
+    except Invalid as invalid:
+        return [
+            Fault(f"{place}{field}", ": ".join(filter(None, (what, _name(row, field), " ".join(messages)))))
+            for field, messages in invalid.message_dict.items()
+        ]
+    return []
+
+
+def _name(row: models.Model, field: str) -> str:
+    names = {one.name: str(one.verbose_name) for one in row._meta.fields}
+    return names.get(field, "scene")
+
+
+def _changed(before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> str:
+    names = [name for name, value in after.items() if before and before[name] != value]
+    return f"changed in the scene editor: {', '.join(names)}"
+
+
+def _remarks(scene: Scene, before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> list[str]:
+    """What a change means for what was done with the scene as it was."""
+    if before is None or before == after:
+        return []
+    said = []
+    trials = scene.trials.count()
+    if trials and any(before[name] != after[name] for name in ("positions", "milestones")):
+        said.append(
+            f"{trials} trial{'s' if trials > 1 else ''} made before keep the old positions and milestones in their "
+            "scores: where trials are to be compared, make another scene instead."
+        )
+    plans = running_plans(scene)
+    frozen = set(after) - {"active", "failure_required", "positions"}
+    if plans and any(before[name] != after[name] for name in frozen):
+        said.append(f"This stops {', '.join(plans)} until it is changed back, or the plan is amended.")
+    moved = {row["id"]: row for row in before["positions"]}
+    stale = [
+        row for row in after["positions"] if row["id"] in moved and moved[row["id"]]["bench"] != row["bench"]
+    ]
+    pictured = scene.positions.filter(pk__in=[row["id"] for row in stale], references__isnull=False)
+    return said + [
+        f"Position {row.number} has reference pictures of how it was: take them anew."
+        for row in pictured.distinct()
+    ]

@@ -1,0 +1,37 @@
+// A line of hints for who has a simulated station for the first time: the next thing to press, until it is hidden.
+
+import { current } from "./trial/steps.js";
+
+const KEY = "eva-tour"; // of this browser: "off" once the hints were hidden
+const HINTS = {
+  free: "Take the station: you command, all others watch.",
+  choose: "Choose a position, then press Set up.",
+  setup: "The policy answers a first time; then press Run.",
+  run: "Press Run: the policy moves the arms.",
+  running: "Press Stop once the block is on the plate.",
+  score: "Tick what was reached, then press Save score.",
+};
+
+function hint(store) {
+  if (store.lease === "free") return HINTS.free;
+  if (store.lease !== "mine") return "";
+  const step = current(document.getElementById("steps").dataset, store.snapshot);
+  return HINTS[store.snapshot?.state_is?.run_open ? "running" : step] ?? "";
+}
+
+/** Show the hints where the page has a place for them. */
+export function tour(store) {
+  const line = document.getElementById("tour");
+  if (!line || localStorage.getItem(KEY) === "off") return;
+  const words = line.querySelector("[data-tour]");
+  const show = () => {
+    const text = hint(store);
+    if (words.textContent !== text) words.textContent = text;
+    line.hidden = !text;
+  };
+  line.querySelector("button").addEventListener("click", () => {
+    localStorage.setItem(KEY, "off");
+    line.remove();
+  });
+  store.on(["snapshot", "second"], () => line.isConnected && show());
+}

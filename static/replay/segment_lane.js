@@ -1,0 +1,209 @@
+// The lane of the segments under the time axis: bands of their label's colour, those that overlap below each other.
+// On the empty lane a drag draws one; the ends of one's own are moved by a drag, or by arrow keys while they have the focus.
+
+import { overlaps, stacked } from "./review_lanes.js";
+
+const SETTLED_MS = 700; // after the last arrow key an end is where it was meant to be
+
+/** The row at `x` [px] of a lane that is `width` wide. */
+export function rowOn(x, width, rows) {
+  return Math.min(rows - 1, Math.max(0, Math.floor((x / Math.max(1, width)) * rows)));
+}
+
+export class SegmentLane {
+  #strip;
+  #clock;
+  #user;
+  #drawn;
+  #moved;
+  #segments = [];
+  #colours = new Map();
+  #open = document.createElement("i"); // the one that has no end yet
+  #moving = null; // {segment, end, band, waiting}
+
+  /** `drawn({first, last})` hears of a new one; `moved(segment)` of one of `user` with another end, and resolves when it is kept. */
+  constructor({ strip, clock, user = "", drawn = null, moved = null }) {
+    this.#strip = strip;
+    this.#clock = clock;
+    this.#user = user;
+    this.#drawn = drawn;
+    this.#moved = moved;
+    this.#open.className = "lane-band lane-segment";
+    this.#open.dataset.open = "";
+    if (drawn) strip.addEventListener("pointerdown", (event) => event.target === strip && event.button === 0 && this.#draw(event));
+  }
+
+  /** Show them, [{uuid, first, last, label, milestone, annotator}]; `colours` by label. */
+  show(segments, colours = this.#colours) {
+    this.#segments = segments;
+    this.#colours = colours;
+    if (!this.#moving) this.#render();
+  }
+
+  /** Show one that has no end yet; null: none. */
+  open(span) {
+    this.#open.remove();
+    if (!span) return;
+    this.#place(this.#open, { first: Math.min(span.first, span.last), last: Math.max(span.first, span.last), lane: 0 });
+    this.#open.dataset.colour = this.#colours.get(span.label) ?? "";
+    this.#open.textContent = span.label || "…";
+    this.#strip.append(this.#open);
+  }
+
+  #render() {
+    const { uuid, end } = this.#focused();
+    const open = this.#open.isConnected;
+    const placed = stacked(this.#segments);
+    this.#strip.style.setProperty("--lanes", String(1 + Math.max(0, ...placed.map(({ lane }) => lane))));
+    this.#strip.replaceChildren(...placed.map((one) => this.#band(one)), ...overlaps(this.#segments).map((one) => this.#overlap(one)));
+    if (open) this.#strip.append(this.#open);
+    if (uuid) this.#strip.querySelector(`[data-uuid="${CSS.escape(uuid)}"] [data-end="${end}"]`)?.focus();
+  }
+
+  #focused() {
+    const held = document.activeElement;
+    const band = this.#strip.contains(held) ? held.closest("[data-uuid]") : null;
+    return band ? { uuid: band.dataset.uuid, end: held.dataset.end } : {};
+  }
+
+  #place(element, { first, last, lane }) {
+    element.style.left = `${(100 * first) / this.#clock.rows}%`;
+    element.style.width = `${(100 * (last - first + 1)) / this.#clock.rows}%`;
+    element.style.setProperty("--lane", String(lane));
+  }
+
+  #overlap(span) {
+    const part = Object.assign(document.createElement("i"), { className: "lane-overlap" });
+    this.#place(part, { ...span, lane: 0 });
+    return part;
+  }
+
+  #band(segment) {
+    const band = document.createElement("div");
+    band.className = "lane-band lane-segment";
+    Object.assign(band.dataset, { uuid: segment.uuid, colour: this.#colours.get(segment.label) ?? "" });
+    this.#place(band, segment);
+    const name = Object.assign(document.createElement("button"), { type: "button", className: "segment-name clip", textContent: segment.label });
+    name.dataset.end = "name";
+    name.title = `${segment.label}, rows ${segment.first} to ${segment.last}, ${segment.annotator}`;
+    name.addEventListener("click", () => this.#clock.seekRow(segment.first));
+    band.append(name);
+    const own = segment.annotator === this.#user && Boolean(this.#moved);
+    band.dataset.own = String(own);
+    if (own) band.append(...["first", "last"].map((end) => this.#end(segment, end, band)));
+    return band;
+  }
+
+  /** What moves one end of it. */
+  #end(segment, end, band) {
+    const handle = document.createElement("i");
+    handle.className = "segment-end";
+    handle.tabIndex = 0;
+    handle.setAttribute("role", "slider");
+    handle.setAttribute("aria-label", `${end === "first" ? "First" : "Last"} row of ${segment.label}`);
+    handle.dataset.end = end;
+    this.#say(handle, segment, end);
+    handle.addEventListener("pointerdown", (event) => this.#drag(event, handle, { segment: { ...segment }, end, band }));
+    handle.addEventListener("keydown", (event) => this.#key(event, handle, { segment: { ...segment }, end, band }));
+    handle.addEventListener("blur", () => this.#settle());
+    return handle;
+  }
+
+  #say(handle, segment, end) {
+    const row = segment[end];
+    const [low, high] = end === "first" ? [0, segment.last] : [segment.first, this.#clock.rows - 1];
+    const said = { valuemin: low, valuemax: high, valuenow: row, valuetext: `row ${row}, ${(row / this.#clock.fps).toFixed(2)} s` };
+    for (const [name, value] of Object.entries(said)) handle.setAttribute(`aria-${name}`, String(value));
+  }
+
+  #row(clientX) {
+    const { left, width } = this.#strip.getBoundingClientRect();
+    return rowOn(clientX - left, width, this.#clock.rows);
+  }
+
+  /** Put an end to a row, as far as the other one allows; the picture of that row is shown. */
+  #to(row, handle, { segment, end, band }) {
+    const { rows } = this.#clock;
+    segment[end] = end === "first" ? Math.min(Math.max(0, row), segment.last) : Math.max(Math.min(rows - 1, row), segment.first);
+    this.#place(band, { ...segment, lane: segment.lane });
+    this.#say(handle, segment, end);
+    this.#clock.pause();
+    this.#clock.seekRow(segment[end]);
+  }
+
+  #drag(event, handle, move) {
+    if (event.button !== 0) return;
+    event.preventDefault(); // it gets no focus: arrow keys go on moving the clock
+    this.#settle();
+    this.#moving = move;
+    handle.setPointerCapture(event.pointerId);
+    const over = new AbortController();
+    const { signal } = over;
+    handle.addEventListener("pointermove", ({ clientX }) => this.#to(this.#row(clientX), handle, move), { signal });
+    const done = (keep) => {
+      over.abort();
+      this.#leave(move, keep);
+    };
+    handle.addEventListener("pointerup", () => done(true), { signal });
+    handle.addEventListener("pointercancel", () => done(false), { signal });
+  }
+
+  #key(event, handle, fresh) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const move = this.#moving ?? fresh;
+    if (event.key === "Escape" && this.#moving) {
+      event.stopPropagation();
+      this.#leave(this.#moving, false);
+      return;
+    }
+    const way = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
+    if (!way) return;
+    event.preventDefault();
+    event.stopPropagation(); // the page's own arrows move the clock
+    clearTimeout(move.waiting);
+    this.#moving = move;
+    this.#to(move.segment[move.end] + way * (event.shiftKey ? Math.round(this.#clock.fps) : 1), handle, move);
+    move.waiting = setTimeout(() => this.#settle(), SETTLED_MS);
+  }
+
+  #settle() {
+    if (this.#moving?.waiting) this.#leave(this.#moving, true);
+  }
+
+  /** Keep what was moved, or show what was there before. */
+  async #leave(move, keep) {
+    clearTimeout(move.waiting);
+    move.waiting = null;
+    const before = this.#segments.find(({ uuid }) => uuid === move.segment.uuid);
+    const changed = before && (before.first !== move.segment.first || before.last !== move.segment.last);
+    if (keep && changed) await this.#moved(move.segment);
+    if (move.waiting) return; // an arrow key was pressed meanwhile: it is kept next
+    if (this.#moving === move) this.#moving = null;
+    if (!this.#moving) this.#render();
+  }
+
+  #draw(event) {
+    const first = this.#row(event.clientX);
+    let last = first;
+    this.#strip.setPointerCapture(event.pointerId);
+    this.#clock.pause();
+    this.#clock.seekRow(first);
+    const over = new AbortController();
+    const { signal } = over;
+    const move = ({ clientX }) => {
+      last = this.#row(clientX);
+      this.open({ first, last, label: "" });
+      this.#clock.seekRow(last);
+    };
+    this.#strip.addEventListener("pointermove", move, { signal });
+    this.#strip.addEventListener("pointercancel", () => (over.abort(), this.open(null)), { signal });
+    this.#strip.addEventListener(
+      "pointerup",
+      () => {
+        over.abort();
+        if (last !== first) this.#drawn({ first: Math.min(first, last), last: Math.max(first, last) });
+      },
+      { signal },
+    );
+  }
+}

@@ -1,0 +1,48 @@
+// The tags of an episode: each leads to the episodes that have it; one is typed in, one is taken off.
+
+import { post, RequestFailed } from "../site/api.js";
+
+const place = document.querySelector("[data-tags]");
+
+if (place?.dataset.tags) {
+  const form = place.querySelector("form");
+  const said = place.querySelector("[role=status]");
+
+  const change = async (content) => {
+    try {
+      const { tags } = await post(place.dataset.tags, content);
+      draw(tags);
+      said.textContent = "";
+      return true;
+    } catch (error) {
+      if (!(error instanceof RequestFailed)) throw error;
+      said.textContent = error.message;
+      return false;
+    }
+  };
+
+  const draw = (tags) => {
+    const items = tags.map((words) => {
+      const item = place.querySelector("template").content.firstElementChild.cloneNode(true);
+      const [link, button] = item.children;
+      link.textContent = words;
+      link.href = `${place.dataset.list}?tag=${encodeURIComponent(words)}`;
+      button.value = words;
+      button.setAttribute("aria-label", `Remove the tag ${words}`);
+      return item;
+    });
+    place.querySelector("ul").replaceChildren(...items);
+  };
+
+  place.querySelector("ul").addEventListener("click", async ({ target }) => {
+    const button = target.closest("button");
+    if (!button) return;
+    await change({ remove: [button.value] });
+    form.tag.focus();
+  });
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    if (await change({ add: [form.tag.value] })) form.reset();
+  });
+  draw(JSON.parse(document.getElementById("tags").textContent));
+}

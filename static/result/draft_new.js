@@ -1,0 +1,8 @@
+// A plan that is begun: what was typed outlives a reload until the draft is made.
+
+import { drafts } from "../site/drafts.js";
+
+drafts();
+document.querySelector("form[data-draft]").addEventListener("submit", ({ target }) => {
+  target.dispatchEvent(new Event("eva:saved", { bubbles: true }));
+});

@@ -1,0 +1,145 @@
+// A position of a bench as drawings have it: from above in millimetres, the arms at the lower edge; markup and no page.
+
+export const ROUND = 32; // corners of what stands for a circle
+
+/** What lies on the bench of a position: [{key, name, kind, x, y, yaw, width, depth}], in millimetres and degrees. */
+export function things(bench, sizes) {
+  const found = [];
+  if (bench?.plate) found.push({ key: "plate", name: "plate", kind: "plate", yaw: 0, ...at(bench.plate), ...square(2 * sizes.plate) });
+  if (bench?.block) found.push({ key: "block", name: "block", kind: "block", yaw: bench.block[2], ...at(bench.block), ...square(sizes.block) });
+  for (const [name, place] of Object.entries(bench?.objects ?? {}).sort(([a], [b]) => a.localeCompare(b))) {
+    found.push({ key: `object ${name}`, name, kind: "object", yaw: place[2], ...at(place), width: mm(place[3]), depth: mm(place[4]) });
+  }
+  return found;
+}
+
+/** The bench with one of its things elsewhere; `change` has x, y, yaw, width or depth. */
+export function placed(bench, thing, change) {
+  const { x, y, yaw, width, depth } = { ...thing, ...change };
+  const place = [metres(x), metres(y)];
+  if (thing.kind === "plate") return { ...bench, plate: place };
+  if (thing.kind === "block") return { ...bench, block: [...place, turned(yaw)] };
+  return { ...bench, objects: { ...bench.objects, [thing.name]: [...place, turned(yaw), metres(width), metres(depth)] } };
+}
+
+/** The bench without one of its things. */
+export function without(bench, thing) {
+  const { [thing.kind]: _, ...rest } = bench;
+  if (thing.kind !== "object") return rest;
+  const { [thing.name]: __, ...objects } = bench.objects;
+  return { ...bench, objects };
+}
+
+/** The corners of a thing [mm], as many for a circle as make it one. */
+export function outline({ kind, x, y, yaw, width, depth }) {
+  if (kind === "plate") {
+    const turns = Array.from({ length: ROUND }, (_, k) => (2 * Math.PI * k) / ROUND);
+    return turns.map((turn) => [x + (width / 2) * Math.cos(turn), y + (width / 2) * Math.sin(turn)]);
+  }
+  const [cos, sin] = [Math.cos((yaw * Math.PI) / 180), Math.sin((yaw * Math.PI) / 180)];
+  const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([a, b]) => [(a * width) / 2, (b * depth) / 2]);
+  return corners.map(([a, b]) => [x + a * cos - b * sin, y + a * sin + b * cos]);
+}
+
+/** What of the bench no simulated one would lay, or lies in something else: sentences. */
+export function problems(bench, sizes) {
+  const all = things(bench, sizes);
+  const [left, right, near, far] = sizes.area.map(mm);
+  const said = [];
+  for (const { kind, name, x, y } of all) {
+    if (kind !== "object" && !(x >= left && x <= right && y >= near && y <= far)) said.push(`${name} is outside the area that a simulated bench can lay out`);
+  }
+  all.forEach((one, index) => {
+    for (const other of all.slice(index + 1)) {
+      const least = one.kind !== "object" && other.kind !== "object" ? mm(sizes.apart) : radius(one) + radius(other);
+      const apart = Math.hypot(one.x - other.x, one.y - other.y);
+      if (apart < least - 1e-6) said.push(`${one.name} and ${other.name} are ${apart.toFixed(0)} mm apart; at least ${least.toFixed(0)} mm are needed`);
+    }
+  });
+  return said;
+}
+
+/** True if an arm of the simulated bench grasps there; what lies on other benches is where people say. */
+export function reachable({ kind, x, y }, sizes) {
+  return kind === "object" || sizes.sides.some((side) => Math.hypot(x - mm(side[0]), y - mm(side[1])) <= mm(sizes.reach));
+}
+
+/** What a drawing of these benches shows [mm]: {x, y, width, height}, y downwards as SVG has it. */
+export function windowOf(benches, sizes, margin = 40) {
+  const [left, right, near, far] = sizes.area.map(mm);
+  const corners = benches.flatMap((bench) => things(bench, sizes).flatMap(outline));
+  const [xs, ys] = [[left, right, ...corners.map(([x]) => x)], [near, far, ...corners.map(([, y]) => y)]];
+  const [low, high] = [Math.min(...xs) - margin, Math.max(...xs) + margin];
+  const [bottom, top] = [Math.min(...ys) - margin, Math.max(...ys) + margin];
+  return { x: low, y: -top, width: high - low, height: top - bottom };
+}
+
+/** The area in which things may lie, and the table around it, below everything else. */
+export function ground(sizes, { x, y, width, height }) {
+  const [left, right, near, far] = sizes.area.map(mm);
+  return (
+    `<rect class="table" x="${n(x)}" y="${n(y)}" width="${n(width)}" height="${n(height)}"/>` +
+    `<rect class="area" x="${n(left)}" y="${n(-far)}" width="${n(right - left)}" height="${n(far - near)}"/>`
+  );
+}
+
+/** One thing; `inside` is markup that moves and turns with it. */
+export function drawn(thing, { attributes = "", inside = "", words = "" } = {}) {
+  const { kind, x, y, yaw, width, depth } = thing;
+  const shape =
+    kind === "plate"
+      ? `<circle class="shape" r="${n(width / 2)}"/><circle class="rim" r="${n(width / 2 - 9)}"/>`
+      : `<rect class="shape" x="${n(-width / 2)}" y="${n(-depth / 2)}" width="${n(width)}" height="${n(depth)}" rx="2"/><path class="ahead" d="M0 0V${n(-depth / 2)}"/>`;
+  const text = words && `<text class="thing-name" x="${n(x)}" y="${n(-y + Math.max(width, depth) / 2 + 16)}">${escaped(words)}</text>`;
+  return `<g class="thing thing-${kind}" ${attributes}><g transform="translate(${n(x)} ${n(-y)}) rotate(${n(-yaw)})">${shape}${inside}</g>${text}</g>`;
+}
+
+/** A small picture of a bench; without a title it says nothing that does not stand beside it. */
+export function thumbnail(bench, sizes, view, title, picture = "") {
+  const all = things(bench, sizes);
+  const [x, y, width, height] = [view.x, view.y, view.width, view.height].map(n);
+  const seen = `<image href="${escaped(picture)}" x="${x}" y="${y}" width="${width}" height="${height}" preserveAspectRatio="xMidYMid slice"/>`;
+  const words = `<text class="thing-name" x="${n(view.x + view.width / 2)}" y="${n(view.y + view.height / 2)}">in words</text>`;
+  const inside = all.length ? ground(sizes, view) + all.map((thing) => drawn(thing)).join("") : picture ? seen : words;
+  const named = title ? `role="img" aria-label="${escaped(title)}"` : 'aria-hidden="true"';
+  return `<svg class="bench-drawing" viewBox="${box(view)}" ${named}>${inside}</svg>`;
+}
+
+export function box({ x, y, width, height }) {
+  return [x, y, width, height].map(n).join(" ");
+}
+
+export function escaped(text) {
+  return String(text).replace(/[&<>"']/g, (sign) => `&#${sign.charCodeAt(0)};`);
+}
+
+/** Degrees from -180 to 180. */
+export function turned(yaw) {
+  return Math.round((((((yaw + 180) % 360) + 360) % 360) - 180) * 10) / 10;
+}
+
+/** A number as markup has it. */
+export function n(value) {
+  return String(Math.round(value * 100) / 100);
+}
+
+function radius({ kind, width, depth }) {
+  return kind === "plate" ? width / 2 : Math.hypot(width, depth) / 2;
+}
+
+function at([x, y]) {
+  return { x: mm(x), y: mm(y) };
+}
+
+function square(side) {
+  return { width: mm(side), depth: mm(side) };
+}
+
+function mm(value) {
+  return Math.round(value * 1e6) / 1e3;
+}
+
+/** To tenths of a millimetre, so that what is shown is what is saved. */
+function metres(value) {
+  return Math.round(value * 10) / 1e4;
+}

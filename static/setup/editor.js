@@ -1,0 +1,182 @@
+// The editor of a scene: everything typed and dragged is one table, kept as a draft until it is saved.
+
+import { post, RequestFailed } from "../site/api.js";
+import { MilestoneList } from "./milestones.js";
+import { Overlay } from "./overlay.js";
+import { Positions } from "./positions.js";
+
+const PREVIEW_MS = 600;
+const SAVE_MS = 30000; // an outcome that is not known is worse than a long wait
+
+class Editor {
+  #given = JSON.parse(document.getElementById("state").textContent);
+  #form = document.getElementById("scene");
+  #said = document.getElementById("said");
+  #faults = document.getElementById("faults");
+  #save = document.getElementById("save");
+  #key = `eva-draft:${location.pathname}${location.search}`;
+  #saved;
+  #timer = 0;
+
+  constructor() {
+    const { scene, seen, kept, references, bench, stations, addresses } = this.#given;
+    this.#saved = JSON.stringify(scene);
+    const draft = sessionStorage.getItem(this.#key);
+    this.scene = draft ? JSON.parse(draft).scene : scene;
+    this.seen = draft ? JSON.parse(draft).seen : seen;
+    const changed = () => this.#changed();
+    const overlay = new Overlay(document.getElementById("overlay"), { bench, stations, addresses });
+    this.positions = new Positions(this, { bench, kept, references, may: Boolean(this.#save), changed, overlay });
+    this.milestones = new MilestoneList(this, changed);
+    this.#fill();
+    if (draft) this.#tell("Your unsaved changes are restored.", "pressed");
+    document.getElementById("discard").addEventListener("click", () => this.#discard());
+    this.#form.addEventListener("input", (event) => this.#typed(event.target));
+    this.#save?.addEventListener("click", () => this.#sent());
+    document.addEventListener("keydown", (event) => {
+      if (event.key !== "s" || !(event.ctrlKey || event.metaKey)) return;
+      event.preventDefault();
+      this.#save?.click();
+    });
+    document.getElementById("operator").addEventListener("toggle", () => this.#previewed());
+    this.#faults.addEventListener("click", (event) => event.target.dataset.place && this.#find(event.target.dataset.place));
+    this.#mark();
+    this.#previewed();
+    document.querySelector(".scene-grid").inert = false; // what is typed before is not heard
+  }
+
+  #fill() {
+    for (const field of this.#form.querySelectorAll("[data-of]")) {
+      if (field.type === "checkbox") field.checked = this.scene[field.dataset.of];
+      else field.value = this.scene[field.dataset.of] ?? "";
+    }
+    this.positions.show();
+    this.milestones.show();
+  }
+
+  #typed(field) {
+    const name = field.dataset.of;
+    if (!name) return;
+    if (field.type === "checkbox") this.scene[name] = field.checked;
+    else if (field.type === "number") this.scene[name] = field.value === "" ? null : Number(field.value);
+    else this.scene[name] = field.value;
+    const own = this.#form.querySelector("[data-of=name]");
+    if (name === "title" && own && !own.dataset.typed) own.value = this.scene.name = named(field.value);
+    if (field === own) own.dataset.typed = "yes"; // it does not follow the title any more
+    this.#changed();
+  }
+
+  #changed() {
+    sessionStorage.setItem(this.#key, JSON.stringify({ scene: this.scene, seen: this.seen }));
+    this.#mark();
+    clearTimeout(this.#timer);
+    this.#timer = setTimeout(() => this.#previewed(), PREVIEW_MS);
+  }
+
+  #mark() {
+    const other = JSON.stringify(this.scene) !== this.#saved;
+    document.getElementById("unsaved").hidden = !other;
+    document.getElementById("discard").hidden = !other;
+  }
+
+  #discard() {
+    if (!confirm("Discard everything that is not saved?")) return;
+    sessionStorage.removeItem(this.#key);
+    location.reload();
+  }
+
+  /** The operator's cards, of the position that is shown. */
+  async #previewed() {
+    if (!document.getElementById("operator").open) return;
+    const place = document.getElementById("preview");
+    try {
+      const { html } = await post(this.#given.addresses.preview, { scene: this.scene, position: this.positions.index });
+      place.innerHTML = html;
+    } catch (error) {
+      place.textContent = `Not shown: ${error.message}`;
+    }
+  }
+
+  async #sent() {
+    if (this.#save.disabled) return;
+    this.#save.disabled = true;
+    this.#tell("Saving …", "pressed");
+    this.#show([]);
+    try {
+      const { address, remarks, scene, seen, kept } = await post(location.pathname, { scene: this.scene, seen: this.seen }, { timeout: SAVE_MS });
+      sessionStorage.removeItem(this.#key);
+      if (address !== location.pathname) {
+        location.assign(address);
+        return;
+      }
+      Object.assign(this, { scene, seen });
+      this.#saved = JSON.stringify(scene);
+      this.positions.kept = kept;
+      this.#fill();
+      this.#mark();
+      this.#tell(["Saved.", ...remarks].join(" "), "accepted");
+    } catch (error) {
+      if (!(error instanceof RequestFailed)) throw error;
+      this.#refused(error);
+    } finally {
+      this.#save.disabled = false;
+    }
+  }
+
+  #refused({ message, body }) {
+    this.#show(body.faults ?? []);
+    this.#tell(body.faults ? "Not saved: see what is wrong. Nothing that you typed is lost." : `Not saved: ${message}`, "refused");
+    if (!body.seen) return;
+    const over = document.createElement("button");
+    Object.assign(over, { type: "button", className: "button", textContent: "Overwrite with mine" });
+    over.addEventListener("click", () => {
+      this.seen = body.seen;
+      this.#sent();
+    });
+    const look = document.createElement("a");
+    Object.assign(look, { href: location.pathname, target: "_blank", rel: "noopener", textContent: "Show theirs" });
+    this.#said.append(" ", look, " ", over);
+  }
+
+  /** What is wrong, each a way to where it is; the fields are marked. */
+  #show(faults) {
+    for (const field of this.#form.querySelectorAll("[aria-invalid]")) field.removeAttribute("aria-invalid");
+    this.#faults.replaceChildren(
+      ...faults.map(({ place, text }) => {
+        const item = document.createElement("li");
+        const way = document.createElement("button");
+        Object.assign(way, { type: "button", className: "link", textContent: text });
+        way.dataset.place = place;
+        item.append(way);
+        return item;
+      }),
+    );
+    this.#faults.hidden = !faults.length;
+    for (const { place } of faults) this.#field(place)?.setAttribute("aria-invalid", "true");
+  }
+
+  #find(place) {
+    const [kind, index] = place.split(".");
+    if (kind === "positions" && index) this.positions.choose(Number(index));
+    (this.#field(place) ?? document.getElementById(kind))?.focus();
+  }
+
+  #field(place) {
+    const [kind, index, name] = place.split(".");
+    if (kind === "milestones" && index) return document.querySelector(`#milestone-rows > :nth-child(${Number(index) + 1}) [data-milestone=${name ?? "text"}]`);
+    if (kind === "positions") return Number(index) === this.positions.index ? document.querySelector(`[data-position=${name === "description" ? name : "label"}]`) : null;
+    return this.#form.querySelector(`[data-of="${CSS.escape(kind)}"]`);
+  }
+
+  #tell(words, kind) {
+    this.#said.textContent = words;
+    this.#said.dataset.kind = kind;
+  }
+}
+
+/** A short name of a title, for addresses. */
+function named(title) {
+  return title.normalize("NFKD").toLowerCase().replace(/[^a-z0-9]+/g, "-").replace(/^-+|-+$/g, "").slice(0, 60);
+}
+
+new Editor();

@@ -1,0 +1,97 @@
+// Positions that are generated from the one that is shown: what is asked for, and what came of it, before it is kept.
+
+import { things } from "./bench.js";
+import { generated, nearest } from "./generate.js";
+
+const MOST = 100; // positions at once
+
+export class Generator {
+  made = []; // benches that are not kept yet
+  #form;
+  #sizes;
+  #bench;
+  #draw;
+  #keep;
+
+  /** `bench()` is the one to begin from, `draw()` shows what is `made`, `keep(benches, replace)` takes it. */
+  constructor(form, sizes, { bench, draw, keep }) {
+    this.#form = form;
+    this.#sizes = sizes;
+    this.#bench = bench;
+    this.#draw = draw;
+    this.#keep = keep;
+    form.addEventListener("change", () => this.offer());
+    form.addEventListener("submit", (event) => {
+      event.preventDefault(); // Enter in one of its fields
+      this.#generate();
+    });
+    for (const [id, act] of Object.entries({
+      "generate": () => this.#generate(),
+      "another-seed": () => this.#again(),
+      "keep-generated": () => this.#kept(),
+      "drop-generated": () => this.#drop(),
+    })) document.getElementById(id).addEventListener("click", act);
+  }
+
+  /** The fields of the method that is chosen, and what can be laid elsewhere. */
+  offer() {
+    const method = this.#form.elements.method.value;
+    for (const field of this.#form.querySelectorAll("[data-methods]")) field.hidden = !field.dataset.methods.split(" ").includes(method);
+    const all = things(this.#bench(), this.#sizes);
+    const choice = this.#form.elements.thing;
+    const before = choice.value;
+    const options = all.map(({ key, name }) => new Option(name, key));
+    if (method !== "grid" && all.length > 1) options.unshift(new Option("everything", "*"));
+    choice.replaceChildren(...options);
+    if (options.some(({ value }) => value === before)) choice.value = before;
+    document.getElementById("generate").disabled = !all.length;
+  }
+
+  #again() {
+    this.#form.elements.seed.value = Math.floor(Math.random() * 1e6);
+    this.#generate();
+  }
+
+  #generate() {
+    const { elements } = this.#form;
+    const value = (name) => Number(elements[name].value);
+    const bench = this.#bench();
+    const keys = elements.thing.value === "*" ? things(bench, this.#sizes).map(({ key }) => key) : [elements.thing.value];
+    const area = ["left", "right", "near", "far"].map(value);
+    const counts = Object.fromEntries(["n", "columns", "rows", "least", "seed", "turn"].map((name) => [name, value(name)]));
+    const method = elements.method.value;
+    const wanted = method === "grid" ? counts.columns * counts.rows : counts.n;
+    if (!(Number.isInteger(wanted) && wanted >= 1 && wanted <= MOST && area[0] <= area[1] && area[2] <= area[3])) {
+      this.#say(`Not generated: allowed are 1 to ${MOST} positions, in an area given from low to high.`);
+      return;
+    }
+    const { benches, left } = generated({ method, bench, sizes: this.#sizes, keys, area, ...counts });
+    const apart = nearest(benches, this.#sizes);
+    const said = [`${benches.length} position${benches.length === 1 ? "" : "s"}, shown faintly`];
+    if (Number.isFinite(apart)) said.push(`the nearest two are ${apart.toFixed(0)} mm apart`);
+    if (left) said.push(`${left} of ${wanted} left out: too close to something, or out of reach`);
+    this.#show(benches, `${said.join("; ")}.`);
+  }
+
+  #kept() {
+    const { made } = this;
+    this.#drop();
+    this.#keep(made, this.#form.elements.replace.checked);
+  }
+
+  #drop() {
+    this.#show([], "");
+  }
+
+  #show(benches, words) {
+    this.made = benches;
+    document.getElementById("generated-actions").hidden = !benches.length;
+    document.getElementById("keep-generated").textContent = `Keep these ${benches.length}`;
+    this.#say(words);
+    this.#draw();
+  }
+
+  #say(words) {
+    document.getElementById("generated-said").textContent = words;
+  }
+}

@@ -1,0 +1,41 @@
+// A list whose rows are brought into another order: dragged by their handles, or moved with the arrow keys there.
+
+/** `moved(from, to)` is told of each row that goes elsewhere; the list is then drawn anew by whoever has its contents. */
+export function orderable(list, moved) {
+  const rows = () => [...list.children];
+  const indexOf = (target) => rows().indexOf(target.closest("li"));
+  const move = (from, to) => {
+    if (to === from || to < 0 || to >= rows().length) return from;
+    moved(from, to);
+    rows()[to].querySelector("[data-handle]").focus({ preventScroll: true });
+    return to;
+  };
+  list.addEventListener("keydown", (event) => {
+    const step = { ArrowUp: -1, ArrowDown: 1 }[event.key];
+    if (!step || !event.target.closest("[data-handle]")) return;
+    event.preventDefault();
+    const from = indexOf(event.target);
+    move(from, from + step);
+  });
+  list.addEventListener("pointerdown", (event) => {
+    const handle = event.target.closest("[data-handle]");
+    if (!handle || handle.disabled || event.button !== 0) return;
+    event.preventDefault();
+    let at = indexOf(handle);
+    handle.focus({ preventScroll: true });
+    list.setPointerCapture(event.pointerId);
+    list.dataset.dragging = "";
+    const drag = ({ clientY }) => {
+      const middles = rows().map((row) => row.getBoundingClientRect()).map(({ top, height }) => top + height / 2);
+      const above = middles.filter((middle, index) => index !== at && middle < clientY).length;
+      at = move(at, above);
+    };
+    const end = () => {
+      delete list.dataset.dragging;
+      list.removeEventListener("pointermove", drag);
+      for (const kind of ["pointerup", "pointercancel"]) list.removeEventListener(kind, end);
+    };
+    list.addEventListener("pointermove", drag);
+    for (const kind of ["pointerup", "pointercancel"]) list.addEventListener(kind, end);
+  });
+}

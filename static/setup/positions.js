@@ -1,0 +1,232 @@
+// The positions of a scene: thumbnails, and the one that is on the stage with its numbers.
+
+import { escaped, placed, problems, things, thumbnail, windowOf, without } from "./bench.js";
+import { Generator } from "./generator.js";
+import { Stage } from "./stage.js";
+
+const NUMBERS = [["x", "x mm"], ["y", "y mm"], ["yaw", "turn °"], ["width", "width mm"], ["depth", "depth mm"]];
+const OBJECT = [0, 0.3, 0, 0.08, 0.08]; // metres and degrees
+
+export class Positions {
+  index = 0;
+  #editor;
+  #bench;
+  #references;
+  #may;
+  #changed;
+  #overlay;
+  #stage;
+  #view; // of the thumbnails
+  #generator;
+  #part = (id) => document.getElementById(id);
+
+  constructor(editor, { bench, kept, references, may, changed, overlay }) {
+    Object.assign(this, { kept });
+    this.#editor = editor;
+    this.#bench = bench;
+    this.#references = references;
+    this.#may = may;
+    this.#changed = changed;
+    this.#overlay = overlay;
+    this.#stage = new Stage(this.#part("stage"), bench, (laid) => this.#laid(laid));
+    this.#part("thumbnails").addEventListener("click", (event) => this.#pressed(event));
+    this.#part("position").addEventListener("input", (event) => this.#typed(event.target));
+    this.#part("position").addEventListener("click", (event) => event.target.closest("[data-take-away]") && this.#taken(event.target.closest("[data-thing-row]").dataset.thingRow));
+    for (const [id, act] of Object.entries({
+      "add-position": () => this.#added(),
+      "remove-position": () => this.#removed(),
+      "add-thing": () => this.#thing(),
+    })) this.#part(id)?.addEventListener("click", act);
+    const form = this.#part("generator");
+    if (form) this.#generator = new Generator(form, bench, { bench: () => this.#one?.bench, draw: () => this.#draw(), keep: (...made) => this.#keep(...made) });
+  }
+
+  get #all() {
+    return this.#editor.scene.positions;
+  }
+
+  get #one() {
+    return this.#all[this.index];
+  }
+
+  get #still() {
+    return !this.#may || Boolean(this.kept[this.#one?.id]);
+  }
+
+  choose(index) {
+    this.index = index;
+    this.show();
+  }
+
+  show() {
+    this.index = Math.min(this.index, Math.max(0, this.#all.length - 1));
+    this.#thumbnails();
+    this.#numbers(true);
+    this.#draw();
+    this.#generator?.offer();
+    const pictures = this.#references[this.#one?.id] ?? [];
+    this.#part("references").innerHTML = pictures
+      .map(({ station, camera, picture, page }) => `<li class="small"><a href="${page}"><img src="${picture}" alt="" width="120" height="90">${escaped(`${camera} of ${station}`)}</a></li>`)
+      .join("");
+    this.#part("references-title").hidden = !pictures.length;
+  }
+
+  #draw() {
+    this.#stage.show(this.#one?.bench, { still: this.#still, ghosts: this.#generator?.made ?? [], all: this.#all.map(({ bench }) => bench) });
+    this.#told();
+  }
+
+  #told() {
+    const said = this.#one ? problems(this.#one.bench, this.#bench) : [];
+    this.#part("bench-problems").replaceChildren(...said.map((words) => Object.assign(document.createElement("li"), { textContent: words })));
+    this.#overlay.show(this.#one?.bench, this.#references[this.#one?.id] ?? []);
+  }
+
+  #thumbnails() {
+    const view = (this.#view = windowOf(this.#all.map(({ bench }) => bench), this.#bench, 15));
+    const list = this.#part("thumbnails");
+    const focused = list.contains(document.activeElement);
+    list.innerHTML = this.#all
+      .map(({ id, number, label, bench }, index) => {
+        const name = `Position ${number}${label ? ` · ${label}` : ""}`;
+        return `<li><button type="button" class="position-pick" data-index="${index}"${index === this.index ? ' aria-current="true"' : ""}>${thumbnail(bench, this.#bench, view, "", this.#references[id]?.[0].picture)}<span class="clip">${escaped(name)}</span></button></li>`;
+      })
+      .join("");
+    if (focused) list.querySelector("[aria-current]")?.focus();
+  }
+
+  #pressed(event) {
+    const button = event.target.closest("[data-index]");
+    if (button) this.choose(Number(button.dataset.index));
+  }
+
+  /** Label, words and the numbers of everything that lies there; `whole`: also the fields that a person may be in. */
+  #numbers(whole) {
+    const one = this.#one;
+    const why = this.kept[one?.id];
+    this.#part("position").hidden = !one;
+    this.#part("position-kept").hidden = !why;
+    this.#part("position-kept").textContent = why ? `Position ${one.number} stays as it is, because of ${why}. Add a position: it begins like this one.` : "";
+    if (!one) return;
+    this.#part("position-title").textContent = `Position ${one.number}`;
+    for (const name of ["label", "description"]) {
+      const field = this.#part("position").querySelector(`[data-position=${name}]`);
+      if (whole) field.value = one[name];
+      field.readOnly = this.#still;
+    }
+    for (const id of ["add-thing", "add-kind", "remove-position"]) if (this.#part(id)) this.#part(id).disabled = this.#still;
+    const all = things(one.bench, this.#bench);
+    const rows = this.#part("things");
+    const keys = [...rows.children].map((row) => row.dataset.thingRow).join("\n");
+    if (keys !== all.map(({ key }) => key).join("\n")) rows.innerHTML = all.map((thing) => this.#row(thing)).join("");
+    all.forEach((thing, index) => {
+      for (const [name] of NUMBERS) {
+        const field = rows.children[index].querySelector(`[data-number=${name}]`);
+        if (!field) continue;
+        field.readOnly = this.#still;
+        if (field !== document.activeElement) field.value = String(Math.round(10 * thing[name]) / 10);
+      }
+      const away = rows.children[index].querySelector("[data-take-away]");
+      if (away) away.disabled = this.#still;
+    });
+    this.#part("no-things").hidden = all.length > 0;
+  }
+
+  #row({ key, name, kind }) {
+    const has = { plate: 2, block: 3, object: 5 }[kind];
+    const fields = NUMBERS.slice(0, has).map(
+      ([field, words]) => `<label class="field small"><span class="label">${words}</span><input type="number" step="1" data-number="${field}" aria-label="${escaped(name)}: ${words}"></label>`,
+    );
+    const away = this.#may ? `<button type="button" class="button button-quiet" data-take-away aria-label="Take away ${escaped(name)}">Take away</button>` : "";
+    return `<li class="thing-row" data-thing-row="${escaped(key)}"><span class="row spread line"><span class="strong thing-key thing-key-${kind}">${escaped(name)}</span>${away}</span><span class="thing-numbers">${fields.join("")}</span></li>`;
+  }
+
+  #laid(bench) {
+    this.#one.bench = bench;
+    this.#numbers(false);
+    const picture = this.#part("thumbnails").children[this.index].querySelector("svg"); // the others stay as they are
+    picture.outerHTML = thumbnail(bench, this.#bench, this.#view, "", this.#references[this.#one.id]?.[0].picture);
+    this.#told();
+    this.#changed();
+  }
+
+  #typed(field) {
+    const { position, number } = field.dataset;
+    if (position) {
+      this.#one[position] = field.value;
+      this.#thumbnails();
+      this.#changed();
+    } else if (number && field.value !== "" && Number.isFinite(Number(field.value))) {
+      const thing = things(this.#one.bench, this.#bench).find(({ key }) => key === field.closest("[data-thing-row]").dataset.thingRow);
+      this.#laid(placed(this.#one.bench, thing, { [number]: Number(field.value) }));
+      this.#draw();
+    }
+  }
+
+  #taken(key) {
+    const thing = things(this.#one.bench, this.#bench).find((one) => one.key === key);
+    this.#laid(without(this.#one.bench, thing));
+    this.#draw();
+    this.#part("add-thing").focus();
+  }
+
+  /** The simulated bench's block or plate, or an object by its name. */
+  #thing() {
+    const kind = this.#part("add-kind").value;
+    const name = this.#part("thing-name").value.trim();
+    const bench = this.#one.bench ?? {};
+    if (kind === "object" && !name) {
+      this.#part("thing-name").focus();
+      return;
+    }
+    if (kind === "object" ? bench.objects?.[name] : bench[kind]) {
+      this.#tell(`${kind === "object" ? name : kind} is there already`);
+      return;
+    }
+    const more = kind === "object" ? { objects: { ...bench.objects, [name]: OBJECT } } : { [kind]: this.#bench.first[kind] };
+    this.#part("thing-name").value = "";
+    this.#laid({ ...bench, ...more });
+    this.#draw();
+    this.#generator?.offer();
+  }
+
+  #tell(words) {
+    this.#part("positions-said").textContent = words;
+  }
+
+  /** One like the position that is shown. */
+  #added() {
+    const like = this.#one ?? { label: "", description: "", bench: null };
+    this.#all.push({ ...structuredClone(like), id: null, label: "", number: 0 });
+    this.#numbered();
+    this.choose(this.#all.length - 1);
+    this.#tell(`Position ${this.#one.number} is added: move what should be elsewhere`);
+    this.#changed();
+  }
+
+  #removed() {
+    const [{ number }] = this.#all.splice(this.index, 1);
+    this.#numbered();
+    this.show();
+    this.#tell(`Position ${number} is removed`);
+    this.#changed();
+  }
+
+  /** Those that are not saved yet go on counting after those that are. */
+  #numbered() {
+    let number = Math.max(0, ...this.#all.filter(({ id }) => id).map((one) => one.number));
+    for (const one of this.#all) if (!one.id) one.number = number += 1;
+  }
+
+  /** Positions that were generated join the others, in place of those that may go if that is wanted. */
+  #keep(benches, replace) {
+    const { description } = this.#one;
+    if (replace) this.#editor.scene.positions = this.#all.filter(({ id }) => this.kept[id]);
+    const first = this.#all.length;
+    this.#all.push(...benches.map((bench) => ({ id: null, number: 0, label: "", description, bench })));
+    this.#numbered();
+    this.choose(first);
+    this.#tell(`${benches.length} position${benches.length === 1 ? " is" : "s are"} kept`);
+    this.#changed();
+  }
+}

@@ -1,0 +1,125 @@
+// The bench from above, on which things are moved and turned with mouse, finger and keys. Millimetres and degrees.
+
+import { box, drawn, ground, n, placed, things, turned, windowOf } from "./bench.js";
+
+const STEP = 10; // mm for an arrow key, 1 with Shift
+const TURN = 5; // degrees for Page Up and Page Down, 1 with Shift
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+const HANDLE = 26; // mm from a thing's far edge to the handle that turns it
+
+export class Stage {
+  #svg;
+  #sizes;
+  #changed;
+  #bench = {};
+  #still = true;
+  #ghosts = [];
+  #view;
+  #chosen = ""; // key of the thing whose handle is shown
+
+  /** `changed(bench)` is told of each bench that a person makes of the one that is shown. */
+  constructor(svg, sizes, changed) {
+    this.#svg = svg;
+    this.#sizes = sizes;
+    this.#changed = changed;
+    svg.addEventListener("pointerdown", (event) => this.#pressed(event));
+    svg.addEventListener("keydown", (event) => this.#key(event));
+    svg.addEventListener("focusin", (event) => this.#choose(event.target.closest("[data-thing]")?.dataset.thing));
+  }
+
+  /** Show this bench, and faintly those of `ghosts`; `still`: nothing of it can be moved. */
+  show(bench, { still = false, ghosts = this.#ghosts, all = [] } = {}) {
+    this.#bench = bench ?? {};
+    this.#still = still;
+    this.#ghosts = ghosts;
+    this.#view = windowOf([this.#bench, ...all, ...ghosts], this.#sizes);
+    this.#draw();
+  }
+
+  #draw() {
+    const focused = this.#svg.contains(document.activeElement) ? document.activeElement.dataset.thing : "";
+    const { sides, reach } = this.#sizes;
+    const circles = sides.map(([x, y]) => `<circle class="reach" cx="${n(1000 * x)}" cy="${n(-1000 * y)}" r="${n(1000 * reach)}"/>`);
+    const faint = this.#ghosts.flatMap((bench) => things(bench, this.#sizes).map((thing) => drawn(thing, { attributes: "data-ghost" })));
+    const own = things(this.#bench, this.#sizes).map((thing) => this.#movable(thing));
+    const arms = `<text class="side" x="0" y="${n(this.#view.y + this.#view.height - 10)}">the arms are on this side</text>`;
+    this.#svg.setAttribute("viewBox", box(this.#view));
+    this.#svg.innerHTML = ground(this.#sizes, this.#view) + circles.join("") + arms + faint.join("") + own.join("");
+    if (focused) this.#svg.querySelector(`[data-thing="${CSS.escape(focused)}"]`)?.focus({ preventScroll: true });
+  }
+
+  #movable(thing) {
+    const { key, name, kind, x, y, yaw, depth } = thing;
+    const turn = kind === "plate" ? "" : `, turned by ${n(yaw)}°`;
+    const label = `${name}: x ${n(x)} mm, y ${n(y)} mm${turn}`;
+    const named = `data-thing="${attribute(key)}"`;
+    if (this.#still) return drawn(thing, { attributes: `${named} role="img" aria-label="${attribute(label)}"`, words: name });
+    const far = -depth / 2 - HANDLE;
+    const handle = kind !== "plate" && key === this.#chosen ? `<path class="turn-line" d="M0 0V${n(far)}"/><circle class="turn" data-turn cy="${n(far)}" r="9"/>` : "";
+    const attributes = `${named} tabindex="0" role="button" aria-roledescription="thing on the bench" aria-label="${attribute(label)}"`;
+    return drawn(thing, { attributes, inside: handle, words: name });
+  }
+
+  #choose(key) {
+    if (!key || key === this.#chosen) return;
+    this.#chosen = key;
+    this.#draw();
+  }
+
+  #thing(key) {
+    return things(this.#bench, this.#sizes).find((thing) => thing.key === key);
+  }
+
+  #put(thing, change) {
+    const { x = thing.x, y = thing.y } = change;
+    const [left, right, near, far] = thing.kind === "object" ? [-2000, 2000, -2000, 2000] : this.#sizes.area.map((side) => 1000 * side);
+    const inside = { ...change, x: Math.min(Math.max(x, left), right), y: Math.min(Math.max(y, near), far) };
+    this.#bench = placed(this.#bench, thing, inside);
+    this.#draw();
+    this.#changed(this.#bench);
+  }
+
+  #at(event) {
+    const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.#svg.getScreenCTM().inverse());
+    return { x: point.x, y: -point.y };
+  }
+
+  #pressed(event) {
+    const pressed = event.target.closest("[data-thing]");
+    if (!pressed || this.#still || event.button !== 0) return;
+    event.preventDefault();
+    const { thing: key } = pressed.dataset;
+    const [before, from] = [this.#thing(key), this.#at(event)];
+    const turning = event.target.closest("[data-turn]");
+    pressed.focus({ preventScroll: true });
+    const drag = (later) => {
+      const to = this.#at(later);
+      if (turning) this.#put(before, { yaw: turned(Math.round((Math.atan2(to.y - before.y, to.x - before.x) * 180) / Math.PI - 90)) });
+      else this.#put(before, { x: Math.round(before.x + to.x - from.x), y: Math.round(before.y + to.y - from.y) });
+    };
+    const end = (last) => {
+      this.#svg.removeEventListener("pointermove", drag);
+      for (const kind of ["pointerup", "pointercancel"]) this.#svg.removeEventListener(kind, end);
+      if (last.type === "pointercancel") this.#put(before, before);
+    };
+    this.#svg.setPointerCapture(event.pointerId);
+    this.#svg.addEventListener("pointermove", drag);
+    for (const kind of ["pointerup", "pointercancel"]) this.#svg.addEventListener(kind, end);
+  }
+
+  #key(event) {
+    const thing = this.#thing(event.target.closest("[data-thing]")?.dataset.thing);
+    if (!thing || this.#still || event.ctrlKey || event.altKey || event.metaKey) return;
+    const [along, turns] = [ARROWS[event.key], { PageUp: 1, PageDown: -1 }[event.key]];
+    if (along) {
+      const step = event.shiftKey ? 1 : STEP;
+      this.#put(thing, { x: thing.x + step * along[0], y: thing.y + step * along[1] });
+    } else if (turns && thing.kind !== "plate") this.#put(thing, { yaw: thing.yaw + turns * (event.shiftKey ? 1 : TURN) });
+    else return;
+    event.preventDefault();
+  }
+}
+
+function attribute(text) {
+  return text.replace(/[&"<]/g, (sign) => `&#${sign.charCodeAt(0)};`);
+}

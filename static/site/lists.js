@@ -1,0 +1,175 @@
+// Lists: the address says what one is narrowed to, without what is empty; and what is done to all that are ticked.
+
+import { post, RequestFailed } from "./api.js";
+
+document.body.addEventListener("htmx:configRequest", ({ detail }) => {
+  if (!detail.elt.matches("[data-list-filter]")) return;
+  for (const [name, value] of [...detail.formData.entries()]) if (!value) detail.formData.delete(name);
+});
+
+const NONE = "00000000-0000-0000-0000-000000000000"; // stands for the uuid in an address
+
+const count = (n, thing) => `${n} ${thing}${n === 1 ? "" : "s"}`;
+
+/** What can be done to several at once, one after the other, each by its own address: what is refused is named. */
+class Bulk {
+  #bar = document.querySelector("[data-bulk]");
+  #ticked = new Set();
+  #busy = false;
+  #ended = false; // by the one who pressed
+  #undo = []; // of the last change of tags: {value, content}
+
+  constructor() {
+    document.addEventListener("change", ({ target }) => this.#changed(target));
+    document.addEventListener("click", ({ target }) => this.#clicked(target));
+    document.body.addEventListener("htmx:afterSwap", () => this.#show());
+    for (const box of this.#boxes) this.#tick(box); // before this script was there, or by the browser on the way back
+    this.#show();
+  }
+
+  get #boxes() {
+    return [...document.querySelectorAll("[data-tick]")];
+  }
+
+  #part(name) {
+    return this.#bar.querySelector(`[data-bulk-${name}]`);
+  }
+
+  #changed(target) {
+    if (target.matches("[data-tick]")) this.#tick(target);
+    if (target.matches("[data-tick-all]")) {
+      for (const box of this.#boxes) this.#tick(Object.assign(box, { checked: target.checked }));
+    }
+    this.#show();
+  }
+
+  #tick({ checked, value }) {
+    if (checked) this.#ticked.add(value);
+    else this.#ticked.delete(value);
+  }
+
+  /** Rows that are new are ticked as those before; those that are gone are ticked no more. */
+  #show() {
+    const there = new Set(this.#boxes.map(({ value }) => value));
+    for (const value of this.#ticked) if (!there.has(value)) this.#ticked.delete(value);
+    for (const box of this.#boxes) box.checked = this.#ticked.has(box.value);
+    const all = document.querySelector("[data-tick-all]");
+    if (all) {
+      all.checked = there.size > 0 && this.#ticked.size === there.size;
+      all.indeterminate = this.#ticked.size > 0 && !all.checked;
+    }
+    this.#bar.hidden = !this.#ticked.size && !this.#busy && !this.#part("said").textContent;
+    this.#part("count").textContent = `${this.#ticked.size} chosen`;
+    for (const button of this.#bar.querySelectorAll("[data-bulk-address]")) button.disabled = this.#busy || !this.#ticked.size;
+    this.#part("end").hidden = !this.#busy;
+    this.#part("undo").hidden = this.#busy || !this.#undo.length;
+    this.#datasets();
+  }
+
+  /** To the page that makes a new dataset of those that are published, one for each dataset that has some. */
+  #datasets() {
+    const published = new Map();
+    for (const { checked, dataset } of this.#boxes) {
+      if (checked && dataset.of) published.set(dataset.of, [...(published.get(dataset.of) ?? []), Number(dataset.index)]);
+    }
+    const links = [...published].map(([address, indices]) => {
+      const chosen = indices.sort((one, other) => one - other);
+      const [name] = address.split("/").slice(-2);
+      const text = `New dataset from ${chosen.length} of ${decodeURIComponent(name)}`;
+      return Object.assign(document.createElement("a"), { className: "button", href: `${address}?chosen=${chosen}#split`, textContent: text });
+    });
+    this.#part("datasets").replaceChildren(...links);
+  }
+
+  async #clicked(target) {
+    const button = target.closest?.("button");
+    if (button?.matches("[data-bulk-end]")) this.#ended = true;
+    if (this.#busy) return;
+    if (button?.matches("[data-bulk-undo]")) await this.#takeBack();
+    if (button?.matches("[data-bulk-address]")) await this.#do(button);
+  }
+
+  async #do(button) {
+    const chosen = [...this.#ticked];
+    const words = button.textContent.trim();
+    const content = this.#content(button);
+    if (!content) {
+      this.#say("Type the tag first.");
+      this.#bar.querySelector("[name=tag]").focus();
+      return;
+    }
+    const { bulkAsk, bulkTitle } = button.dataset;
+    if (bulkAsk && !(await this.#sure(bulkTitle.replace("N", count(chosen.length, "episode")), bulkAsk))) return;
+    const work = chosen.map((value) => ({ value, content }));
+    const answers = await this.#all(words, button.dataset.bulkAddress, work);
+    this.#undo = answers
+      .map(({ value, answer: { added, removed } }) => ({ value, content: { add: removed ?? [], remove: added ?? [] } }))
+      .filter(({ content: { add, remove } }) => add.length || remove.length);
+    this.#show();
+  }
+
+  /** What a button sends; null where a tag is missing. */
+  #content({ dataset }) {
+    const field = (name) => this.#bar.querySelector(`[data-bulk-field][name=${name}]`).value.trim();
+    if (dataset.bulkTag) return field("tag") && { [dataset.bulkTag]: [field("tag")] };
+    const content = JSON.parse(dataset.bulkContent ?? "{}");
+    if (dataset.bulkFields) content[dataset.bulkFields] = field(dataset.bulkFields);
+    return content;
+  }
+
+  async #takeBack() {
+    const work = this.#undo;
+    const done = await this.#all("Undo", this.#bar.querySelector("[data-bulk-tag]").dataset.bulkAddress, work);
+    const values = new Set(done.map(({ value }) => value));
+    this.#undo = work.filter(({ value }) => !values.has(value));
+    this.#show();
+  }
+
+  /** True if the person who is asked means it. */
+  #sure(title, words) {
+    const dialog = this.#part("sure");
+    dialog.querySelector("h2").textContent = `${title}?`;
+    dialog.querySelector("form > p").textContent = words;
+    dialog.querySelector("[value=yes]").textContent = title;
+    dialog.returnValue = "";
+    dialog.showModal();
+    return new Promise((resolve) => {
+      dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true });
+    });
+  }
+
+  /** Send `work`, each of value and content; what was answered, by value. */
+  async #all(words, address, work) {
+    this.#busy = true;
+    this.#ended = false;
+    const faults = [];
+    const answers = [];
+    for (const [index, { value, content }] of work.entries()) {
+      if (this.#ended) break;
+      this.#say(`${words}: ${index + 1} of ${work.length} …`);
+      try {
+        answers.push({ value, answer: await post(address.replace(NONE, value), content) });
+      } catch (error) {
+        if (!(error instanceof RequestFailed)) throw error;
+        faults.push(error.message);
+      }
+    }
+    this.#busy = false;
+    const left = work.length - answers.length - faults.length;
+    const changes = answers.filter(({ answer: { added, removed } }) => added?.length || removed?.length).length;
+    const said = [`${words}: ${answers.length} of ${work.length} done`];
+    if (address.endsWith("/tags") && changes < answers.length) said.push(`${answers.length - changes} unchanged`);
+    if (left) said.push(`ended, ${left} left unchanged`);
+    if (faults.length) said.push(`${faults.length} refused: ${[...new Set(faults)].join("; ")}`);
+    this.#say(`${said.join(". ")}.`);
+    if (answers.length) window.htmx.ajax("GET", window.location.href, { target: "#list", select: "#list", swap: "outerHTML" });
+    return answers;
+  }
+
+  #say(words) {
+    this.#part("said").textContent = words;
+    this.#show();
+  }
+}
+
+if (document.querySelector("[data-bulk]")) new Bulk();
