@@ -10,15 +10,18 @@ from pathlib import Path
 from robots.broken_pipe import unread_ends
 
 _BENCHMARKS = (
+    "chaos",
     "coverage",
     "designs",
     "estop",
     "ik",
+    "lab",
     "latency",
     "live",
     "loop",
     "measures",
     "moving_target",
+    "pages",
     "recording",
     "replay",
     "results",
@@ -28,7 +31,8 @@ _BENCHMARKS = (
     "wires",
 )
 _SETTABLE = ("latency", "loop")
-_LONG = ("designs", "recording")
+_SEEDED = ("chaos",)
+_LONG = ("designs", "recording", "results")
 _SECONDS = 20.0
 
 
@@ -53,16 +57,21 @@ def main() -> int:
     parser.add_argument(
         "--long", "--full", action="store_true", help=f"more and longer cases, for {' and '.join(_LONG)}"
     )
+    parser.add_argument("--seed", type=int, help=f"of what happens, for {' and '.join(_SEEDED)}; else drawn")
     given = parser.parse_args()
     if given.assignments and given.name not in _SETTABLE:
         parser.error(f"--set is for {' and '.join(_SETTABLE)}")
     if given.long and given.name not in _LONG:
         parser.error(f"--long is for {' and '.join(_LONG)}")
+    if given.seed is not None and given.name not in _SEEDED:
+        parser.error(f"--seed is for {' and '.join(_SEEDED)}")
     if given.seconds and given.minutes:
         parser.error("--seconds and --minutes say the same: give one of them")
     module = importlib.import_module(f"benchmarks.{given.name}")
     seconds = given.seconds or 60.0 * (given.minutes or 0.0) or getattr(module, "SECONDS", _SECONDS)
     options = {"long": True} if given.long else {}
+    if given.seed is not None:
+        options["seed"] = given.seed
     report = module.measure(seconds, *([given.assignments] if given.assignments else []), **options)
     print(report.json() if given.json == "-" else report.table())
     if given.json not in (None, "-"):

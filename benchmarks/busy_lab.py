@@ -61,7 +61,7 @@ def _up(lab: Any, given: argparse.Namespace) -> None:
     from evaweb.roles import Role
     from runtime.sim.standin import announce
 
-    node = lab.processes.start(programs.tabletop(ROBOT, 1))
+    node = lab.processes.start(programs.tabletop(ROBOT, programs.bench(1, 640, 480)))
     serving = ("-m", "runtime.sim.serve", "openpi", *_POLICY)
     policy = lab.processes.start(Program("policy", serving, announces=True))
     assignments = [

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from benchmarks import coverage
 from benchmarks.report import Figure, Report
+from evaweb.plans.schedule import RANDOM, Condition, Unit, counts_of, schedule
 from evaweb.statistics.boundaries import MOST, Boundary, Look, extremeness
 from evaweb.statistics.courses import course
-from evaweb.statistics.designs import ANYTIME, FIXED, SCORE, conclude, design
+from evaweb.statistics.designs import ANYTIME, FIXED, SCORE, conclude, design, findings, in_blocks
 from evaweb.statistics.difference import barnard
 
 SECONDS = coverage.SECONDS
@@ -27,6 +28,7 @@ SIZES = (50, 100)  # pairs
 ALPHA, LOOSE = 0.05, 0.1
 MARGIN = 0.2
 _STEPS = 3  # milestones of a trial with partial credit: its score is how many of them were reached
+_SOME_RATES = (0.2, 0.5, 0.8)
 _RATES = tuple(round(0.05 * i, 2) for i in range(1, 20))  # at which simulated designs err
 _RUNS_OF_RATES, _SIMULATED = 4000, 0.003  # of `courses`, and what standard error that has at alpha .05
 _RUNS = 1000
@@ -36,13 +38,17 @@ Courses = list[dict[str, object]]
 
 
 class Case(NamedTuple):
-    """A design as it is frozen, but for its number of pairs; `every` so many of them there is a look."""
+    """A design as it is frozen, but for its number of pairs; `every` so many of them there is a look.
+
+    `random`: two checkpoints in random order, in blocks of two trials at ten conditions.
+    """
 
     rule: str
     alpha: float = ALPHA
     margin: float | None = None
     every: int = 1
     outcome: str = "success"
+    random: bool = False
 
 
 class Found(NamedTuple):
@@ -62,6 +68,8 @@ DESIGNS = {
     "fixed_margin": Case(FIXED, margin=MARGIN),
     "late_margin": Case("late", margin=MARGIN),
     "early_margin": Case("early", margin=MARGIN),
+    "late_random": Case("late", random=True),
+    "early_random": Case("early", random=True),
     "anytime": Case(ANYTIME),
     "fixed_scores": Case(FIXED, outcome=SCORE),
     "anytime_scores": Case(ANYTIME, outcome=SCORE),
@@ -81,7 +89,12 @@ def measure(seconds: float, long: bool = False) -> Report:
     has designs of 250 pairs too.
     """
     rows: Courses = []
-    figures = [*errors((*SIZES, MOST) if long else SIZES, rows), *powers(rows), *drifts(rows)]
+    figures = [
+        *errors((*SIZES, MOST) if long else SIZES, rows),
+        *families(rows),
+        *powers(rows),
+        *drifts(rows),
+    ]
     covered = coverage.measure(seconds)
     return Report("designs", [*figures, *covered.figures], [*rows, *covered.rows])
 
@@ -145,8 +158,43 @@ def boundary_of(case: Case, pairs: int) -> Boundary | None:
     if case.rule == FIXED and case.margin is None:
         return Boundary((Look(pairs, pairs, _least(pairs, case.alpha)),), case.alpha)
     looks = range(case.every, pairs, case.every) if case.every > 1 else ()
-    found = design(rule=case.rule, pairs=pairs, alpha=case.alpha, margin=case.margin, looks=looks)
+    counts = counts_of(_in_random_order(pairs), "ab") if case.random else None
+    found = design(
+        rule=case.rule, blocks=pairs, alpha=case.alpha, margin=case.margin, looks=looks, counts=counts
+    )
     return found.boundary
+
+
+def _in_random_order(blocks: int) -> list[Unit]:
+    conditions = [Condition("scene", number) for number in range(10)]
+    return schedule(
+        checkpoints=["a", "b"],
+        conditions=conditions,
+        repetitions=blocks // 10,
+        key=bytes(32),
+        allocation=RANDOM,
+    )
+
+
+def families(rows: Courses) -> Iterator[Figure]:
+    """How often any of several comparisons of equal checkpoints is significant, simulated, with dropped ones and
+    without; allowed are three standard errors above alpha.
+    """
+    three = ((0, 1), (0, 2), (1, 2))
+    allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
+    for name, rule, drops in (
+        ("all_of_three_fixed", FIXED, False),
+        ("all_of_three_early", "early", False),
+        ("all_of_three_early_dropped", "early", True),
+    ):
+        planned = design(rule=rule, blocks=SIZES[0], alpha=ALPHA, comparisons=three, drops=drops)
+        worst = 0.0
+        for rate in _SOME_RATES:
+            won = np.random.default_rng(7).random((_RUNS, SIZES[0], 3)) < rate
+            ended = (findings(planned, [tuple(enumerate(map(float, block))) for block in run]) for run in won)
+            worst = max(worst, sum(any(one.winner for one in found.each) for found in ended) / _RUNS)
+        rows.append({"family": name, "blocks": SIZES[0], "simulated": worst})
+        yield Figure(f"type1.{name}.{SIZES[0]}", worst, "", f"<= {allowed:.4f}")
 
 
 def _least(n: int, alpha: float) -> tuple[int, int] | None:
@@ -233,9 +281,9 @@ def _found(case: Case, rates: Rates, pairs: int) -> Found:
 def _simulated(case: Case, rates: Rates, pairs: int) -> Found:
     """Of scores, each the share of milestones that were reached, at these chances each."""
     chance = np.random.default_rng(pairs)
-    planned = design(rule=case.rule, pairs=pairs, alpha=case.alpha, outcome=case.outcome)
+    planned = design(rule=case.rule, blocks=pairs, alpha=case.alpha, outcome=case.outcome)
     scores = chance.binomial(_STEPS, rates, size=(_RUNS, pairs, 2)) / _STEPS
-    ended = [conclude(planned, [(one, other) for one, other in run]) for run in scores.tolist()]
+    ended = [conclude(planned, in_blocks([(one, other) for one, other in run])) for run in scores.tolist()]
     power = sum(found.winner is not None for found in ended) / _RUNS
     return Found(power, float(np.median([found.at or pairs for found in ended])), _error(power, _RUNS))
 

@@ -44,9 +44,9 @@ class Press:
 class _Page(LivePage):
     """A page that hears what becomes of its presses."""
 
-    def __init__(self, visitor: Visitor) -> None:
+    def __init__(self, visitor: Visitor, station: str) -> None:
         self._acks: dict[str, queue.SimpleQueue[tuple[float, Mapping[str, Any]]]] = {}  # by uuid
-        super().__init__(visitor, PRESSED)
+        super().__init__(visitor, station)
 
     @property
     def broken(self) -> str:
@@ -76,10 +76,10 @@ class OpenPage:
     Where its connection breaks it is opened again.
     """
 
-    def __init__(self, visitor: Visitor, stops: str) -> None:
-        self._visitor = visitor
-        self._page, self._opening = _Page(visitor), threading.Lock()
-        self._way = Program(stops, {"Cookie": visitor.cookies})
+    def __init__(self, visitor: Visitor, stops: str, station: str = PRESSED) -> None:
+        self._visitor, self._station = visitor, station
+        self._page, self._opening = _Page(visitor, station), threading.Lock()
+        self._way = Program(stops, {"Cookie": visitor.cookies}, station)
         self._way.ready()
 
     def press(self, why: str) -> Press:
@@ -100,7 +100,7 @@ class OpenPage:
             if self._page.broken:
                 self.close()
                 try:
-                    self._page = _Page(self._visitor)
+                    self._page = _Page(self._visitor, self._station)
                 except VisitFailed as fault:
                     return Press("", str(fault), 0.0)
             page = self._page
@@ -113,8 +113,8 @@ class OpenPage:
 class Program:
     """A program with these headers, which opens a connection for each press."""
 
-    def __init__(self, url: str, headers: Mapping[str, str]) -> None:
-        self._address = urlsplit(url).netloc
+    def __init__(self, url: str, headers: Mapping[str, str], station: str = PRESSED) -> None:
+        self._address, self._station = urlsplit(url).netloc, station
         self._headers = {**headers, "Content-Type": "application/json"}
 
     def ready(self) -> None:
@@ -134,7 +134,7 @@ class Program:
 
     def _asked(self, method: str, body: str) -> dict[str, Any]:
         with closing(http.client.HTTPConnection(self._address, timeout=PATIENCE_S)) as connection:
-            connection.request(method, f"/api/v1/stations/{PRESSED}/estop", body, self._headers)
+            connection.request(method, f"/api/v1/stations/{self._station}/estop", body, self._headers)
             found: dict[str, Any] = json.loads(connection.getresponse().read())
             return found
 

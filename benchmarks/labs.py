@@ -75,10 +75,10 @@ def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Ite
         yield running
 
 
-def watch(visitor: Visitor, seconds: float, **counts: int) -> subprocess.Popen[str]:
+def watch(visitor: Visitor, seconds: float, station: str = STATION, **counts: int) -> subprocess.Popen[str]:
     """Pages open on the station for so long, in a process of their own; `reading` or `stalled` of them."""
     options = [part for name, count in counts.items() for part in (f"--{name}", str(count))]
-    command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, STATION, visitor.cookies]
+    command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, station, visitor.cookies]
     command += ["--streams", ",".join(STREAMS), "--seconds", str(seconds), *options]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
 
@@ -108,7 +108,11 @@ class Processors:
         """Processor time of the lab's processes by their name, of all of ours, of the machine [s]."""
         lab = _used([self._lab, *self._lab.children(recursive=True)])
         me = psutil.Process()
-        return {**lab, "ours": sum(_used([me, *me.children(recursive=True)]).values()), "busy": _busy()}
+        return {
+            **lab,
+            "ours": sum(_used([me, *me.children(recursive=True)]).values()),
+            "busy": machine_used(),
+        }
 
 
 def _used(processes: Iterable[psutil.Process]) -> dict[str, float]:
@@ -116,7 +120,7 @@ def _used(processes: Iterable[psutil.Process]) -> dict[str, float]:
     found: dict[str, float] = {}
     for process in processes:
         try:
-            name, times = _name(process.cmdline()), process.cpu_times()
+            name, times = named(process.cmdline()), process.cpu_times()
         except psutil.NoSuchProcess:  # it has ended since it was listed: nothing of it can be asked
             continue
         found[name] = found.get(name, 0.0) + times.user + times.system
@@ -127,7 +131,7 @@ class Scheduling:
     """The kernel's scheduling of one process of a lab from now on."""
 
     def __init__(self, lab: psutil.Process, module: str) -> None:
-        (self._process,) = (p for p in lab.children(recursive=True) if _name(p.cmdline()) == module)
+        (self._process,) = (p for p in lab.children(recursive=True) if named(p.cmdline()) == module)
         self._begun = time.monotonic()
         self._before = self._counts()
 
@@ -150,12 +154,12 @@ class Scheduling:
         }
 
 
-def _busy() -> float:
+def machine_used() -> float:
     times = psutil.cpu_times()
     return float(sum(times) - times.idle - times.iowait - times.guest - times.guest_nice)
 
 
-def _name(command: Sequence[str]) -> str:
+def named(command: Sequence[str]) -> str:
     """The module or the management command that a process runs."""
     if "-m" in command:
         return command[command.index("-m") + 1]

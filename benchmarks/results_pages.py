@@ -19,7 +19,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from benchmarks.results_seed import Seeded, closed_episode, seed
+from benchmarks.results_seed import Seeded, closed_episode, multiplied, seed
 
 ROUNDS = 120
 _MS = 1000.0
@@ -31,6 +31,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--plans", type=int, default=200)
     parser.add_argument("--trials", type=int, default=100_000)
+    parser.add_argument("--copies", type=int, default=1, help="of each evaluation; PostgreSQL alone")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     given = parser.parse_args()
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
@@ -45,6 +46,8 @@ def main() -> None:
     call_command("migrate", verbosity=0)
     began = time.perf_counter()
     seeded = seed(given.plans, given.trials)
+    if given.copies > 1:
+        seeded = multiplied(seeded, given.copies)
     with connection.cursor() as cursor:
         cursor.execute("ANALYZE")
     found = {

@@ -13,6 +13,19 @@ _MILESTONES = ("grasped", "lifted", "placed")
 _FAILURES = ("dropped", "missed the grasp", "collided", "stood still", "wrong object")
 _BEGIN = datetime(2024, 1, 1, tzinfo=UTC)
 _BATCH = 5000
+_COPIED = (
+    "trials.Evaluation",
+    "plans.Plan",
+    "plans.Plan_checkpoints",
+    "plans.Plan_positions",
+    "plans.PlanEvent",
+    "plans.Slot",
+    "episodes.Episode",
+    "trials.Trial",
+    "trials.Score",
+    "trials.MilestoneOutcome",
+    "plans.Handout",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +69,63 @@ def seed(plans: int, trials: int) -> Seeded:
         _plan(i, share, chance, operators, stations, scenes, checkpoints, i >= late) for i in range(plans)
     ]
     return Seeded(made, viewer, operators, stations, trials)
+
+
+def multiplied(seeded: Seeded, times: int) -> Seeded:
+    """Each evaluation with all that belongs to it so many times, each copy before the last one; on PostgreSQL.
+
+    The server copies rows, and checks none of them: its user has to be its superuser.
+    """
+    from django.apps import apps
+    from django.db import connection, transaction
+
+    from evaweb.plans.models import Plan
+
+    models = [apps.get_model(name) for name in _COPIED]
+    with transaction.atomic(), connection.cursor() as cursor:
+        cursor.execute("SET LOCAL session_replication_role = replica")  # neither triggers nor foreign keys
+        steps = {model: _newest(cursor, model) for model in models}
+        for model in models:
+            table, fields = model._meta.db_table, model._meta.concrete_fields
+            columns = ", ".join(f'"{field.column}"' for field in fields)
+            copied = ", ".join(_copied(field, steps) for field in fields)
+            cursor.execute(
+                f'INSERT INTO "{table}" ({columns}) SELECT {copied} FROM "{table}", generate_series(1, %s) AS copy',
+                [times - 1],
+            )
+            if steps[model]:
+                column = model._meta.pk.column
+                cursor.execute("SELECT pg_get_serial_sequence(%s, %s)", [table, column])
+                cursor.execute(
+                    f'SELECT setval(%s, (SELECT max("{column}") FROM "{table}"))', cursor.fetchone()
+                )
+    plans = list(Plan.objects.order_by("pk"))
+    return Seeded(plans, seeded.viewer, seeded.operators, seeded.stations, seeded.trials * times)
+
+
+def _newest(cursor: Any, model: Any) -> int:
+    """The highest number of a row; 0 where rows have no numbers."""
+    from django.db.models import AutoField
+
+    if not isinstance(model._meta.pk, AutoField):
+        return 0
+    cursor.execute(f'SELECT max("{model._meta.pk.column}") FROM "{model._meta.db_table}"')
+    return int(cursor.fetchone()[0])
+
+
+def _copied(field: Any, steps: Mapping[Any, int]) -> str:
+    """A column of a copy, in SQL."""
+    column = f'"{field.column}"'
+    of = field.related_model if field.is_relation else field.model if field.primary_key else None
+    if steps.get(of):
+        return f"{column} + copy * {steps[of]}"
+    if of in steps or (field.unique and field.get_internal_type() == "UUIDField"):
+        return f"md5({column}::text || copy)::uuid"
+    if field.name == "name":
+        return f"{column} || '-' || copy"
+    if field.get_internal_type() == "DateTimeField":
+        return f"{column} - copy * interval '1 year'"
+    return column
 
 
 def _plan(
@@ -123,9 +193,6 @@ def _run(
     begin: datetime,
 ) -> list[Any]:
     """A trial of each slot with its recording; each block at one station, by one operator."""
-    from evaweb.episodes.models import Episode
-    from evaweb.trials.models import Trial
-
     block_of = {slot.block: (chance.choice(stations), chance.choice(operators)) for slot in slots}
     trials = []
     for number, slot in enumerate(slots):
@@ -134,8 +201,8 @@ def _run(
             station, begin + timedelta(seconds=100 * number), round(chance.uniform(6, 60), 3)
         )
         trials.append(_trial(plan, slot, episode, operator))
-    Episode.objects.bulk_create([trial.episode for trial in trials], batch_size=_BATCH)
-    return list(Trial.objects.bulk_create(trials, batch_size=_BATCH))
+    _written([trial.episode for trial in trials])
+    return _written(trials)
 
 
 def closed_episode(station: Any, started: datetime, seconds: float) -> Any:
@@ -197,9 +264,9 @@ def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Ra
                 scored_at=trial.ended_at,
             )
         )
-    scores = Score.objects.bulk_create(scores, batch_size=_BATCH)
-    MilestoneOutcome.objects.bulk_create(
-        (
+    _written(scores)
+    _written(
+        [
             MilestoneOutcome(
                 score=score,
                 milestone=stone,
@@ -211,8 +278,7 @@ def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Ra
             )
             for score, far in zip(scores, reached, strict=True)
             for n, stone in enumerate(stones[score.trial.scene_id])
-        ),
-        batch_size=_BATCH,
+        ]
     )
 
 
@@ -222,13 +288,48 @@ def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
     from evaweb.plans.models import Handout
 
     known = codes(bytes(plan.key), len(slots))
-    Handout.objects.bulk_create(
-        (
+    _written(
+        [
             Handout(plan=plan, number=n, slot=slot, trial=trial, code=code)
             for n, (slot, trial, code) in enumerate(zip(slots, trials, known, strict=True), start=1)
-        ),
-        batch_size=_BATCH,
+        ]
     )
+
+
+def _written(rows: Sequence[Any]) -> list[Any]:
+    """The rows of one model in the database: on PostgreSQL by COPY, with their numbers fetched first."""
+    from django.db import connection
+    from django.db.models import AutoField
+    from django.db.models.expressions import DatabaseDefault
+
+    if not rows:
+        return []
+    options = type(rows[0])._meta
+    if connection.vendor != "postgresql":
+        return list(type(rows[0])._default_manager.bulk_create(rows, batch_size=_BATCH))
+    table = connection.ops.quote_name(options.db_table)
+    with connection.cursor() as cursor:
+        if isinstance(options.pk, AutoField):
+            cursor.execute(
+                "SELECT nextval(pg_get_serial_sequence(%s, %s)) FROM generate_series(1, %s)",
+                [options.db_table, options.pk.column, len(rows)],
+            )
+            for row, (number,) in zip(rows, cursor.fetchall(), strict=True):
+                row.pk = number
+        fields = [
+            field
+            for field in options.concrete_fields
+            if not isinstance(getattr(rows[0], field.attname), DatabaseDefault)
+        ]
+        columns = ", ".join(connection.ops.quote_name(field.column) for field in fields)
+        with cursor.copy(f"COPY {table} ({columns}) FROM STDIN") as copy:
+            for row in rows:
+                copy.write_row(
+                    [field.get_db_prep_save(field.pre_save(row, True), connection) for field in fields]
+                )
+    for row in rows:
+        row._state.adding = False
+    return list(rows)
 
 
 def _counted(plan: Any) -> None:
@@ -237,7 +338,7 @@ def _counted(plan: Any) -> None:
 
     with connection.cursor() as cursor:
         cursor.execute(
-            "UPDATE trials_trial SET status = 'scored', "
+            "UPDATE trials_trial SET status = 'scored', changed_at = ended_at, "
             "verdict_id = (SELECT s.id FROM trials_score s WHERE s.trial_id = trials_trial.id) "
             "WHERE evaluation_id = %s",
             [plan.evaluation_id],

@@ -81,16 +81,22 @@ def started(
             cwd=ROOT,
             env=environment,
         )
-    client = StationClient(folder / "stations" / "bench-1", holder="benchmark")
+    client = StationClient(_station_dir(folder, assignments), holder="benchmark")
     try:
         _await_idle(client, family, folder)
         seconds = time.monotonic() - begun
-        pids = {**Endpoints(folder / "stations" / "bench-1").read("supervisor"), "supervisor": family.pid}
+        pids = {**Endpoints(_station_dir(folder, assignments)).read("supervisor"), "supervisor": family.pid}
         yield StartedStation(client, {name: psutil.Process(int(pids[name])) for name in PROGRAMS}, seconds)
     finally:
         client.close()
         family.send_signal(signal.SIGTERM)
         family.wait(_PATIENCE_S)
+
+
+def _station_dir(folder: Path, assignments: tuple[str, ...]) -> Path:
+    """That of the deployment's station, or of the one that is named in its place."""
+    named = [one.partition("=")[2].strip('"') for one in assignments if one.startswith("station=")]
+    return folder / "stations" / (named[-1] if named else "bench-1")
 
 
 def _await_idle(client: StationClient, family: subprocess.Popen[bytes], folder: Path) -> None:

@@ -11,9 +11,9 @@ def _take_away(names: list[str]) -> None:
     from runtime.core import realtime
 
     nothing = {
-        "fifo": ("_fifo", lambda priority: ""),
+        "fifo": ("_fifo", lambda *given: ""),
         "slice": ("_short_slice", lambda libc: False),
-        "lock": ("_locked_memory", lambda libc: False),
+        "lock": ("_locked_memory", lambda *given: False),
         "gc": ("_quiet_gc", lambda: None),
         "timers": ("_fine_timers", lambda libc: None),
     }

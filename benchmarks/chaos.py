@@ -1,0 +1,357 @@
+"""A lab whose processes are killed while trials are run and scored at it: what it acknowledged is counted at the end.
+
+Lab and one station with a simulated robot are linked over loopback, each with a data folder of its own. By seed a
+process of either is killed (SIGKILL), or the link is stopped for some seconds (SIGSTOP), which stands for one that is
+cut. Not killed: the lab's and the station's supervisors, who restart the rest, and the simulated robot and policy. A
+station that loses a sixth process within a minute ends for good: four of its processes are killed in one at the most.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import secrets
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import psutil
+
+from benchmarks.estop_lab import PRESSED
+from benchmarks.lab import enrol, two_free_ports
+from benchmarks.labs import RunningLab, lab
+from benchmarks.report import Figure, Report
+from benchmarks.start import started
+from evaweb.lab.patience import NoReply, VisitFailed
+from evaweb.lab.visitor import Visitor
+from tests.crash.lab import ROOT, Lab
+
+SECONDS = 600.0
+_PAUSE_S = (3.0, 9.0)  # between two kills
+_STOPPED_S = (1.0, 4.0)
+_RUN_S = (1.0, 6.0)
+_MOST_OF_STATION = 4  # killed in a minute
+_AGAIN_S = 0.3
+_PATIENCE_S = 90.0
+_REST_S = 180.0
+_OF_LAB = ("serve", "stops", "worker", "gate")
+_OF_STATION = ("control", "coordinator", "reception", "media", "guard", "link")
+
+
+@dataclass(frozen=True, slots=True)
+class Act:
+    """What was acknowledged with a 2xx: `prepare`, `run` with its episode, or `score` with its uuid."""
+
+    kind: str
+    trial: int
+    uuid: str = ""
+    episode: str = ""
+
+
+@dataclass(slots=True)
+class Found:
+    """What database and data folders hold at the end."""
+
+    trials: dict[int, str] = field(default_factory=dict)  # status
+    scores: list[tuple[int, str]] = field(default_factory=list)  # trial, uuid
+    rows: set[str] = field(default_factory=set)  # of episodes
+    trial_episodes: list[str] = field(default_factory=list)
+    folders: set[str] = field(default_factory=set)  # of episodes, at the lab, with an outcome
+    at_home: set[str] = field(default_factory=set)  # at the station
+    unopened: set[str] = field(default_factory=set)  # runs of which the lab says that they never began
+    refusing: list[str] = field(default_factory=list)  # stations that take no new trial
+
+
+_OVER = ("scored", "voided", "abandoned")
+
+
+def counted(acts: Iterable[Act], found: Found) -> dict[str, list[str]]:
+    """What is wrong, by the name of its figure: each thing lost, there twice, or stuck."""
+    acts = list(acts)
+    runs = {act.episode: act for act in acts if act.kind == "run" and act.uuid not in found.unopened}
+    scores = {act.uuid for act in acts if act.kind == "score"}
+    kept = {uuid for _, uuid in found.scores}
+    prepared = {act.trial for act in acts if act.kind == "prepare"}
+    twice = [f"score {uuid}" for uuid, n in Counter(uuid for _, uuid in found.scores).items() if n > 1]
+    scored = Counter(trial for trial, _ in found.scores)
+    twice += [f"trial {trial} has {n} scores" for trial, n in scored.items() if n > 1]
+    twice += [f"episode {uuid} is that of {n}" for uuid, n in Counter(found.trial_episodes).items() if n > 1]
+    twice += [f"trial {trial} was prepared by nobody" for trial in found.trials if trial not in prepared]
+    here = found.rows & found.folders
+    return {
+        "lost_episodes": sorted(set(runs) - (found.rows & (found.folders | found.at_home))),
+        "lost_scores": sorted(scores - kept),
+        "lost_trials": sorted(str(trial) for trial in prepared - set(found.trials)),
+        "doubled": twice,
+        "stuck_trials": [f"trial {n} is {s}" for n, s in found.trials.items() if s not in _OVER]
+        + found.refusing,
+        "lost_after_delete": sorted(set(runs) - found.at_home - here),
+    }
+
+
+class _Operator(threading.Thread):
+    """Prepares, runs, ends and scores one trial after the other over REST, and keeps what was acknowledged."""
+
+    def __init__(self, running: RunningLab, chance: random.Random) -> None:
+        super().__init__(daemon=True)
+        self.acts: list[Act] = []
+        self.said: Counter[str] = Counter()  # refusals and lost answers
+        self.over = threading.Event()
+        self.voided = 0  # at rest, because no score was taken
+        self._visitor = Visitor(running.visitor.url)
+        self._password = running.announced["passwords"]["operator"]
+        self._chance, self._page, self._logged_in = chance, uuid4().hex, False
+
+    def run(self) -> None:
+        while not self.over.is_set():
+            self.once()
+
+    def once(self) -> bool:
+        """One trial, or whatever is open, to its end; True where it came to one."""
+        try:
+            return self._trial()
+        except VisitFailed as fault:  # refused, or no answer came for long: as a person, look anew
+            self.said[str(fault)[:160]] += 1
+            time.sleep(_AGAIN_S)
+            return False
+
+    def leave_none(self, number: int) -> str:
+        """Score a trial that was left behind, or void it where that is refused; "" or why neither could be done."""
+        try:
+            self._end(number)
+            return ""
+        except VisitFailed as fault:
+            self.said[f"at rest: {fault}"[:160]] += 1
+        try:
+            self._ask("post", f"trials/{number}/void", {"reason": "left behind"})
+            self.voided += 1
+            return ""
+        except VisitFailed as fault:
+            return str(fault)
+
+    def _trial(self) -> bool:
+        opened = self._look()["trial"]
+        number = int(opened["id"] if opened else self._prepare()["id"])
+        if not opened or opened["status"] == "prepared":
+            self._act(Act("prepare", number))  # also where the answer was lost: the page shows it
+            self._command("setup", number)
+            self._state("ready", "idle", "faulted")
+            self._begin(number)
+            time.sleep(self._chance.uniform(*_RUN_S))
+        return self._end(number)
+
+    def _prepare(self) -> Mapping[str, Any]:
+        wanted = {"scene": "block-on-plate", "position": 1, "checkpoint": "chaos"}
+        return self._ask("post", f"stations/{PRESSED}/trials", wanted, again=False)
+
+    def _begin(self, number: int) -> None:
+        answer = self._command("run", number)
+        self._act(Act("run", number, answer["uuid"], answer["data"]["episode"]))
+
+    def _end(self, number: int) -> bool:
+        until = time.monotonic() + _PATIENCE_S
+        while (status := self._ask("get", f"trials/{number}")["status"]) in ("running", "paused"):
+            if time.monotonic() > until:
+                raise VisitFailed(f"trial {number} stays {status}")
+            if "stop" in (self._look()["snapshot"] or {}).get("allowed", ()):
+                self._command("stop")
+            time.sleep(_AGAIN_S)
+        if status in ("ended", "interrupted"):
+            steps = self._ask("get", "scenes/block-on-plate")["milestones"]
+            reached = {str(step["id"]): self._chance.random() < 0.5 for step in steps}
+            uuid = str(uuid4())
+            self._ask("post", f"trials/{number}/score", {"milestones": reached, "uuid": uuid})
+            self._act(Act("score", number, uuid))
+        return status in ("ended", "interrupted", *_OVER)
+
+    def _command(self, kind: str, trial: int | None = None) -> Mapping[str, Any]:
+        epoch = self._ask("post", f"stations/{PRESSED}/lease", {"action": "claim", "page": self._page})[
+            "epoch"
+        ]
+        state = self._look()["snapshot"] or {}
+        order = {"uuid": str(uuid4()), "kind": kind, "page": self._page, "epoch": epoch, "trial": trial}
+        decided = {"boot": state.get("boot", ""), "sequence": state.get("sequence", 0)}
+        return self._ask("post", f"stations/{PRESSED}/commands", order | decided)
+
+    def _state(self, *wanted: str) -> None:
+        until = time.monotonic() + _PATIENCE_S
+        while (self._look()["snapshot"] or {}).get("state") not in wanted and time.monotonic() < until:
+            time.sleep(_AGAIN_S)
+
+    def _look(self) -> Mapping[str, Any]:
+        return self._ask("get", f"stations/{PRESSED}")
+
+    def _act(self, act: Act) -> None:
+        if act not in self.acts:
+            self.acts.append(act)
+
+    def _ask(self, verb: str, *given: Any, again: bool = True) -> Mapping[str, Any]:
+        """The answer; where none came, or it says that the outcome is not known (504), the same once more."""
+        until = time.monotonic() + _PATIENCE_S
+        while True:
+            try:
+                if not self._logged_in:
+                    self._visitor.login("operator", self._password)
+                    self._logged_in = True
+                found: Mapping[str, Any] = getattr(self._visitor, verb)(*given)
+                return found
+            except VisitFailed as fault:
+                unknown = isinstance(fault, NoReply) or "HTTP 50" in str(fault)
+                self._logged_in = self._logged_in and "HTTP 401" not in str(fault)
+                if not (unknown and again) or time.monotonic() > until:
+                    raise
+                self.said["no answer: the same again"] += 1
+            except OSError as fault:  # the connection broke where urllib does not wrap it
+                if not again or time.monotonic() > until:
+                    raise NoReply(str(fault)) from None
+                self.said["no answer: the same again"] += 1
+            time.sleep(_AGAIN_S)
+
+
+def _name(process: psutil.Process) -> str:
+    """Which of ours it is, "" for none."""
+    words = process.cmdline()
+    found = [name for name in _OF_LAB if any(one.endswith("manage.py") for one in words) and name in words]
+    found += [name for name in _OF_STATION if f"runtime.processes.{name}.process" in words]
+    found += ["link"] if "runtime.link" in words else []
+    return found[0] if found else ""
+
+
+def _ours(*parents: psutil.Process) -> dict[str, psutil.Process]:
+    """Those that are there now, by name; the first of each."""
+    found: dict[str, psutil.Process] = {}
+    for parent in parents:
+        for child in parent.children(recursive=False):
+            try:
+                found.setdefault(_name(child), child)
+            except psutil.Error:  # it has just ended
+                continue
+    found.pop("", None)
+    return found
+
+
+def _hurt(parents: tuple[psutil.Process, ...], seconds: float, chance: random.Random) -> Counter[str]:
+    """Kill and stop until the time is over; how often what."""
+    done: Counter[str] = Counter()
+    of_station: list[float] = []
+    until = time.monotonic() + seconds
+    while (now := time.monotonic()) < until:
+        time.sleep(min(chance.uniform(*_PAUSE_S), until - now))
+        of_station = [at for at in of_station if at > time.monotonic() - 60.0]
+        name = chance.choice((*_OF_LAB, *_OF_STATION, "link stopped"))
+        process = _ours(*parents).get(name.split()[0])
+        if process is None or (name in _OF_STATION and len(of_station) >= _MOST_OF_STATION):
+            continue
+        try:
+            if name == "link stopped":
+                process.send_signal(signal.SIGSTOP)
+                time.sleep(chance.uniform(*_STOPPED_S))
+                process.send_signal(signal.SIGCONT)
+            else:
+                process.kill()
+                of_station += [time.monotonic()] if name in _OF_STATION else []
+        except psutil.NoSuchProcess:  # it has ended by itself
+            continue
+        done[name] += 1
+    return done
+
+
+def measure(seconds: float, seed: int | None = None) -> Report:
+    """`lost_episodes`, `lost_scores`, `lost_trials`, `doubled`, `stuck_trials`, `lost_after_delete` after `seconds`."""
+    seed = secrets.randbelow(2**31) if seed is None else seed
+    chance = random.Random(seed)
+    with tempfile.TemporaryDirectory(prefix="chaos") as name:
+        folder = Path(name)
+        robot = folder / PRESSED
+        robot.mkdir()
+        extra = {"EVA_GATE": f"127.0.0.1:{two_free_ports()}", "EVA_GATE_NAME": "127.0.0.1"}
+        os.environ.update(
+            extra, EVA_DATA_DIR=str(folder / "data"), EVA_LOG_LEVEL="WARNING", EVA_KEEP_DAYS="0"
+        )
+        bench = Lab(robot)
+        try:
+            ready = folder / "ready.json"
+            with lab(["-m", "benchmarks.linked_lab", str(ready)], ready, extra) as running:
+                node = bench.node("--bench", "tabletop").addresses["node"]
+                _rows(bench.server().addresses["server"]["url"])
+                patient = ("recording.export=false", "lease.ttl_s=30.0", "safety.joint_age_s=10.0")
+                patient += ("safety.picture_age_s=10.0",)
+                with started(node, robot, f'station="{PRESSED}"', *patient) as station:
+                    enrol(robot, running.announced["enrol"][PRESSED])
+                    operator = _Operator(running, random.Random(seed + 1))
+                    operator.start()
+                    parents = (running.process, station.processes["supervisor"])
+                    hurt = _hurt(parents, seconds, chance)
+                    operator.over.set()
+                    operator.join()
+                    found = _at_rest(operator, robot, folder / "data")
+        finally:
+            bench.close()
+    wrong = counted(operator.acts, found)
+    kinds = Counter(act.kind for act in operator.acts)
+    figures = [Figure(name, float(len(things)), "", "== 0") for name, things in wrong.items()]
+    figures += [Figure(f"acknowledged.{kind}", float(n), "") for kind, n in sorted(kinds.items())]
+    figures += [Figure(f"killed.{kind}", float(n), "") for kind, n in sorted(hurt.items())]
+    figures += [Figure("never_begun", float(len(found.unopened)), "")]
+    figures += [Figure("removed_at_home", float(len(found.folders - found.at_home)), "")]
+    figures += [Figure("voided_at_rest", float(operator.voided), "")]
+    rows = [{"seed": seed, "wrong": wrong, "said": operator.said.most_common(30)}]
+    return Report("chaos", figures, [*rows, *map(asdict, operator.acts)])
+
+
+def _rows(policy: str) -> None:
+    """Scene and checkpoint of the trials."""
+    os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
+    import django
+
+    django.setup()
+    from evaweb.lab import seed
+
+    seed.demo_scene()
+    seed.demo_checkpoint(name="chaos", description="", policy={"url": policy})
+
+
+def _at_rest(operator: _Operator, robot: Path, data: Path) -> Found:
+    """One more trial, which shows that the station takes one; wait for what travels, end what was left, reconcile."""
+    from evaweb.stations.models import Command
+    from evaweb.trials.models import Score, Trial
+
+    until, taken, before = time.monotonic() + _REST_S, False, len(operator.acts)
+    while not taken and time.monotonic() < until:
+        taken = operator.once() and any(act.kind == "run" for act in operator.acts[before:])
+    while time.monotonic() < until and _closed(robot) - _closed(data):
+        time.sleep(1.0)
+    left = Trial.objects.filter(status__in=("ended", "interrupted")).values_list("pk", flat=True)
+    for number in list(left):
+        if why := operator.leave_none(number):
+            operator.said[f"stuck: {why}"[:200]] += 1
+    command = [sys.executable, str(ROOT / "manage.py"), "reconcile"]
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    runs = Command.objects.filter(kind="run").exclude(unopened="")
+    trials = Trial.objects.values_list("pk", "status", "episode_id")
+    from evaweb.episodes.models import Episode
+
+    return Found(
+        trials={pk: status for pk, status, _ in trials},
+        scores=[(trial, str(uuid)) for trial, uuid in Score.objects.values_list("trial_id", "uuid")],
+        rows={str(uuid) for uuid in Episode.objects.values_list("pk", flat=True)},
+        trial_episodes=[str(uuid) for _, _, uuid in trials if uuid],
+        folders=_closed(data),
+        at_home=_closed(robot),
+        unopened={str(uuid) for uuid in runs.values_list("pk", flat=True)},
+        refusing=[] if taken else [f"{PRESSED}: {json.dumps(operator.said.most_common(3))}"],
+    )
+
+
+def _closed(data: Path) -> set[str]:
+    return {path.parent.name for path in data.glob("episodes/*/outcome.json")}

@@ -1,0 +1,141 @@
+"""How many stations, and how many pages on one of them, a lab bears: twice as many each time, until one is too late.
+
+Everything is on this machine: the lab, each station with a simulated robot of its own, the pages. What is full there
+at the rung that fails was not necessarily the lab.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import psutil
+
+from benchmarks.estop_presses import OpenPage
+from benchmarks.labs import RunningLab, machine_used, named, watch
+from benchmarks.report import Figure
+
+MOST_STATIONS = 32
+_MOST_VIEWERS = 640
+_ESTOP_MS, _VIEWER_MS = 200.0, 250.0
+_FULL = 90.0  # percent of a core
+_PAUSE_S = 0.05  # between two presses
+_STATION_BYTES = 500e6  # that one more takes, with its robot
+
+
+@dataclass(frozen=True, slots=True)
+class _Rung:
+    """So many stations or pages, what presses and pages waited for, and what the processors did."""
+
+    count: int
+    estop_p99_ms: float
+    viewer_p99_ms: float
+    machine_percent: float
+    fullest: str  # the process that took most of a core, and how much
+    fullest_percent: float
+
+    @property
+    def holds(self) -> bool:
+        """True if neither is too late."""
+        return self.estop_p99_ms <= _ESTOP_MS and self.viewer_p99_ms <= _VIEWER_MS
+
+    @property
+    def saturated(self) -> str:
+        """What was late, and what was full."""
+        late = "presses" if self.estop_p99_ms > _ESTOP_MS else "pages"
+        if self.machine_percent >= _FULL * (psutil.cpu_count() or 1):
+            return (
+                f"{late}, with all processors full (most of it {self.fullest}, {self.fullest_percent:.0f} %)"
+            )
+        if self.fullest_percent >= _FULL:
+            return f"{late}, with one processor full of {self.fullest}"
+        return f"{late}, with no processor full"
+
+    def row(self, what: str) -> dict[str, Any]:
+        """For the report."""
+        return {
+            what: self.count,
+            **{name: getattr(self, name) for name in self.__slots__ if name != "count"},
+        }
+
+
+def stations(
+    running: RunningLab, add: Callable[[str], None], names: list[str], seconds: float
+) -> tuple[list[Figure], list[Mapping[str, Any]]]:
+    """`stations_max`: presses go round all of them, each has one page open; the first of `names` is up already.
+
+    `add` brings up one more.
+    """
+    rungs, up = [], 1
+    for count in (1, 2, 4, 8, 16, MOST_STATIONS):
+        if psutil.virtual_memory().available < (count - up) * _STATION_BYTES:
+            return _told("stations", rungs, "the machine's memory")
+        while up < count:
+            add(names[up])
+            up += 1
+        rungs.append(_rung(running, names[:count], 1, count, seconds))
+        if not rungs[-1].holds:
+            break
+    return _told("stations", rungs, f"nothing up to {MOST_STATIONS}")
+
+
+def viewers(running: RunningLab, name: str, seconds: float) -> tuple[list[Figure], list[Mapping[str, Any]]]:
+    """`viewers_max`: so many pages draw one station, which is pressed meanwhile."""
+    rungs, count = [], 10
+    while count <= _MOST_VIEWERS:
+        rungs.append(_rung(running, [name], count, count, seconds))
+        if not rungs[-1].holds:
+            break
+        count *= 2
+    return _told("viewers", rungs, f"nothing up to {_MOST_VIEWERS}")
+
+
+def _told(what: str, rungs: list[_Rung], otherwise: str) -> tuple[list[Figure], list[Mapping[str, Any]]]:
+    most = max((rung.count for rung in rungs if rung.holds), default=0)
+    failed = [rung for rung in rungs if not rung.holds]
+    rows = [rung.row(what) for rung in rungs]
+    saturated = failed[0].saturated if failed else otherwise
+    return [Figure(f"{what}_max", float(most), "")], [*rows, {f"{what}_saturated_first": saturated}]
+
+
+def _rung(running: RunningLab, names: list[str], pages: int, count: int, seconds: float) -> _Rung:
+    """`pages` on each of `names` for so long, and presses round and round; then what became of them."""
+    watching = [watch(running.visitor, seconds, station=name, reading=pages) for name in names]
+    open_pages = [OpenPage(running.visitor, running.announced["stops"], name) for name in names]
+    before, taken, begun = _used(), [], time.monotonic()
+    while time.monotonic() - begun < seconds:
+        page = open_pages[len(taken) % len(open_pages)]
+        taken.append(page.press(f"press {len(taken)}").ms)
+        time.sleep(_PAUSE_S)
+    passed, after = time.monotonic() - begun, _used()
+    percent = {name: 100.0 * (used - before.get(name, 0.0)) / passed for name, used in after.items()}
+    machine = percent.pop("")
+    ages = [age for child in watching for age in json.loads(child.communicate()[0])["ages_ms"]]
+    for page in open_pages:
+        page.close()
+    fullest = max(percent, key=lambda name: percent[name])
+    return _Rung(
+        count,
+        float(np.percentile(taken, 99)),
+        float(np.percentile(ages, 99)) if ages else float("inf"),
+        machine,
+        fullest.rpartition(" ")[0],
+        percent[fullest],
+    )
+
+
+def _used() -> dict[str, float]:
+    """Processor time of every process by its name and number [s]; that of the whole machine under ""."""
+    found: dict[str, float] = {}
+    for process in psutil.process_iter():
+        try:
+            name, times = named(process.cmdline()), process.cpu_times()
+        except psutil.Error:  # it has ended, or nobody may ask
+            continue
+        found[f"{name} {process.pid}"] = times.user + times.system
+    found[""] = machine_used()
+    return found

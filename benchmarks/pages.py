@@ -1,0 +1,282 @@
+"""Pages in Debian's Chromium over a lab of 100,000 trials, one page at a time, while nothing runs on the station.
+
+Each page is loaded five times by a browser that has kept nothing. LCP, CLS and event durations are those of Chromium's
+own PerformanceObserver, what leads to another document included; pages that draw in 3D do so in software here, and have
+their own wanted values.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.labs import ROOT, STATION, RunningLab, lab
+from benchmarks.report import Figure, Report
+from evaweb.lab.once import Choice, perform
+
+PLANS, TRIALS = 200, 100_000
+LOADS = 5
+_AXE = ROOT / "node_modules" / "axe-core" / "axe.min.js"
+_LATER_MS = 1000  # after a page has loaded, in which what it shows last is seen
+_VIEWPORT = {"width": 1440, "height": 900}
+_SEEKS = (0.3, 0.7, 0.1, 0.9, 0.5)  # of an episode
+# Runs before a page's own scripts. A press that leads away is told at the page's end, and known to the next one.
+_WATCH = """
+window.seen = { fcp: 0, lcp: 0, cls: 0, inp: Number(sessionStorage.getItem("inp")) };
+const watch = (type, each, more = {}) => {
+  const observer = new PerformanceObserver((list) => list.getEntries().forEach(each));
+  observer.observe({ type, buffered: true, ...more });
+  return observer;
+};
+watch("paint", ({ name, startTime }) => name === "first-contentful-paint" && (seen.fcp = startTime));
+watch("largest-contentful-paint", ({ startTime }) => (seen.lcp = startTime));
+watch("layout-shift", ({ value, hadRecentInput }) => hadRecentInput || (seen.cls += value));
+const interacted = ({ interactionId, duration }) => interactionId && (seen.inp = Math.max(seen.inp, duration));
+const presses = watch("event", interacted, { durationThreshold: 16 });
+watch("first-input", interacted); // whatever it takes
+window.addEventListener("pagehide", () => {
+  presses.takeRecords().forEach(interacted);
+  sessionStorage.setItem("inp", seen.inp);
+});
+"""
+_KB = """() => [...performance.getEntriesByType("navigation"), ...performance.getEntriesByType("resource")]
+  .filter(({ initiatorType }) => initiatorType !== "video")
+  .reduce((sum, { transferSize }) => sum + transferSize, 0) / 1000"""
+_FOUND = (
+    "async () => (await axe.run(document, { resultTypes: ['violations'] })).violations.map(({ id }) => id)"
+)
+_PLAYABLE = """() => {
+  const videos = [...document.querySelectorAll("video[data-camera]")];
+  return videos.length > 0 && videos.every(({ readyState, seeking }) => readyState >= 2 && !seeking);
+}"""
+_PAINTED = (
+    "new Promise((done) => requestAnimationFrame(() => setTimeout(done, 100)))"  # events are told after it
+)
+# From the press to the picture: every camera stands at the row that was asked for. Chromium does not tell of each frame
+# that it shows: what was sought and has been painted since is there too.
+_SEEK = """async (share) => {
+  const range = document.querySelector("#scrub"), videos = [...document.querySelectorAll("video[data-camera]")];
+  const shown = (video) => new Promise((done, late) => {
+    video.requestVideoFrameCallback(done);
+    const painted = () => requestAnimationFrame(() => requestAnimationFrame(done));
+    video.addEventListener("seeked", painted, { once: true });
+    setTimeout(() => late(new Error(`${video.dataset.camera} shows no picture within 20 s`)), 20_000);
+  });
+  const all = Promise.all(videos.map(shown)), from = performance.now();
+  range.value = String(Math.round(share * Number(range.max)));
+  range.dispatchEvent(new Event("input", { bubbles: true }));
+  await all;
+  return performance.now() - from;
+}"""
+
+
+Control = Callable[[Any], None]
+"""What somebody does on a page of Playwright's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """An address, its commonest controls, those that lead to another document apart, and whether it draws in 3D."""
+
+    name: str
+    address: str
+    controls: Sequence[Control]
+    onward: Sequence[str] = ()
+    draws: bool = False
+
+
+def click(selector: str) -> Control:
+    """A press of the first such element."""
+    return lambda page: page.locator(selector).first.click()
+
+
+def press(selector: str, key: str) -> Control:
+    """A key while the first such element has the focus."""
+    return lambda page: page.locator(selector).first.press(key)
+
+
+def drag(selector: str) -> Control:
+    """The first such element, a bit to the side."""
+
+    def dragged(page: Any) -> None:
+        page.locator(selector).first.hover()
+        page.mouse.down()
+        box = page.locator(selector).first.bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2 + 20, box["y"] + box["height"] / 2, steps=5)
+        page.mouse.up()
+
+    return dragged
+
+
+def narrow(name: str, words: str = "") -> Control:
+    """A list to what is typed, else to the next choice, until it shows that."""
+
+    def narrowed(page: Any) -> None:
+        with page.expect_response(lambda answer: f"{name}=" in answer.url):
+            field = page.locator(f"[data-list-filter] [name={name}]")
+            if words:
+                field.press_sequentially(words)
+            else:
+                field.press("ArrowDown")
+        page.locator(".filter-chip").first.wait_for()
+
+    return narrowed
+
+
+def pages(episode: str, trial: int) -> Sequence[Page]:
+    """The pages that are measured."""
+    menu = click(".bar-user summary")
+    find = (click("[data-open-find]"), press("#find-words", "b"), press("#find-words", "Escape"))
+    curves, above = click("#joint-next"), click("[data-view=top]")
+    sort, unchip = "#list thead a", ".filter-chip a"
+    figure = click(".figure-keep button")
+    plan = "/result/plans/evaluation-001/1/"
+    bench = f"/stations/{STATION}/"
+    return (
+        Page("home", "/", (*find, menu)),
+        Page("eval", f"{bench}eval/", (curves, above, menu), draws=True),
+        Page("debug", f"{bench}debug/", (curves, above, menu), draws=True),
+        Page("replay", f"/replay/{episode}/", (click("#forth"), click("#back"), menu), draws=True),
+        Page("episodes", "/replay/", (click("[data-tick]"), narrow("words", "block")), (sort, unchip)),
+        Page(
+            "datasets",
+            "/replay/datasets/",
+            (click("[name=datasets]"), click(".dataset-order > summary")),
+            (sort,),
+        ),
+        Page("evaluations", "/result/plans/", (narrow("words", "evaluation"),), (sort, unchip)),
+        Page("result", plan, (figure, click(".plan-record details > summary"), *find)),
+        Page("comparison", f"{plan}compare/", (figure, *find), ("a[href*='differs=1']",)),
+        Page("trials", "/result/", (narrow("scene"),), (sort, unchip)),
+        Page(
+            "trial",
+            f"/result/trials/{trial}/",
+            (click("[data-player-play]"), click("[data-seek]"), press("[data-player-slider]", "ArrowRight")),
+        ),
+        Page(
+            "failures",
+            "/result/failures/",
+            (click("[data-trial] [data-why]"), press("[data-trial]", "ArrowRight"), click("#clips-play")),
+        ),
+        Page("setup", "/setup/", (*find, menu)),
+        Page(
+            "scene",
+            "/setup/scenes/block-on-plate/",
+            (click("#thumbnails button"), drag("#stage [data-thing]"), press("#label", "a")),
+        ),
+        Page("jobs", "/jobs/?status=done", find, (sort, unchip)),
+        Page("dashboard", "/result/lab/", (*find, menu)),
+    )
+
+
+def measure(seconds: float, plans: int = PLANS, trials: int = TRIALS) -> Report:
+    """`fcp_ms.PAGE` and the others; `seconds` bounds nothing here, because loads are counted."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        _seed(folder / "data", plans, trials)
+        ready = folder / "ready.json"
+        with lab(["manage.py", "demo", "--port", "0", "--ready-file", str(ready)], ready) as demo:
+            done = perform(demo.visitor, Choice(STATION, "block-on-plate", 1, "pick-place-40k", 1))
+            rows, sought = _visits(demo, pages(done.episode, done.trial))
+    return Report("pages", [*figures(rows), Figure("seek_ms", sought, "ms", "<= 150")], rows)
+
+
+def figures(rows: Sequence[Mapping[str, Any]]) -> Iterator[Figure]:
+    """Of the loads of each page."""
+    for name in dict.fromkeys(row["page"] for row in rows):
+        own = [row for row in rows if row["page"] == name]
+        kind, lcp, inp = ("_3d", 2500, 200) if own[0]["draws"] else ("", 1000, 100)
+        yield Figure(f"fcp_ms.{name}", _median(own, "fcp"), "ms")
+        yield Figure(f"lcp{kind}_ms.{name}", _median(own, "lcp"), "ms", f"<= {lcp}")
+        yield Figure(f"inp{kind}_ms.{name}", _median(own, "inp"), "ms", f"<= {inp}")
+        yield Figure(f"cls.{name}", _median(own, "cls"), "", "<= 0.02")
+        yield Figure(f"kb.{name}", _median(own, "kb"), "kB", "<= 400" if not own[0]["draws"] else "")
+    yield Figure("axe_violations", sum(len(row["axe"]) for row in rows), "", "== 0")
+
+
+def _seed(data: Path, plans: int, trials: int) -> None:
+    """A database as after years, by a program of its own: this one has no Django of that folder."""
+    data.mkdir()
+    program = (
+        "import django; django.setup()\n"
+        "from django.core.management import call_command; call_command('migrate', verbosity=0)\n"
+        f"from benchmarks.results_seed import seed; seed({plans}, {trials})\n"
+        "from django.db import connection; connection.cursor().execute('ANALYZE')"
+    )
+    variables = os.environ | {
+        "EVA_DATA_DIR": str(data),
+        "EVA_LOG_LEVEL": "ERROR",
+        "DJANGO_SETTINGS_MODULE": "evaweb.settings",
+    }
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=variables, check=True)
+
+
+def _visits(demo: RunningLab, wanted: Sequence[Page]) -> tuple[list[dict[str, Any]], float]:
+    """A row per load, and the median time of a seek in the episode [ms]."""
+    from playwright.sync_api import sync_playwright
+
+    url = demo.announced["url"]
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium") or "/usr/bin/chromium",
+            args=["--no-sandbox", "--enable-unsafe-swiftshader"],
+        )
+        known = _login(browser, url, demo.announced["passwords"]["admin"])
+
+        def fresh() -> Any:
+            return browser.new_context(storage_state=known, viewport=_VIEWPORT).new_page()
+
+        rows = [row for one in wanted for row in _loads(fresh, url, one)]
+        replay = next(one for one in wanted if one.name == "replay")
+        page = fresh()
+        page.goto(url + replay.address)
+        page.wait_for_function(_PLAYABLE)
+        sought = statistics.median(page.evaluate(_SEEK, share) for share in _SEEKS)
+        browser.close()
+    return rows, sought
+
+
+def _login(browser: Any, url: str, password: str) -> Any:
+    page = browser.new_page()
+    page.goto(f"{url}/login/")
+    page.fill("input[name=username]", "admin")
+    page.fill("input[name=password]", password)
+    page.click("button[type=submit]")
+    page.wait_for_url(lambda address: "/login" not in address)
+    return page.context.storage_state()
+
+
+def _loads(fresh: Callable[[], Any], url: str, wanted: Page) -> Iterator[dict[str, Any]]:
+    """Five loads of a page; the first warms up the web and is not counted, the last is looked at by axe-core."""
+    for load in range(LOADS + 1):
+        page = fresh()
+        page.add_init_script(_WATCH)
+        page.goto(url + wanted.address, wait_until="load")
+        page.wait_for_timeout(_LATER_MS)
+        kb = page.evaluate(_KB)
+        for control in wanted.controls:
+            control(page)
+            page.evaluate(_PAINTED)
+        row = page.evaluate("seen") | {"page": wanted.name, "draws": wanted.draws, "kb": kb, "axe": []}
+        if load == LOADS:
+            page.evaluate(_AXE.read_text("utf-8"))
+            row["axe"] = page.evaluate(_FOUND)
+        for selector in wanted.onward:
+            with page.expect_event("load"):
+                page.locator(selector).first.click()
+            row["inp"] = page.evaluate("seen.inp")  # it knows the page before
+        page.context.close()
+        if load:
+            yield row
+
+
+def _median(rows: Sequence[Mapping[str, Any]], name: str) -> float:
+    return statistics.median(float(row[name]) for row in rows)
