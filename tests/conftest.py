@@ -26,7 +26,8 @@ _LABS = (  # whole labs and stations in real time: so many of their files at onc
 _AT_ONCE = max(2, os.cpu_count() or 1)
 _GIVES_WAY = 2
 _OF_ONE_LAB = {  # fixtures of tests/e2e, and the files that use them: side by side each would start a lab of its own
-    "patient": "story curves datasets debug_modes layout policy preflight replay_on_robot review plan",
+    "patient": "story curves datasets debug_modes failures find judging layout policy preflight replay_on_robot review "
+    "scene_editor station_accessibility two_webs plan_wizard plan",
     "shared": "faults stop_process lifetime",
 }
 _SHARED = {f"tests/e2e/test_{name}.py": lab for lab, names in _OF_ONE_LAB.items() for name in names.split()}
@@ -104,10 +105,15 @@ def pytest_report_header() -> str:
     return f"started in the scheduling class {_BEGAN}"
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_collection_finish() -> None:
-    """What is loaded by now stays: the garbage collector does not look at it again and again."""
-    gc.freeze()
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """What is loaded stays: the garbage collector looks at it neither while it grows nor afterwards."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import coverage, designs
 from benchmarks.designs import DESIGNS, DRIFTING, boundary_of, errors_at, worst_drift
-from evaweb.statistics.designs import conclude, design
+from evaweb.statistics.designs import conclude, design, in_blocks
 from evaweb.statistics.difference import barnard
 from evaweb.statistics.planning import exact_power
 
@@ -55,8 +55,10 @@ def test_an_error_under_drift_is_how_often_the_design_ends() -> None:
     case, pairs = DRIFTING["early_margin_at_0.1"]
     exact, rates = boundary_of(case, pairs), np.linspace(0.05, 0.4, pairs)
     assert exact is not None
-    planned = design(rule=case.rule, pairs=pairs, alpha=case.alpha, margin=case.margin)
+    planned = design(rule=case.rule, blocks=pairs, alpha=case.alpha, margin=case.margin)
     chance, worse = np.random.default_rng(2), 0.8 * rates
     runs = chance.random((4000, pairs, 2)) < np.stack([worse, 0.2 + worse], axis=1)
-    ended = sum(conclude(planned, [(float(a), float(b)) for a, b in run]).winner == "first" for run in runs)
+    ended = sum(
+        conclude(planned, in_blocks([(float(a), float(b)) for a, b in run])).winner == "first" for run in runs
+    )
     assert ended / 4000 == pytest.approx(float(errors_at(exact, rates[None])[0]), abs=0.02)

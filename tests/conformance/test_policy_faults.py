@@ -193,7 +193,7 @@ def test_one_batch_and_one_row_are_understood(name: str, fault: str, rows: int |
 def test_a_late_answer_is_never_paired_with_the_next_request(name: str) -> None:
     served = protocol(name)
     deadlines = {"first_inference_deadline": 10.0, "inference_deadline": 0.4}
-    with served.served(Fault("late_reply", "0.6"), **deadlines) as policy:
+    with served.served(Fault("late_reply", "1.5"), **deadlines) as policy:
         if not served.first:  # else its second request is the first for rows, which may take long
             assert served.begins_at(policy, 0.05)
             with pytest.raises(PolicyTimeout):

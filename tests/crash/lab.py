@@ -18,6 +18,7 @@ from tests.processes import eventually
 ROOT = Path(__file__).parents[2]
 ROBOT = "agilex_piper"
 FREE = "tcp://127.0.0.1:0"
+AGES = ("safety.joint_age_s=1.0", "safety.picture_age_s=2.0")  # of a machine that is busy with something else
 
 
 def seen_since(status, moment):
@@ -86,8 +87,7 @@ class Lab:
             "recording.export=false",
             "bus.preview_rate=0",
             "control.orphan_hold_s=0.2",
-            "safety.joint_age_s=1.0",  # of a machine that is busy with something else
-            "safety.picture_age_s=2.0",
+            *AGES,
             *assignments,
         ]
         sets = [part for setting in settings for part in ("--set", setting)]

@@ -10,9 +10,11 @@ class BenchPage:
 
     def __init__(self, browser, demo, username, size, **screen):
         self.demo = demo
-        self.context = browser.new_context(viewport=size, ignore_https_errors=True, **screen)
+        self.context = browser.new_context(
+            viewport=size, ignore_https_errors=True, **{"color_scheme": "dark", **screen}
+        )
         self.page = self.context.new_page()
-        self.page.set_default_timeout(30_000)
+        self.page.set_default_timeout(90_000)  # of a busy machine, as in tests.processes
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("console", lambda said: said.type == "error" and self.errors.append(said.text))

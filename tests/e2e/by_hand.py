@@ -58,6 +58,20 @@ class ByHand(BenchPage):
         begun.wait_for(state="attached")
         assert self.snapshot()["mode"] == mode
 
+    def step_and_commit(self, before):
+        """In preview: the robot moves by a chunk that was shown; asked for anew where this machine was late."""
+        phases = {"a chunk is shown": "k", "waiting for you": "n"}
+
+        def moved():
+            phase = self.page.locator("[data-mode=phase]").inner_text()
+            key = "o" if self.state() == "HOLDING" else phases.get(phase)
+            if key and not self.moved_from(before):
+                self.keys(key)
+                self.page.wait_for_timeout(200)
+            return self.moved_from(before)
+
+        eventually(moved, 3 * SOON_S, "the committed chunk is executed")
+
     def stop(self):
         self.press("stop")
         self.reaches("READY")

@@ -18,10 +18,11 @@ PATIENT = {
     "safety.picture_age_s": 10,
     "lease.ttl_s": 20,
 }
-SETS = [f"--set={key}={value}" for key, value in PATIENT.items()]
+SMALL = "--pictures=400x300"  # less processor time; those of --once and of tests/crash are whole
+SETS = [SMALL, *(f"--set={key}={value}" for key, value in PATIENT.items())]
 FIRST, LAST = (
     "test_story",
-    ("test_plan", "test_lifetime"),
+    ("test_plan", "test_plan_wizard", "test_lifetime"),
 )  # it sees a fresh lab; they leave it blind, or end it
 LABS = ("patient", "shared")
 running = {}  # by the name of the fixture
@@ -37,13 +38,16 @@ def pytest_collection_modifyitems(items):
     items.sort(key=place)
 
 
-@pytest.hookimpl(trylast=True)
+@pytest.hookimpl(wrapper=True)
 def pytest_runtest_teardown(item, nextitem):
-    """End each lab after the last test that uses it; what it logged is shown where it ended badly."""
-    for name in [name for name in running if nextitem is None or name not in nextitem.fixturenames]:
-        lab = running.pop(name)
-        if lab.runs:
-            assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
+    """End each lab after the last test that uses it, also where a fixture fails at its end; a bad end is shown."""
+    try:
+        return (yield)
+    finally:
+        for name in [name for name in running if nextitem is None or name not in nextitem.fixturenames]:
+            lab = running.pop(name)
+            if lab.runs:
+                assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
 
 
 @pytest.fixture(scope="session")
@@ -57,7 +61,7 @@ def patient(tmp_path_factory):
 def shared(tmp_path_factory):
     """A lab as users have it, with more people and a dead checkpoint, whose programs may be killed."""
     folder, patience = tmp_path_factory.mktemp("shared"), "--set=lease.ttl_s=10"  # a page may be kept waiting
-    running["shared"] = lab = Demo(folder, patience, EVA_JOB_STALE_S="6").start().people()
+    running["shared"] = lab = Demo(folder, SMALL, patience, EVA_JOB_STALE_S="6").start().people()
     return lab
 
 

@@ -127,14 +127,14 @@ def left(processes):
 def environment(data):
     """What a lab of the tests is started with: nothing of the settings that the tests themselves run on."""
     ours = {key: value for key, value in os.environ.items() if not key.startswith(("EVA_", "DJANGO_"))}
-    return ours | {"EVA_DATA_DIR": str(data), "EVA_LOG_LEVEL": "INFO"}
+    return ours | {"EVA_DATA_DIR": str(data), "EVA_LOG_LEVEL": "INFO", "EVA_WORKER_NICE": "5"}
 
 
 @contextmanager
-def browsing(playwright):
+def browsing(playwright, chromium=CHROMIUM):
     """Debian's chromium without a screen, drawing 3D in software."""
     browser = playwright.chromium.launch(
-        executable_path=CHROMIUM, args=["--no-sandbox", "--enable-unsafe-swiftshader"]
+        executable_path=chromium, args=["--no-sandbox", "--enable-unsafe-swiftshader"]
     )
     try:
         yield browser

@@ -1,6 +1,7 @@
 """Collecting in a real browser: a session by keyboard, episodes, a gamepad, the queue, the dataset, another day."""
 
 import json
+from contextlib import suppress
 
 import pytest
 
@@ -23,7 +24,7 @@ _OTHER_DAY = """
 from datetime import timedelta
 from evaweb.collect.models import CollectSession
 newest = CollectSession.objects.get()
-setup = {**newest.setup, "fps": 50.0, "cameras": {**newest.setup["cameras"], "cam_high": {"width": 320, "height": 240}}}
+setup = {**newest.setup, "fps": 50.0, "cameras": {**newest.setup["cameras"], "cam_high": {"width": 640, "height": 480}}}
 then = newest.opened_at - timedelta(days=3)
 CollectSession.objects.create(
     station=newest.station, dataset="older", task="fold", operator=newest.operator, setup=setup,
@@ -69,15 +70,15 @@ class Collector(BenchPage):
         eventually(can, 30, "an episode can start")
 
     def record(self):
-        """An episode of more than a second, by Space; returns its uuid."""
+        """An episode of more than a second, by Enter; returns its uuid."""
         self.can_start()
-        self.key("Space")
+        self.key("Enter")
         self.reaches("RUNNING")
         eventually(
             lambda: self.api(f"stations/{STATION}")["snapshot"]["run"]["elapsed"] > 1.5, 30, "it is led"
         )
         uuid = self.collect["episode"]
-        self.key("Space")
+        self.key("Enter")
         self.closed(uuid)
         return uuid
 
@@ -111,7 +112,7 @@ def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(an
     ann.key("u")
     ann.reaches("READY")
     page.locator("#big:not([data-settling])").wait_for()
-    ann.key("Space")
+    ann.key("Enter")
     ann.said("Start: arm first")
     assert ann.state() == "READY"
     ann.key("a")
@@ -128,6 +129,16 @@ def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(an
     counted = "1 success · 0 partial · 1 fail"
     eventually(lambda: counted in page.locator("#results").inner_text(), 20, f"the summary says {counted!r}")
 
+    ann.key("a")
+    page.locator("#arm[aria-checked=false]").wait_for()
+    ann.key("Enter")  # a start that does not take
+    ann.said("Start: arm first")
+    ann.key("1")
+    ann.said("press again to label the episode before it")
+    ann.key("3")
+    ann.said("fail: the last start did not take")
+    assert ann.collect["last"]["result"] == "fail"
+
     eventually(
         lambda: (
             page.locator("#last-episode .episode-quality").count() == 1
@@ -141,7 +152,7 @@ def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(an
     eventually(lambda: ann.counts()["published"] == 1, 60, "the success is published")
     dataset = demo.data / "datasets" / "tabletop_demonstrations-simulated"
     lines = [json.loads(line) for line in (dataset / "meta" / "eva_episodes.jsonl").read_text().splitlines()]
-    assert [(line["uuid"], line["success"]) for line in lines] == [(first, True)]
+    assert [(line["uuid"], line["success"], line["result"]) for line in lines] == [(first, True, "success")]
     assert json.loads((dataset / "meta" / "info.json").read_text())["codebase_version"] == "v3.0"
     told = ann.api(f"episodes/{second}")
     assert (told["kind"], told["task"], told["dataset_index"]) == ("demonstration", TASK, None)
@@ -156,24 +167,56 @@ def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(ann
 
     looks = "() => new Promise((seen) => requestAnimationFrame(() => requestAnimationFrame(seen)))"
 
-    def press(button):
+    def push(button):
         for held in ([], [button], []):
             page.evaluate("held => { window.held = held }", held)
             page.evaluate(looks)
 
-    ann.can_start()
-    press(0)
+    def press(button):
+        """Until the page has seen it: one that draws less than twice a second takes nothing for a press."""
+        said = page.locator("[data-pad=said]")
+
+        def seen():
+            said.evaluate("element => { element.textContent = '' }")
+            push(button)
+            return said.text_content()
+
+        eventually(seen, 30, f"the page sees button {button}")
+
+    def begin():
+        """Start, anew where a page that draws slowly did not look in time, or the arm had fallen."""
+        ann.can_start()
+        press(0)
+        with suppress(AssertionError):
+            eventually(lambda: ann.collect["episode"], 4, "an episode is open")
+        return ann.collect["episode"]
+
+    begun = eventually(begin, 60, "an episode is open")
     ann.reaches("RUNNING")
-    begun = ann.collect["episode"]
     press(3)
     ann.said("press again")
     assert ann.collect["episode"] == begun
-    press(3)
-    eventually(lambda: ann.collect["episode"] not in (None, begun), 30, "the next episode is open")
+
+    def recorded_again():
+        """The second press, anew where a busy machine was too late for it, or for the robot to be at rest."""
+        if ann.collect["episode"] == begun:
+            press(3)
+        elif "not started" in page.locator("#outcome").inner_text():
+            begin()
+        return ann.collect["episode"] not in (None, begun)
+
+    eventually(recorded_again, 60, "the next episode is open")
     again = ann.collect["episode"]
     eventually(lambda: ann.api(f"stations/{STATION}")["snapshot"]["run"]["elapsed"] > 1.2, 30, "it is led")
-    press(0)
+
+    def stopped():
+        if ann.collect["episode"] == again:
+            press(0)
+        return ann.collect["episode"] is None
+
+    eventually(stopped, 30, "the episode is ended")
     ann.closed(again)
+
     press(15)
     page.locator("[data-result=partial][aria-pressed=true]").wait_for()
 
@@ -188,7 +231,7 @@ def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(ann
 
     ann.key("m")
     page.locator(".pad-row[data-action=fail] button").click()
-    press(5)
+    push(5)
     page.locator(".pad-row[data-action=fail] .pad-button", has_text="RB (5)").wait_for()
     page.evaluate("window.held = null")
     ann.key("m")
@@ -208,7 +251,7 @@ def test_another_day_the_session_goes_on_and_one_of_another_set_up_is_refused(an
     ann.said("Resume refused")
     said = page.locator("#outcome").inner_text()
     assert "fps = 30, allowed 50" in said
-    assert "camera cam_high = 640x480, allowed 320x240" in said
+    assert "camera cam_high = 400x300, allowed 640x480" in said
     page.locator("#session-earlier").select_option(mine)
     ann.key("Shift+O")
     page.locator(f"[data-session-uuid='{mine}']").wait_for()

@@ -1,5 +1,6 @@
 """The Debug tab by hand, in every mode, with the real processes: what is pressed, what is said, what moves."""
 
+import math
 import os
 import signal
 
@@ -98,10 +99,7 @@ def test_preview_shows_a_chunk_that_is_cancelled_or_committed(ready):
     ready.quiet("[data-mode=note]")
     assert ready.snapshot()["proposal"] == {}
     assert not ready.moved_from(before)
-    ready.press("step")
-    ready.says("[data-mode=note]", "Chunk")
-    ready.press("commit")
-    eventually(lambda: ready.moved_from(before), SOON_S, "the committed chunk is executed")
+    ready.step_and_commit(before)
     ready.says("[data-mode=phase]", "waiting for you")
 
 
@@ -224,19 +222,97 @@ def test_a_first_action_that_is_far_is_warned_of_and_approached(ready):
     assert ready.snapshot()["first_action"]["far"] is False
 
 
-def test_space_on_a_button_and_escape_in_a_field_are_the_e_stop_and_nothing_else(ready):
+def test_space_is_a_focused_controls_and_escape_closes_what_is_open_before_it_stops(ready):
     page = ready.page
-    ready.keys("6")
-    before = ready.snapshot()["last_run"]
-    for focused, key in (("[data-command=run]", "Space"), ("#strategy-kind", "Space"), ("#task", "Escape")):
-        page.locator(focused).focus()
-        page.keyboard.press(key)
+
+    def stopped():
         ready.reaches("FAULTED")
         ready.press("release")
         ready.reaches("IDLE")
-    page.fill("#task", "two words")
-    page.locator("#task").press("Space")
-    page.locator("#task").blur()
-    page.fill("#task", "")
-    assert ready.state() == "IDLE"
-    assert ready.snapshot()["last_run"] == before
+
+    def closes(what, opened):
+        """Escape closes it and stops nothing; a page that a busy machine left without news stops as well."""
+        opened()
+        page.locator(f"{what}[open]").wait_for()
+        page.keyboard.press("Escape")
+        page.locator(f"{what}:not([open])").wait_for(state="attached")
+        if ready.snapshot()["state"] != "faulted":
+            return True
+        stopped()
+        return False
+
+    ready.keys("6")
+    for focused in ("#task", "#strategy-kind", "[data-toggle=frames]", ".bar-user summary"):
+        page.locator(focused).focus()
+        page.keyboard.press("Space")
+    page.locator(".bar-user[open]").wait_for()
+    page.locator("[data-toggle=frames][aria-pressed=true]").wait_for()
+    ready.keys("e")
+    page.locator(".bar-user summary").click()
+    menu = page.locator(".bar-user summary")
+    eventually(
+        lambda: closes("#keys", lambda: ready.keys("?")), 60, "Escape closes the keys and stops nothing"
+    )
+    eventually(lambda: closes(".bar-user", menu.click), 60, "Escape closes the menu and stops nothing")
+
+    page.locator("#task").focus()
+    page.keyboard.press("Escape")
+    stopped()
+    page.locator("[data-toggle=frames]").click()  # what was clicked has not the keys
+    page.keyboard.press("Space")
+    stopped()
+    page.locator("[data-toggle=frames]").click()
+    ready.keys("?")
+    page.keyboard.press("Space")  # nor has what only shows something
+    stopped()
+    ready.keys("?")
+
+
+def test_escape_with_something_open_stops_a_robot_that_moves(ready):
+    ready.run_in("continuous")
+    ready.keys("?")
+    ready.page.locator("#keys[open]").wait_for()
+    ready.page.keyboard.press("Escape")
+    ready.reaches("FAULTED")
+    ready.page.locator("#keys:not([open])").wait_for(state="attached")
+    ready.press("release")
+    ready.reaches("IDLE")
+
+
+_SEEN = """hidden => {
+  Object.defineProperty(document, "hidden", { value: hidden, configurable: true });
+  document.dispatchEvent(new Event("visibilitychange"));
+}"""
+
+
+def test_a_hidden_page_keeps_the_station_at_rest_and_lets_a_run_be_held(ready):
+    epoch, left, renewed = ready.snapshot()["lease"]["epoch"], math.inf, 0
+    ready.page.evaluate(_SEEN, True)
+
+    def renewed_while_hidden():
+        nonlocal left, renewed
+        before, left = left, ready.snapshot()["lease"]["expires_in"]
+        renewed += left > before
+        return renewed > 2  # the first may have been on its way
+
+    eventually(renewed_while_hidden, SOON_S, "the lease is renewed again and again")
+    assert ready.snapshot()["lease"]["epoch"] == epoch
+    assert ready.snapshot()["lease"]["holder"].startswith("web:operator:")
+    ready.page.evaluate(_SEEN, False)
+
+    ready.run_in("continuous")
+    ready.page.evaluate(_SEEN, True)
+    assert ready.page.title().startswith("COME BACK: holds in")
+
+    def held_for_nobody():
+        """What this machine was late with held the run before its lease ended: a station at rest keeps its holder."""
+        found = ready.snapshot()
+        if found["state"] == "holding" and found["lease"]["holder"] and ready.state() == "HOLDING":
+            ready.keys("o")
+            ready.answered("resume")
+        return found["state"] == "holding" and not found["lease"]["holder"]
+
+    eventually(held_for_nobody, 2 * SOON_S, "the run is held and nobody has the station")
+    ready.page.evaluate(_SEEN, False)
+    ready.page.locator("#outcome", has_text="its lease has ended").wait_for()
+    ready.take_again()

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from runtime.recording.reader import open_episode
+from tests.e2e.remote import was_late
 
 ROOT = Path(__file__).parents[2]
 READER = ROOT / "tests" / "conformance" / "read_lerobot_v21.py"
@@ -18,14 +19,17 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("demo")
-    done = subprocess.run(
-        [sys.executable, "-m", "runtime.sim.demo", "--once", "--json", str(folder / "out.json")],
-        cwd=ROOT,
-        env={**os.environ, "EVA_DATA_DIR": str(folder / "data")},
-        capture_output=True,
-        text=True,
-    )
+    for _ in range(3):  # on a machine that has too much to do joints are too old for the robot to move
+        folder = tmp_path_factory.mktemp("demo")
+        done = subprocess.run(
+            [sys.executable, "-m", "runtime.sim.demo", "--once", "--json", str(folder / "out.json")],
+            cwd=ROOT,
+            env={**os.environ, "EVA_DATA_DIR": str(folder / "data")},
+            capture_output=True,
+            text=True,
+        )
+        if done.returncode == 0 or not was_late(done.stdout + done.stderr):
+            break
     assert done.returncode == 0, done.stdout + done.stderr
     return done, json.loads((folder / "out.json").read_text())
 

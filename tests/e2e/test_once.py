@@ -55,7 +55,7 @@ def first(folder):
 @pytest.fixture(scope="module")
 def evaluated(folder, first):
     """Two trials of a blind plan on the same data, and what was said of them."""
-    return run(folder, "--evaluate", "2", *SETS, timeout=350)
+    return run(folder, "--evaluate", "2", *SETS[1:], timeout=350)
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,9 @@ def test_two_blind_trials_are_made_revealed_and_compared(evaluated):
     assert found["commitment"] in done.stderr
     assert len(bytes.fromhex(found["key"])) == 32
     assert [arm["success"]["n"] for arm in found["analysis"]["arms"]] == [1, 1]
-    assert "Barnard p" in done.stdout
+    assert "difference" in done.stdout
+    assert found["headline"] in done.stdout  # the design's own, of a plan that was closed before it ended
+    assert "were not compared: closed after 1 of 4 pairs" in found["headline"]
     assert not any(trial["checkpoint"] in done.stderr for trial in trials)
 
 

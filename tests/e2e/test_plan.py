@@ -6,6 +6,7 @@ import pytest
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
+from tests.e2e.planned import handed, saved, shown, stopped
 from tests.processes import eventually
 
 pytestmark = [
@@ -29,20 +30,6 @@ def operator(browser, patient):
     bench.close()
 
 
-def shown(operator):
-    """The code of the trial that is on the page."""
-    return operator.page.locator(".plan-code").inner_text()
-
-
-def handed(operator):
-    """The code of the next trial, which is handed out and set up."""
-    operator.page.locator("[data-next]:not([aria-disabled=true])").click()
-    operator.page.locator(".plan-code").wait_for()
-    operator.reaches("READY")
-    operator.page.locator("#steps[data-set-up=yes]").wait_for()
-    return shown(operator)
-
-
 def started(operator):
     """The next trial is handed out, set up, and runs."""
     handed(operator)
@@ -54,20 +41,8 @@ def started(operator):
 
 def scored(operator, ticks, failure=()):
     """The run is stopped, and what is ticked is saved, with what is pressed of its failure."""
-    operator.page.locator("[data-command=stop][data-trial]:visible").click()
-    operator.page.locator("#score").wait_for()
-    for key in ticks:
-        box = operator.page.locator("#score input[name=milestone]").nth(key - 1)
-        if not box.is_checked():
-            box.check()
-    if failure:  # of a success it is not asked
-        for state in ("hidden", "visible"):
-            operator.page.keyboard.press("4")
-            operator.page.locator("#why").wait_for(state=state)
-    for key in failure:
-        operator.page.keyboard.press(key)
-    operator.page.locator("button[form=score]").click()
-    operator.page.locator("[data-next]").wait_for()
+    stopped(operator)
+    saved(operator, ticks, failure)
 
 
 def drawn(operator):

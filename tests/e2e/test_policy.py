@@ -57,7 +57,8 @@ WANTED = {
     *("result-plan", "lab-dashboard", "lab-wall", "result-planner", "rate", "prefer", "admin:index"),
     *("admin:auth_user_changelist", "admin:auth_user_add", "admin:auth_user_change"),
     *("admin:trials_scene_change", "admin:trials_checkpoint_change", "admin:stations_station_change"),
-    *("admin:plans_plan_changelist", "admin:plans_plan_import"),
+    *("admin:plans_plan_changelist", "admin:plans_plan_import", "result-plan-new"),
+    *("setup", "setup-scenes", "setup-scene", "setup-new-scene", "setup-sheet"),
 }
 
 
@@ -105,7 +106,9 @@ class Watched(BenchPage):
 
         Those of administration are the same pages filtered, sorted, and on the way back there, unless they pop up.
         """
-        for address in self.page.locator("a[href]").evaluate_all("(all) => all.map((one) => one.href)"):
+        for address in self.page.locator("a[href]").evaluate_all(
+            "(all) => all.map((one) => new URL(one.getAttribute('href'), document.baseURI).href)"
+        ):
             if not address.startswith(self.demo.url + "/") or "#" in address:
                 continue
             path = urlsplit(address).path
@@ -118,7 +121,7 @@ class Watched(BenchPage):
 
     def shows(self, path):
         """Whether it answers with a page, and not with a file to keep."""
-        answer = self.page.request.get(self.demo.url + path)
+        answer = self.page.request.get(self.demo.url + path, timeout=120_000)
         kind, name = answer.headers["content-type"], answer.headers.get("content-disposition", "")
         assert "default-src 'self'" in answer.headers["content-security-policy"], path
         return kind.startswith("text/html") and "attachment" not in name

@@ -43,7 +43,7 @@ def operator(browser, patient):
 def test_it_is_set_up_approached_and_run_to_its_last_row(operator, patient, recorded, kind):
     places, actions = recorded
     page = operator.open(places[kind]).page
-    on_robot = page.get_by_role("link", name="On the robot")
+    on_robot = page.get_by_role("link", name="Run on the robot")
     eventually(on_robot.is_visible, 60, "the episode is prepared")
     on_robot.click()
     page.locator(f"[data-station={STATION}] a").click()

@@ -57,7 +57,7 @@ def test_body_and_head_are_moved_drawn_recorded_and_played_back(browser, demo):
     start = bench.joints()
     assert len(start) == 5
     bench.keys("Shift+I", *["ArrowRight"] * 15)  # the last joint: all above it turns
-    bench.says(".scene-tags", "nothing moves before it is sent")
+    bench.says(".scene-tags", "nothing moves until it is sent")
     bench.press("move")
     eventually(lambda: "has arrived" in bench.said(), SOON_S, "the body is where it was sent")
     eventually(lambda: bench.joints()[4] == pytest.approx(start[4] + 0.15, abs=0.01), SOON_S, "it has turned")

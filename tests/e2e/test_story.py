@@ -139,7 +139,8 @@ def test_the_playback_says_whose_step_it_is_and_gives_the_streams_away(trial, op
     for _ in range(3):
         page.keyboard.press("ArrowRight")  # the pointer wins over the clock while it is there
     assert f"chunk {found[1]} " in told.inner_text()
-    assert {"chunk", "overlap"} <= set(page.locator("#legend .legend-mark").all_inner_texts())
+    assert {"chunk", "overlap"} <= set(page.locator("#legend-marks .strong").all_text_contents())
+    page.locator(".replay-details summary").click()
     table = page.locator("#table a")
     table.wait_for()
     answer = page.request.get(f"{operator.demo.url}{table.get_attribute('href')}")

@@ -20,7 +20,7 @@ _ALIVE_S = 1.0  # what answers no connection for so long is gone
 def https(folder, web, stops):
     """The origin of a proxy that leads to the ports `web` and `stops`."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(_certificate(folder))
+    context.load_cert_chain(certificate(folder))
     loop, port = asyncio.new_event_loop(), []
     listens = threading.Event()
 
@@ -86,7 +86,8 @@ async def _pump(source, sink):
             await sink.drain()
 
 
-def _certificate(folder):
+def certificate(folder):
+    """A file with a key and a certificate for NAME, signed by itself."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, NAME)])
     now = datetime.now(UTC)

@@ -21,9 +21,11 @@ from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_close, plan_freeze
 from evaweb.preflights.models import Preflight
 from evaweb.results.models import Judgement
+from evaweb.reviews.services import tags_change
 from evaweb.stations.models import Command
 from evaweb.trials import services as trials
 from evaweb.trials.models import Checkpoint, Trial
+from runtime.core.sentences import Pattern, within
 from runtime.processes.coordinator.session.transitions import SessionEvent
 from runtime.recording.export import export
 from tests.evaweb.trials import builders
@@ -40,7 +42,8 @@ SECRETS = (
     *("secret-alder", "secret-birch", "host-alder", "host-birch", ":64611", ":64622"),  # no ephemeral ports
     *("did not answer", f"{ROWS} rows", LATENCY, DIGEST, *map(str, KEYS)),
 )
-ERROR = "ws://host-alder.example:64611 did not answer within 5 s"
+_SILENT = Pattern("test.blind.silent", "{url} did not answer within {seconds:g} s")
+ERROR = _SILENT(url="ws://host-alder.example:64611", seconds=5)  # with arguments, which tell as much
 
 
 class Lab:
@@ -110,7 +113,7 @@ class Lab:
     def _snapshot(self, plain):
         def told():
             own = plain(self.runtime)
-            return own | {
+            said = own | {
                 "checkpoint": {"id": self.trial.checkpoint_id, "name": self.trial.checkpoint.name},
                 "validated": f"{ROWS} rows in {FIGURE} ms",
                 "reason": ERROR,
@@ -129,6 +132,7 @@ class Lab:
                 "last_run": {"reason": ERROR},
                 "something_new": ERROR,
             }
+            return said | {"sentences": within(said)}
 
         return told
 
@@ -223,6 +227,9 @@ class Lab:
         words = [[text, True, FIGURE / 1e12] for text in self.scene.milestones.values_list("text", flat=True)]
         Judgement.objects.create(
             trial=self.trial, judge="seer", version="chat 1, x", milestones=words, reason=ERROR
+        )
+        tags_change(
+            user=self.owner, episode=self.episode, add=["slips", f"{self.trial.checkpoint.name}-slips"]
         )
         if not self.dataset:
             told = publish_episode(Work({"uuid": str(self.episode.uuid)}, lambda text: None))

@@ -31,6 +31,7 @@ def addresses(lab):
             "preflight": [preflight],
             "api:preflight": [preflight],
             "api:job-retry": [job.pk for job in Job.objects.all()[:1]] or [1],
+            "api:job-cancel": [job.pk for job in Job.objects.all()[:1]] or [1],
             "reference": [row.pk for row in Reference.objects.all()[:1]] or [1],
             "api:reference-regions": [row.pk for row in Reference.objects.all()[:1]] or [1],
             "": [lab.trial.pk if lab.trial else 1],
@@ -39,14 +40,18 @@ def addresses(lab):
         "segment": {"": [uuids.uuid4()]},
         "version": {"": [1]},
         "camera": {"": ["cam_high"]},
+        "code": {"": ["xx"]},
         "index": {"": [0]},
         "robot": {"": ["agilex_piper"]},
         "digest": {"": [(lab.plan.at_reveal or {}).get("digest", "0" * 64)]},
         "checkpoint": {"": KEYS},
         "rest": {"": ["nowhere"]},
+        "file": {"": ["eva-diagnosis-20260101-000000.zip"]},
         "name": {
             "picture": ["0" * 64],
             "api:scene": [lab.scene.name],
+            "setup-scene": [lab.scene.name],
+            "setup-sheet": [lab.scene.name],
             "api:checkpoint": KEYS,
             "": [lab.station.name, lab.plan.name, *filter(None, [lab.dataset])],
         },
@@ -80,7 +85,12 @@ def filled(name, parameters, values):
 QUERIES = ("?format=csv", "?inactive=true", "?state=frozen", "?plan=blocks")
 WANTED = "?name=datasets/{}&first={}&second={}&checkpoint={}&show={}"  # what some addresses must be told
 NOTHING = (400, 404, 405, 422)  # nothing else is said there for another question
-ORACLES = (("checkpoint", KEYS), ("checkpoint", NAMES), ("words", NAMES))
+ORACLES = (
+    ("checkpoint", KEYS),
+    ("checkpoint", NAMES),
+    ("words", NAMES),
+    ("tag", [f"{name}-slips" for name in NAMES]),
+)
 LIST = re.compile(
     r"^/(?!.*(/\d+(/|$)|[0-9a-f]{8}-[0-9a-f]{4}-))"
 )  # an address in which no one thing is named
@@ -206,7 +216,7 @@ async def heard(lab, user):
         await asyncio.to_thread(lab.publish)
         await page.shown(lambda streams: "joints" in streams)
     last = f"that was all ({uuids.uuid4()})"
-    await asyncio.to_thread(lab.runtime.say, "truth", last)
+    await asyncio.to_thread(lab.runtime.say, "camera_back", last)
     await page.told("events", lambda told: told["events"][-1]["text"] == last)
     await page.shown(lambda streams: "recent" in streams)
     await page.close()

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import zmq
 
+from runtime.core.sentences import Pattern, within
 from runtime.ipc.bus import CommandServer, Endpoints, EventLog, Key, Publisher
 from runtime.ipc.identity import forged, identified, lacking
 from runtime.ipc.messages import Ack, Command, Event
@@ -23,6 +24,7 @@ from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, Sessio
 from runtime.processes.coordinator.session.transitions import STOPPING, GuardFacts, SessionEvent
 
 DIM = 14
+_CHANGED = Pattern("session.changed", "{before} -> {after}: {reason}")  # as the coordinator says it
 
 
 class Effortless:
@@ -118,6 +120,10 @@ class StandIn:
         self.do(lambda: self._streams.publish(stream, content))
 
     def snapshot(self) -> dict[str, Any]:
+        said = self._said()
+        return said | {"sentences": within(said)}
+
+    def _said(self) -> dict[str, Any]:
         return {
             "boot": self.boot,
             "clock": time.monotonic(),
@@ -133,7 +139,7 @@ class StandIn:
     def _happen(self, happening: SessionEvent, reason: str) -> None:
         before = self.session.state
         if self.session.observe(happening, reason):
-            text = f"{before} -> {self.session.state}: {reason}"
+            text = _CHANGED(before=before, after=self.session.state, reason=reason)
             data = {"state": str(self.session.state), "state_is": self.session.told()}
             self.events.append(Event("state", text, time.monotonic(), data=data))
 

@@ -27,6 +27,8 @@ def test_a_flag_is_a_word(monkeypatch, given, found):
         (lambda: environment.seconds("EVA_X", 1.0), "0", "seconds above zero"),
         (lambda: environment.seconds("EVA_X", 1.0), "nan", "seconds above zero"),
         (lambda: environment.seconds("EVA_X", 1.0), "2 s", "seconds above zero"),
+        (lambda: environment.niceness("EVA_X", 19), "20", "allowed: 0 to 19"),
+        (lambda: environment.niceness("EVA_X", 19), "-1", "allowed: 0 to 19"),
         (lambda: environment.networks("EVA_X"), "10.0.0.1/24", "10.0.0.0/24"),
         (lambda: environment.networks("EVA_X"), "proxy", "127.0.0.1"),
         (lambda: environment.log_level("EVA_X", "INFO"), "LOUD", "DEBUG, INFO, WARNING, ERROR, CRITICAL"),
@@ -47,6 +49,7 @@ def test_what_is_not_given_is_the_default(monkeypatch):
     monkeypatch.delenv("EVA_X", raising=False)
     assert environment.flag("EVA_X", True) is True
     assert environment.seconds("EVA_X", 2.5) == 2.5
+    assert environment.niceness("EVA_X", 19) == 19
     assert environment.words("EVA_X", ("a", "b")) == ["a", "b"]
     assert environment.log_level("EVA_X", "INFO") == "INFO"
     assert environment.time_zone("EVA_X", "Asia/Shanghai") == "Asia/Shanghai"

@@ -71,12 +71,6 @@ def test_a_page_with_a_style_of_its_own_names_its_number_and_another_one_each_ti
     assert len(numbers) == 2
 
 
-def test_static_files_may_be_kept_and_have_the_policy_too(client):
-    answer = client.get("/static/css/base.css")
-    assert answer["Cache-Control"] == "max-age=0, public"
-    assert "Content-Security-Policy" in answer
-
-
 @pytest.mark.parametrize("seconds", [0, 3600])
 def test_over_https_browsers_are_told_to_come_over_it_again(client, settings, seconds):
     settings.SECURE_HSTS_SECONDS = seconds

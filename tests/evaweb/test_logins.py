@@ -42,7 +42,7 @@ def locked(**where):
 def test_after_a_few_wrong_passwords_the_name_is_locked_there_and_the_page_says_how_long(ann, path):
     answer = locked(path=path)
     assert answer.status_code == 429
-    assert "tried again in 15 minutes" in answer.content.decode()
+    assert "Try again in 15 minutes" in answer.content.decode()
     assert 0 < int(answer["Retry-After"]) <= 900
     right = login(password="ann", path=path)
     assert right.status_code == 429
@@ -60,7 +60,7 @@ def test_the_lock_ends_by_itself_and_trying_does_not_prolong_it(ann):
     locked()
     AccessAttempt.objects.update(attempt_time=timezone.now() - timedelta(minutes=14))
     answer = login(password="ann")
-    assert "tried again in 1 minute;" in answer.content.decode()
+    assert "Try again in 1 minute;" in answer.content.decode()
     AccessAttempt.objects.update(attempt_time=timezone.now() - timedelta(minutes=16))
     assert login(password="ann").status_code == 302
 

@@ -8,7 +8,7 @@ import uuid
 import pytest
 from django.test import Client
 
-from evaweb.api.api import api
+from evaweb.api.management.commands.openapi_snapshot import PLACE  # a test holds it to what the interface is
 from evaweb.posts import post_at
 from evaweb.roles import Role
 from evaweb.stations.models import Command
@@ -20,7 +20,7 @@ KIB = 1024
 
 def posts():
     """The addresses that take a body."""
-    for path, methods in sorted(api.get_openapi_schema()["paths"].items()):
+    for path, methods in sorted(json.loads(PLACE.read_text("utf-8"))["paths"].items()):
         if "requestBody" in methods.get("post", {}):
             numbered = path.startswith(("/api/v1/trials/", "/api/v1/references/"))
             yield path.replace("{id}", "1" if numbered else str(uuid.UUID(int=1)))

@@ -14,7 +14,16 @@ from django.test import Client
 from evaweb.collect.models import CollectSession
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Station
-from tests.evaweb.collect.conftest import Demonstrate, at, data, demonstrate, recorded, session, station
+from tests.evaweb.collect.conftest import (
+    Demonstrate,
+    at,
+    data,
+    demonstrate,
+    labelled,
+    recorded,
+    session,
+    station,
+)
 from tests.evaweb.trials.builders import Wire
 
 __all__ = ["at", "data", "demonstrate", "recorded", "session", "station"]
@@ -94,3 +103,14 @@ def test_a_command_for_a_session_is_one_of_its_station(
         browser, "stations/other/commands", uuid=str(uuid4()), kind="run", session=both["session"], **PAGE
     )
     assert "is one of bench, not of other" in elsewhere.json()["error"]
+
+
+def test_a_demonstration_is_published_alone_only_where_its_session_would(
+    browser: Client, data: Path, demonstrate: Demonstrate
+) -> None:
+    made = demonstrate(result="fail")
+    answer = post(browser, f"episodes/{made.pk}/publish")
+    assert answer.status_code == 409
+    assert "it has to be labelled success or partial" in answer.json()["error"]
+    labelled(data, made, "success")
+    assert post(browser, f"episodes/{made.pk}/publish").status_code == 202

@@ -70,7 +70,7 @@ def test_a_table_is_asked_for_made_and_downloaded(rest, viewer, episode):
     assert viewer.post(path)[0] == 403
     status, job = rest.post(path)
     assert (status, job["kind"], job["status"]) == (202, "export", "queued")
-    assert work("lab") == 1
+    assert work("cpu") == 1
     answer, content = download(viewer, episode)
     assert answer["Content-Type"] == "application/vnd.apache.parquet"
     assert answer["Content-Disposition"].startswith("attachment")
@@ -85,3 +85,21 @@ def test_an_episode_that_is_not_known_has_no_table(rest, tmp_path, method):
         status, refused = getattr(rest, method)(f"episodes/{name}/export")
         assert (status, refused["error"]) == (404, f"episode {name} does not exist")
     assert not Episode.objects.exists()
+
+
+@pytest.mark.django_db
+def test_an_episode_is_published_on_demand_where_it_ever_is(rest, viewer, episode):
+    path = f"episodes/{episode.uuid}/publish"
+    assert viewer.post(path)[0] == 403
+    status, job = rest.post(path)
+    assert (status, job["kind"], job["key"]) == (202, "publish", f"publish:{episode.uuid}")
+    for facts, said in (
+        ({"mode": "sim"}, "no dataset ever holds it"),
+        ({"status": "recording"}, "is still being recorded"),
+    ):
+        Episode.objects.filter(pk=episode.pk).update(**{"mode": "step", "status": "finished", **facts})
+        status, refused = rest.post(path)
+        assert status == 409
+        assert said in refused["error"]
+    assert Job.objects.filter(kind="publish").count() == 1
+    assert rest.post(f"episodes/{uuid.uuid4()}/publish")[0] == 404

@@ -4,7 +4,7 @@ import io
 import pytest
 from pyarrow import parquet
 
-from tests.evaweb.results.conftest import _alone, carry_out, owner, plan, revealed  # noqa: F401  fixtures
+from tests.evaweb.results.conftest import _alone, bench, carry_out, owner, plan, revealed  # noqa: F401  fixtures
 
 PLAN = "/api/v1/plans/blocks/1"
 
@@ -75,6 +75,12 @@ def test_the_planner(asked, client):
     several = client.get("/api/v1/planner?rate=0.3&better=0.9&checkpoints=3").json()
     assert (several["comparisons"], several["alpha"]) == (3, pytest.approx(0.05 / 3))
     assert several["designs"][0]["total"] == 3 * several["designs"][0]["pairs"]
+    assert {row["mean"] for row in several["designs"]} == {
+        None
+    }  # it goes on until the last comparison has ended
+    with_first = client.get("/api/v1/planner?rate=0.3&better=0.9&checkpoints=3&comparing=control").json()
+    assert (with_first["comparisons"], with_first["alpha"]) == (2, pytest.approx(0.025))
+    assert client.get("/api/v1/planner?comparing=each").status_code == 422
     assert client.get("/api/v1/planner?rate=3").status_code == 422
     near = client.get("/api/v1/planner?rate=0&better=1e-170")
     assert (near.status_code, "at least 0.001" in near.json()["error"]) == (400, True)

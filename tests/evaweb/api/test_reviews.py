@@ -18,7 +18,7 @@ def test_an_episode_is_checked_and_its_flags_are_read(rest, viewer, episode):
     assert viewer.post(path)[0] == 403
     status, job = rest.post(path)
     assert (status, job["kind"]) == (202, "quality")
-    work("lab")
+    work("cpu")
     assert Job.objects.get(kind="quality").error == ""
     status, report = viewer.get(path)
     assert status == 200
@@ -42,6 +42,26 @@ def test_a_verdict_a_note_and_a_segment_are_said_and_read(rest, viewer, episode)
     said = rest.post(f"{path}/segments/{segment['uuid']}/remove")[1]
     assert said["segments"] == []
     assert len(viewer.get(f"{path}/reviews")[1]["reviews"]) == 1
+
+
+def test_episodes_are_tagged_listed_by_tag_and_untagged(rest, viewer, episode):
+    path = f"episodes/{episode.uuid}"
+    assert viewer.post(f"{path}/tags", add=["cup"])[0] == 403
+    status, changed = rest.post(f"{path}/tags", add=["Cup", "slips"])
+    assert (status, changed) == (
+        200,
+        {"tags": ["cup", "slips"], "added": ["cup", "slips"], "removed": []},
+    )
+    assert rest.post(f"{path}/tags", add=["cup"], remove=["slips"])[1] == {
+        "tags": ["cup"],
+        "added": [],
+        "removed": ["slips"],
+    }
+    assert viewer.get("reviews/tags")[1] == [{"words": "cup", "episodes": 1}]
+    (found,) = viewer.get("episodes?tag=cup")[1]["items"]
+    assert found["tags"] == viewer.get(path)[1]["tags"] == ["cup"]
+    assert viewer.get("episodes?tag=slips")[1]["items"] == []
+    assert "allowed: 1 to 60 characters" in rest.post(f"{path}/tags", add=["a,b"])[1]["error"]
 
 
 def test_what_is_wrong_is_said(rest, episode):

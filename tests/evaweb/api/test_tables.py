@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from evaweb.api.tables import cell, csv_answer
 
 
-@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "=cmd|' /C calc'!A0"])
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "\n=1", "\uff1d1", "=cmd|' /C calc'!A0"]
+)
 def test_no_text_is_a_formula(text):
     assert cell(text) == f"'{text}"
 

@@ -106,8 +106,11 @@ def test_a_running_trial_is_not_scored(rest, bench):
         ({"milestones": {"999": True}}, 400),
         ({"milestones": {}}, 400),
         ({"milestones": {"1": "perhaps"}}, 422),
+        ({"milestones": {"1": "yes"}}, 422),
+        ({"milestones": {"1": 1}}, 422),
         ({"milestones": [1]}, 422),
         ({"success": "perhaps"}, 422),
+        ({"success": "true"}, 422),
     ],
 )
 def test_scores_that_make_no_sense_are_refused(rest, body, status):
@@ -117,6 +120,14 @@ def test_scores_that_make_no_sense_are_refused(rest, body, status):
     assert got == status
     assert answer["error"]
     assert Trial.objects.get().status == "ended"
+
+
+@pytest.mark.parametrize("agree", ["yes", "true", "no", 1, 0, None])
+def test_whoever_answers_a_void_says_true_or_false_and_nothing_like_it(rest, bench, agree):
+    trial = bench.scored()
+    status, answer = rest.post(f"trials/{trial.pk}/void/answer", agree=agree)
+    assert status == 422
+    assert "agree" in answer["error"]
 
 
 def test_a_viewer_prepares_and_scores_nothing(viewer, bench):
@@ -183,6 +194,18 @@ def test_a_failure_is_scored_in_the_labs_words_which_are_listed(rest, bench):
     assert (answer["failure_phase"], answer["scores"][0]["failure_phase"]) == ("grasp", "grasp")
     (row,) = csv.DictReader(io.StringIO(rest.csv("trials"), newline=""))
     assert (row["failure_phase"], row["failure"]) == ("grasp", "dropped")
+
+
+def test_a_failure_is_corrected_alone_and_not_over_a_score_that_was_not_seen(rest, bench):
+    builders.failure_terms()
+    trial = bench.scored(False)
+    seen = str(trial.verdict.uuid)
+    status, answer = rest.post(f"trials/{trial.pk}/failure", failure="dropped", score=seen)
+    assert (status, answer["failure_phase"], answer["failure"]) == (200, "", "dropped")
+    assert answer["scores"][0]["reason"] == "failure was not said, now dropped"
+    assert [row["milestones"] for row in answer["scores"]] == [answer["scores"][0]["milestones"]] * 2
+    status, answer = rest.post(f"trials/{trial.pk}/failure", failure_phase="grasp", score=seen)
+    assert (status, "scored anew" in answer["error"]) == (409, True)
 
 
 def test_csv_has_the_columns_of_json_and_all_rows(rest, bench):

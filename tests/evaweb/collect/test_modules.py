@@ -138,7 +138,7 @@ def test_after_a_while_of_not_looking_nothing_counts_as_pressed() -> None:
 def test_a_button_does_one_thing_and_what_was_kept_badly_is_as_delivered() -> None:
     changed = run(PADS, "return m.assigned(m.delivered(), 'arm', 0);")
     assert (changed["arm"], changed["big"], changed["discard"]) == (0, None, 1)
-    kept = '{"arm": 4, "big": null, "discard": "x", "fail": -1, "other": 3}'
+    kept = '{"arm": 4, "big": null, "discard": [], "fail": -1, "other": 3}'
     found = run(PADS, "return m.restored(given);", kept)
     assert (found["arm"], found["big"], found["discard"], found["fail"]) == (4, None, 1, 13)
     assert run(PADS, "return m.restored('{');") == run(PADS, "return m.delivered();")
@@ -147,3 +147,25 @@ def test_a_button_does_one_thing_and_what_was_kept_badly_is_as_delivered() -> No
         "button 9",
         "none",
     ]
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        (" ", "Space is the e-stop"),
+        ("Escape", "Esc is the e-stop"),
+        ("D", "the page already uses D"),
+        ("Shift", "Shift alone cannot be assigned"),
+        ("b", ""),
+        ("F13", ""),
+    ],
+)
+def test_the_key_of_a_pedal_is_neither_the_e_stop_nor_one_of_the_pages(key: str, said: str) -> None:
+    assert run(PADS, "return m.whyNotKey(given, ['d', 'enter']);", key) == said
+
+
+def test_the_key_of_a_pedal_is_kept_as_a_button_is() -> None:
+    found = run(PADS, "return m.restored(JSON.stringify(m.assigned(m.delivered(), 'big', 'b')));")
+    assert (found["big"], found["arm"]) == ("b", 9)
+    assert run(PADS, "return m.buttonName('b');") == "key B"
+    assert run(PADS, "return m.restored(given).big;", '{"big": " "}') == 0

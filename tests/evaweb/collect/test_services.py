@@ -12,6 +12,7 @@ from django.db import IntegrityError, connection, transaction
 from evaweb.collect import selectors, services
 from evaweb.collect.models import CollectSession
 from evaweb.collect.record import SESSIONS
+from evaweb.datasets import listing
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
@@ -92,11 +93,11 @@ def test_a_changed_set_up_is_not_resumed_and_every_difference_is_listed(
     with pytest.raises(Conflict) as refused:
         services.session_resume(user=ann, session=session)
     assert str(refused.value) == (
-        "the set-up is not that of session stack the cups (cups): fps = 50, allowed 30; "
+        "the set-up differs from that of session stack the cups (cups): fps = 50, allowed 30; "
         "camera cam_high = 640x480, allowed 64x48"
     )
     assert kinds(session) == ["opened", "closed"]
-    with pytest.raises(Conflict, match="not that of the dataset cups: fps = 50"):
+    with pytest.raises(Conflict, match="from that of the dataset cups: fps = 50"):
         services.session_begin(user=ann, station=session.station, task="another")
 
 
@@ -135,10 +136,13 @@ def test_accepted_episodes_go_to_the_sessions_dataset_in_the_version_that_is_ask
         services.session_publish(user=ann, session=session, version="v1.0")
     jobs = services.session_publish(user=ann, session=session, version="v3.0")
     assert {job.key for job in jobs} == {f"publish:{good.pk}", f"publish:{partial.pk}"}
-    assert work("lab") >= 2
+    assert work("cpu") >= 2
     assert not Job.objects.exclude(error="").exists()
     dataset = open_dataset(data / "datasets" / "cups")
     assert len(dataset.episodes) == 2
+    said = [(row.success, row.result) for row in listing.rows("datasets/cups")]
+    assert sorted(said) == [(False, "partial"), (True, "success")]  # whichever was written first
+    assert [row.result for row in listing.rows("datasets/cups", result="partial")] == ["partial"]
     assert selectors.dataset_of(session=session).version == "v3.0"
     with pytest.raises(Conflict, match="nothing to publish"):
         services.session_publish(user=ann, session=session)
@@ -155,11 +159,11 @@ def test_what_is_labelled_otherwise_after_it_was_published_goes_there_anew(
 ) -> None:
     made = demonstrate("success")
     services.session_publish(user=ann, session=session)
-    work("lab")
+    work("cpu")
     Job.objects.all().delete()
     labelled(data, made, "fail")
     assert [job.key for job in Job.objects.all()] == [f"publish:{made.pk}"]
-    assert work("lab") == 1
+    assert work("cpu") == 1
     lines = (data / "datasets" / "cups" / "meta" / "eva_episodes.jsonl").read_text().splitlines()
     assert [json.loads(line)["success"] for line in lines] == [False]
 
@@ -170,7 +174,7 @@ def test_what_was_discarded_while_its_publication_waited_is_not_published(
     made = demonstrate("success")
     services.session_publish(user=ann, session=session)
     labelled(data, made, "success", discarded=True)
-    work("lab")
+    work("cpu")
     job = Job.objects.get(kind="publish")
     assert (job.status, job.result) == ("done", {"published": False, "why": "it was discarded by ann"})
     assert not (data / "datasets" / "cups").exists()

@@ -19,6 +19,7 @@ from tests.evaweb.console.test_serve import MANAGE, served
 LAB = "bodies"  # its id
 NAME = f"eva_session_{LAB}"
 SESSION = [f"theme=dark; {settings.SESSION_COOKIE_NAME}=abc".encode()]
+IDENTITY = {"id", "arguments"}  # of the sentences that have them
 HUGE = 200_000_000
 
 
@@ -118,11 +119,11 @@ def test_whatever_is_refused_is_said_in_json_or_on_a_page_of_the_lab(
         port, path.format("/api/v1/" if rest else "/"), *headers, "Accept: text/html", method=method
     )
     if rest and status not in (413, 414, 431, 400):
-        assert (answered, set(json.loads(content))) == (404, {"error"})
+        assert (answered, set(json.loads(content)) - IDENTITY) == (404, {"error"})
     else:
         assert answered == status
         assert status < 400 or (
-            set(json.loads(content)) == {"error"} if rest else b"css/tokens.css" in content
+            set(json.loads(content)) - IDENTITY == {"error"} if rest else b"css/tokens.css" in content
         )
 
 
@@ -143,7 +144,7 @@ def test_what_is_too_long_is_refused_by_its_headers_alone(port, path, header, st
     assert answered == status
     assert (b"log in first" if status == 403 else b"the body is too long; allowed") in content
     if path.startswith("/api"):
-        assert set(json.loads(content)) == {"error"}
+        assert set(json.loads(content)) - IDENTITY == {"error"}
 
 
 @pytest.mark.slow
@@ -193,7 +194,7 @@ def test_cookies_of_other_programs_keep_no_stop_from_being_heard(port):
         (200_000, stop + "estop", 431),
     ):
         status_now, content = asked(port, path, "Cookie: theme=" + "x" * size)
-        assert (status_now, set(json.loads(content))) == (status, {"error"})
+        assert (status_now, set(json.loads(content)) - IDENTITY) == (status, {"error"})
     assert asked(port, stop + "estop?" + "x" * 20_000)[0] == 414
 
 

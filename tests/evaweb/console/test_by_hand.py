@@ -121,8 +121,8 @@ def test_a_stop_needs_no_news_and_everything_else_does() -> None:
     old, others = store(fresh=False), store(fresh=False, lease="other")
 
     assert refusals("stop", old) == refusals("halt", old) == [""]
-    assert refusals("run", old) == ["nothing is known of the station at the moment"]
-    assert refusals("stop", others) == ["nothing is known of the station at the moment"]
+    assert refusals("run", old) == ["the state of the station is not known at the moment"]
+    assert refusals("stop", others) == ["the state of the station is not known at the moment"]
 
 
 def test_who_does_not_command_is_told_how_to() -> None:
@@ -133,7 +133,7 @@ def test_who_does_not_command_is_told_how_to() -> None:
     assert said == [
         "take the station first",
         "another page of yours commands the station; take it here first",
-        "somebody else commands the station; ask for it",
+        "someone else commands the station; ask for it",
         "a viewer watches; an administrator can make you an operator",
     ]
 

@@ -760,7 +760,7 @@ def test_a_page_that_opens_while_the_database_is_away_can_stop(live, ann, runtim
     lease = leases.claim(user=ann, station=live, page="p1")
     runtime.ready()
     runtime.do(lambda: runtime.session._enter(SessionState.RUNNING, ""))
-    away = threading.Event()
+    away, pressed = threading.Event(), str(uuid4())
     look = credentials.look
 
     def gone(kind, secret):
@@ -782,12 +782,12 @@ def test_a_page_that_opens_while_the_database_is_away_can_stop(live, ann, runtim
         await page.say(type="halt", uuid=str(uuid4()), epoch=lease.epoch)
         halted = await page.told("ack")
         assert halted["status"] == ("accepted" if remembered else "failed")
-        await page.say(type="estop", uuid=str(uuid4()), why="smoke")
+        await page.say(type="estop", uuid=pressed, why="smoke")
         assert (await page.told("ack"))["status"] == "done"
         away.clear()
         assert (await page.told("hello"))["user"] == "ann"
         await page.close()
-        await _written()
+        await _written(pressed)
 
     run(scenario())
     assert [command.user for command in runtime.pressed] == ["ann" if remembered else "unverified"]

@@ -56,7 +56,9 @@ def test_a_robot_that_is_not_drawn_has_no_parts(live, runtime):
 
 def test_a_station_that_is_away_is_a_reason():
     found = aimed("bench-nowhere", "ann", {}, PIPER)
-    assert found == {"ok": False, "reason": "bench-nowhere is not running: its runtime has to be started"}
+    reason = "bench-nowhere is not running: its runtime has to be started"
+    sentence = {"id": "stations.runtime_client.not_running", "arguments": {"name": "bench-nowhere"}}
+    assert found == {"ok": False, "reason": reason, "sentence": sentence}
 
 
 def test_what_cannot_be_sent_never_reaches_the_station(live, runtime):
@@ -125,4 +127,9 @@ def test_a_viewer_is_told_so_and_nothing_is_asked(monkeypatch):
     assert not page.says(3)
     assert page.asked == []
     reason = "ann is a viewer; aiming needs an operator: ask an administrator"
-    assert page.told == [{"type": "aimed", "id": 3, "ok": False, "reason": reason}]
+    said = {
+        "ok": False,
+        "reason": reason,
+        "sentence": {"id": "console.aim.viewer", "arguments": {"user": "ann"}},
+    }
+    assert page.told == [{"type": "aimed", "id": 3, **said}]

@@ -157,7 +157,7 @@ def test_every_page_asks_for_a_login(client: Client, station: Station, address: 
 def test_the_login_page_says_when_the_password_is_wrong(client: Client, ada: User) -> None:
     answer = client.post("/login/", {"username": "ada", "password": "wrong"})
 
-    assert "Name or password is wrong" in answer.content.decode()
+    assert "The name or the password is wrong" in answer.content.decode()
     assert 'value="ada"' in answer.content.decode()  # forms keep what was typed
 
 
@@ -190,7 +190,7 @@ def test_a_viewer_is_told_that_a_viewer_watches(client: Client, station: Station
 
     html = text_of(client, "/stations/bench-1/lease")
 
-    assert "a viewer does not command" in html
+    assert "viewers do not command" in html
     assert "data-lease=" not in html
 
 
@@ -379,11 +379,11 @@ def test_a_bench_is_laid_out_only_where_it_is_simulated(browser: Client, station
 
 
 def test_an_empty_lab_shows_the_way_to_the_first_trial(browser: Client, client: Client) -> None:
-    assert "An administrator does this" in text_of(browser, "/")
+    assert "An administrator sets up the first one" in text_of(browser, "/")
 
     client.force_login(User.objects.create_superuser("root"))
 
-    assert reverse("admin:stations_station_add") in text_of(client, "/")
+    assert f'class="button button-primary" href="{reverse("first-steps")}"' in text_of(client, "/")
 
 
 def test_home_lists_stations_with_who_commands_and_what_is_tried(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -47,7 +48,7 @@ def done(root: User) -> Done:
 
     def do(**order: Any) -> dict[str, Any]:
         job = orders.asked(user=root, given=order)
-        work("lab")
+        work("cpu")
         job.refresh_from_db()
         assert job.error == ""
         return dict(job.result)
@@ -106,9 +107,9 @@ def test_episodes_are_deleted_once_however_often_the_job_is_done(
     job = orders.asked(user=root, given={"what": "delete", "dataset": "cups", "episodes": [0, 0]})
     with pytest.raises(Conflict, match="are being deleted"):
         orders.asked(user=root, given={"what": "delete", "dataset": "cups", "episodes": [1]})
-    work("lab")
+    work("cpu")
     Job.objects.filter(pk=job.pk).update(status="queued", attempts=0)  # its worker died after the last step
-    work("lab")
+    work("cpu")
     job.refresh_from_db()
     assert "nothing was deleted" in job.result["why"]
     assert [entry.length for entry in open_dataset(data / "datasets" / "cups").episodes] == [8, 7]
@@ -122,10 +123,16 @@ def test_episodes_are_deleted_once_however_often_the_job_is_done(
         ({"what": "convert", "dataset": "cups", "to": "new", "version": "v2.0"}, "v2.1"),
         ({"what": "convert", "dataset": "cups", "to": "../out", "version": "v3.0"}, "names no dataset"),
         ({"what": "convert", "dataset": "cups", "to": "episodes/x", "version": "v3.0"}, "names no dataset"),
+        ({"what": "convert", "dataset": "cups", "to": "a\nb", "version": "v3.0"}, "names no dataset"),
+        ({"what": "convert", "dataset": "cups", "to": "cups/-", "version": "v3.0"}, "names no dataset"),
         ({"what": "merge", "datasets": ["cups"], "to": "new"}, "datasets"),
         ({"what": "split", "dataset": "cups", "to": "new", "parts": {"../a": [0]}}, "names no dataset"),
         ({"what": "delete", "dataset": "cups", "episodes": []}, "episodes"),
         ({"what": "check", "dataset": "cups", "more": 1}, "more"),
+        (
+            {"what": "push", "dataset": "cups", "repository": "lab/cups", "private": "no"},
+            "private: .* boolean",
+        ),
     ],
 )
 def test_an_order_that_is_none_is_refused_by_name(
@@ -172,6 +179,20 @@ def test_a_push_without_the_client_says_so(
 # --- pages -----------------------------------------------------------------------------------------------------
 
 
+def test_episodes_that_another_page_hands_over_stand_in_the_form_that_makes_a_dataset_of_them(
+    browser: Client, foreign: Foreign
+) -> None:
+    foreign("cups", version="v2.1")
+    address = reverse("dataset", args=["cups"])
+    page = browser.get(address, {"chosen": "0,2"}).content.decode()
+    assert '<details class="card dataset-order" id="split" open>' in page
+    assert 'value="chosen=0,2"' in page
+    assert 'id="split" open' not in browser.get(address).content.decode()
+    refused = browser.get(address, {"chosen": "0;2"}, headers={"Accept": "text/html"})
+    assert refused.status_code == 400
+    assert "allowed: indices of episodes, separated by commas" in refused.content.decode()
+
+
 def test_forms_of_the_page_ask_and_a_deletion_wants_the_name(
     browser: Client, foreign: Foreign, data: Path
 ) -> None:
@@ -179,18 +200,18 @@ def test_forms_of_the_page_ask_and_a_deletion_wants_the_name(
     ask = reverse("dataset-ask")
     form = {"what": "delete", "dataset": "datasets/cups", "episodes": ["0", "2"]}
     answer = browser.post(ask, form | {"confirm": "plates"}, follow=True)
-    assert "nothing was deleted: write the name" in answer.content.decode()
+    assert "nothing was deleted: type the name" in answer.content.decode()
     assert not Job.objects.exists()
     answer = browser.post(ask, form | {"confirm": "cups"}, follow=True)
     assert "Delete 2 episodes of cups" in answer.content.decode()
-    work("lab")
+    work("cpu")
     assert len(open_dataset(data / "datasets" / "cups").episodes) == 1
     answer = browser.post(
         ask,
         {"what": "split", "dataset": "datasets/cups", "to": "one", "parts": "first=0 again=0"},
         follow=True,
     )
-    work("lab")
+    work("cpu")
     page = browser.get(reverse("dataset", args=["cups"])).content.decode()
     assert "one/first" in page
     assert browser.get(reverse("dataset-work"))["HX-Refresh"] == "true"
@@ -204,6 +225,28 @@ def test_a_viewer_sees_everything_and_is_offered_nothing(client: Client, foreign
     assert "Convert" not in page
     assert "Delete" not in page
     assert "task 0" in page
+
+
+def test_datasets_and_their_episodes_are_sorted_filtered_and_saved(browser: Client, foreign: Foreign) -> None:
+    foreign("cups")
+    foreign("plates", lengths=(3,), version="v2.1")
+    listed = reverse("dataset-list")
+    names = re.findall(
+        r'data-dataset="datasets/(\w+)"', browser.get(listed, {"sort": "rows"}).content.decode()
+    )
+    assert names == ["plates", "cups"]
+    narrowed = browser.get(listed, {"version": "v2.1"}).content.decode()
+    assert re.findall(r'data-dataset="datasets/(\w+)"', narrowed) == ["plates"]
+    assert "No datasets match" in browser.get(listed, {"words": "saucers"}).content.decode()
+    file = b"".join(browser.get(listed, {"format": "csv", "words": "cups"}).streaming_content).decode()
+    assert file.splitlines()[1].startswith("cups,")
+    one = reverse("dataset", args=["cups"])
+    rows = re.findall(r'data-index="(\d)"', browser.get(one, {"sort": "-rows"}).content.decode())
+    assert rows == ["1", "2", "0"]
+    file = b"".join(browser.get(one, {"format": "csv", "sort": "-index"}).streaming_content).decode()
+    assert [line.split(",")[0] for line in file.splitlines()] == ["index", "2", "1", "0"]
+    for sort in ("index", "task", "result", "recording", "review", "rows", "lasts"):
+        assert "aria-sort" in browser.get(one, {"sort": sort}).content.decode()
 
 
 # --- REST and terminal -----------------------------------------------------------------------------------------
@@ -249,7 +292,7 @@ def test_a_station_of_another_robot_is_refused_with_the_differences(
     foreign("cups")
     Station.objects.create(name="bench", robot="ur5e", title="Bench")
     page = browser.get(reverse("on-robot"), {"show": "cups:1"}).content.decode()
-    assert "say on its page in Replay whose numbers it has" in page
+    assert "choose its robot on its page in Replay" in page
     page = browser.get(reverse("on-robot"), {"show": "cups:1", "robot": "agilex_piper"}).content.decode()
     assert "the episode is of the robot agilex_piper, the station has ur5e" in page
     assert 'aria-disabled="true"' in page
@@ -282,6 +325,38 @@ def test_the_stations_page_sets_up_what_the_address_names(
     ).context["replay"]
     assert len(poses.differences) == 1
     assert "replay_problem" in browser.get(reverse("station-debug", args=["bench"]), {"replay": "x"}).context
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        ({"dataset": "a\r\nb"}, "names no dataset"),
+        ({"what": "split", "to": "x", "parts": "a=0:60000 b=0:60000"}, "too many episodes"),
+        ({"what": "delete", "confirm": "cups", "episodes": "9" * 5000}, "episodes"),
+    ],
+)
+def test_what_a_form_never_sends_is_refused_with_a_sentence(
+    foreign: Foreign, root: User, more: dict[str, str], sentence: str
+) -> None:
+    foreign("cups")
+    browser = Client()
+    browser.force_login(root)
+    form = {"what": "check", "dataset": "cups", **more}
+    assert sentence in browser.post(reverse("dataset-ask"), form, follow=True).content.decode()
+    assert not Job.objects.exists()
+
+
+def test_a_folder_that_no_address_can_name_hides_no_other_dataset(
+    foreign: Foreign, data: Path, root: User
+) -> None:
+    plain = foreign("plain")
+    for name in ("cups", "a\nb", "c\udcffd"):
+        shutil.copytree(plain, data / "datasets" / name)
+    browser = Client()
+    browser.force_login(root)
+    assert dataset_names() == ["datasets/cups", "datasets/plain"]
+    assert "cups" in browser.get(reverse("dataset-list")).content.decode()
+    assert browser.get("/api/v1/find", {"q": "cups"}).json()["groups"][0]["items"][0]["title"] == "cups"
 
 
 def own_folders() -> list[str]:

@@ -246,3 +246,23 @@ def test_curves_of_another_rate_and_start_lie_at_their_time_and_nowhere_else() -
     assert sampled["state"] == [None, 1, 1, 2, 2, None, None, None, None]
     assert sampled["executed"] == [None, 4, 4, 5, 5, 6, 6, 6, None]
     assert absent == [None] * 9
+
+
+def test_the_joint_that_is_shown_first_is_the_one_that_differs_most() -> None:
+    found = run(
+        ALIGNED,
+        """
+        const arrays = { time: "time", measured: "measured", executed: "executed" };
+        const header = { joints: ["a", "b", "c"], period: 0.1, streams: { ticks: { arrays } } };
+        const episode = (...states) => {
+          const measured = Float32Array.from(states.flat());
+          const stored = { time: Float64Array.from([0, 0.1]), measured, executed: new Float32Array(6) };
+          return { header, shift: 0, numbers: (name) => stored[name] };
+        };
+        const one = episode([0, 9], [1, 1], [0, NaN]);
+        const other = episode([0, 9], [1, 3], [NaN, 50]);
+        const times = m.grid({ fps: 10, frames: 2 });
+        return [m.differing(times, [one, other], ["a", "b", "c"]), m.differing(times, [one, one], ["a", "b", "c"])];
+        """,
+    )
+    assert found == [1, 0]

@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,13 @@ from django.test import AsyncClient, Client
 from django.urls import reverse
 
 from evaweb.binary_frames import decode
+from evaweb.datasets import stills
 from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
 from runtime.datasets.operations import convert
 from runtime.datasets.published import publish
 from runtime.datasets.sides import attach
+from runtime.recording.files import RecordingError
 from tests.runtime.datasets.foreign import column
 from tests.runtime.datasets.small import JOINTS
 
@@ -175,8 +178,9 @@ def test_a_dataset_says_of_each_episode_what_is_known_of_it(browser: Client, our
     Episode.objects.create(uuid=ours[0], station=station, frames=20)
     page = browser.get(reverse("dataset", args=["home"]))
     (row,) = page.context["page"]
-    assert (row.success, row.verdict, str(row.recording.uuid)) == (True, "", ours[0])
-    assert list(browser.get(reverse("dataset", args=["home"]) + "?success=no").context["page"]) == []
+    assert (row.success, row.result, row.verdict) == (True, "success", "")
+    assert str(row.recording.uuid) == ours[0]
+    assert list(browser.get(reverse("dataset", args=["home"]) + "?result=partial").context["page"]) == []
     assert len(browser.get(reverse("dataset", args=["home"]) + "?verdict=unreviewed").context["page"]) == 1
     assert list(browser.get(reverse("dataset", args=["home"]) + "?words=nothing+such").context["page"]) == []
 
@@ -228,3 +232,14 @@ def test_the_sample_episode_is_replayed_with_its_robot(browser: Client, data: Pa
     for measured, executed in seen[1:]:
         assert np.array_equal(measured, seen[0][0])
         assert np.array_equal(executed, seen[0][1])
+
+
+def test_a_picture_of_a_dataset_that_is_far_too_large_is_refused_and_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    large = stills.simplejpeg.encode_jpeg(stills.np.zeros((48, 64, 3), "u1"))
+    monkeypatch.setattr(stills, "_stored", lambda *given: large)
+    monkeypatch.setattr(stills.Image, "MAX_IMAGE_PIXELS", 1000)
+    episode: Any = SimpleNamespace(video=lambda camera: None, cameras={"top": "observation.images.top"})
+    with pytest.raises(RecordingError, match=r"picture 3 of 'observation\.images\.top' cannot be decoded"):
+        stills.still(episode, "top", 3)

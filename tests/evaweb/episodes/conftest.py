@@ -91,6 +91,6 @@ def closed(put: Put, station: Station) -> Callable[..., Episode]:
 def previewed(closed: Callable[..., Episode]) -> Episode:
     """One that can be played."""
     episode = closed()
-    assert work("lab") == 1
+    assert work("cpu") == 1
     assert Job.objects.get().error == ""
     return Episode.objects.get(uuid=UUID(str(episode.uuid)))

@@ -38,7 +38,7 @@ def score(data: Path, episode: Episode, success: bool, **more: object) -> None:
 def publish(episode: Episode) -> Job:
     """Ask for the dataset and let the worker do all that waits."""
     job = services.publish_asked(episode=episode)
-    jobs.work("lab")
+    jobs.work("cpu")
     job.refresh_from_db()
     return job
 
@@ -55,9 +55,9 @@ def test_a_preview_has_the_same_coded_pictures_with_the_index_at_the_front(
     folder = data / "previews" / str(previewed.uuid)
     journal = data / "episodes" / str(previewed.uuid)
     assert sorted(path.name for path in folder.iterdir()) == [
-        "cam_high.mp4",
-        "cam_left_wrist.mp4",
-        "cam_right_wrist.mp4",
+        *("cam_high.mp4", "cam_high.sheet.jpg"),
+        *("cam_left_wrist.mp4", "cam_left_wrist.sheet.jpg"),
+        *("cam_right_wrist.mp4", "cam_right_wrist.sheet.jpg"),
         "thumbnail.jpg",
     ]
     for camera in previewed.cameras:
@@ -80,9 +80,9 @@ def test_a_preview_that_was_cut_off_leaves_nothing_and_is_made_anew(closed: Clos
     left = data / "previews" / f".{episode.uuid}.abandoned"
     left.mkdir(parents=True)
     (left / "cam_high.mp4").write_bytes(b"half")
-    jobs.work("lab")
+    jobs.work("cpu")
     services.preview_asked(episode=episode)
-    jobs.work("lab")
+    jobs.work("cpu")
     assert [path.name for path in (data / "previews").iterdir()] == [str(episode.uuid)]
     assert [job.status for job in Job.objects.all()] == [JobStatus.DONE] * 2
 
@@ -100,7 +100,7 @@ def test_a_damaged_episode_fails_its_job_with_the_file_named(
     job = Job.objects.get()
     for _ in range(jobs.MOST_ATTEMPTS):
         Job.objects.update(not_before=None)
-        jobs.work("lab")
+        jobs.work("cpu")
     job.refresh_from_db()
     assert job.status == JobStatus.FAILED
     assert str(file) in job.error
@@ -205,7 +205,7 @@ def test_an_episode_that_is_still_being_written_is_tried_again(closed: Closed, d
     assert "has no outcome.json" in job.error
     outcome.write_bytes(content)
     Job.objects.update(not_before=None)
-    jobs.work("lab")
+    jobs.work("cpu")
     job.refresh_from_db()
     assert job.result["published"] is True
 
@@ -257,7 +257,7 @@ def test_a_worker_killed_while_publishing_leaves_a_dataset_that_the_next_one_com
     assert job.status == JobStatus.RUNNING
     Job.objects.filter(pk=job.pk).update(seen_at=timezone.now() - timedelta(hours=1))
     assert jobs.sweep() == 1
-    assert jobs.work("lab") == 1
+    assert jobs.work("cpu") == 1
     job.refresh_from_db()
     assert (job.status, job.attempts, job.result["index"]) == (JobStatus.DONE, 0, 1)
     assert check(root) == []
@@ -269,7 +269,7 @@ def test_the_job_reconcile_tells_what_it_found(closed: Closed, data: Path) -> No
     episode = closed()
     Episode.objects.all().delete()
     job = jobs.enqueue(kind="reconcile", key="reconcile", args={})
-    jobs.work("lab")
+    jobs.work("cpu")
     job.refresh_from_db()
     assert job.result == {
         "episodes": 1,
@@ -281,7 +281,7 @@ def test_the_job_reconcile_tells_what_it_found(closed: Closed, data: Path) -> No
     }
     shutil.rmtree(data / "episodes" / str(episode.uuid))
     again = jobs.enqueue(kind="reconcile", key="reconcile", args={})
-    jobs.work("lab")
+    jobs.work("cpu")
     again.refresh_from_db()
     assert again.result["missing"] == 1
 
@@ -292,14 +292,14 @@ def test_the_table_is_made_once_and_stays(closed: Closed, data: Path) -> None:
     before = path.stat()
     for _ in range(2):
         job = services.export_asked(episode=episode)
-        jobs.work("lab")
+        jobs.work("cpu")
         job.refresh_from_db()
         assert job.status == JobStatus.DONE, job.error
         assert job.result == {"file": str(path.relative_to(data)), "bytes": before.st_size}
     assert path.stat().st_mtime_ns == before.st_mtime_ns
     path.unlink()
     services.export_asked(episode=episode)
-    jobs.work("lab")
+    jobs.work("cpu")
     assert path.stat().st_size == before.st_size
 
 

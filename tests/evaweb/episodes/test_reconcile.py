@@ -49,7 +49,7 @@ def test_a_lost_database_comes_back_with_stations_previews_and_datasets(
         scores.parent.mkdir(exist_ok=True)
         scores.write_bytes(SCORE.read_bytes())
         services.publish_asked(episode=episode)
-    jobs.work("lab")
+    jobs.work("cpu")
     before = {row.uuid: row for row in Episode.objects.all()}
     Episode.objects.all().delete()
     Station.objects.all().delete()
@@ -222,7 +222,7 @@ def test_an_episode_that_was_scored_after_it_was_published_is_published_again(
 ) -> None:
     episode = closed()
     services.publish_asked(episode=episode)
-    jobs.work("lab")
+    jobs.work("cpu")
     Job.objects.all().delete()
     assert reconcile().published == 1
     assert not Job.objects.exists()
@@ -231,7 +231,7 @@ def test_an_episode_that_was_scored_after_it_was_published_is_published_again(
     scores.write_text('{"kind": "score", "success": false}\n')
     reconcile()
     assert Job.objects.get().key == f"publish:{episode.uuid}"
-    jobs.work("lab")
+    jobs.work("cpu")
     Job.objects.all().delete()
     reconcile()
     assert not Job.objects.exists()
@@ -265,7 +265,7 @@ def test_a_table_that_is_missing_is_asked_for_and_a_damaged_episode_has_none(
     closed: Callable[..., Episode], data: Path
 ) -> None:
     whole, broken = closed(), closed("interrupted")
-    jobs.work("lab")
+    jobs.work("cpu")
     Job.objects.all().delete()
     tables = {path.stem: path for path in (data / "exports").rglob("*.parquet")}
     for path in tables.values():
@@ -273,7 +273,7 @@ def test_a_table_that_is_missing_is_asked_for_and_a_damaged_episode_has_none(
     (data / "episodes" / str(broken.uuid) / "manifest.json").write_text("{")
     reconcile()
     assert [job.key for job in Job.objects.all()] == [f"export:{whole.uuid}"]
-    jobs.work("lab")
+    jobs.work("cpu")
     assert tables[str(whole.uuid)].is_file()
     Job.objects.all().delete()
     reconcile()
@@ -288,7 +288,7 @@ def published(closed: Callable[..., Episode], data: Path) -> Episode:
     """An episode in the dataset that it was published into."""
     episode = closed()
     services.publish_asked(episode=episode)
-    jobs.work("lab")
+    jobs.work("cpu")
     return Episode.objects.get(uuid=episode.uuid)
 
 

@@ -135,3 +135,18 @@ def test_folders_that_are_gone_are_missing_but_one_just_announced_is_not(
     assert services.missing_marked() == 1
     assert Episode.objects.get(uuid=old.uuid).status == EpisodeStatus.MISSING
     assert Episode.objects.get(uuid=fresh.uuid).status == EpisodeStatus.RECORDING
+
+
+def test_a_station_says_nothing_of_anothers_episode(station: Station) -> None:
+    """Its computer may be anybody's: it is believed of its own episodes."""
+    other = Station.objects.create(name="bench-elsewhere", robot="agilex_piper")
+    episode = opened(station, str(uuid.uuid4()))
+    told = {"uuid": str(episode.uuid), "status": "failed", "reason": "made up"}
+    for say in (
+        lambda: services.episode_closed(station=other, data=told),
+        lambda: opened(other, str(episode.uuid)),
+    ):
+        with pytest.raises(EvaError, match=f"is of {station.name}: bench-elsewhere says nothing of it"):
+            say()
+    services.episode_unopened(station=other, uuid=episode.uuid)
+    assert Episode.objects.get().status == EpisodeStatus.RECORDING

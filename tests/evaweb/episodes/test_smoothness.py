@@ -133,7 +133,7 @@ def test_it_is_asked_for_once_and_kept_with_the_episode(closed, monkeypatch):
     assert look_for_unmeasured() == 0
     job = Job.objects.get(kind="smoothness")
     Job.objects.exclude(pk=job.pk).delete()
-    assert work("lab") == 1
+    assert work("cpu") == 1
     episode = Episode.objects.get(pk=episode.pk)
     found = smoothness_in(services.journal_folder(episode.uuid))
     assert (episode.smoothness, episode.smoothness_commanded) == (found.measured, found.commanded)
@@ -148,7 +148,7 @@ def test_what_could_not_be_measured_is_tried_again_when_its_folder_is_read_anew(
     manifest.unlink()
     look_for_unmeasured()
     Job.objects.exclude(kind="smoothness").delete()
-    work("lab")
+    work("cpu")
     episode.refresh_from_db()
     assert episode.smoothness is None
     assert "manifest.json" in episode.smoothness_detail["why"]

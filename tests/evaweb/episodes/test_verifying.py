@@ -35,7 +35,7 @@ Closed = Callable[..., Episode]
 def old(closed: Closed) -> Episode:
     """An episode of a week ago, whose worker has nothing else to do."""
     episode = closed()
-    jobs.work("lab")
+    jobs.work("cpu")
     Episode.objects.update(created_at=timezone.now() - timedelta(days=7))
     episode.refresh_from_db()
     return episode
@@ -54,7 +54,7 @@ def a_bit_off(path: Path) -> Iterator[None]:
 def scrubbed() -> Job:
     """The worker's next look, and what it then does."""
     assert look_for_unverified()
-    jobs.work("lab")
+    jobs.work("cpu")
     return Job.objects.filter(kind="scrub").latest("created_at")
 
 
@@ -81,7 +81,7 @@ def test_what_was_just_recorded_waits_and_so_does_a_scrub_while_anything_else_is
     assert Job.objects.filter(status=JobStatus.QUEUED).exists()  # its preview
     Episode.objects.update(created_at=timezone.now() - timedelta(days=7))
     assert not look_for_unverified()
-    jobs.work("lab")
+    jobs.work("cpu")
     Episode.objects.update(created_at=timezone.now())
     assert not look_for_unverified()
     Episode.objects.filter(pk=episode.pk).update(created_at=timezone.now() - timedelta(days=7))
@@ -93,7 +93,7 @@ def test_a_scrub_goes_round_a_bounded_part_at_a_time(
 ) -> None:
     folder = put("interrupted")
     services.episode_read(uuid=folder.name)
-    jobs.work("lab")
+    jobs.work("cpu")
     Episode.objects.update(created_at=timezone.now() - timedelta(days=7))
     monkeypatch.setattr(verifying, "MOST_BYTES", 1)
     assert scrubbed().result["sound"] == 1
@@ -124,7 +124,7 @@ def test_damage_is_kept_on_the_disk_and_shown_until_the_files_are_back(
         assert [damage["file"] for damage in old.damage] == ["ticks.arrow"]
         with pytest.raises(Conflict, match=r"is damaged: ticks\.arrow is changed"):
             recorded_at(str(old.uuid))
-        jobs.work("lab")
+        jobs.work("cpu")
     Episode.objects.update(verified_at=None, created_at=timezone.now() - timedelta(days=7))
     assert scrubbed().result["sound"] == 1
     old.refresh_from_db()
@@ -139,7 +139,7 @@ def test_damage_is_kept_on_the_disk_and_shown_until_the_files_are_back(
 def test_a_publication_finds_the_damage_itself_and_keeps_it(old: Episode, data: Path, name: str) -> None:
     with a_bit_off(folder_of(data, old) / name):
         job = services.publish_asked(episode=old)
-        jobs.work("lab")
+        jobs.work("cpu")
         job.refresh_from_db()
     assert (job.status, job.attempts, job.result["published"]) == (JobStatus.DONE, 0, False)
     assert f"is damaged: {name} is " in job.result["why"]
@@ -152,7 +152,7 @@ def test_figures_of_damaged_rows_are_not_measured(old: Episode, data: Path) -> N
     Episode.objects.update(smoothness=None, smoothness_detail=None)
     with a_bit_off(folder_of(data, old) / "rows.arrow"):
         assert services.smoothness_asked(most=1) == 1
-        jobs.work("lab")
+        jobs.work("cpu")
     old.refresh_from_db()
     assert old.smoothness is None
     assert "rows.arrow is changed" in old.smoothness_detail["why"]
@@ -163,7 +163,7 @@ def test_an_older_recording_is_published_and_said_to_have_no_digests(old: Episod
     Episode.objects.update(seal="")
     assert scrubbed().result["unsealed"] == 1
     job = services.publish_asked(episode=old)
-    jobs.work("lab")
+    jobs.work("cpu")
     job.refresh_from_db()
     assert (job.result["published"], job.result["remark"]) == (True, UNSEALED)
 
@@ -181,7 +181,7 @@ def test_a_recording_that_is_gone_keeps_none_of_the_others(old: Episode, data: P
 
 def again() -> Job:
     """The next look, a month later."""
-    jobs.work("lab")
+    jobs.work("cpu")
     Episode.objects.update(verified_at=None, created_at=timezone.now() - timedelta(days=7))
     return scrubbed()
 
@@ -225,7 +225,7 @@ def test_one_that_was_sealed_anew_before_anybody_looked_is_damaged_and_not_publi
     (folder / "rows.arrow").write_bytes(aside["rows.arrow"][:-20])
     assert repair(folder).verdict == "repaired"
     publication = services.publish_asked(episode=old)
-    jobs.work("lab")
+    jobs.work("cpu")
     publication.refresh_from_db()
     said = "outcome.json is not the one with which the recording was closed"
     assert publication.result["published"] is False

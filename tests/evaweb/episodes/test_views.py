@@ -176,12 +176,16 @@ def test_a_camera_that_the_row_does_not_name_never_reaches_the_disk(
 
 
 @pytest.mark.parametrize("identity", ["..", "%2e%2e", "not-a-uuid", "c86a888b"])
-@pytest.mark.parametrize("what", ["thumbnail", "video/cam_high", "curves", "poses", "export"])
+@pytest.mark.parametrize(
+    "what", ["thumbnail", "video/cam_high", "sheet/cam_high", "curves", "poses", "bench", "export"]
+)
 def test_an_address_without_a_uuid_does_not_exist(fetch: Fetch, identity: str, what: str) -> None:
     assert fetch(f"/episodes/{identity}/{what}")[0] == 404
 
 
-@pytest.mark.parametrize("what", ["thumbnail", "video/cam_high", "curves", "poses", "export"])
+@pytest.mark.parametrize(
+    "what", ["thumbnail", "video/cam_high", "sheet/cam_high", "curves", "poses", "bench", "export"]
+)
 def test_a_folder_that_the_database_does_not_know_is_not_shown(
     put: Callable[..., Path], fetch: Fetch, what: str
 ) -> None:
@@ -209,6 +213,18 @@ def test_nobody_sees_an_episode_without_logging_in(previewed: Episode, client: C
 def test_the_thumbnail_is_a_picture(previewed: Episode, fetch: Fetch) -> None:
     status, headers, body = fetch(reverse("episode-thumbnail", args=[previewed.uuid]))
     assert (status, headers["Content-Type"], body[:2]) == (200, "image/jpeg", b"\xff\xd8")
+
+
+def test_every_camera_has_a_sheet_of_small_pictures_and_an_older_preview_has_none(
+    previewed: Episode, data: Path, fetch: Fetch, browser: Client
+) -> None:
+    address = reverse("episode-sheet", args=[previewed.uuid, "cam_high"])
+    status, headers, body = fetch(address)
+    assert (status, headers["Content-Type"], body[:2]) == (200, "image/jpeg", b"\xff\xd8")
+    assert fetch(reverse("episode-sheet", args=[previewed.uuid, "cam_low"]))[0] == 404
+    assert address in page_of(browser, previewed)
+    (data / "previews" / str(previewed.uuid) / "cam_high.sheet.jpg").unlink()
+    assert address not in page_of(browser, previewed)
 
 
 # --- messages ------------------------------------------------------------------------------------------------
@@ -272,7 +288,7 @@ def test_the_page_waits_for_the_preview_and_goes_on_by_itself(
     assert 'hx-trigger="every 1s"' in page
     address = reverse("replay-stage", args=[episode.uuid])
     assert "HX-Refresh" not in browser.get(address)
-    jobs.work("lab")
+    jobs.work("cpu")
     assert browser.get(address)["HX-Refresh"] == "true"
 
 
@@ -285,7 +301,7 @@ def test_an_episode_whose_folder_is_gone_says_what_to_do(
     station: Station, data: Path, browser: Client
 ) -> None:
     episode = Episode.objects.create(station=station, status=EpisodeStatus.MISSING)
-    assert "missing on the disk" in page_of(browser, episode)
+    assert "missing from the disk" in page_of(browser, episode)
     assert "manage.py reconcile" in page_of(browser, episode)
 
 
@@ -318,7 +334,7 @@ def test_the_list_shows_how_each_stands_and_looks_again_while_something_goes_on(
 ) -> None:
     page = browser.get("/replay/").content.decode()
     assert f'data-episode="{previewed.uuid}" data-stage="ready"' in page
-    assert "hx-trigger" not in page
+    assert 'hx-trigger="every' not in page
     Episode.objects.create(station=station)
     page = browser.get("/replay/").content.decode()
     assert 'hx-trigger="every 3s"' in page
@@ -332,7 +348,6 @@ def test_the_list_shows_how_each_stands_and_looks_again_while_something_goes_on(
         ({"words": "CUPS"}, 1),
         ({"words": "cups nowhere"}, 0),
         ({"station": "bench"}, 1),
-        ({"station": "other"}, 0),
         ({"status": "finished"}, 1),
         ({"status": "failed"}, 0),
         ({"mode": "continuous"}, 1),
@@ -343,6 +358,54 @@ def test_the_list_shows_how_each_stands_and_looks_again_while_something_goes_on(
 )
 def test_the_list_is_filtered(previewed: Episode, browser: Client, query: dict[str, str], count: int) -> None:
     assert browser.get("/replay/", query).content.decode().count("data-episode=") == count
+
+
+def test_what_the_list_does_not_know_is_named_and_all_is_shown(previewed: Episode, browser: Client) -> None:
+    for query, said in (
+        ({"station": "other"}, "station = &#x27;other&#x27;; allowed: bench"),
+        ({"sort": "luck"}, "sort = &#x27;luck&#x27;; allowed: recorded, task, checkpoint"),
+    ):
+        page = browser.get("/replay/", query).content.decode()
+        assert said in page
+        assert page.count("data-episode=") == 1
+
+
+def test_every_column_sorts_and_the_file_has_what_is_filtered(
+    previewed: Episode, station: Station, browser: Client
+) -> None:
+    other = Episode.objects.create(station=station, status="failed", task="=later", duration_s=1e6)
+    for name in (
+        "recorded",
+        "task",
+        "checkpoint",
+        "mode",
+        "station",
+        "result",
+        "time",
+        "recording",
+        "dataset",
+    ):
+        for sort in (name, f"-{name}"):
+            page = browser.get("/replay/", {"sort": sort}).content.decode()
+            assert page.count("data-episode=") == 2
+            assert page.count("aria-sort") == 1
+    first = browser.get("/replay/", {"sort": "-time"}).content.decode().partition('data-episode="')[2]
+    assert first.startswith(str(other.uuid))
+    answer = browser.get("/replay/", {"format": "csv", "status": "failed"})
+    lines = b"".join(answer.streaming_content).decode().splitlines()
+    assert lines[0].startswith("recorded,task,checkpoint,mode,station,result,time")
+    assert len(lines) == 2
+    assert "'=later" in lines[1]
+    assert str(other.uuid) in lines[1]
+
+
+def test_who_only_looks_chooses_nothing(previewed: Episode, browser: Client, db: Any) -> None:
+    assert "data-tick" in browser.get("/replay/").content.decode()
+    visitor = Client()
+    visitor.force_login(User.objects.create_user("visitor"))
+    page = visitor.get("/replay/").content.decode()
+    assert "data-tick" not in page
+    assert "data-bulk" not in page
 
 
 # --- the table -----------------------------------------------------------------------------------------------
@@ -371,11 +434,11 @@ def test_a_table_that_is_not_made_yet_is_made_on_demand(
     assert status == 404
     assert "is not made yet: POST to this address has it made" in body.decode()
     page = page_of(browser, previewed)
-    assert "make it" in page
+    assert "Make the table" in page
     asked = browser.post(address).content.decode()
     assert "is being made" in asked
     assert f'hx-get="{reverse("episode-table", args=[previewed.uuid])}"' in asked
-    assert jobs.work("lab") == 1
+    assert jobs.work("cpu") == 1
     assert fetch(address)[2] == content
     shown = browser.get(reverse("episode-table", args=[previewed.uuid])).content.decode()
     assert f'href="{address}"' in shown
@@ -397,7 +460,7 @@ def test_a_table_that_cannot_be_made_says_why(previewed: Episode, data: Path, br
     table_file(data).unlink()
     Job.objects.create(kind="export", key=f"export:{previewed.uuid}", status="failed", error="disk full")
     page = page_of(browser, previewed)
-    assert "failed: try again" in page
+    assert "Failed: try again" in page
     assert "disk full" in page
     (data / "episodes" / str(previewed.uuid) / "manifest.json").write_text("{")
     assert "manifest.json is not a whole JSON document" in page_of(browser, previewed)

@@ -25,7 +25,7 @@ class Toy:
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> Toy:
     made = Toy()
-    monkeypatch.setitem(kinds._kinds, "toy", made)
+    monkeypatch.setitem(kinds._kinds, "toy", kinds.Declared(made))
     return made
 
 

@@ -6,7 +6,7 @@ import threading
 
 from django.db import OperationalError
 
-from evaweb.jobs.heartbeat import Heartbeat
+from evaweb.jobs.heartbeat import Heartbeat, Lapse
 
 
 def test_it_beats_until_the_block_is_left_also_after_an_error() -> None:
@@ -33,3 +33,26 @@ def test_it_stops_where_the_job_is_not_ours_any_more() -> None:
     with Heartbeat(lambda: bool(beats.append(1)), 0.001) as heart:
         heart._thread.join(20)
         assert beats == [1]
+
+
+def test_it_lapses_where_no_beat_arrives_and_only_then() -> None:
+    lapsed = threading.Event()
+
+    def beat() -> bool:
+        raise OperationalError("the server closed the connection")
+
+    with Heartbeat(beat, 0.01, Lapse(0.05, lapsed.set)):
+        assert lapsed.wait(20)
+    again = threading.Event()
+    with Heartbeat(lambda: True, 0.001, Lapse(3600.0, again.set)):
+        pass
+    assert not again.is_set()
+    for timer in [one for one in threading.enumerate() if isinstance(one, threading.Timer)]:
+        timer.join(20)
+        assert not timer.is_alive()
+
+
+def test_it_lapses_at_once_where_the_job_is_anothers() -> None:
+    lapsed = threading.Event()
+    with Heartbeat(lambda: False, 0.001, Lapse(3600.0, lapsed.set)):
+        assert lapsed.wait(20)

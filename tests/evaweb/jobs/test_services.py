@@ -6,15 +6,19 @@ from datetime import timedelta
 from uuid import uuid4
 
 import pytest
+from django.contrib.auth.models import User
 from django.db import OperationalError
 from django.db.models.functions import Now
 from django.utils import timezone
 
+from evaweb.errors import Conflict, NotAllowed
 from evaweb.jobs import database_retry, locks, services
 from evaweb.jobs.kinds import UnknownKind, Work
 from evaweb.jobs.locks import alone
 from evaweb.jobs.models import Job, JobStatus
+from tests.evaweb.conftest import person
 from tests.evaweb.jobs.conftest import Toy
+from tests.evaweb.trials import builders
 
 pytestmark = [pytest.mark.django_db, pytest.mark.usefixtures("rung")]
 
@@ -34,7 +38,7 @@ def due(job: Job) -> None:
 
 def claim() -> Job:
     """The oldest job, as a worker gets it that never says anything again."""
-    claimed = services.claim(queue="lab", owner=uuid4())
+    claimed = services.claim(queue="cpu", owner=uuid4())
     assert claimed is not None
     return claimed
 
@@ -45,22 +49,22 @@ def break_down(work: Work) -> dict[str, object]:
 
 def test_a_job_is_done_and_keeps_its_result(toy: Toy) -> None:
     job = enqueue(a=1)
-    assert services.work("lab") == 1
+    assert services.work("cpu") == 1
     job.refresh_from_db()
     assert (job.status, job.result, job.attempts) == (JobStatus.DONE, {"seen": {"a": 1}}, 0)
     assert job.finished_at is not None
-    assert services.work("lab") == 0
+    assert services.work("cpu") == 0
 
 
 @pytest.mark.django_db(transaction=True)
 def test_the_doorbell_rings_when_the_row_can_be_seen(toy: Toy, rung: list[str]) -> None:
-    services.enqueue(kind="toy", key="k", args={}, queue="bench-1")
-    assert rung == ["bench-1"]
+    services.enqueue(kind="toy", key="k", args={})
+    assert rung == ["cpu"]
 
 
 def test_the_same_key_twice_is_one_job_with_the_newest_args(toy: Toy) -> None:
     assert enqueue(a=1).pk == enqueue(a=2).pk
-    services.work("lab")
+    services.work("cpu")
     assert toy.asked == [{"a": 2}]
 
 
@@ -70,23 +74,23 @@ def test_what_is_asked_for_while_the_same_is_being_done_is_done_once_more_afterw
     def ask_again(work: Work) -> dict[str, object]:
         if work.args["a"] == 1:
             enqueue(a=2)
-            assert services.claim(queue="lab", owner=uuid4()) is None, "two of one key at once"
+            assert services.claim(queue="cpu", owner=uuid4()) is None, "two of one key at once"
         return {}
 
     toy.does = ask_again
-    assert services.work("lab") == 2
+    assert services.work("cpu") == 2
     assert toy.asked == [{"a": 1}, {"a": 2}]
 
 
 def test_of_two_workers_one_gets_the_job(toy: Toy) -> None:
     enqueue()
     claim()
-    assert services.claim(queue="lab", owner=uuid4()) is None
+    assert services.claim(queue="cpu", owner=uuid4()) is None
 
 
 def test_another_queue_is_left_alone(toy: Toy) -> None:
     enqueue()
-    assert services.work("bench-2") == 0
+    assert services.work("gpu") == 0
 
 
 def test_a_kind_that_nobody_knows_is_refused_when_it_is_asked_for(toy: Toy) -> None:
@@ -98,18 +102,18 @@ def test_an_error_is_kept_and_tried_again_later_until_the_last_attempt(toy: Toy)
     toy.does = break_down
     job = enqueue()
     for attempt in range(1, services.MOST_ATTEMPTS):
-        assert services.work("lab") == 1
+        assert services.work("cpu") == 1
         job.refresh_from_db()
         assert (job.status, job.attempts) == (JobStatus.QUEUED, attempt)
         assert job.error == "rows.arrow is damaged"
-        assert services.work("lab") == 0, "it waits before it is tried again"
+        assert services.work("cpu") == 0, "it waits before it is tried again"
         due(job)
-    services.work("lab")
+    services.work("cpu")
     job.refresh_from_db()
     assert (job.status, job.error) == (JobStatus.FAILED, "rows.arrow is damaged")
     toy.does = lambda work: {}
-    services.try_again(job=job)
-    assert services.work("lab") == 1
+    services.try_again(user=person("olga", "operator"), job=job)
+    assert services.work("cpu") == 1
 
 
 def test_a_silent_worker_is_swept_and_its_job_done_once_by_another(toy: Toy) -> None:
@@ -119,7 +123,7 @@ def test_a_silent_worker_is_swept_and_its_job_done_once_by_another(toy: Toy) -> 
     silent(job)
     assert services.sweep() == 1
     assert services.sweep() == 0
-    assert services.work("lab") == 1
+    assert services.work("cpu") == 1
     job.refresh_from_db()
     assert (job.status, job.attempts, job.deaths) == (JobStatus.DONE, 0, 1)
     assert services.job_done(job=silenced, result={"late": True}) is False
@@ -133,11 +137,11 @@ def test_the_clocks_of_workers_decide_nothing(
 ) -> None:
     toy.does = break_down
     enqueue()
-    services.work("lab")
+    services.work("cpu")
     now = timezone.now()
     off = now + timedelta(seconds=seconds)
     monkeypatch.setattr(timezone, "now", lambda: off)
-    assert services.claim(queue="lab", owner=uuid4()) is None, "it waits before it is tried again"
+    assert services.claim(queue="cpu", owner=uuid4()) is None, "it waits before it is tried again"
     Job.objects.update(not_before=None)
     job = claim()
     assert services.sweep() == 0, "it was seen just now"
@@ -163,7 +167,7 @@ def test_a_worker_that_has_ended_is_not_waited_for_where_that_is_certain(toy: To
     assert services.sweep() == 0, "locks of another machine may not reach here"
     locks._path(job.key).write_bytes(left)
     assert services.sweep() == 1
-    assert services.work("lab") == 1
+    assert services.work("cpu") == 1
     job.refresh_from_db()
     assert (job.status, job.attempts, job.deaths) == (JobStatus.DONE, 0, 1)
     assert not locks._path(job.key).exists()
@@ -173,13 +177,13 @@ def test_two_of_one_key_are_never_at_work_on_one_disk(toy: Toy, monkeypatch: pyt
     monkeypatch.setattr(locks, "_AGAIN_S", 0.0)
     job = enqueue()
     with alone(job.key, uuid4()):
-        assert services.work("lab") == 1
+        assert services.work("cpu") == 1
     assert toy.asked == []
     job.refresh_from_db()
     assert (job.status, job.attempts, job.deaths) == (JobStatus.QUEUED, 0, 0)
     assert "the worker that had it before is still at it" in job.progress
     due(job)
-    assert services.work("lab") == 1
+    assert services.work("cpu") == 1
     assert len(toy.asked) == 1
 
 
@@ -195,7 +199,7 @@ def test_a_worker_whose_job_was_taken_goes_no_further_with_it(toy: Toy) -> None:
 
     other = uuid4()
     toy.does = tell
-    services.work("lab")
+    services.work("cpu")
     job.refresh_from_db()
     assert (job.status, job.owner, job.attempts, job.progress) == (JobStatus.RUNNING, other, 0, "")
     assert written == []
@@ -208,15 +212,15 @@ def test_a_job_that_ends_every_worker_fails_in_the_end_and_lets_others_have_thei
         dead = claim()
         silent(job)
         assert services.sweep() == 1
-        assert death == 0 or services.claim(queue="lab", owner=uuid4()) is None, "it waits for its next turn"
+        assert death == 0 or services.claim(queue="cpu", owner=uuid4()) is None, "it waits for its next turn"
     job.refresh_from_db()
     assert (job.status, job.attempts) == (JobStatus.FAILED, 0)
     assert job.error == (
         f"its worker {dead.owner} ended or went silent, which is number 8 of 8: "
         "the worker's log says what ended them; then try it again"
     )
-    services.try_again(job=job)
-    assert services.work("lab") == 1
+    services.try_again(user=person("olga", "operator"), job=job)
+    assert services.work("cpu") == 1
 
 
 def test_deaths_of_workers_use_up_no_attempts(toy: Toy) -> None:
@@ -228,7 +232,7 @@ def test_deaths_of_workers_use_up_no_attempts(toy: Toy) -> None:
         silent(job)
         services.sweep()
         due(job)
-        services.work("lab")
+        services.work("cpu")
         job.refresh_from_db()
         assert (job.attempts, job.deaths) == (errors, errors)
     assert job.status == JobStatus.FAILED
@@ -242,7 +246,7 @@ def test_a_stale_job_gives_way_to_one_that_was_asked_for_anew(toy: Toy) -> None:
     assert services.sweep() == 1
     old.refresh_from_db()
     assert old.status == JobStatus.FAILED
-    assert services.work("lab") == 1
+    assert services.work("cpu") == 1
     new.refresh_from_db()
     assert new.status == JobStatus.DONE
 
@@ -264,7 +268,7 @@ def test_what_an_ending_worker_puts_back_is_neither_an_error_nor_a_death(toy: To
     assert services.put_back(owner=claimed.owner) == 1
     job.refresh_from_db()
     assert (job.status, job.attempts, job.deaths) == (JobStatus.QUEUED, 0, 0)
-    assert services.work("lab") == 1
+    assert services.work("cpu") == 1
 
 
 def test_progress_is_shown_while_it_works_and_gone_afterwards(toy: Toy) -> None:
@@ -277,7 +281,7 @@ def test_progress_is_shown_while_it_works_and_gone_afterwards(toy: Toy) -> None:
         return {}
 
     toy.does = tell
-    services.work("lab")
+    services.work("cpu")
     job.refresh_from_db()
     assert (job.status, job.progress) == (JobStatus.DONE, "")
 
@@ -291,7 +295,7 @@ def test_a_locked_database_is_waited_for_before_a_job_and_after_it(
     for name in ("claim", "job_done"):
         monkeypatch.setattr(services, name, locked_twice(getattr(services, name)))
     job = enqueue()
-    assert services.work("lab") == 1
+    assert services.work("cpu") == 1
     job.refresh_from_db()
     assert job.status == JobStatus.DONE
     assert len(toy.asked) == 1
@@ -322,3 +326,73 @@ def test_a_database_that_stays_away_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(OperationalError, match="locked"):
         database_retry.patiently(away)
     assert len(attempts) == len(database_retry.WAITS_S) + 1
+
+
+# --- cancelled -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def ann() -> User:
+    return builders.user("ann")
+
+
+def test_a_job_that_waits_is_cancelled_at_once(toy: Toy, ann: User) -> None:
+    job = services.cancel(user=ann, job=enqueue())
+    assert (job.status, job.error, job.cancelled_by) == (JobStatus.FAILED, "cancelled by ann", ann)
+    assert services.work("cpu") == 0
+    assert toy.asked == []
+
+
+def test_a_job_that_runs_ends_at_its_next_step_and_can_be_repeated(toy: Toy, ann: User) -> None:
+    steps = []
+
+    def walk(work: Work) -> dict[str, object]:
+        for step in range(3):
+            steps.append(step)
+            if step == 1:
+                services.cancel(user=ann, job=Job.objects.get())
+            work.tell(f"step {step + 1} of 3")
+        return {}
+
+    toy.does = walk
+    job = enqueue()
+    services.work("cpu")
+    job.refresh_from_db()
+    assert steps == [0, 1]
+    assert (job.status, job.error, job.attempts) == (JobStatus.FAILED, "cancelled by ann", 0)
+    toy.does = lambda work: {}
+    services.try_again(user=person("olga", "operator"), job=job)
+    assert services.work("cpu") == 1
+
+
+def test_what_is_cancelled_is_not_tried_again_after_an_error_or_a_death(toy: Toy, ann: User) -> None:
+    def cancelled(work: Work) -> dict[str, object]:
+        services.cancel(user=ann, job=Job.objects.get())
+        raise ValueError("rows.arrow is damaged")
+
+    toy.does = cancelled
+    job = enqueue()
+    services.work("cpu")
+    job.refresh_from_db()
+    assert (job.status, job.error) == (JobStatus.FAILED, "cancelled by ann")
+    other = services.enqueue(kind="toy", key="toy:2", args={})
+    services.cancel(user=ann, job=claim())
+    silent(other)
+    services.sweep()
+    other.refresh_from_db()
+    assert (other.status, other.error) == (JobStatus.FAILED, "cancelled by ann")
+
+
+def test_what_was_done_before_its_next_step_is_done(toy: Toy, ann: User) -> None:
+    toy.does = lambda work: {"by": services.cancel(user=ann, job=Job.objects.get()).pk}
+    job = enqueue()
+    services.work("cpu")
+    job.refresh_from_db()
+    assert job.status == JobStatus.DONE
+    with pytest.raises(Conflict, match="nothing to cancel"):
+        services.cancel(user=ann, job=job)
+
+
+def test_who_only_looks_cancels_nothing(toy: Toy) -> None:
+    with pytest.raises(NotAllowed):
+        services.cancel(user=builders.user("visitor", "viewer"), job=enqueue())

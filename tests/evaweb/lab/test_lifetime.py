@@ -1,5 +1,9 @@
 import os
+import signal
 import socket
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -51,3 +55,65 @@ def test_a_second_lab_on_the_same_folder_is_refused_with_the_first_ones_number(t
         pass
     with lifetime.only_one(tmp_path):
         assert (tmp_path / "lab.lock").read_text() == str(os.getpid())
+
+
+ENDS = """
+import signal, sys, time
+from evaweb.lab import lifetime
+if "ignored" in sys.argv:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+lifetime.end_on_signals()
+try:
+    try:
+        print("up", flush=True)
+        time.sleep(60)
+    except Exception:
+        print("caught on the way", flush=True)
+except lifetime.Ended:
+    print("ending", flush=True)
+    sys.stdin.readline()
+    print("ended", flush=True)
+"""
+
+
+@pytest.fixture
+def ending():
+    made = []
+
+    def start(*arguments):
+        made.append(
+            subprocess.Popen(
+                [sys.executable, "-c", ENDS, *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                cwd=Path(__file__).parents[3],
+            )
+        )
+        assert made[-1].stdout.readline() == "up\n"
+        return made[-1]
+
+    yield start
+    for one in made:
+        one.kill()
+        one.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_each_way_to_end_a_lab_lets_it_end_in_order_and_a_second_one_changes_nothing(ending, number):
+    lab = ending()
+    lab.send_signal(number)
+    assert lab.stdout.readline() == "ending\n"
+    for another in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        lab.send_signal(another)
+    assert lab.communicate("\n", timeout=20) == ("ended\n", None)
+    assert lab.returncode == 0
+
+
+def test_a_lab_that_is_to_outlive_its_terminal_does(ending):
+    lab = ending("ignored")
+    lab.send_signal(signal.SIGHUP)
+    lab.send_signal(signal.SIGTERM)
+    assert lab.stdout.readline() == "ending\n"
+    lab.send_signal(signal.SIGHUP)
+    assert lab.communicate("\n", timeout=20) == ("ended\n", None)

@@ -96,6 +96,37 @@ def test_a_program_that_says_nothing_is_given_up(processes):
         processes.start(Program("one", ("-c", WAITS), announces=True), ready_s=0.5)
 
 
+def test_one_that_is_getting_ready_is_looked_at_while_others_are_watched(processes):
+    begun = processes.starting(
+        Program("slow", ("-c", f"import time; time.sleep(0.3)\n{SAYS}", "there"), announces=True)
+    )
+    next(begun)
+    processes.start(Program("one", ("-c", WAITS)))
+    before = processes.pids()
+    os.kill(before["one"], signal.SIGKILL)
+    eventually(lambda: not alive(before["one"]), 20, "its end")
+    processes.watch()
+    assert processes.pids()["one"] != before["one"]
+
+    def ready():
+        try:
+            next(begun)
+        except StopIteration as done:
+            return done.value
+
+    assert eventually(ready, 20, "it announces itself") == {"url": "here there"}
+    assert processes.pids()["slow"] == before["slow"]
+
+
+def test_one_that_does_not_get_ready_is_ended_and_may_be_started_anew(processes):
+    with pytest.raises(LabError, match="one did not start: no such robot"):
+        processes.start(Program("one", ("-c", "raise SystemExit('no such robot')"), announces=True))
+    assert processes.pids() == {}
+    assert processes.start(Program("one", ("-c", SAYS, "again"), announces=True)) == {"url": "here again"}
+    with pytest.raises(LabError, match="one is a program of this lab already"):
+        processes.start(Program("one", ("-c", WAITS)))
+
+
 def test_a_slow_one_is_waited_for_as_long_as_it_works(processes, monkeypatch):
     spent = iter(range(1, 40))
     monkeypatch.setattr("evaweb.lab.processes.processor_s", lambda pid: float(next(spent)))
@@ -126,6 +157,30 @@ def test_all_end_with_their_lifelines_and_the_stubborn_are_killed(processes):
     assert processes.pids() == {}
 
 
+def test_one_that_is_dropped_holds_up_nobody_and_is_killed_when_its_time_is_over(processes, caplog):
+    processes.start(Program("one", ("-c", STUBBORN), patience_s=0.2))
+    one = processes.pids()["one"]
+    processes.drop("one")
+    assert processes.pids() == {}
+    assert processes.ending() == {"one"}
+
+    def ended():
+        processes.watch()
+        return not processes.ending()
+
+    eventually(ended, 20, "its end")
+    assert not alive(one)
+    assert caplog.text.count("one does not end by itself: killed") == 1
+
+
+def test_one_that_is_dropped_has_ended_when_all_end(processes):
+    processes.start(Program("one", ("-c", WAITS)))
+    one = processes.pids()["one"]
+    processes.drop("one")
+    processes.end()
+    assert not alive(one)
+
+
 @pytest.mark.slow
 def test_they_end_with_us_even_when_we_are_killed(tmp_path):
     script = (
@@ -145,7 +200,7 @@ def test_they_end_with_us_even_when_we_are_killed(tmp_path):
     assert parent.returncode == -signal.SIGKILL
 
 
-_OF_WEB = (programs.web("h", 1), programs.worker(["lab"]), programs.stops(2, "1"))
+_OF_WEB = (programs.web("h", 1), programs.worker(), programs.stops(2, "1"))
 
 
 def test_the_process_for_stops_has_a_socket_of_the_labs_and_gives_way_to_nobody():

@@ -1,11 +1,14 @@
 import pytest
+from django.contrib.admin import site
 from django.core.files.uploadedfile import SimpleUploadedFile
 from django.core.management import CommandError, call_command
+from django.forms import JSONField
 from django.urls import reverse
 
 from evaweb.plans.exchange import exported
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
+from evaweb.trials.admin import Table
 from tests.evaweb.trials import builders
 
 
@@ -27,6 +30,8 @@ def form_of(plan, **changed):
         "repetitions": plan.repetitions,
         "strategy": "",
         "blind": "on",
+        "allocation": "paired",
+        "comparing": "pair",
         "stopping": "none",
         "outcome": "success",
         "alpha": "0.05",
@@ -48,6 +53,25 @@ def test_a_draft_is_edited_and_a_frozen_plan_only_read(client, admin, draft):
     draft.refresh_from_db()
     assert draft.repetitions == 7
     assert client.post(reverse("admin:plans_plan_delete", args=[draft.pk])).status_code == 403
+
+
+def test_lists_within_each_other_beyond_all_bounds_are_refused_with_a_sentence(client, admin, draft):
+    page = reverse("admin:plans_plan_change", args=[draft.pk])
+    answer = client.post(page, form_of(draft, look_after="[" * 5000, strategy="[" * 5000))
+    assert answer.status_code == 200
+    assert answer.content.decode().count("lists within each other; allowed: at most 40") == 2
+    assert client.post(page, form_of(draft, look_after="[5, 10]")).status_code == 302
+    draft.refresh_from_db()
+    assert draft.look_after == [5, 10]
+
+
+def test_every_field_for_json_in_the_administration_is_bounded(admin, rf):
+    request = rf.get("/admin/")
+    request.user = admin
+    for of in (of for of in site._registry.values() if of.has_change_permission(request)):
+        for form in (of.get_form(request), *(made.form for made, _ in of.get_formsets_with_inlines(request))):
+            for name, field in form.base_fields.items():
+                assert not isinstance(field, JSONField) or isinstance(field, Table), f"{of}: {name}"
 
 
 def test_positions_of_several_scenes_are_told_apart_by_their_scene(client, admin, draft):

@@ -1,4 +1,7 @@
+from datetime import timedelta
+
 import pytest
+from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.plans import bench_checks as looking
@@ -9,6 +12,7 @@ from evaweb.trials import services as trials
 from evaweb.trials import voids
 from tests.evaweb.plans.lab import jpeg
 from tests.evaweb.trials import builders
+from tests.evaweb.unguarded import unguarded
 
 CAMERAS = ("cam_high", "cam_left_wrist", "cam_right_wrist")
 
@@ -102,6 +106,21 @@ def test_after_the_reveal_nothing_is_voided(bench, plan, owner, shown):
         voids.trial_void(user=bench.operator, trial=trial, reason="it looks bad")
 
 
+def test_a_look_that_is_old_is_made_again_before_the_run(bench, plan, shown):
+    looking.cameras_confirm(user=bench.operator, station=bench.station, first=True)
+    trial = looking.next_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    looking.references_take(user=bench.operator, station=bench.station, position=trial.position)
+    looking.achieve(user=bench.operator, trial=trial)
+    shown["cam_high"] = jpeg(77)
+    trials.checked("run", trial, bench.operator)  # seen a moment ago
+    with unguarded("plans"):
+        Achieved.objects.update(at=timezone.now() - looking.LOOK_HOLDS - timedelta(seconds=1))
+    with pytest.raises(Conflict, match="the bench is not as its reference shows: cam_high"):
+        trials.checked("run", trial, bench.operator)
+    looking.achieve(user=bench.operator, trial=trial, override="the lamp is another one")
+    trials.checked("run", trial, bench.operator)
+
+
 # --- regions -------------------------------------------------------------------------------------------------
 
 
@@ -170,10 +189,16 @@ def test_regions_are_another_reference_and_stay_with_the_next_picture(bench, lai
     assert high(laid).regions == []
 
 
-def test_regions_are_not_changed_under_a_running_plan_that_has_judged_by_them(bench, laid, plan, owner):
+def test_neither_picture_nor_regions_change_under_a_running_plan_that_has_judged_by_them(
+    bench, laid, plan, owner
+):
     looking.achieve(user=bench.operator, trial=laid)
+    before = high(laid)
     with pytest.raises(Conflict, match="is running and has judged trials by the reference of cam_high here"):
-        looking.regions_draw(user=bench.operator, reference=high(laid), drawn=[CORNER])
+        looking.regions_draw(user=bench.operator, reference=before, drawn=[CORNER])
+    with pytest.raises(Conflict, match="is running and has judged trials by the reference of cam_"):
+        looking.references_take(user=bench.operator, station=bench.station, position=laid.position)
+    assert high(laid) == before
     builders.over(laid)
     trials.trial_score(user=bench.operator, trial=laid, milestones=bench.ticks(True, True, True))
     plan_close(user=owner, plan=plan, reason="enough")

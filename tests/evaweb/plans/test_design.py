@@ -4,15 +4,18 @@ import pytest
 from django.db import IntegrityError, transaction
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.plans import services
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.blinding_rules import look
 from evaweb.plans.canonical import digest
-from evaweb.plans.design import conclusion_of, frozen, pairs_of
+from evaweb.plans.design import dropped_of, findings_of, frozen, tried
+from evaweb.plans.documents import UnevenError, document_of
 from evaweb.plans.models import Plan, PlanState
 from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
 from evaweb.results.presentation.headline import headline
+from evaweb.results.presentation.would_be import would_be
 from evaweb.stations.models import Station
-from evaweb.statistics.designs import conclude
+from evaweb.statistics.designs import conclude, in_blocks
 from evaweb.trials import services as trials
 from evaweb.trials import voids
 from evaweb.trials.models import Checkpoint
@@ -47,7 +50,7 @@ def carry_out(bench, plan, count):
 def until_it_ends(bench, plan, **said):
     """Trials, until a boundary is crossed and the next one refused; how many were made."""
     made = 0
-    while conclusion_of(plan).ended != "boundary":
+    while findings_of(plan).ended != "boundary":
         scored(bench, handed(bench, plan), **said)
         made += 1
     with pytest.raises(Conflict, match="has ended: a boundary of its design was crossed"):
@@ -86,13 +89,15 @@ def test_it_ends_by_itself_as_soon_as_a_boundary_is_crossed_and_says_not_for_whi
 
 
 def test_a_score_that_was_mistyped_can_be_corrected_before_the_next_trial_is_asked_for(bench, early):
-    needed = next(n for n in range(1, 21) if conclude(frozen(early.document), [(1.0, 0.0)] * n).ended)
+    needed = next(
+        n for n in range(1, 21) if conclude(frozen(early.document), in_blocks([(1.0, 0.0)] * n)).ended
+    )
     carry_out(bench, early, 2 * needed)
-    assert (early.state, conclusion_of(early).ended) == (PlanState.FROZEN, "boundary")
+    assert (early.state, findings_of(early).ended) == (PlanState.FROZEN, "boundary")
     last = early.handouts.order_by("number").last().trial
     scored(bench, last, success=last.checkpoint.name != BETTER, reason="the wrong key")
     carry_out(bench, early, 1)
-    assert (early.state, conclusion_of(early).ended) == (PlanState.FROZEN, "")
+    assert (early.state, findings_of(early).ended) == (PlanState.FROZEN, "")
 
 
 def test_a_trial_that_is_under_way_elsewhere_is_finished_first_and_changes_nothing(bench, early, other):
@@ -103,22 +108,26 @@ def test_a_trial_that_is_under_way_elsewhere_is_finished_first_and_changes_nothi
         scored(bench, handed(bench, early))
     early.refresh_from_db()
     assert early.state == PlanState.FROZEN
-    assert pairs_of(early) == []  # the first block is not made: what was finished before it does not enter
+    assert (
+        tried(early).counted == []
+    )  # the first block is not made: what was finished before it does not enter
     scored(bench, waiting)
     with pytest.raises(Conflict, match="has ended"):
         handed(bench, early)
     early.refresh_from_db()
     assert early.state == PlanState.CLOSED
-    assert conclusion_of(early).at < 11
-    assert len(pairs_of(early)) == 11
+    assert findings_of(early).at < 11
+    assert len(tried(early).counted) == 11
 
 
 def test_while_its_last_trial_runs_no_other_is_handed_out(bench, early, other):
-    needed = next(n for n in range(1, 21) if conclude(frozen(early.document), [(1.0, 0.0)] * n).ended)
+    needed = next(
+        n for n in range(1, 21) if conclude(frozen(early.document), in_blocks([(1.0, 0.0)] * n)).ended
+    )
     carry_out(bench, early, 2 * needed - 1)
     late = handed(bench, early, other)  # of the next block
     carry_out(bench, early, 1)
-    assert (early.state, conclusion_of(early).at) == (PlanState.FROZEN, needed)
+    assert (early.state, findings_of(early).at) == (PlanState.FROZEN, needed)
     with pytest.raises(
         Conflict, match=f"has ended: a boundary of its design was crossed, after {needed} pairs"
     ):
@@ -173,13 +182,13 @@ def test_what_is_corrected_after_the_reveal_makes_no_other_headline(bench, early
     plan_reveal(user=owner, plan=early)
     before = headline(early)
     assert before.corrected == ""
-    held = {name: early.at_reveal[name] for name in ("pairs", "arms")}
+    held = {name: early.at_reveal[name] for name in ("blocks", "arms")}
     assert early.at_reveal["digest"] == digest({"plan": early.digest, **held})
     for handout in early.handouts.all():
         scored(bench, handout.trial, success=True, reason="looked again")
     after = headline(early)
     assert after.sentence == before.sentence
-    assert after.corrected.startswith(f"{BETTER} and pi0-block were not compared")
+    assert after.corrected.startswith(f"{BETTER} and pi0-block would not be compared yet")
     with pytest.raises(IntegrityError, match="never changed"), transaction.atomic():
         Plan.objects.filter(pk=early.pk).update(at_reveal=None)
 
@@ -287,7 +296,7 @@ def test_designs_that_cannot_be_are_said_before_the_freeze(draft, owner):
     for changed, words in (
         ({"stopping": "late", "repetitions": 200}, "400 pairs of a design with an exact boundary"),
         ({"stopping": "late", "outcome": "score"}, "outcome = 'score' with a boundary of successes"),
-        ({"look_after": [3, "x"]}, r"looks = \[3, 'x'\]; allowed: a list of numbers of pairs"),
+        ({"look_after": [3, "x"]}, r"looks = \[3, 'x'\]; allowed: a list of rising numbers of pairs"),
         ({"first": None, "second": None, "margin": 0.1}, "needs the comparison that it is about"),
     ):
         with transaction.atomic():
@@ -304,5 +313,304 @@ def test_an_amendment_keeps_the_design(early, owner):
 def test_a_plan_from_before_there_were_boundaries_is_read(bench, early):
     document = {**early.document, "stopping": {"rule": "evidence", "alpha": 0.05}}
     found = frozen(document)
-    assert (found.rule, found.pairs, found.boundary) == ("evidence", 20, None)
+    assert (found.rule, found.blocks, found.boundary) == ("evidence", 20, None)
+    del document["comparisons"]
+    assert frozen({**document, "comparison": [BETTER, "pi0-block"]}) == found
     assert frozen({**document, "comparison": None}) is None
+
+
+def test_a_plan_does_not_close_itself_on_a_repetition_whose_trial_may_count_yet(bench, early, owner):
+    first = handed(bench, early)
+    while first.checkpoint.name != BETTER:
+        scored(bench, first)
+        first = handed(bench, early)
+    scored(bench, first, success=False)
+    voids.trial_void(user=bench.operator, trial=first, reason="the plate had slipped")
+    while findings_of(early).ended != "boundary":
+        scored(bench, handed(bench, early))
+    with pytest.raises(Conflict, match=f"closed once the void of trial {first.pk} is answered"):
+        handed(bench, early)
+    early.refresh_from_db()
+    assert early.state == PlanState.FROZEN
+    voids.void_answer(user=builders.user("sam"), trial=first, agree=False, reason="it had not")
+    assert findings_of(early).ended == ""  # with the failure it goes on
+    scored(bench, handed(bench, early))
+
+
+def test_the_worst_of_what_was_thrown_away_is_held_against_what_the_reveal_kept(bench, draft, owner):
+    plan = frozen_plan(draft, owner, repetitions=5)
+    thrown = handed(bench, plan)
+    while thrown.checkpoint.name != BETTER:
+        scored(bench, thrown)
+        thrown = handed(bench, plan)
+    builders.over(thrown, 9.0)
+    voids.trial_void(user=bench.operator, trial=thrown, reason="the plate had slipped")
+    while plan.state == PlanState.FROZEN:
+        scored(bench, handed(bench, plan))
+        plan.refresh_from_db()
+    plan_reveal(user=owner, plan=plan)
+    plan.refresh_from_db()
+    before = headline(plan).worst
+    assert "9/10 against 0/10" in before
+    for handout in plan.handouts.filter(slot__checkpoint__name=BETTER, trial__status="scored")[:6]:
+        scored(bench, handout.trial, success=False, reason="looked again")
+    assert headline(plan).worst == before
+    assert "4/10 against 0/10" in headline(plan).corrected
+
+
+# --- several comparisons, dropped checkpoints, random order ---------------------------------------------------------
+
+
+@pytest.fixture
+def three(draft):
+    """Three checkpoints: one always succeeds, one in every second block, one never."""
+    draft.checkpoints.add(Checkpoint.objects.create(name="pi0-third", policy={}))
+    draft.first = draft.second = None
+    draft.save()
+    return draft
+
+
+def won(trial):
+    return {BETTER: True, "pi0-third": trial.handout.slot.block % 2 == 0}.get(trial.checkpoint.name, False)
+
+
+def carry_out_three(bench, plan):
+    """Trials until no more is handed out; the checkpoints of each block that was begun."""
+    blocks = {}
+    while plan.state == PlanState.FROZEN:
+        try:
+            trial = handed(bench, plan)
+        except Conflict:
+            plan.refresh_from_db()
+            assert plan.state == PlanState.CLOSED
+            break
+        blocks.setdefault(trial.handout.slot.block, []).append(trial.checkpoint.name)
+        scored(bench, trial, success=won(trial))
+        plan.refresh_from_db()
+    return blocks
+
+
+def test_all_checkpoints_are_compared_and_one_that_was_found_worse_is_tried_no_more(bench, three, owner):
+    plan = frozen_plan(three, owner, stopping="early", comparing="all", drop_arms=True, repetitions=20)
+    assert plan.document["comparisons"] == [
+        ["pi0-block", BETTER],
+        ["pi0-block", "pi0-third"],
+        [BETTER, "pi0-third"],
+    ]
+    blocks = carry_out_three(bench, plan)
+    sizes = [len(names) for _, names in sorted(blocks.items())]
+    assert sizes == sorted(sizes, reverse=True)
+    assert set(sizes) == {2, 3}
+    at = sizes.index(2)
+    assert all("pi0-block" not in names for block, names in blocks.items() if block >= at)
+    assert dropped_of(plan) == {"pi0-block": at}
+    said = headline(plan)
+    first, second, third = said.sentences
+    assert first.startswith(f"{BETTER} succeeded more often than pi0-block: {at}/{at} against 0/{at}")
+    assert second.endswith("when one of them was dropped")
+    assert third.startswith(f"{BETTER} succeeded more often than pi0-third")
+    assert said.letters == ((BETTER, "a"), ("pi0-third", "b"), ("pi0-block", "b"))
+    assert "shared by 3 comparisons" in said.method
+    assert "pi0" not in plan.closed_because
+    plan_reveal(user=owner, plan=plan)
+    assert headline(plan).sentences == said.sentences
+
+
+def until_one_is_dropped(bench, plan, stations):
+    """Trials, block by block at one station after the other, until a checkpoint is dropped; it, and after how many."""
+    made = 0
+    while not (dropped := dropped_of(plan)):
+        trial = handed(bench, plan, stations[made // 3 % len(stations)])
+        scored(bench, trial, success=won(trial))
+        made += 1
+    ((name, at),) = dropped.items()
+    return name, at
+
+
+def test_a_boundary_that_ends_a_plan_with_drops_closes_it_when_the_next_trial_is_asked_for(
+    bench, three, owner
+):
+    plan = frozen_plan(three, owner, stopping="early", comparing="all", drop_arms=True, repetitions=20)
+    while not findings_of(plan).ended:
+        last = handed(bench, plan)
+        scored(bench, last, success=won(last))
+    plan.refresh_from_db()
+    assert plan.state == PlanState.FROZEN
+    scored(bench, last, success=not won(last), reason="mistyped")
+    plan.refresh_from_db()
+    assert (plan.state, findings_of(plan).ended) == (PlanState.FROZEN, "")
+    assert handed(bench, plan).handout.slot.block == last.handout.slot.block + 1
+
+
+def test_while_a_trial_is_repeated_a_dropped_checkpoint_stays_dropped(bench, three, owner):
+    other = Station.objects.create(name="bench-2", robot="agilex_piper", simulated=True, boot="b")
+    plan = frozen_plan(three, owner, stopping="early", comparing="all", drop_arms=True, repetitions=20)
+    name, at = until_one_is_dropped(bench, plan, [bench.station, other])
+    for station in (bench.station, bench.station, other, other):  # blocks that have a trial less
+        scored(bench, handed(bench, plan, station), success=True)
+    of_it = plan.handouts.filter(slot__checkpoint__name=name).order_by("number")
+    others = plan.handouts.exclude(slot__checkpoint__name=name).order_by("number")
+    for voided in (others.first(), of_it.first()):
+        voids.trial_void(user=bench.operator, trial=voided.trial, reason="a camera had moved")
+        assert dropped_of(plan) == {name: at}
+        elsewhere = other if voided.trial.station == bench.station else bench.station
+        following = handed(bench, plan, elsewhere)
+        assert (following.checkpoint.name == name, following.handout.slot.block > at) == (False, True)
+        scored(bench, following, success=True)
+        again = handed(bench, plan, voided.trial.station)
+        assert again.handout.slot_id == voided.slot_id
+        scored(bench, again, success=voided.trial.verdict.success)
+
+
+@pytest.mark.parametrize("margin", [None, 0.4])
+def test_a_control_stays_whatever_is_found_of_it(bench, three, owner, margin):
+    control = Checkpoint.objects.get(name="pi0-block")
+    plan = frozen_plan(
+        three,
+        owner,
+        stopping="early",
+        comparing="control",
+        drop_arms=True,
+        repetitions=20,
+        margin=margin,
+        first=control,
+    )
+    blocks = carry_out_three(bench, plan)
+    ends = {
+        names[0]: one.at
+        for names, one in zip(plan.document["comparisons"], findings_of(plan).each, strict=True)
+    }
+    assert ends[BETTER] < ends["pi0-third"]
+    assert all(control.name in names for names in blocks.values())
+    assert {BETTER in blocks[block] for block in range(ends[BETTER], len(blocks))} == {False}
+    assert not any(one.dropped for one in findings_of(plan).each)
+    assert dropped_of(plan) == {BETTER: ends[BETTER]}
+
+
+def test_doubts_of_a_plan_that_dropped_a_checkpoint_are_judged_comparison_by_comparison(bench, three, owner):
+    plan = frozen_plan(three, owner, stopping="early", comparing="all", drop_arms=True, repetitions=20)
+    bob, thrown = builders.user("bob"), None
+    while plan.state == PlanState.FROZEN:
+        user = bench.operator if dropped_of(plan) else bob
+        try:
+            trial = hand_out(user=user, station=bench.station, plan=plan).trial
+        except Conflict:
+            break
+        builders.over(trial, 9.0)
+        if thrown is None and dropped_of(plan) and trial.checkpoint.name == BETTER:
+            thrown = voids.trial_void(user=user, trial=trial, reason="the plate had slipped")
+            continue
+        trials.trial_score(user=user, trial=trial, milestones=bench.ticks(True, won(trial), won(trial)))
+        plan.refresh_from_db()
+    plan_reveal(user=owner, plan=Plan.objects.get(pk=plan.pk))
+    plan.refresh_from_db()
+    ways = {row["what"]: row for row in would_be(plan, {})}
+    worst = ways.pop("attempts discarded unscored counted against it")
+    assert f"{BETTER} and pi0-third" in worst["sentence"]
+    assert not any("closed after" in row["sentence"] or "go on" in row["sentence"] for row in ways.values())
+    first = ways["only first attempts"]
+    assert first["sentence"].count(f"{BETTER} succeeded more often than") == 2
+    assert first["same"] is True
+    alone = ways[f"without operator {bench.operator.username}"]
+    assert f"{BETTER} succeeded more often than pi0-block" in alone["sentence"]
+    assert ways["without operator bob"]["same"] is None
+    assert ways["without operator bob"]["sentence"].startswith(f"No pair of pi0-block and {BETTER} is left")
+
+
+def test_each_checkpoint_is_compared_with_the_first_at_its_share_of_alpha(bench, three, owner):
+    three.first = Checkpoint.objects.get(name="pi0-third")
+    three.save()
+    plan = frozen_plan(three, owner, comparing="control", repetitions=6)
+    assert plan.document["comparisons"] == [["pi0-block", "pi0-third"], [BETTER, "pi0-third"]]
+    carry_out_three(bench, plan)
+    found = findings_of(plan)
+    assert [one.at for one in found.each] == [12, 12]
+    assert all(one.p is not None for one in found.each)
+    assert [one.winner for one in found.each] == [
+        "second" if found.each[0].p <= 0.025 else None,
+        "first" if found.each[1].p <= 0.025 else None,
+    ]
+    assert headline(plan).letters == ()
+
+
+def test_checkpoints_in_random_order_are_judged_by_the_numbers_that_were_drawn(bench, draft, owner):
+    plan = frozen_plan(draft, owner, stopping="early", allocation="random", repetitions=20)
+    said = plan.document["stopping"]
+    assert said["counts"][-1] == [
+        plan.slots.filter(checkpoint__name=name).count() for name in (BETTER, "pi0-block")
+    ]
+    assert len(said["counts"]) == 40
+    assert [row[:2] for row in said["boundary"]] == [count for count in said["counts"] if min(count) > 0]
+    sizes = {len({slot.checkpoint_id for slot in plan.slots.filter(block=block)}) for block in range(40)}
+    assert sizes == {1, 2}
+    made = until_it_ends(bench, plan)
+    assert made < 80
+    assert plan.closed_because == f"a boundary of its design was crossed, after {made // 2} blocks"
+    numbers = [row.trial.number for row in plan.handouts.filter(slot__block=0)]
+    assert numbers == [1, 2]  # which tells not whether both are of one checkpoint
+    assert headline(plan).sentence.startswith(f"{BETTER} succeeded more often than pi0-block: ")
+    assert headline(plan).sentence.endswith(f"after {made // 2} of 40 blocks")
+    again = plan_amend(user=owner, plan=plan, reason="another lamp")
+    frozen_plan(again, owner, repetitions=15)
+    told = again.events.get(what="frozen").text
+    assert "repetitions: 20 -> 15" in told
+    assert "counts" not in told
+    assert "boundary" not in told
+
+
+def test_comparisons_that_cannot_be_are_said_before_the_freeze(three, owner):
+    named = Checkpoint.objects.get(name=BETTER)
+    for changed, words in (
+        ({"comparing": "control"}, "no control is chosen"),
+        (
+            {"comparing": "all", "first": named},
+            "comparisons of all checkpoints with each other name none by name",
+        ),
+        ({"comparing": "all", "margin": 0.1}, "margin with comparisons of all checkpoints"),
+        ({"comparing": "all", "drop_arms": True}, "arms are dropped with the design 'none'"),
+        ({"drop_arms": True}, "needs the comparison that it is about"),
+        ({"comparing": "all", "allocation": "random"}, "3 checkpoints in random order; allowed: 2"),
+    ):
+        with transaction.atomic():
+            with pytest.raises(EvaError, match=words):
+                frozen_plan(three, owner, **changed)
+            transaction.set_rollback(True)
+
+
+def test_a_random_order_that_its_design_has_no_room_for_is_drawn_again(draft, owner, monkeypatch):
+    keys = iter(bytes([n]) * 32 for n in range(1, 250))
+    made = []
+
+    def drawn(plan, key):
+        made.append(key)
+        if len(made) < 3:
+            raise UnevenError(
+                "in random order two checkpoints came to 251 and 247 trials; allowed: 1 to 250 of each"
+            )
+        return document_of(plan, key)
+
+    monkeypatch.setattr(services, "new_key", lambda: next(keys))
+    monkeypatch.setattr(services, "document_of", drawn)
+    plan = frozen_plan(draft, owner, allocation="random", stopping="late", repetitions=5)
+    assert bytes(plan.key) == bytes([3]) * 32
+    monkeypatch.undo()
+    counts = plan.document["stopping"]["counts"]
+    assert sum(counts[-1]) == 20
+
+
+def test_more_blocks_than_a_boundary_has_room_for_are_refused_in_random_order(draft, owner):
+    with pytest.raises(
+        EvaError, match=r"came to \d+ and \d+ trials; allowed: 1 to 250 of each: plan fewer of them"
+    ):
+        frozen_plan(draft, owner, allocation="random", stopping="late", repetitions=130)
+
+
+def test_random_order_needs_enough_blocks_and_no_e_process(draft, owner):
+    for changed, words in (
+        ({"repetitions": 2}, "4 blocks of checkpoints in random order; allowed: 5 or more"),
+        ({"stopping": "evidence"}, "two arms in random order; allowed with"),
+    ):
+        with transaction.atomic():
+            with pytest.raises(EvaError, match=words):
+                frozen_plan(draft, owner, allocation="random", **changed)
+            transaction.set_rollback(True)

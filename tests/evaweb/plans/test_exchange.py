@@ -8,8 +8,10 @@ from evaweb.plans.documents import document_of
 from evaweb.plans.exchange import exported, imported
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
-from evaweb.trials.models import Checkpoint, Scene
+from evaweb.trials.models import Checkpoint, Milestone, Scene
 from tests.evaweb.trials import builders
+
+KEY = bytes(32)
 
 
 @pytest.fixture
@@ -22,20 +24,20 @@ def test_what_was_exported_is_the_same_when_it_is_read_again(draft, admin):
     draft.stations.add(builders.Station.objects.get(name="bench-1"))
     draft.save()
     text = exported(plans=[draft])
-    before = document_of(draft)
+    before = document_of(draft, KEY)
     assert imported(user=admin, text=text) == [
         "scene block-on-plate: the same",
         "checkpoint pi0-block: the same",
         "checkpoint pi0-new: the same",
         "plan blocks: draft changed",
     ]
-    assert document_of(Plan.objects.get(pk=draft.pk)) == before
+    assert document_of(Plan.objects.get(pk=draft.pk), KEY) == before
 
 
 def test_another_lab_reads_it(draft, admin):
     Scene.objects.update(failure_required=True)
     text = exported(plans=[draft])
-    before = document_of(draft)
+    before = document_of(draft, KEY)
     draft.delete()
     Scene.objects.all().delete()
     Checkpoint.objects.all().delete()
@@ -48,7 +50,7 @@ def test_another_lab_reads_it(draft, admin):
     found = Plan.objects.get()
     assert found.owner == admin
     assert Scene.objects.get().failure_required
-    assert document_of(found) == {**before, "owner": "adam"}
+    assert document_of(found, KEY) == {**before, "owner": "adam"}
     assert plan_freeze(user=admin, plan=found).slots.count() == 12
 
 
@@ -62,6 +64,15 @@ def test_what_trials_were_made_with_is_not_changed_by_a_file(bench, admin):
     policy = exported(checkpoints=[bench.checkpoint]).replace("8000", "8009")
     with pytest.raises(Conflict, match="checkpoint pi0-block has trials"):
         imported(user=admin, text=policy)
+
+
+def test_a_new_scene_with_the_same_milestone_twice_is_refused_and_an_old_one_stays(bench, admin):
+    Milestone.objects.filter(scene=bench.scene, text="lifted").update(text="held")
+    text = exported(scenes=[bench.scene])
+    assert imported(user=admin, text=text) == ["scene block-on-plate: the same"]
+    with pytest.raises(EvaError, match="scene other: two milestones are 'held'; allowed: different words"):
+        imported(user=admin, text=text.replace('name = "block-on-plate"', 'name = "other"'))
+    assert not Scene.objects.filter(name="other").exists()
 
 
 def test_a_frozen_plan_is_not_changed_by_a_file(draft, owner, admin):
@@ -114,6 +125,23 @@ def test_the_export_is_toml_that_people_read(draft):
     assert read["plan"][0]["comparison"] == ["pi0-new", "pi0-block"]
 
 
+def test_several_comparisons_and_random_order_travel(draft, admin):
+    for changed, wanted in (
+        ({"comparing": "all", "first": None, "second": None, "drop_arms": True, "stopping": "early"}, []),
+        ({"comparing": "control", "first": draft.first, "second": None}, ["pi0-new"]),
+        ({"comparing": "pair", "first": draft.first, "second": draft.second, "allocation": "random"}, None),
+    ):
+        Plan.objects.filter(pk=draft.pk).update(**changed)
+        text = exported(plans=[Plan.objects.get(pk=draft.pk)])
+        assert wanted is None or tomllib.loads(text)["plan"][0]["comparison"] == wanted
+        Plan.objects.filter(pk=draft.pk).update(comparing="pair", drop_arms=False, allocation="paired")
+        assert "plan blocks: draft changed" in imported(user=admin, text=text)
+        again = Plan.objects.get(pk=draft.pk)
+        assert {name: getattr(again, name) for name in changed} == changed
+    with pytest.raises(EvaError, match="comparing = 'all'; allowed: 0 checkpoints"):
+        imported(user=admin, text=text.replace('comparing = "pair"', 'comparing = "all"'))
+
+
 def test_weights_lineage_and_tags_travel_the_older_before_the_younger(draft, admin):
     old = Checkpoint.objects.create(name="zero", policy={}, tags=["pretrained"])
     Checkpoint.objects.filter(name="pi0-new").update(
@@ -160,8 +188,8 @@ def test_nothing_is_trained_on_from_itself(db):
 
 
 def test_other_weights_are_another_document_and_other_tags_are_not(draft):
-    before = document_of(draft)
+    before = document_of(draft, KEY)
     Checkpoint.objects.filter(name="pi0-new").update(tags=["v3"])
-    assert document_of(Plan.objects.get(pk=draft.pk)) == before
+    assert document_of(Plan.objects.get(pk=draft.pk), KEY) == before
     Checkpoint.objects.filter(name="pi0-new").update(digest="sha256:0123abcd")
-    assert document_of(Plan.objects.get(pk=draft.pk)) != before
+    assert document_of(Plan.objects.get(pk=draft.pk), KEY) != before

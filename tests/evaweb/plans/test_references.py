@@ -95,7 +95,7 @@ def test_what_a_lab_has_itself_stays(taken, admin):
     own = pictures.keep(jpeg(9))
     first = taken.scene.positions.get(number=1)
     Reference.objects.create(station=taken.station, position=first, camera="top", picture=own, by=admin)
-    assert take(content, admin)[1].endswith(": 1 the same, 1 left out, for this lab has its own")
+    assert take(content, admin)[1].endswith(": 1 the same, 1 left out, because this lab has its own")
     assert Reference.objects.filter(camera="top", position=first).first().picture == own
 
 
@@ -104,10 +104,10 @@ def test_without_the_archive_and_without_the_station_it_is_said(taken, admin, se
     lose()
     elsewhere(settings, tmp_path)
     assert imported(user=admin, text=text)[1].endswith(
-        "2 left out, for the file has not their pictures: import the archive"
+        "2 left out, because the file lacks their pictures: import the archive"
     )
     other = imported(user=admin, text=text.replace('station = "bench-1"', 'station = "far"'))
-    assert other[1].endswith("2 left out, for there is no station far")
+    assert other[1].endswith("2 left out, because there is no station far")
     assert Reference.objects.count() == 0
 
 
@@ -187,7 +187,7 @@ def test_regions_go_with_their_picture(taken, admin, settings, tmp_path):
     Reference.objects.create(
         station=own.station, position=own.position, camera="top", picture=own.picture, by=admin
     )
-    assert take(content, admin)[1].endswith(": 1 the same, 1 left out, for this lab has its own")
+    assert take(content, admin)[1].endswith(": 1 the same, 1 left out, because this lab has its own")
 
 
 def test_regions_of_a_file_that_cannot_be_are_refused(taken, admin):

@@ -135,6 +135,22 @@ def test_regions_that_cannot_be_are_refused_and_named():
     check_sizes([BLOCK], encoded(bench()))
 
 
+def test_a_live_picture_in_which_a_region_has_no_pixel_is_refused_and_named():
+    drawn = region(297, 196, 8, 8)
+    with pytest.raises(EvaError, match="region 'block' has no pixel in a picture of 64 x 48; allowed: "):
+        look(bench()[::10, ::10], drawn=drawn)
+    assert look(bench()[::2, ::2], drawn=drawn)["match"] >= 0
+
+
+def test_a_small_file_that_is_a_very_large_picture_is_refused_before_it_is_decoded(monkeypatch):
+    large = simplejpeg.encode_jpeg(np.zeros((4100, 4100, 1), "u1"), colorspace="GRAY")
+    monkeypatch.setattr(simplejpeg, "decode_jpeg", lambda *given, **named: pytest.fail("decoded"))
+    with pytest.raises(EvaError, match="a picture of 4100 x 4100 pixels; allowed: 16777216 pixels in all"):
+        pictures.match(large, large)
+    with pytest.raises(EvaError, match="4100 x 4100 pixels"):
+        check_sizes([], large)
+
+
 # --- the real episode ----------------------------------------------------------------------------------------
 
 SAMPLE = os.environ.get("EVA_SAMPLE_EPISODE")

@@ -277,7 +277,7 @@ def test_a_changed_document_is_not_revealed(plan, owner):
     document = {**plan.document, "question": "Is old better?"}
     with unguarded("plans"):
         Plan.objects.filter(pk=plan.pk).update(document=document)
-    with pytest.raises(EvaError, match="somebody has changed the database"):
+    with pytest.raises(EvaError, match="someone has changed the database"):
         plan_reveal(user=owner, plan=plan)
     assert Plan.objects.get(pk=plan.pk).state == PlanState.CLOSED
 

@@ -9,9 +9,9 @@ from django.utils import timezone
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import hand_out, progress
 from evaweb.plans.blinding_rules import look
-from evaweb.plans.design import tried
+from evaweb.plans.design import kept_blocks, tried
 from evaweb.plans.selectors import remaining
-from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
 from evaweb.trials import services, voids
 from evaweb.trials.models import Trial, VoidRequest
 from tests.evaweb.trials import builders
@@ -124,7 +124,7 @@ def test_without_an_answer_it_counts_at_the_reveal(bench, plan, owner, made, ask
     again.refresh_from_db()
     assert (asked.status, again.status) == ("scored", "voided")
     plan.refresh_from_db()
-    assert [tuple(pair) for pair in plan.at_reveal["pairs"]] == before.at_first == tried(plan).counted
+    assert kept_blocks(plan) == before.at_first == tried(plan).counted
     with pytest.raises(EvaError, match="with the result in view"):
         voids.trial_void(user=bench.operator, trial=asked, reason=WHY)
 
@@ -156,3 +156,113 @@ def test_an_answer_stays(asked, second):
     for change in ({"answer": "refused"}, {"reason": "x"}, {"answered_by": None}, {"answer_reason": "x"}):
         with pytest.raises(IntegrityError), transaction.atomic():
             row.update(**change)
+
+
+# --- a repetition whose void is asked for as well ------------------------------------------------------------
+
+
+@pytest.fixture
+def both_asked(bench, made, asked):
+    """The trial, its repetition, and the repetition of that; the voids of the first two are asked for."""
+    again = voids.trial_void(user=bench.operator, trial=made(success=True), reason="it slipped again")
+    return asked, again, made()
+
+
+def states(*trials):
+    for trial in trials:
+        trial.refresh_from_db()
+    return [trial.status for trial in trials]
+
+
+def test_a_refusal_answers_for_the_repetitions_too(plan, owner, both_asked, second):
+    first, again, third = both_asked
+    voids.void_answer(user=second, trial=first, agree=False, reason="it had not")
+    assert states(first, again, third) == ["scored", "voided", "voided"]
+    assert (again.void_requests.get().answer, voids.may_answer(again, second)) == ("lapsed", False)
+    plan_close(user=owner, plan=plan, reason="enough")
+    plan_reveal(user=owner, plan=plan)
+    assert states(first, again, third) == ["scored", "voided", "voided"]
+
+
+@pytest.mark.parametrize("at", ["hand-out", "reveal"])
+def test_none_of_them_is_answered_for_twice(plan, owner, made, both_asked, at):
+    if at == "hand-out":
+        with unguarded("trials"):
+            VoidRequest.objects.update(at=timezone.now() - voids.ANSWERED_WITHIN - timedelta(seconds=1))
+        made()
+    else:
+        plan_close(user=owner, plan=plan, reason="enough")
+        plan_reveal(user=owner, plan=plan)
+    assert states(*both_asked) == ["scored", "voided", "voided"]
+    assert set(VoidRequest.objects.values_list("answer", flat=True)) == {"lapsed"}
+
+
+def test_one_attempt_of_a_slot_has_a_score_that_counts(bench, plan, asked, second):
+    again = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    services.trial_abandon(user=bench.operator, trial=again)
+    voids.void_answer(user=second, trial=asked, agree=False, reason="it had not")
+    builders.over(again, 9.0)  # the answer to its run was lost: it ran after all
+    with pytest.raises(Conflict, match=f"trial {asked.pk} counts in place of trial {again.pk}"):
+        services.trial_score(user=bench.operator, trial=again, milestones=bench.ticks(True, True, True))
+    assert voids.trial_void(user=bench.operator, trial=again, reason="the other counts").status == "voided"
+
+
+def test_after_the_close_nothing_that_has_a_score_is_voided(bench, plan, owner, made):
+    trial = made()
+    plan_close(user=owner, plan=plan, reason="enough")
+    with pytest.raises(Conflict, match=r"is closed: trial \d+ could not be repeated, so it counts"):
+        voids.trial_void(user=bench.operator, trial=trial, reason=WHY)
+    assert states(trial) == ["scored"]
+
+
+def test_what_is_not_answered_when_the_next_version_is_frozen_counts(plan, owner, asked):
+    amended = plan_amend(user=owner, plan=plan, reason="another lamp")
+    assert states(asked) == ["void_asked"]
+    plan_freeze(user=owner, plan=amended)
+    assert (states(asked), asked.void_requests.get().answer) == (["scored"], "lapsed")
+
+
+def test_what_the_bench_says_is_shown_once_the_trial_is_scored(bench, plan, client):
+    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    builders.over(trial, 9.0)
+    Trial.objects.filter(pk=trial.pk).update(truth={"milestones": {"lifted": True}, "success": True})
+    client.force_login(bench.operator)
+    page = f"/result/trials/{trial.pk}/"
+    assert "The simulated bench says" not in client.get(page).content.decode()
+    services.trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, True, True))
+    assert "The simulated bench says" in client.get(page).content.decode()
+
+
+def test_a_void_that_lapses_when_nothing_is_left_closes_the_plan(bench, plan, made):
+    first, *_ = [made() for _ in range(11)]
+    voids.trial_void(user=bench.operator, trial=first, reason=WHY)
+    made()
+    made()  # the repetition
+    plan.refresh_from_db()
+    assert plan.state == "frozen"  # it waits for the answer
+    with unguarded("trials"):
+        VoidRequest.objects.update(at=timezone.now() - voids.ANSWERED_WITHIN - timedelta(seconds=1))
+    with pytest.raises(Conflict, match="has ended: all pairs of its comparison are made"):
+        hand_out(user=bench.operator, station=bench.station, plan=plan)
+    plan.refresh_from_db()
+    assert (plan.state, states(first)) == ("closed", ["scored"])
+
+
+def test_an_answer_closes_a_plan_that_waits_for_nothing_else(bench, plan, made, second):
+    first, *_ = [made() for _ in range(11)]
+    voids.trial_void(user=bench.operator, trial=first, reason=WHY)
+    made()
+    made()
+    voids.void_answer(user=second, trial=first, agree=True)
+    plan.refresh_from_db()
+    assert (plan.state, plan.closed_because) == (
+        "closed",
+        "all pairs of its comparison are made, after 6 pairs",
+    )
+
+
+def test_after_the_close_what_was_not_repeated_is_not_voided_by_an_answer(plan, owner, asked, second):
+    plan_close(user=owner, plan=plan, reason="enough")
+    with pytest.raises(Conflict, match="was not repeated, so it counts; refuse its void"):
+        voids.void_answer(user=second, trial=asked, agree=True)
+    assert voids.void_answer(user=second, trial=asked, agree=False, reason="it had not").status == "scored"

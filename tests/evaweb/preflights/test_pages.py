@@ -104,7 +104,7 @@ def test_the_newest_of_a_checkpoint_is_what_is_known_of_it(operator, row, bench)
     text = operator.get(address, {"checkpoint": bench.checkpoint.name}).content.decode()
     assert "port closed" in text
     Checkpoint.objects.create(name="fresh")
-    assert "never asked yet" in operator.get(address, {"checkpoint": "fresh"}).content.decode()
+    assert "not asked yet" in operator.get(address, {"checkpoint": "fresh"}).content.decode()
     assert operator.get(address, {"checkpoint": "nobody"}).status_code == 404
     assert operator.get(address).status_code == 404
 
@@ -187,7 +187,7 @@ def change_page(admin, checkpoint):
 
 
 def test_a_checkpoints_page_of_administration_asks_and_shows(admin, checkpoint, runtime, bench):
-    assert "never asked yet" in change_page(admin, checkpoint)
+    assert "not asked yet" in change_page(admin, checkpoint)
     address = f"/admin/trials/checkpoint/{checkpoint.pk}/preflight/"
     answer = admin.post(address, {"station": bench.station.name})
     assert answer["Location"] == f"/admin/trials/checkpoint/{checkpoint.pk}/change/#preflight"

@@ -168,7 +168,7 @@ def test_where_the_station_does_not_run_the_worker_asks(ask, resting, checkpoint
     row = ask(station=resting)
     assert (row.by, row.status) == ("worker", "running")
     assert preflight_settled(row=row).status == "running"
-    assert work("lab") == 1
+    assert work("station") == 1
     assert preflight_settled(row=row).status == "running" or row.verdict == "port_closed"
     row.refresh_from_db()
     assert (row.status, row.verdict) == ("done", "port_closed")
@@ -197,7 +197,7 @@ def test_the_workers_errors_are_the_reason(ask, resting):
     row = ask(station=resting)
     Preflight.objects.filter(pk=row.pk).update(asked_at=timezone.now() - timedelta(hours=2))
     row.refresh_from_db()
-    assert "is one running?" in preflight_settled(row=row).reason
+    assert "No worker is running" in preflight_settled(row=row).reason
 
 
 def test_the_worker_too_leaves_a_server_alone_that_is_at_work(ask, resting, runtime):

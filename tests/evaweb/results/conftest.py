@@ -1,12 +1,15 @@
 import pytest
+from django.contrib.auth.models import User
 
 from evaweb.episodes.folders import preview_folder
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze, plan_reveal
 from evaweb.results.analysis import caching
+from evaweb.stations.models import Station
 from evaweb.trials import services
-from evaweb.trials.models import Checkpoint
+from evaweb.trials.models import Checkpoint, Scene
+from tests.evaweb.played import played
 from tests.evaweb.trials import builders
 
 
@@ -18,17 +21,26 @@ def _alone(settings, tmp_path):
 
 @pytest.fixture
 def bench(db):
-    return builders.bench()
+    played("bench", builders.bench)
+    return builders.Bench(
+        Station.objects.get(), Scene.objects.get(), Checkpoint.objects.get(), User.objects.get(username="ann")
+    )
 
 
 @pytest.fixture
-def owner(db):
-    return builders.user("olga")
+def owner(bench):
+    played("owner", lambda: builders.user("olga"))
+    return User.objects.get(username="olga")
 
 
 @pytest.fixture
 def plan(bench, owner):
     """Two checkpoints at two positions, four times each: 16 trials, blind, not begun."""
+    played("plan", lambda: _frozen(bench, owner))
+    return Plan.objects.get()
+
+
+def _frozen(bench, owner):
     other = Checkpoint.objects.create(name="pi0-new", policy={})
     made = Plan.objects.create(
         name="blocks",
@@ -42,7 +54,7 @@ def plan(bench, owner):
     )
     made.checkpoints.set([bench.checkpoint, other])
     made.positions.set(bench.scene.positions.all())
-    return plan_freeze(user=owner, plan=made)
+    plan_freeze(user=owner, plan=made)
 
 
 @pytest.fixture
@@ -50,30 +62,33 @@ def carry_out(bench):
     """Makes the next trials of a plan; the new checkpoint succeeds three times of four, the old one once of four."""
 
     def carry(plan, n, pictures=True):
-        for _ in range(n):
-            trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
-            new = trial.checkpoint.name == "pi0-new"
-            ok = (trial.number + trial.position.number) % 4 != 0 if new else trial.number == 1
-            smooth = (
-                -5.0 - 0.1 * trial.number if trial.number > 1 else None
-            )  # the first of each was not measured
-            facts = {"smoothness": smooth, "smoothness_commanded": smooth and smooth + 0.5 * new}
-            facts |= {"cameras": ["top"] if pictures else []}
-            builders.over(trial, 8.0 + trial.number + 0.25 * new, **facts)
-            if pictures:
-                preview_folder(trial.episode_id).mkdir(parents=True)  # it can be watched
-            services.trial_score(
-                user=bench.operator,
-                trial=trial,
-                milestones=bench.ticks(True, ok or new, ok),
-                failure="" if ok else "=dropped",
-            )
+        played(("carried out", plan.pk, n, pictures), lambda: _carried_out(bench, plan, n, pictures))
 
     return carry
+
+
+def _carried_out(bench, plan, n, pictures):
+    for _ in range(n):
+        trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+        new = trial.checkpoint.name == "pi0-new"
+        ok = (trial.number + trial.position.number) % 4 != 0 if new else trial.number == 1
+        smooth = -5.0 - 0.1 * trial.number if trial.number > 1 else None  # the first of each was not measured
+        facts = {"smoothness": smooth, "smoothness_commanded": smooth and smooth + 0.5 * new}
+        facts |= {"cameras": ["top"] if pictures else []}
+        builders.over(trial, 8.0 + trial.number + 0.25 * new, **facts)
+        if pictures:
+            preview_folder(trial.episode_id).mkdir(parents=True)  # it can be watched
+        services.trial_score(
+            user=bench.operator,
+            trial=trial,
+            milestones=bench.ticks(True, ok or new, ok),
+            failure="" if ok else "=dropped",
+        )
 
 
 @pytest.fixture
 def revealed(plan, owner, carry_out):
     """All of it carried out, which closes it, and revealed."""
     carry_out(plan, 16)
-    return plan_reveal(user=owner, plan=plan)
+    played("revealed", lambda: plan_reveal(user=owner, plan=plan))
+    return Plan.objects.get()

@@ -24,7 +24,7 @@ def test_an_episode_that_was_closed_is_checked_once(closed, data):
     episode = closed()
     assert job_kinds.look_for_unchecked() == 1
     assert job_kinds.look_for_unchecked() == 0
-    work("lab")
+    work("cpu")
     assert job("quality").error == ""
     report = json.loads((data / "quality" / f"{episode.uuid}.json").read_text())
     standing = Standing.objects.get(episode=episode)
@@ -39,13 +39,13 @@ def test_other_bounds_of_the_lab_count(closed, data):
     episode = closed()
     (data / "quality.toml").write_text("min_length_s = 1000.0\n")
     services.quality_asked(episode=episode)
-    work("lab")
+    work("cpu")
     report = json.loads((data / "quality" / f"{episode.uuid}.json").read_text())
     short = [flag for flag in report["flags"] if flag["kind"] == "too_short"]
     assert [flag["bound"] for flag in short] == [1000.0]
     (data / "quality.toml").write_text("min_length = 1000.0\n")
     services.quality_asked(episode=episode)
-    work("lab")
+    work("cpu")
     assert "min_length" in Job.objects.filter(kind="quality").latest("pk").error
 
 
@@ -54,7 +54,7 @@ def test_an_episode_whose_tables_are_damaged_has_errors_and_the_job_is_done(clos
     rows = data / "episodes" / str(episode.uuid) / "rows.arrow"
     rows.write_bytes(rows.read_bytes()[:200])
     services.quality_asked(episode=episode)
-    work("lab")
+    work("cpu")
     assert job("quality").status == "done"
     assert Standing.objects.get(episode=episode).worst == "error"
 
@@ -67,10 +67,10 @@ def test_what_is_said_goes_beside_the_published_episode(closed, data, ann, bob):
     services.segment_remove(user=bob, episode=episode, segment=removed.uuid)
     assert job_kinds.look_for_outdated() == 0, "it is in no dataset yet"
     episodes.publish_asked(episode=episode)
-    work("lab")
+    work("cpu")
     assert job_kinds.look_for_outdated() == 1
     assert job_kinds.look_for_outdated() == 0
-    work("lab")
+    work("cpu")
     assert job("sides").result == {"attached": True, "reviews": 1, "annotations": 1}
     dataset = data / Episode.objects.get().dataset
     (review,) = (dataset / "eva/reviews" / f"{episode.uuid}.jsonl").read_text().splitlines()
@@ -86,7 +86,7 @@ def test_what_is_said_goes_beside_the_published_episode(closed, data, ann, bob):
     )
     services.review_add(user=ann, episode=episode, verdict="fail")
     assert job_kinds.look_for_outdated() == 1
-    work("lab")
+    work("cpu")
     assert len((dataset / "eva/reviews" / f"{episode.uuid}.jsonl").read_text().splitlines()) == 2
 
 
@@ -97,9 +97,9 @@ def test_a_review_is_published_however_far_ahead_the_clock_of_the_worker_is(clos
         hence = timezone.now() + timedelta(hours=1)
         ahead.setattr(timezone, "now", lambda: hence)
         episodes.publish_asked(episode=episode)
-        work("lab")
+        work("cpu")
         assert job_kinds.look_for_outdated() == 1
-        work("lab")
+        work("cpu")
     assert job_kinds.look_for_outdated() == 0
     services.review_add(user=ann, episode=episode, verdict="fail")
     assert job_kinds.look_for_outdated() == 1
@@ -110,7 +110,7 @@ def test_what_was_said_before_goes_into_the_dataset_with_the_episode_itself(clos
     services.review_add(user=ann, episode=episode, verdict="pass")
     services.segment_put(user=ann, episode=episode, first=1, last=4, label="reach")
     episodes.publish_asked(episode=episode)
-    work("lab")
+    work("cpu")
     row = Episode.objects.get(uuid=episode.uuid)
     beside = {path.parent.name: path for path in (data / row.dataset / "eva").rglob(f"{episode.uuid}.jsonl")}
     (segment,) = [json.loads(line) for line in beside["annotations"].read_text().splitlines()]

@@ -67,7 +67,11 @@ def test_the_list_is_narrowed_to_what_is_flagged_or_waits(browser, two, ann):
     assert listed(browser, review="unreviewed")[0] == {waiting}
     assert listed(browser, review="fail")[0] == {flagged}
     assert listed(browser, review="pass")[0] == set()
-    assert "Show all" in listed(browser, review="pass")[1]
+    assert "Review: passed" in listed(browser, review="pass")[1]
+    assert (
+        "review = &#x27;maybe&#x27;; allowed: unreviewed, pass, fail. All are shown"
+        in listed(browser, review="maybe")[1]
+    )
 
 
 @pytest.mark.django_db
@@ -75,7 +79,7 @@ def test_the_page_of_an_episode_has_its_review_where_it_can_be_played(browser, c
     episode = closed()
     address = reverse("replay", args=[episode.uuid])
     assert 'id="review"' not in browser.get(address).content.decode()
-    work("lab")
+    work("cpu")
     page = browser.get(address).content.decode()
     assert f'data-address="/api/v1/episodes/{episode.uuid}/reviews"' in page
     assert f'data-next="/api/v1/reviews/next?after={episode.uuid}"' in page
@@ -114,6 +118,17 @@ def test_segments_that_overlap_lie_below_each_other(spans):
         for other in lanes[:number]:
             apart = other["last"] < one["first"] or one["last"] < other["first"]
             assert apart or one["lane"] != other["lane"]
+
+
+@needs_node
+@settings(max_examples=15)
+@given(SPANS)
+def test_where_segments_overlap_is_said_with_how_many(spans):
+    segments = [{"first": first, "last": last} for first, last in spans]
+    found = run("return m.overlaps(given);", segments)
+    told = {row: one["count"] for one in found for row in range(one["first"], one["last"] + 1)}
+    counted = {row: sum(first <= row <= last for first, last in spans) for row in range(80)}
+    assert told == {row: count for row, count in counted.items() if count > 1}
 
 
 @needs_node

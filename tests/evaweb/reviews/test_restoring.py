@@ -5,7 +5,7 @@ import json
 import pytest
 from django.contrib.auth.models import User
 
-from evaweb.episodes.models import Episode
+from evaweb.episodes.models import Episode, Tag
 from evaweb.episodes.reconcile import reconcile
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
@@ -25,6 +25,7 @@ def everything():
                 Segment,
                 ("uuid", "episode", "first", "last", "label", "milestone", "annotator__username", "at"),
             ),
+            (Tag, ("uuid", "episode", "words", "by__username", "at")),
             (Standing, ("episode", "clean", "worst", "flags", "review", "checked_at")),
         )
     ]
@@ -43,14 +44,16 @@ def spoken(closed, ann, bob):
     gone = services.segment_put(user=ann, episode=episode, first=10, last=12, label="wrong")
     services.segment_put(user=ann, episode=episode, first=1, last=9, label="reach", segment=kept.uuid)
     services.segment_remove(user=ann, episode=episode, segment=gone.uuid)
-    work("lab")
+    services.tags_change(user=ann, episode=episode, add=["slips", "wrong"])
+    services.tags_change(user=bob, episode=episode, remove=["wrong"])
+    work("cpu")
     return episode
 
 
 def lose():
     """All rows, as a database that was lost has none; no trigger stands in the way."""
     with unguarded("reviews"):
-        for model in (Standing, Segment, Review, Episode, Job, User):
+        for model in (Standing, Tag, Segment, Review, Episode, Job, User):
             model.objects.all().delete()
 
 
@@ -59,7 +62,7 @@ def test_what_was_said_comes_back_from_the_disk(spoken):
     lose()
     report = reconcile()
     assert report.problems == ()
-    assert report.restored == 3
+    assert report.restored == 4
     assert everything() == before
     assert Standing.objects.get().changed_at is not None, "it is to be published again"
     assert not User.objects.filter(is_active=True).exists(), "people that are gone come back switched off"
@@ -103,12 +106,12 @@ def test_a_line_that_is_there_twice_is_one_review_and_the_last_counts(spoken, da
     before = everything()
     lose()
     report = reconcile()
-    assert (report.problems, report.restored) == ((), 3)
+    assert (report.problems, report.restored) == ((), 4)
     assert everything() == before
     assert reconcile().restored == 0
 
 
-@pytest.mark.parametrize("kind", ["review", "segment"])
+@pytest.mark.parametrize("kind", ["review", "segment", "tag"])
 def test_what_is_said_of_another_episode_is_named(spoken, data, closed, kind):
     other = closed("interrupted")
     lines = (data / "reviews" / f"{spoken.uuid}.jsonl").read_text().splitlines(keepends=True)

@@ -48,3 +48,18 @@ def test_what_takes_more_pairs_than_are_computed_is_none():
     ):
         with pytest.raises(StatisticsError, match=words):
             wrong()
+
+
+def test_with_a_margin_it_is_found_that_the_first_is_not_worse():
+    level, ahead = (course("none", 60, better, 0.7, 0.05, 0.2).power for better in (0.7, 0.9))
+    assert level < ahead
+    assert course("none", 60, 0.5, 0.7, 0.05, 0.2).power <= 0.05
+    assert course("none", 60, 0.7, 0.7, 0.05, 0.3).power > level
+    with pytest.raises(StatisticsError, match=r"margin = 0\.2 with the design 'evidence'"):
+        course("evidence", 60, 0.7, 0.7, 0.05, 0.2)
+
+
+def test_of_fewer_looks_more_trials_are_made():
+    often, seldom = (course("early", 40, 0.9, 0.4, 0.05, None, looks) for looks in ((), (20,)))
+    assert often.mean < seldom.mean
+    assert seldom.median == 20

@@ -8,85 +8,98 @@ from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.boundaries import in_pairs
-from evaweb.statistics.designs import RULES, Conclusion, conclude, design, of_table, table
+from evaweb.statistics.designs import (
+    RULES,
+    Conclusion,
+    conclude,
+    design,
+    findings,
+    in_blocks,
+    of_table,
+    table,
+)
 
 BETTER, WORSE, SAME = (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)
 PAIRS = st.lists(st.sampled_from([BETTER, WORSE, SAME, (0.0, 0.0)]), max_size=40)
 
 
 def made(rule, pairs=20, **options):
-    return design(rule=rule, pairs=pairs, alpha=0.05, **options)
+    return design(rule=rule, blocks=pairs, alpha=0.05, **options)
+
+
+def told(found, pairs):
+    return conclude(found, in_blocks(pairs))
 
 
 @pytest.mark.parametrize("rule", RULES)
 def test_before_its_pairs_are_made_nothing_is_said(rule):
     found = made(rule)
-    assert conclude(found, []) == Conclusion(0, None, None, None, 20)
-    assert conclude(found, [BETTER, WORSE]).ended == ""
+    assert told(found, []) == Conclusion(0, None, None, None, 20)
+    assert told(found, [BETTER, WORSE]).ended == ""
 
 
 def test_a_fixed_number_is_tested_once_at_its_end_however_clear_it_is_before():
     found = made("none")
-    assert conclude(found, [BETTER] * 19) == Conclusion(19, None, None, None, 20)
-    ended = conclude(found, [BETTER] * 20)
+    assert told(found, [BETTER] * 19) == Conclusion(19, None, None, None, 20)
+    ended = told(found, [BETTER] * 20)
     assert (ended.at, ended.winner, ended.ended) == (
         20,
         "first",
         "full",
     )  # which tells nothing of what was found
     assert ended.p < 1e-6
-    equal = conclude(found, [SAME] * 20)
+    equal = told(found, [SAME] * 20)
     assert (equal.at, equal.winner, equal.ended, equal.p) == (20, None, "full", 1.0)
 
 
 @pytest.mark.parametrize("rule", ["evidence", "late", "early"])
 def test_a_boundary_ends_it_early_for_the_one_that_is_better(rule):
     for pairs, winner in (([BETTER] * 20, "first"), ([WORSE] * 20, "second")):
-        ended = conclude(made(rule), pairs)
+        ended = told(made(rule), pairs)
         assert (ended.winner, ended.ended) == (winner, "boundary")
         assert ended.at < 20
-        assert conclude(made(rule), pairs[: ended.at - 1]).ended == ""
+        assert told(made(rule), pairs[: ended.at - 1]).ended == ""
         # What was under way when it ended changes nothing.
-        assert conclude(made(rule), pairs[: ended.at] + [SAME] * 5).at == ended.at
-    full = conclude(made(rule), [SAME] * 20)
+        assert told(made(rule), pairs[: ended.at] + [SAME] * 5).at == ended.at
+    full = told(made(rule), [SAME] * 20)
     assert (full.at, full.winner, full.ended) == (20, None, "full")
 
 
 def test_scores_end_it_where_success_alone_would_not():
     values = [(0.9, 0.2)] * 60
-    assert conclude(made("evidence", 60, outcome="score"), values).winner == "first"
-    assert conclude(made("evidence", 60), [(0.0, 0.0)] * 60).winner is None
+    assert told(made("evidence", 60, outcome="score"), values).winner == "first"
+    assert told(made("evidence", 60), [(0.0, 0.0)] * 60).winner is None
 
 
 def test_a_fixed_number_of_scores_is_tested_by_scores_not_by_whether_they_are_above_0():
     found = made("none", 20, outcome="score")
-    ended = conclude(found, [(0.9, 0.2)] * 20)
+    ended = told(found, [(0.9, 0.2)] * 20)
     assert (ended.at, ended.winner) == (20, "first")
     assert ended.p == pytest.approx(2 / 2**20)
-    assert conclude(found, [(0.2, 0.9)] * 20).winner == "second"
+    assert told(found, [(0.2, 0.9)] * 20).winner == "second"
     # Seldom above 0, but then far: success alone would call the second better.
-    assert conclude(found, [(0.5, 0.4)] * 10 + [(0.0, 0.1)] * 10).winner is None
+    assert told(found, [(0.5, 0.4)] * 10 + [(0.0, 0.1)] * 10).winner is None
 
 
 def test_not_worse_by_the_margin_is_asked_of_the_first():
     found = made("late", 60, margin=0.2)
-    assert conclude(found, [BETTER] * 60).winner == "first"
-    assert conclude(found, [WORSE] * 60).winner is None
+    assert told(found, [BETTER] * 60).winner == "first"
+    assert told(found, [WORSE] * 60).winner is None
     equal = [SAME, (0.0, 0.0)] * 30
-    assert conclude(made("none", 60, margin=0.3), equal).winner == "first"
+    assert told(made("none", 60, margin=0.3), equal).winner == "first"
 
 
 def test_looks_that_are_named_are_the_only_ones():
     found = made("early", 30, looks=[10, 20])
     assert [look.first for look in found.boundary.looks] == [10, 20, 30]
-    assert conclude(found, [BETTER] * 9).ended == ""
-    assert conclude(found, [BETTER] * 15).at == 10
+    assert told(found, [BETTER] * 9).ended == ""
+    assert told(found, [BETTER] * 15).at == 10
 
 
 @given(PAIRS, st.sampled_from(["none", "evidence", "late", "early"]))
 def test_mirrored_pairs_end_it_for_the_other_one_at_the_same_pair(pairs, rule):
     found = made(rule, 12)
-    here, there = conclude(found, pairs), conclude(found, [(other, one) for one, other in pairs])
+    here, there = told(found, pairs), told(found, [(other, one) for one, other in pairs])
     assert here.at == there.at
     assert {here.winner, there.winner} in ({None}, {"first", "second"})
 
@@ -114,7 +127,7 @@ def test_equal_checkpoints_are_told_apart_at_most_as_often_as_alpha_whatever_the
         for number in range(40):
             rate = rates[number % len(rates)] * (1 - drift) + drift * number / 40
             pairs.append((float(chance.random() < rate), float(chance.random() < rate)))
-        wrong += conclude(found, pairs).winner is not None
+        wrong += told(found, pairs).winner is not None
     assert wrong <= 0.05 * runs + 3 * (0.05 * 0.95 * runs) ** 0.5
 
 
@@ -137,5 +150,169 @@ def test_a_design_that_cannot_be_is_an_error_in_words(options, words):
 
 
 def test_a_fixed_number_may_be_large():
-    assert made("none", 5000).pairs == 5000
+    assert made("none", 5000).blocks == 5000
     assert in_pairs(3, [1]) == [(1, 1), (3, 3)]
+
+
+# --- several comparisons ----------------------------------------------------------------------------------------
+
+ALL_OF_THREE = ((0, 1), (0, 2), (1, 2))
+OUTCOMES = st.lists(st.lists(st.booleans(), min_size=3, max_size=3), min_size=1, max_size=20)
+
+
+def blocks_of_three(rows):
+    return [tuple((arm, float(won)) for arm, won in enumerate(row)) for row in rows]
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_each_of_several_comparisons_has_its_share_of_alpha(rule):
+    found = made(rule, comparisons=ALL_OF_THREE)
+    alone = design(rule=rule, blocks=20, alpha=0.05 / 3)
+    rows = [(True, number % 3 > 0, number % 2 > 0) for number in range(20)]
+    said = findings(found, blocks_of_three(rows))
+    for (one, other), conclusion in zip(ALL_OF_THREE, said.each, strict=True):
+        pairs = [(float(row[one]), float(row[other])) for row in rows]
+        assert conclusion == told(alone, pairs)
+    if found.boundary:
+        assert found.boundary.error()[1] <= 0.05 / 3
+
+
+def test_a_checkpoint_that_was_found_worse_is_dropped_and_the_others_go_on():
+    found = made("early", 40, comparisons=ALL_OF_THREE, drops=True)
+    rows = [(True, number % 2 > 0, False) for number in range(40)]
+    said = findings(found, blocks_of_three(rows))
+    arm, at = min(said.dropped.items(), key=lambda each: each[1])
+    assert arm == 2
+    # From then on its trials are no part of it, whatever is made of them.
+    left = [row[: 3 if number < at else 2] for number, row in enumerate(rows)]
+    assert findings(found, blocks_of_three(left)) == said
+    assert said.each[1].winner == "first"
+    assert said.ended
+
+
+def test_a_comparison_ends_with_the_checkpoint_that_was_dropped():
+    found = made("early", 40, comparisons=ALL_OF_THREE, drops=True)
+    rows = [(True, number % 2 > 0, False) for number in range(40)]
+    said = findings(found, blocks_of_three(rows))
+    by_itself = findings(made("early", 40, comparisons=ALL_OF_THREE), blocks_of_three(rows))
+    third = said.each[2]
+    assert (third.winner, third.dropped, third.at) == (None, True, said.dropped[2])
+    assert by_itself.each[2].winner == "first"  # and was not waited for
+    assert by_itself.each[2].at > third.at
+
+
+@pytest.mark.parametrize("margin", [None, 0.3])
+def test_a_control_stays_and_each_comparison_with_it_ends_by_itself(margin):
+    star = {"comparisons": ((1, 0), (2, 0)), "margin": margin}
+    rows = [(False, True, number % 2 > 0) for number in range(30)]
+    said = findings(made("late", 30, **star, drops=True), blocks_of_three(rows))
+    by_itself = findings(made("late", 30, **star), blocks_of_three(rows))
+    assert [(one.winner, one.at) for one in said.each] == [(one.winner, one.at) for one in by_itself.each]
+    assert said.dropped[1] == said.each[0].at < said.each[1].at == said.dropped[0]
+    assert not any(one.dropped for one in said.each)
+
+
+@given(OUTCOMES, st.sampled_from(["evidence", "late", "early"]), st.randoms())
+def test_what_was_found_does_not_depend_on_who_finished_first(rows, rule, chance):
+    """Trials come in any order: what is dropped on the way is dropped at the end, at the same block."""
+    found = made(rule, 20, comparisons=ALL_OF_THREE, drops=True)
+    whole = findings(found, blocks_of_three(rows))
+    trials = [(block, arm) for block in range(len(rows)) for arm in range(3)]
+    chance.shuffle(trials)
+    there, before = set(), {}
+    for trial in trials:
+        there.add(trial)
+        partly = [
+            tuple((arm, float(row[arm])) for arm in range(3) if (block, arm) in there)
+            for block, row in enumerate(rows)
+        ]
+        said = findings(found, partly)
+        assert before.items() <= said.dropped.items()
+        assert said.dropped.items() <= whole.dropped.items()
+        before = said.dropped
+    assert before == whole.dropped
+
+
+@pytest.mark.parametrize("drops", [False, True])
+def test_any_of_several_equal_checkpoints_is_called_better_at_most_as_often_as_alpha(drops):
+    found, chance, runs = made("early", 30, comparisons=ALL_OF_THREE, drops=drops), random.Random(3), 600
+    wrong = 0
+    for _ in range(runs):
+        rows = [[chance.random() < 0.5 for _ in range(3)] for _ in range(30)]
+        wrong += any(one.winner for one in findings(found, blocks_of_three(rows)).each)
+    assert wrong <= 0.05 * runs + 3 * (0.05 * 0.95 * runs) ** 0.5
+
+
+# --- two arms in random order -----------------------------------------------------------------------------------
+
+
+def in_random_order(chance, rates, blocks=30):
+    """Blocks of two trials of whichever is drawn, and how many there were of each."""
+    made_of, counts, total = [], [], [0, 0]
+    for _ in range(blocks):
+        arms = [chance.randrange(2), chance.randrange(2)]
+        made_of.append(tuple((arm, float(chance.random() < rates[arm])) for arm in arms))
+        for arm in arms:
+            total[arm] += 1
+        counts.append((total[0], total[1]))
+    return made_of, counts
+
+
+@pytest.mark.parametrize("rule", ["none", "late", "early"])
+def test_two_arms_in_random_order_are_judged_by_the_counts_that_were_drawn(rule):
+    blocks, counts = in_random_order(random.Random(5), (1.0, 0.0))
+    found = made(rule, 30, counts=counts)
+    said = conclude(found, blocks)
+    assert said.winner == "first"
+    assert conclude(found, [[(1 - arm, value) for arm, value in block] for block in blocks]).blocks < 30
+    assert conclude(found, [*blocks[:10], blocks[10][:1], *blocks[11:]]).blocks == 10
+    if rule != "none":
+        assert said.at < 30
+        assert [look.first + look.second for look in found.boundary.looks][-1] == 60
+        assert found.boundary.error()[1] <= 0.05
+
+
+def test_two_arms_in_random_order_that_are_equal_are_told_apart_at_most_as_often_as_alpha():
+    chance, runs, wrong = random.Random(8), 600, 0
+    _, counts = in_random_order(chance, (0.5, 0.5))
+    found = made("early", 30, counts=counts)
+    arms = [
+        [0] * (after[0] - before[0]) + [1] * (after[1] - before[1])
+        for before, after in zip([(0, 0), *counts], counts, strict=False)
+    ]
+    for _ in range(runs):
+        rates = [chance.choice((0.2, 0.5, 0.8)) for _ in range(30)]
+        blocks = [
+            [(arm, float(chance.random() < rate)) for arm in of] for rate, of in zip(rates, arms, strict=True)
+        ]
+        wrong += conclude(found, blocks).winner is not None
+    assert wrong <= 0.05 * runs + 3 * (0.05 * 0.95 * runs) ** 0.5
+
+
+def test_not_worse_by_the_margin_is_asked_in_random_order_too():
+    chance = random.Random(2)
+    blocks, counts = in_random_order(chance, (1.0, 1.0), 40)
+    found = made("late", 40, counts=counts, margin=0.3)
+    assert conclude(found, blocks).winner == "first"
+    worse = [[(arm, float(arm == 1)) for arm, _ in block] for block in blocks]
+    assert conclude(found, worse).winner is None
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            {"rule": "none", "drops": True, "comparisons": ALL_OF_THREE},
+            "arms are dropped with the design 'none'",
+        ),
+        ({"rule": "early", "drops": True}, "arms are dropped with 1 comparison"),
+        (
+            {"rule": "evidence", "counts": [(1, 1)]},
+            "two arms in random order; allowed with: success, one comparison",
+        ),
+        ({"rule": "early", "counts": [(2, 0)] * 20}, "a design needs at least one look"),
+    ],
+)
+def test_what_cannot_go_together_is_said(options, words):
+    with pytest.raises(StatisticsError, match=words):
+        made(**options)

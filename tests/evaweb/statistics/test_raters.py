@@ -34,9 +34,18 @@ def test_krippendorff_of_his_own_example():
 def test_unweighted_is_cohens_kappa_and_agreement_is_1(pairs):
     if len({level for pair in pairs for level in pair}) > 1:
         assert weighted_kappa(pairs, 4, "none") == pytest.approx(cohen_kappa(pairs), abs=1e-9)
-    same = [(one, one) for one, _ in pairs]
+    same = [*((one, one) for one, _ in pairs), (0, 0), (1, 1)]
     assert cohen_kappa(same) == gwet_ac1(same, 4) == weighted_kappa(same, 4) == 1.0
     assert krippendorff_alpha(same) == 1.0
+
+
+@pytest.mark.parametrize(
+    "statistic", [cohen_kappa, lambda pairs: weighted_kappa(pairs, 2), krippendorff_alpha]
+)
+def test_ratings_that_all_say_the_same_word_tell_nothing_of_chance(statistic):
+    with pytest.raises(StatisticsError, match="all ratings say 1: how often chance agrees is not defined"):
+        statistic([(1, 1)] * 30)
+    assert gwet_ac1([(1, 1)] * 30) == 1.0
 
 
 def test_being_one_level_apart_is_less_wrong():

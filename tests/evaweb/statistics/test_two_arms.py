@@ -1,17 +1,19 @@
 import math
+from collections import defaultdict
 from fractions import Fraction
+from itertools import product
 from math import comb
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import barnard_exact
+from scipy.stats import barnard_exact, hypergeom
 
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.difference import barnard, newcombe, probability_better
 from evaweb.statistics.paired import mcnemar, over_conditions
 from evaweb.statistics.proportions import posterior
-from evaweb.statistics.strata import Table, mantel_haenszel
+from evaweb.statistics.strata import Table, exact_within, interaction, mantel_haenszel
 
 COUNTS = st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
@@ -155,3 +157,51 @@ def test_one_stratum_is_a_plain_table():
 def test_no_difference_anywhere_is_no_evidence():
     found = mantel_haenszel([Table(5, 5, 7, 7)])
     assert (found.p, found.odds_ratio, found.reversed) == (1.0, None, False)
+
+
+SIZES, WINS = st.integers(1, 5), st.integers(0, 5)
+TABLES = st.lists(
+    st.builds(lambda n1, n2, a, b: Table(min(a, n1), n1, min(b, n2), n2), SIZES, SIZES, WINS, WINS),
+    min_size=1,
+    max_size=3,
+)
+
+
+def one_by_one(tables):
+    """Every way to fill the tables with these margins: the first's successes in each, and its probability."""
+    ways = [
+        [(x, float(hypergeom.pmf(x, t.n1 + t.n2, t.x1 + t.x2, t.n1))) for x in range(t.n1 + 1)]
+        for t in tables
+    ]
+    for chosen in product(*ways):
+        yield [x for x, _ in chosen], math.prod(p for _, p in chosen)
+
+
+@given(TABLES)
+def test_exact_tests_over_strata_count_every_way_to_fill_the_tables(tables):
+    telling = [t for t in tables if t.tells]
+    if len(telling) < 2:
+        assert (exact_within(tables), interaction(tables)) == (None, None)
+        return
+    seen = [t.x1 for t in telling]
+    sums, whole = defaultdict(float), [(xs, p) for xs, p in one_by_one(telling) if p > 0]
+    for xs, p in whole:
+        sums[sum(xs)] += p
+    expected = sum(p for p in sums.values() if p <= sums[sum(seen)] * (1 + 1e-9))
+    assert exact_within(tables) == pytest.approx(expected)
+    alike = [(xs, p) for xs, p in whole if sum(xs) == sum(seen)]
+    own = next(p for xs, p in alike if xs == seen)
+    expected = sum(p for _, p in alike if p <= own * (1 + 1e-9)) / sum(p for _, p in alike)
+    assert interaction(tables) == pytest.approx(expected)
+
+
+def test_a_confounded_difference_is_none_within_strata():
+    """One checkpoint had the better operator more often; with each operator both are alike."""
+    assert exact_within([Table(18, 20, 4, 5), Table(1, 5, 5, 20)]) > 0.5
+    assert barnard(19, 25, 9, 25).p < 0.01
+
+
+def test_an_interaction_is_found_where_the_difference_turns_and_not_where_it_is_the_same():
+    assert interaction([Table(18, 20, 4, 20), Table(5, 20, 17, 20)]) < 1e-6
+    assert interaction([Table(18, 20, 4, 20), Table(17, 20, 5, 20)]) > 0.5
+    assert interaction([Table(125, 250, 125, 250)] * 4) is None  # too many ways to count

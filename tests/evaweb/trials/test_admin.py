@@ -1,4 +1,5 @@
 import json
+import re
 
 import pytest
 from django.test import Client
@@ -83,6 +84,15 @@ def test_an_admin_adds_a_scene_with_its_positions_and_milestones(admin):
         ({"positions-0-bench": '{"cup": [0, 0]}'}, "cup: unknown key; allowed: block, plate"),
         ({"time_limit_s": "0"}, "greater than or equal to 1"),
         ({"milestones-0-points": "0"}, "greater than or equal to 1"),
+        (
+            {
+                "milestones-TOTAL_FORMS": "2",
+                "milestones-1-order": "2",
+                "milestones-1-text": " held ",
+                "milestones-1-points": "1",
+            },
+            "two milestones are &#x27;held&#x27;; allowed: different words for each",
+        ),
     ],
 )
 def test_a_scene_that_cannot_be_is_refused_with_a_sentence(admin, given, sentence):
@@ -172,3 +182,19 @@ def test_what_was_tried_is_not_deleted(admin, bench):
         answer = admin.post(f"/admin/trials/{kind}/{row.pk}/delete/", {"post": "yes"})
         assert type(row).objects.filter(pk=row.pk).exists()
         assert f"Cannot delete {kind}" in answer.content.decode()
+
+
+def test_every_field_of_the_scene_form_has_a_label(admin, bench):
+    text = admin.get(f"/admin/trials/scene/{bench.scene.pk}/change/").content.decode()
+    labelled = set(re.findall(r'<label[^>]* for="([^"]+)"', text))
+    fields = re.findall(r"<(?:input|select|textarea)\b[^>]*>", text)
+    seen = [field for field in fields if not re.search(r'type="(hidden|submit|search)"', field)]
+    bare = [
+        field
+        for field in seen
+        if "aria-label=" not in field
+        and (found := re.search(r' id="([^"]+)"', field))
+        and found[1] not in labelled
+    ]
+    assert len(seen) > 20
+    assert bare == []

@@ -128,6 +128,21 @@ def test_no_two_have_a_key_or_the_same_words(terms):
     FailureTerm(level="cause", words="stuck").full_clean()
 
 
+@pytest.mark.parametrize(
+    "given", ["not said", "Not Said", " dropped ", "dropped\n", "drop\nped", "drop\x00ped"]
+)
+def test_words_that_would_be_taken_for_others_are_no_term(terms, given):
+    for level in FailureTerm.Level.values:
+        with pytest.raises(ValidationError, match="allowed: "):
+            FailureTerm(level=level, words=given).full_clean()
+
+
+def test_a_score_does_not_say_that_nothing_was_said(bench, terms):
+    with pytest.raises(EvaError, match="failure = 'Not said'; allowed: other words, or none"):
+        score(bench, bench.ended(), failure=" Not said ")
+    assert Score.objects.count() == 0
+
+
 def test_an_administrator_adds_a_cause(admin, terms):
     form = {"level": "cause", "words": "spilled", "key": "z", "order": "9", "active": "on"}
     assert admin.post("/admin/trials/failureterm/add/", form).status_code == 302

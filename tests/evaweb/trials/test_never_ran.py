@@ -2,6 +2,7 @@
 
 import shutil
 from collections import namedtuple
+from contextlib import contextmanager
 
 import pytest
 
@@ -20,6 +21,8 @@ from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Trial
 from evaweb.trials.selectors import statistics
 from evaweb.trials.station_commands import trial_command
+from runtime.recording import episode as episode_module
+from runtime.recording.files import require_room
 from tests.evaweb.trials import builders
 from tests.evaweb.trials.test_restoring import Direct, lab
 
@@ -31,14 +34,25 @@ GIB = 1 << 30
 
 
 class Disk:
-    """Says how much is free, as often as it is asked: the last answer stays."""
+    """Has so much room for whoever asks, and however often."""
 
     def __init__(self, monkeypatch):
-        self.free = [10 * GIB]
-        monkeypatch.setattr(shutil, "disk_usage", self.usage)
+        self.free = 10 * GIB
+        self._monkeypatch = monkeypatch
+        monkeypatch.setattr(shutil, "disk_usage", lambda folder: Usage(20 * GIB, 0, self.free))
 
-    def usage(self, folder):
-        return Usage(20 * GIB, 0, self.free.pop(0) if len(self.free) > 1 else self.free[0])
+    @contextmanager
+    def filled_as_an_episode_is_opened(self):
+        """Until then there is room, for the coordinator too; afterwards there is room again."""
+
+        def full(folder, wanted):
+            self.free = 100
+            require_room(folder, wanted)
+
+        with self._monkeypatch.context() as patched:
+            patched.setattr(episode_module, "require_room", full)
+            yield
+        self.free = 10 * GIB
 
 
 @pytest.fixture
@@ -81,11 +95,10 @@ def goes_on(bench, trial):
 
 def fails_to_open(bench, disk, trial):
     """There is room when the run is asked for, and none when media begins to record."""
-    disk.free = [10 * GIB, 100]
-    row = press_run(bench, trial)
-    assert row.status == "accepted"
-    goes_on(bench, trial)
-    disk.free = [10 * GIB]
+    with disk.filled_as_an_episode_is_opened():
+        row = press_run(bench, trial)
+        assert row.status == "accepted"
+        goes_on(bench, trial)
     return row
 
 
@@ -110,7 +123,7 @@ def runs_and_counts(bench, trial):
 def test_without_room_the_run_is_refused_with_numbers_and_the_trial_stays_prepared(bench, disk):
     trial = bench.bench.prepare()
     ready(bench, trial)
-    disk.free = [GIB - 1]
+    disk.free = GIB - 1
     row = press_run(bench, trial)
     assert row.status == "refused"
     episodes = bench.station.spec.deployment.episodes_dir
@@ -118,7 +131,7 @@ def test_without_room_the_run_is_refused_with_numbers_and_the_trial_stays_prepar
         f"too little room to record in {episodes}: {GIB - 1} bytes free, at least {GIB} wanted" in row.reason
     )
     is_as_it_was(goes_on(bench, trial))
-    disk.free = [GIB]
+    disk.free = GIB
     runs_and_counts(bench, trial)
 
 

@@ -75,7 +75,8 @@ def lab(tmp_path, monkeypatch, db):
     made = Lab(builders.bench("bench"), Lockstep(stubbed(tmp_path, simulated=True)))
     for place in ("evaweb.stations.commands", "evaweb.stations.stops", "evaweb.trials.station_commands"):
         monkeypatch.setattr(f"{place}.wire_to", lambda name: Direct(made.station))
-    return made
+    yield made
+    made.station.close()  # its writer would go on into the tests that follow
 
 
 class Lab:

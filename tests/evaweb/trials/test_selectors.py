@@ -3,6 +3,8 @@ from datetime import timedelta
 import pytest
 from django.utils import timezone
 
+from evaweb.episodes.models import Episode
+from evaweb.episodes.services import trial_changed
 from evaweb.errors import EvaError, NotFound
 from evaweb.trials import selectors, services, voids
 from evaweb.trials.models import Checkpoint, Trial
@@ -128,3 +130,60 @@ def test_exports_come_in_pages_that_neither_repeat_nor_miss(bench):
     pages = list(selectors.trials_in_pages(TrialFilters(), size=2))
     assert [len(page) for page in pages] == [2, 2, 1]
     assert [trial.pk for page in pages for trial in page] == made
+
+
+def test_of_many_cells_only_those_are_made_anew_that_have_a_changed_trial(bench, monkeypatch):
+    other = Checkpoint.objects.create(name="act-block")
+    first, _ = bench.scored(True), bench.scored(True, checkpoint=other)
+    made = []
+    summarised = selectors._summarised
+
+    def noted(trials):
+        cells = summarised(trials)
+        made.append(sorted(cells))
+        return cells
+
+    monkeypatch.setattr(selectors, "_summarised", noted)
+    both = [(bench.scene.pk, bench.checkpoint.pk), (bench.scene.pk, other.pk)]
+    assert len(selectors.statistics()) == 2
+    assert len(selectors.statistics()) == 2
+    assert made == [both], "nothing has changed since"
+    bench.scored(False, checkpoint=other)
+    act, pi0 = selectors.statistics()
+    assert (act.summary.success.n, pi0.summary.success.n) == (2, 1)
+    assert made[1:] == [both[1:]]
+    voids.trial_void(user=bench.operator, trial=first, reason="a hand")
+    assert [row.summary.success.n for row in selectors.statistics()] == [2, 0]
+    long_ago = timezone.now() - timedelta(
+        minutes=5
+    )  # by a clock that is behind, or in a transaction that took long
+    Episode.objects.filter(trial__checkpoint=other).update(smoothness=-1.5)
+    Trial.objects.filter(checkpoint=other).update(changed_at=long_ago)
+    assert selectors.statistics()[0].summary.smoothness.n == 2
+
+
+def test_where_more_has_changed_than_is_looked_through_all_of_it_is_made_anew(bench, monkeypatch):
+    monkeypatch.setattr(selectors, "_MOST_CHANGED", 1)
+    for success in (True, False, True):
+        bench.scored(success)
+        (row,) = selectors.statistics()
+    assert (row.summary.success.successes, row.summary.success.n) == (2, 3)
+
+
+def test_smoothness_that_is_measured_later_is_in_the_summary(bench):
+    trial = bench.scored()
+    assert selectors.statistics()[0].summary.smoothness is None
+    Episode.objects.filter(pk=trial.episode_id).update(smoothness=-1.5)
+    trial_changed(uuid=trial.episode_id)
+    assert selectors.statistics()[0].summary.smoothness.value == -1.5
+
+
+def test_a_name_that_means_another_row_now_has_that_ones_summary(bench):
+    other = Checkpoint.objects.create(name="act-block")
+    for success, checkpoint in ((True, bench.checkpoint), (False, other), (False, other)):
+        bench.scored(success, checkpoint=checkpoint)
+    names, asked = (bench.checkpoint.name, other.name), TrialFilters(checkpoint=other.name)
+    assert selectors.statistics(asked)[0].summary.success.n == 2
+    for row, name in ((bench.checkpoint, "meanwhile"), (other, names[0]), (bench.checkpoint, names[1])):
+        Checkpoint.objects.filter(pk=row.pk).update(name=name)
+    assert selectors.statistics(asked)[0].summary.success.n == 1

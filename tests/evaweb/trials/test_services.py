@@ -35,6 +35,21 @@ def score(bench, trial, *reached, **given):
 # --- preparing ---------------------------------------------------------------------------------------------
 
 
+def test_a_correction_that_says_nothing_of_times_keeps_those_that_are_still_ticked(bench):
+    trial = bench.ended()
+    one, two, _ = keys = list(bench.ticks(True, True, True))
+    score(bench, trial, True, True, False, times={one: 2.5, two: 4.0})
+    fewer = score(bench, trial, True, False, False, reason="it slid")
+    assert list(fewer.outcomes.values_list("milestone", "at_s")) == [(one, 2.5), (two, None), (keys[2], None)]
+    none = score(bench, trial, True, False, False, reason="not seen when", times={})
+    assert [row.at_s for row in none.outcomes.all()] == [None] * 3
+    score(bench, trial, True, False, False, reason="seen", times={one: 2.5})
+    Milestone.objects.filter(pk=one).update(time_limit_s=1)
+    assert (
+        score(bench, trial, True, True, False, reason="seen again").outcomes.exclude(at_s=None).count() == 0
+    )
+
+
 def test_a_trial_is_prepared_on_the_stations_own_open_bench(bench):
     trial = bench.prepare()
     assert (trial.number, trial.attempt, trial.status) == (1, 1, "prepared")

@@ -142,7 +142,7 @@ def test_nothing_is_run_after_a_terminal_set_the_station_up_for_something_else(b
     trial = bench.prepare()
     give(bench, trial, "setup")
     wire.snapshot = told
-    with pytest.raises(Conflict, match="by somebody else, not for pi0-block: press Set up again"):
+    with pytest.raises(Conflict, match="by someone else, not for pi0-block: press Set up again"):
         give(bench, trial, "run")
     assert not heard(wire, "run")
 

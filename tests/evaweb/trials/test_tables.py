@@ -1,7 +1,7 @@
 import pytest
 from django.core.exceptions import ValidationError
 
-from evaweb.trials.tables import check_bench, check_policy
+from evaweb.trials.tables import check_bench, check_policy, simulated_bench
 
 KEY = "-----BEGIN OPENSSH PRIVATE KEY-----\nc2VjcmV0\n"
 
@@ -74,7 +74,14 @@ def test_nothing_of_a_key_is_shown_again():
 
 
 @pytest.mark.parametrize(
-    "bench", [None, {}, {"block": [0.1, 0.3, 45]}, {"block": [0, 0, 0], "plate": [-0.1, 0.3]}]
+    "bench",
+    [
+        None,
+        {},
+        {"block": [0.1, 0.3, 45]},
+        {"block": [0, 0, 0], "plate": [-0.1, 0.3]},
+        {"plate": [-0.1, 0.3], "objects": {"red cup": [0.1, 0.3, -90, 0.08, 0.08]}},
+    ],
 )
 def test_benches_that_can_be_pass(bench):
     check_bench(bench)
@@ -91,9 +98,22 @@ def test_benches_that_can_be_pass(bench):
         ({"plate": [0, float("nan")]}, "allowed: 2 numbers"),
         ({"plate": 3}, "allowed: 2 numbers"),
         ({"plate": [300, 0]}, "at most 2 from the middle"),
+        ({"objects": [1]}, "objects = [1]; allowed: a table such as"),
+        (
+            {"objects": {"cup": [0, 0]}},
+            "cup = [0, 0]; allowed: 5 numbers: [x, y, yaw in degrees, width, depth]",
+        ),
+        ({"objects": {"cup": [0, 0, 0, 0, 0.1]}}, "width and depth from 0.005 to 1.0 metres"),
+        ({"objects": {"a/b": [0, 0, 0, 0.1, 0.1]}}, "allowed: a name of an object"),
     ],
 )
 def test_other_benches_are_refused_with_what_is_allowed(bench, sentence):
     with pytest.raises(ValidationError) as refused:
         check_bench(bench)
     assert sentence in " ".join(refused.value.messages)
+
+
+def test_a_simulated_bench_lays_what_is_its_own():
+    laid = {"block": [0.1, 0.3, 45], "plate": [-0.1, 0.3]}
+    assert simulated_bench({**laid, "objects": {"cup": [0, 0, 0, 0.1, 0.1]}}) == laid
+    assert simulated_bench(None) is None

@@ -29,8 +29,8 @@ def send(bench, trial, *reached, **given):
 
 def test_an_empty_lab_says_what_would_be_here_and_how_to_get_it(browser):
     text = page(browser, "/result/")
-    assert "Nothing has been tried yet" in text
-    assert "To the stations" in text
+    assert "No trials yet" in text
+    assert "Go to the stations" in text
 
 
 def test_nobody_sees_results_without_logging_in(bench):

@@ -44,6 +44,8 @@ ELSEWHERE = {
         "runtime/recording/schema.py",
         'said.get("max_skew_s")',
     ),
+    # Read by a process that reads no deployment, of what the supervisor has resolved.
+    "runtime.config.schema.PanelSettings": ("runtime/clients/panel/settings.py", '["panel"]'),
     "runtime.transports.ros.topics.GroupTopics": ("runtime/transports/ros/topics.py", '"{key}"'),
     "robots.description.RosGroupTable.eef_command": ("runtime/transports/ros/topics.py", '"{key}"'),
     # Without it a validator refuses what leaves this machine.

@@ -94,3 +94,22 @@ def test_advice_is_for_who_lacks_the_class_and_names_both_ways_to_get_it() -> No
     assert "rtprio limit of 30" in told
     assert "LimitRTPRIO=30" in told
     assert "docs/administrator.md" in told
+
+
+_LOCKED = (
+    "from runtime.core import realtime; import mmap; "
+    "large, small = mmap.mmap(-1, 64 << 20, mmap.MAP_PRIVATE), mmap.mmap(-1, 1 << 20, mmap.MAP_PRIVATE); "
+    "words = realtime.enter(20); "
+    "held = int([row for row in open('/proc/self/status') if row.startswith('VmLck')][0].split()[1]); "
+    "used = int([row for row in open('/proc/self/status') if row.startswith('VmRSS')][0].split()[1]); "
+    "print(words, held >> 10, used >> 10, sep='|')"
+)
+
+
+def test_large_memory_that_is_not_used_is_locked_and_takes_no_room() -> None:
+    done = subprocess.run([sys.executable, "-c", _LOCKED], capture_output=True, text=True, check=True)
+    words, held, used = done.stdout.strip().split("|")
+    if words.endswith("unlocked"):
+        pytest.skip("this account may lock no memory")
+    assert int(held) >= 64
+    assert int(used) < 64

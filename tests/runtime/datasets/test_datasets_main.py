@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from runtime.datasets.__main__ import episodes, main
+from runtime.core.errors import RecordingError
+from runtime.datasets.__main__ import MOST, episodes, main
 from tests.runtime.datasets.small import record
 
 
@@ -125,6 +126,12 @@ def test_what_cannot_be_done_is_said(
 @pytest.mark.parametrize(("text", "found"), [("3", [3]), ("0:3", [0, 1, 2]), ("0:2,7,4:5", [0, 1, 7, 4])])
 def test_episodes_are_named_by_index_and_range(text: str, found: list[int]) -> None:
     assert episodes(text) == found
+
+
+@pytest.mark.parametrize("text", ["0:999999999", f"0:{MOST},5", "0:9" + "9" * 5000, "9" * 5000])
+def test_more_episodes_than_anybody_means_are_not_counted_out(text):
+    with pytest.raises(RecordingError, match=r"too many episodes|names no episodes"):
+        episodes(text)
 
 
 def test_recover_removes_what_was_left_and_checks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 from fractions import Fraction
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from runtime.core.errors import RecordingError
 from runtime.datasets.pictures import Pictures
-from runtime.datasets.remux import VideoFacts, remux
+from runtime.datasets.remux import VideoFacts, cut, remux
 from tests.runtime.datasets.small import record, seen, write_video
 
 
@@ -69,3 +70,20 @@ def test_fractions_of_a_rate_stay_exact(tmp_path: Path) -> None:
         assert stream.time_base is not None
         times = [p.pts * stream.time_base for p in container.demux(stream) if p.pts is not None and p.size]
     assert times == [Fraction(1001 * k, 30000) for k in range(30)]
+
+
+def test_a_clip_begins_with_the_key_frame_before_and_ends_where_it_is_said(tmp_path: Path) -> None:
+    write_video(tmp_path / "film.mp4", 40, 10, gop=15, b_frames=0)
+    for begin, end, first, last in (
+        (0.0, 0.5, 0, 4),
+        (1.5, 2.0, 15, 19),
+        (2.9, 3.15, 15, 31),
+        (3.4, 99.0, 30, 39),
+    ):
+        target = io.BytesIO()
+        assert cut(tmp_path / "film.mp4", target, begin, end) == pytest.approx(first / 10)
+        (tmp_path / "clip.mp4").write_bytes(target.getvalue())
+        with Pictures(tmp_path / "clip.mp4") as pictures:
+            assert [seen(pictures[k]) for k in range(len(pictures))] == list(range(first, last + 1))
+    with pytest.raises(RecordingError, match="no pictures from"):
+        cut(tmp_path / "film.mp4", io.BytesIO(), 0.0, 0.0)

@@ -21,6 +21,7 @@ from runtime.ipc.bus import (
     Subscriber,
 )
 from runtime.ipc.messages import Ack, Command, Event, decode, encode
+from tests.processes import eventually
 
 PACE_S = 0.002  # between bursts: ZMQ looks only once a millisecond at what a reader has taken
 
@@ -214,6 +215,36 @@ def test_a_subscriber_gets_what_it_asked_for_by_prefix(context, publisher):
         if len(seen) == 2:
             break
     assert seen == {"camera/high": b"jpeg", "state": {"sequence": 2}}
+
+
+def test_a_publisher_knows_what_is_read(context, publisher):
+    def heard(stream, wanted):
+        begun = []
+
+        def asked():
+            begun.extend(publisher.hear())
+            return publisher.wanted(stream) is wanted
+
+        eventually(asked, 30, f"{stream} is wanted: {wanted}")
+        return begun
+
+    assert not publisher.wanted("state")
+    subscriber = Subscriber(context, publisher.endpoint, "camera/", "state")
+    assert heard("state", True) + publisher.hear() in (["camera/", "state"], ["state", "camera/"])
+    assert publisher.wanted("camera/high")
+    assert not publisher.wanted("joints")
+    subscriber.close()
+    assert heard("state", False) == []
+
+
+def test_what_is_no_subscription_is_passed_over(context, publisher):
+    stranger = context.socket(zmq.XSUB)
+    stranger.connect(publisher.endpoint)
+    stranger.send(b"\x07what is this")
+    stranger.send(b"\x01state")
+    eventually(lambda: publisher.hear() == ["state"] or publisher.wanted("state"), 30, "it is heard")
+    assert publisher.topics == {"state"}
+    stranger.close(linger=0)
 
 
 def test_a_subscriber_without_news_gets_nothing(context, publisher):

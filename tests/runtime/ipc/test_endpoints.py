@@ -205,3 +205,10 @@ def test_what_is_wrong_with_a_socket_is_said_with_what_to_do(runtime_dir: Path) 
         assert "Connection refused" in trouble(f"ipc://{path}")
         listening.listen(1)
         assert trouble(f"ipc://{path}") == ""
+
+
+def test_a_file_that_the_disk_does_not_give_up_ends_nobody(tmp_path, caplog):
+    """A gate withdraws one whenever a link is lost: on a disk that takes no more, every station's went with it."""
+    (tmp_path / "endpoints" / "coordinator.json").mkdir(parents=True)
+    Endpoints(tmp_path).withdraw("coordinator")
+    assert "clients still find the process coordinator" in caplog.text

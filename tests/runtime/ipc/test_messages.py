@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from runtime.core.errors import CodecError
 from runtime.core.msgpack_arrays import pack, unpack
+from runtime.core.sentences import Pattern, Sentence, fixed
 from runtime.ipc.messages import (
     Ack,
     BeginEpisode,
@@ -34,6 +35,11 @@ from runtime.ipc.messages import (
     encode,
     event_row,
 )
+
+HELD = Pattern("test.messages.held", "{holder} holds it: {why}")
+WHY = fixed("test.messages.why", "so it is")
+SAID = HELD(holder="ann", why=WHY)
+TOLD = {"id": "test.messages.why", "arguments": {}, "text": "so it is"}
 
 Q = np.arange(3, dtype=np.float32)
 ROWS = np.arange(6, dtype=np.float64).reshape(2, 3)
@@ -203,3 +209,41 @@ def test_an_event_as_a_line_of_the_log_has_all_of_its_fields():
         "step": 17,
         "data": {"joint": "left"},
     }
+
+
+@pytest.mark.parametrize(
+    ("message", "field"),
+    [
+        (Event("held", SAID, 1.0), "text"),
+        (Ack("u", "refused", SAID), "reason"),
+        (EndEpisode("failed", SAID), "reason"),
+        (EpisodeOpened(1, "u", "/data/u", SAID), "error"),
+        (EpisodeClosed("u", "/data/u", "failed", SAID, 3), "reason"),
+    ],
+)
+def test_a_sentence_keeps_its_id_and_arguments_over_the_wire(message: Message, field: str) -> None:
+    assert (message.id, message.arguments) == (SAID.id, {"holder": "ann", "why": TOLD})
+    there = unpack(encode(message))
+    assert (there[field], there["id"], there["arguments"]["why"]) == ("ann holds it: so it is", SAID.id, TOLD)
+    again = decode(encode(message))
+    said = getattr(again, field)
+    assert isinstance(said, Sentence)
+    assert (again, said.id, said.arguments["why"].id) == (message, SAID.id, WHY.id)
+    assert decode(encode(again)) == message
+
+
+def test_messages_of_before_have_no_id_and_a_wrong_one_is_refused() -> None:
+    said = {"type": "Event", "kind": "held", "text": "so", "time": 1.0}
+    event = decode(pack(said))
+    assert isinstance(event, Event)
+    assert (event.id, event.arguments, type(event.text)) == ("", {}, str)
+    assert "id" not in event_row(event)
+    assert event_row(Event("held", SAID, 1.0))["arguments"]["why"] == TOLD
+    for wrong in (
+        {"id": "No Id"},
+        {"id": "a.b", "arguments": {"x": [1]}},
+        {"id": 3},
+        {"id": "a.b", "arguments": 3},
+    ):
+        with pytest.raises(CodecError, match="Event"):
+            decode(pack(said | wrong))

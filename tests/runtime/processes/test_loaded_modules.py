@@ -34,7 +34,7 @@ PARTS = {
         {"pydantic", "PIL", "cv2", "numba", "scipy", "websockets"},
     ),
     "supervisor": (
-        READING | {"runtime.policies", "runtime.spaces"},
+        READING | {"runtime.link", "runtime.policies", "runtime.spaces"},
         {"pydantic", "av"},
     ),
 }
@@ -156,6 +156,7 @@ def test_a_kind_that_cannot_be_loaded_is_refused_where_a_deployment_names_it(tmp
         "runtime.processes.coordinator.process",
         "runtime.processes.guard.process",
         "runtime.ctl",
+        "runtime.link.station",
     ],
 )
 def test_what_stops_a_robot_is_free_of_codecs_and_tables(module):

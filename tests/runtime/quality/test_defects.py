@@ -119,6 +119,14 @@ def test_one_defect_is_flagged_where_it_is_and_nothing_else(tmp_path, name):
     assert set(found(record(tmp_path, spoil))) == expected
 
 
+def test_a_drawn_camera_that_nothing_moves_before_is_not_frozen(tmp_path):
+    drawn = {"configuration": {"transport": {"simulated": True}}}
+    idle = shown(range(30, 75), lambda index: built.picture(30))
+    assert found(record(tmp_path, idle, **drawn)) == []
+    silent = record(tmp_path, shown(range(30, 60), lambda index: None), **drawn)
+    assert ("frozen", "error", 30, 59, "cam_high") in found(silent)
+
+
 def test_a_camera_of_half_the_rate_is_flagged_once(tmp_path):
     twice = shown(range(FRAMES), lambda index: built.picture(index - index % 2))
     flags = inspect(record(tmp_path, twice)).flags

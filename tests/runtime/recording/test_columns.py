@@ -8,6 +8,7 @@ import pytest
 
 from runtime.core.errors import RecordingError
 from runtime.recording.base import RawChunk
+from runtime.recording.bench_truth import truth_changes, truth_text
 from runtime.recording.columns import RecordedRow
 from runtime.recording.layout import Layout
 from runtime.recording.tables import SCHEMAS, TableWriter, read_table, write_table
@@ -57,6 +58,7 @@ def test_a_row_keeps_every_field_and_times_count_from_the_start(tmp_path: Path) 
         f"lost.{CAMERAS[1]}": False,
         f"stale.{CAMERAS[0]}": False,
         f"stale.{CAMERAS[1]}": False,
+        "bench": None,
     }
     assert found[0]["eef"] is None
     assert found[0][f"repeated.{CAMERAS[0]}"] is True
@@ -131,6 +133,18 @@ def test_how_late_a_tick_was_is_in_its_row_and_null_in_episodes_from_before(tmp_
     older = read_table(tmp_path / "ticks.arrow", SCHEMAS["ticks"](LAYOUT)).table
     assert older["woke"].to_pylist() == [None]
     assert older["step"].to_pylist() == [1]
+
+
+def test_what_a_bench_said_is_kept_where_it_was_something_new_and_episodes_from_before_have_none(
+    tmp_path: Path,
+) -> None:
+    said = truth_text({"blocks": [[0.123456, 0.0, 0.02, 1.0]], "plate": [0.3, math.nan], "seed": 7})
+    assert said == '{"blocks":[[0.1235,0.0,0.02,1.0]],"plate":[0.3,null]}'
+    records = [RecordedRow(row(index, bench=said if index == 1 else None), frozenset()) for index in range(3)]
+    table = written(tmp_path, "rows", *records)
+    assert truth_changes(table) == [(1, {"blocks": [[0.1235, 0.0, 0.02, 1.0]], "plate": [0.3, None]})]
+    write_table(tmp_path / "rows.arrow", table.drop_columns(["bench"]))
+    assert truth_changes(read_table(tmp_path / "rows.arrow", SCHEMAS["rows"](LAYOUT)).table) == []
 
 
 def test_chunks_of_any_width_become_one_row_per_action(tmp_path: Path) -> None:

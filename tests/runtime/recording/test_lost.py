@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from runtime.core.errors import RecordingError
@@ -347,6 +347,9 @@ class Lab:
         self.whole, self.data = whole, data
         self.folder = Path(shutil.copytree(whole, data / "episodes" / whole.name))
         self.mark = data / f"quarantine/{whole.name}.json"
+        self.known = (
+            True  # whether its own outcome is kept anywhere: with the last of it a mark may name another one
+        )
 
     def step(self, kind: str, name: str, harm: Harm, number: int) -> None:
         if kind == "scrub":
@@ -372,6 +375,7 @@ class Lab:
         elif kind == "harm" and (self.folder / name).exists():
             harm(self.folder / name)
         elif kind == "spoil mark" and self.mark.exists():
+            self.known &= self.told
             empty(self.mark)
 
     def _killed_repair(self, number: int) -> None:
@@ -435,6 +439,9 @@ BEGINNINGS = (
     kinds=st.lists(st.sampled_from(STEPS), max_size=8),
     how=st.tuples(st.sampled_from(FILES), st.sampled_from(HARMS), st.integers(0, 12)),
 )
+@example(
+    beginning=BEGINNINGS[-1], kinds=("lose copy", "spoil mark", "scrub", "back"), how=(FILES[1], a_bit_off, 0)
+)
 @settings(max_examples=80, suppress_health_check=SLOW)
 def test_no_sequence_ends_with_changed_bytes_that_pass_for_what_was_recorded(
     whole: Path, tmp_path: Path, beginning: Sequence[str], kinds: Sequence[str], how: tuple[str, Harm, int]
@@ -443,13 +450,14 @@ def test_no_sequence_ends_with_changed_bytes_that_pass_for_what_was_recorded(
     for kind in (*beginning, *kinds):
         lab.step(kind, *how)
     assert not (lab.changed and lab.passes)
-    if not lab.changed and lab.told:
+    if not lab.changed and lab.told and lab.known:
         repair(lab.folder)
         assert lab.passes
         assert (lab.folder / OUTCOME).read_bytes() == (whole / OUTCOME).read_bytes()
 
 
 @given(name=st.sampled_from([*FILES[1:4]]), at=st.floats(0, 1), bit=st.integers(0, 7))
+@example(name=FILES[2], at=0.0078125, bit=7)  # a name in its metadata is no UTF-8 then
 @settings(max_examples=20, suppress_health_check=SLOW)
 def test_nor_where_both_outcomes_are_lost_as_long_as_its_tables_have_their_ends(
     whole: Path, tmp_path: Path, name: str, at: float, bit: int

@@ -182,7 +182,7 @@ def test_a_station_without_a_declared_bench_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         SetupError, match=r"transport.kind = 'zmq' with a bench in lockstep; allowed: zmq with"
     ):
-        lockstep.station(DEPLOYMENTS / "tabletop.toml", given, 1, VirtualClock())
+        lockstep.station(DEPLOYMENTS / "tabletop.toml", given, VirtualClock())
 
 
 def test_only_a_server_that_can_declare_its_times_is_served() -> None:

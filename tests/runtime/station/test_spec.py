@@ -9,8 +9,9 @@ import pytest
 from runtime.config.loader import changed, load
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.pose_format import PoseFormat
+from runtime.ipc.bells import Bell
 from runtime.ipc.lifeline import Lifeline
-from runtime.ipc.shared_state import SharedState
+from runtime.ipc.shared_state import WOKEN, SharedState
 from runtime.kinematics.forward import ChainForward
 from runtime.motion.timeline import DimensionKinds
 from runtime.processes import child
@@ -91,6 +92,8 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
         CAPABILITIES.dump_json(told).decode(),
         "--shared",
         str(descriptor),
+        "--bells",
+        ",".join(str(Bell.made().descriptor) for _ in WOKEN),
         "--boot",
         "b",
     ]

@@ -1,5 +1,6 @@
 """The page of integrity: who looked, what was thrown away, how trials were handed out, delays, the headline then."""
 
+from dataclasses import dataclass
 from datetime import timedelta
 
 import pytest
@@ -9,11 +10,13 @@ from django.test.utils import CaptureQueriesContext
 
 from evaweb.plans.allocation import give_back, hand_out
 from evaweb.plans.blinding_rules import look
-from evaweb.plans.models import Achieved, CameraCheck, Plan
-from evaweb.plans.services import plan_amend, plan_close, plan_reveal
+from evaweb.plans.models import Achieved, CameraCheck, Plan, Reference
+from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
+from evaweb.results.analysis.conduct import balance
 from evaweb.results.presentation.integrity import delays_banner, integrity_document
 from evaweb.stations.models import Station
 from evaweb.trials import services, voids
+from evaweb.trials.corrections import trial_failure
 from evaweb.trials.models import Trial
 from tests.evaweb.trials import builders
 
@@ -22,11 +25,11 @@ ADDRESS = "/result/plans/blocks/1/integrity/"
 
 
 @pytest.fixture
-def make(bench, plan):
+def make(bench, request):
     """Makes the next trial: `wait` [s] from hand-out to run by checkpoint."""
 
-    def one(wait=None, success=None, user=bench.operator, station=bench.station, **facts):
-        trial = hand_out(user=user, station=station, plan=plan).trial
+    def one(wait=None, success=None, user=bench.operator, station=bench.station, plan=None, **facts):
+        trial = hand_out(user=user, station=station, plan=plan or request.getfixturevalue("plan")).trial
         builders.over(trial, 9.0, **facts)
         name = trial.checkpoint.name
         seconds = (wait or {}).get(name, 10 + trial.number % 2)
@@ -54,9 +57,10 @@ def test_delays_that_differ_have_a_banner_and_those_that_do_not_have_none(plan, 
     record = integrity_document(plan)
     rows = {row["what"]: row for row in record["delays"]["rows"]}
     waits = rows["from hand-out to run"]
-    assert (waits["pairs"], waits["difference"], waits["p"]) == (8, 295.0, pytest.approx(2 / 2**8))
-    assert waits["corrected"] == pytest.approx(record["delays"]["tested"] * 2 / 2**8)
-    assert rows["set-up: connecting to the policy"]["p"] == 1.0
+    (test,) = waits["tests"]
+    assert (test["pairs"], test["difference"], test["p"]) == (8, 295.0, pytest.approx(2 / 2**8))
+    assert test["corrected"] == pytest.approx(record["delays"]["tested"] * 2 / 2**8)
+    assert rows["set-up: connecting to the policy"]["tests"][0]["p"] == 1.0
     assert "from hand-out to run, by +295 s" in delays_banner(record)
     assert delays_banner(record).startswith(f"Delays of {NEW} and {OLD} differ: from")
 
@@ -119,6 +123,52 @@ def test_corrections_are_told_before_and_after_the_reveal(bench, plan, owner, ma
     assert "1 score came after the reveal" in integrity_document(plan)["remarks"]
 
 
+def test_categories_and_notes_that_are_corrected_after_the_reveal_change_no_score(bench, plan, owner, make):
+    first, second = make(success=False), make(success=False)
+    plan_close(user=owner, plan=plan, reason="enough")
+    plan_reveal(user=owner, plan=plan)
+    for trial in (first, second):
+        trial_failure(user=bench.operator, trial=trial, failure="slid")
+    ticks = bench.ticks(True, False, False)
+    said = {"failure": "slid", "note": "to the left", "reason": "a word more"}
+    services.trial_score(user=bench.operator, trial=first, milestones=ticks, **said)
+    plan.refresh_from_db()
+    record = integrity_document(plan)
+    assert [(row["changed"], row["late"]) for row in record["corrections"]] == [
+        ("category", True),
+        ("category", True),
+        ("note", True),
+    ]
+    assert "2 failure categories corrected after the reveal" in record["remarks"]
+    assert not any("came after the reveal" in words for words in record["remarks"])
+    assert [row["late"] for row in record["checkpoints"]] == [0, 0]
+    # Milestones that come to the same points are another verdict.
+    ticks = bench.ticks(False, True, False)
+    services.trial_score(user=bench.operator, trial=first, milestones=ticks, reason="on the video")
+    assert "1 score came after the reveal" in integrity_document(plan)["remarks"]
+
+
+@dataclass
+class _Tried:
+    checkpoint: str
+    operator: str
+    counts: bool = True
+
+
+@pytest.mark.parametrize(
+    ("made", "uneven"),
+    [
+        ({("ann", "a"): 9, ("ann", "b"): 3}, 0.0),  # b was dropped
+        ({("ann", "a"): 6, ("ann", "b"): 2, ("ben", "a"): 3, ("ben", "b"): 1}, 0.0),
+        ({("ann", "a"): 6, ("ben", "b"): 2}, 1.5),
+        ({}, 0.0),
+    ],
+)
+def test_balance_is_that_of_operators_and_not_of_what_was_tried_more_often(made, uneven):
+    runs = [_Tried(checkpoint, who) for (who, checkpoint), count in made.items() for _ in range(count)]
+    assert balance(runs, "operator")["uneven"] == uneven
+
+
 def test_looks_and_amendments_are_named(plan, owner, make):
     make()
     look(plan, owner)
@@ -139,7 +189,7 @@ def test_blocks_that_were_split_or_handed_out_of_turn_are_counted(bench, plan, m
     assert found["deviations"]["split_stations"] == found["deviations"]["split_operators"] == [0]
     assert found["deviations"]["order"] == found["deviations"]["out_of_turn"] == []
     assert "the arm broke" in found["deviations"]["given_back"][0]["text"]
-    assert found["stations"]["uneven"] == 1
+    assert found["stations"]["uneven"] == 0.5  # each has one trial of one checkpoint, of two halves
     assert len(found["operators"]["rows"]) == 2
     assert "1 block carried out on more than one station" in integrity_document(plan)["remarks"]
 
@@ -175,7 +225,7 @@ def test_what_the_headline_would_be_without_an_operator(bench, plan, make):
     assert (gone["pairs"], gone["same"]) == (2, False)
     assert found["without station bench-1"]["sentence"] == "No pair is left"
     assert found["without station bench-1"]["same"] is None
-    assert "The headline would be another one without operator sam" in integrity_document(plan)["remarks"]
+    assert "The headline would change: without operator sam" in integrity_document(plan)["remarks"]
 
 
 def test_repetitions_and_benches_below_the_least_match_are_left_out(bench, plan, make):
@@ -238,3 +288,51 @@ def test_it_asks_as_often_whatever_the_number_of_trials(plan, make):
     for _ in range(10):
         make()
     assert asked() == few <= 20
+
+
+def test_what_ran_below_the_least_match_is_told_by_its_worst_region_when_last_looked_at(bench, owner, make):
+    drafted = Plan.objects.create(name="gated", title="Gated", owner=owner, match_gate=0.75)
+    drafted.checkpoints.set([bench.checkpoint])
+    drafted.positions.set(bench.scene.positions.all())
+    plan = plan_freeze(user=owner, plan=drafted)
+    for number in range(2):
+        trial = make(plan=plan)
+        references = [
+            Reference.objects.create(
+                station=trial.station, position=trial.position, camera="cam_high", picture=name, by=owner
+            )
+            for name in ("a" * 64, "b" * 64)
+        ]
+        looks = [(0.9, 0.1, references[0]), (0.99, 0.05, references[number])]
+        for match, worst, reference in looks if number else looks[::-1]:
+            Achieved.objects.create(
+                trial=trial,
+                camera="cam_high",
+                picture="c" * 64,
+                reference=reference,
+                match=match,
+                regions=[
+                    {"name": "block", "match": worst if number else 0.9},
+                    {"name": "cup", "match": 0.95},
+                ],
+                override="the block is lost" if number else "",
+                by=owner,
+            )
+    found = integrity_document(plan)
+    (low,) = found["bench"]["low"]
+    assert (low["code"], low["match"], low["override"]) == (
+        trial.handout.code,
+        0.05,
+        "the block is lost",
+    )
+    assert [(row["camera"], row["used"]) for row in found["bench"]["references"]] == [("cam_high", 2)]
+    assert (
+        f"Run although the bench matched less than 0.75, for a reason: {trial.checkpoint.name} 1"
+        in found["remarks"]
+    )
+    assert any("had 2 references at block-on-plate, position" in line for line in found["remarks"])
+
+
+def test_without_a_least_match_no_trial_is_told_to_be_below_it(plan, make):
+    make()
+    assert integrity_document(plan)["bench"] == {"gate": None, "low": [], "unmatched": [], "references": []}

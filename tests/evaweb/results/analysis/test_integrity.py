@@ -87,7 +87,7 @@ def test_corrections_are_told_by_their_direction_and_late_ones_apart(bench, plan
 
 def test_the_page_says_that_the_plan_was_closed_as_soon_as_it_is(plan, owner, tried):
     def sentence():
-        return summary_page(plan, Chosen())["primary"]["sentence"]
+        return summary_page(plan, Chosen())["headline"].sentence
 
     tried(success=True)
     tried(success=False)

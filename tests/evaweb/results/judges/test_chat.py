@@ -217,6 +217,31 @@ def test_a_key_that_a_server_quotes_is_kept_nowhere(monkeypatch):
         assert KEY not in asked(play, key_variable="EVA_JUDGE_KEY")[0]
 
 
+@pytest.mark.parametrize("written", ["sk-abc\\/def+ghi", "sk-abc\\u002fdef\\u002bghi"])
+def test_a_key_that_a_server_quotes_as_json_escapes_it_is_kept_nowhere(written, monkeypatch):
+    monkeypatch.setenv("EVA_JUDGE_KEY", "sk-abc/def+ghi")
+    line = '{"milestones": [{"number": %d, "verdict": "reached", "probability": 1}%s]}'
+    verdicts = json.dumps(line % (1, ', {"number": 2, "verdict": "reached", "probability": 1}'))
+    extra = json.dumps('{"milestones": [], "KEY": 1}').replace("KEY", written.replace("\\", "\\\\"))
+    bodies = [
+        f'{{"choices": [{{"message": {{"refusal": "bad key {written}"}}}}]}}',
+        f'{{"choices": [{{"message": {{}}, "finish_reason": "after so many words as these are: {written}"}}]}}',
+        f'{{"choices": [{{"message": {{"content": {extra}}}}}]}}',
+        f'{{"model": "m of {written}", "choices": [{{"message": {{"content": {verdicts}}}}}]}}',
+    ]
+    for body in bodies:
+        told, _ = asked(http(body=body.encode()), key_variable="EVA_JUDGE_KEY")
+        assert "abc" not in str(told)
+        assert "..." in str(told)
+
+
+def test_a_model_that_is_called_as_its_key_is_not_asked(monkeypatch):
+    monkeypatch.setenv("EVA_JUDGE_KEY", KEY)
+    with pytest.raises(EvaError, match="name the model without its key") as fault:
+        asked(GOOD, key_variable="EVA_JUDGE_KEY", model=f"seer?key={KEY}")
+    assert KEY not in str(fault.value)
+
+
 @pytest.mark.parametrize("value", [None, "", "two words", "sk-\nX-Other: 1", "ключ"])
 def test_a_key_that_is_none_is_named_by_its_variable_and_nothing_is_sent(value, monkeypatch):
     monkeypatch.delenv("EVA_JUDGE_KEY", raising=False)
@@ -238,6 +263,7 @@ def test_a_key_that_is_none_is_named_by_its_variable_and_nothing_is_sent(value, 
         ({"address": "https://me:secret@judge.example"}, "allowed: https://HOST"),
         ({"address": "https://judge.example/v1?key=1"}, "allowed: https://HOST"),
         ({"address": "https://judge.example:99999"}, "allowed: https://HOST"),
+        ({"address": "https://judge.example:0/"}, "port 0; allowed: 1 to 65535"),
         ({"address": "https://judge.example/a b"}, "allowed: https://HOST"),
         ({"address": "http://judge.example/v1"}, "for everybody to read"),
         ({"address": "http://10.0.0.7:8000"}, "for everybody to read"),

@@ -135,12 +135,12 @@ def test_every_number_leads_to_its_trials(revealed, as_, viewer):
     client = as_(viewer)
     arm = caching.analysis_of(revealed).arms[0]
     listed = client.get(f"{PLAN}trials/?checkpoint={arm.checkpoint}&success=yes")
-    assert f'Trials <span class="muted small">{arm.success.successes}</span>' in listed.content.decode()
+    assert f'<span class="muted">{arm.success.successes} trial' in listed.content.decode()
     failed = client.get(f"{PLAN}trials/?failure=%3Ddropped&success=no").content.decode()
     assert "=dropped" in failed
     assert "success</span>" not in failed
     missed = client.get(f"{PLAN}trials/?missed=lifted").content.decode()
-    assert "Without the milestone" in missed
+    assert "Without the milestone: lifted" in missed
     wrong = client.get(f"{PLAN}trials/?success=maybe")
     assert wrong.status_code == 400
     assert "allowed: yes, no" in wrong.content.decode()
@@ -165,7 +165,7 @@ def test_every_count_of_failures_leads_to_its_trials_and_all_failures_are_counte
     counts = re.findall(r'<a href="([^"]+)">(\d+)</a>', part)
     for address, n in counts:
         listed = client.get(unescape(address)).content.decode()
-        assert f'Trials <span class="muted small">{n}</span>' in listed, address
+        assert f'<span class="muted">{n} trial' in listed, address
     assert {"failure=not+said", "failure_phase=grasp", "failure=%3Ddropped"} <= {
         named for address, _ in counts for named in unescape(address).partition("?")[2].split("&")
     }
@@ -178,13 +178,45 @@ def test_every_count_of_failures_leads_to_its_trials_and_all_failures_are_counte
 def test_filters_are_in_the_address_and_wrong_ones_are_named(revealed, as_, viewer):
     client = as_(viewer)
     part = client.get(f"{PLAN}?position=1").content.decode()
-    assert "Only a part of the trials" in part
+    assert "Only some of the trials" in part
     assert "/4, " in part
     wrong = client.get(f"{PLAN}?scene=none")
     assert wrong.status_code == 400
     assert "allowed: block-on-plate" in wrong.content.decode()
     assert client.get(f"{PLAN}compare/?first=pi0-new&second=nobody").status_code == 400
     assert client.get("/result/plans/blocks/7/").status_code == 404
+
+
+def test_pairs_stand_beside_each_other_with_their_last_pictures(revealed, as_, viewer):
+    Episode.objects.update(fps=30.0)
+    text = as_(viewer).get(f"{PLAN}compare/?first=pi0-new&second=pi0-block").content.decode()
+    assert text.count('class="pair-side"') == 16
+    assert text.count('data-still="12.483"') == 16  # the middle of the last of 375 rows
+    gone = Episode.objects.filter(trial__checkpoint__name="pi0-new").first()
+    preview_folder(gone.uuid).rmdir()
+    text = as_(viewer).get(f"{PLAN}compare/").content.decode()
+    assert (text.count("data-still"), text.count("no pictures here")) == (15, 1)
+    assert text.count("Replay side by side") == 8
+
+
+def test_only_what_differs_and_the_grid_are_in_the_address(revealed, as_, viewer):
+    client = as_(viewer)
+    whole = client.get(f"{PLAN}compare/").content.decode()
+    differing = int(re.search(r"8 pairs, (\d+) differ", whole)[1])
+    assert 0 < differing < 8
+    part = client.get(f"{PLAN}compare/?differs=1").content.decode()
+    assert part.count('class="pair-side"') == 2 * differing
+    assert 'href="?#pairs-head">Show all pairs' in part
+    grid = client.get(f"{PLAN}compare/?differs=1&view=grid").content.decode()
+    assert "pair-table" not in grid
+    assert grid.count('class="pair-side"') == 2 * differing
+    assert '<input type="hidden" name="view" value="grid">' in grid
+    for query, said in (
+        ("differs=yes", "differs = &#x27;yes&#x27;; allowed: 1"),
+        ("view=list", "allowed: table, grid"),
+    ):
+        answer = client.get(f"{PLAN}compare/?{query}")
+        assert (answer.status_code, said in answer.content.decode()) == (400, True)
 
 
 def test_side_by_side_lists_pairs_of_the_same_condition(revealed, as_, viewer):
@@ -194,10 +226,10 @@ def test_side_by_side_lists_pairs_of_the_same_condition(revealed, as_, viewer):
 
 
 def test_a_correction_and_a_void_are_seen_at_once(plan, owner, bench, carry_out, as_):
-    carry_out(plan, 16)
+    carry_out(plan, 15)
     client = as_(owner)
     client.post(f"{PLAN}look")
-    assert "16/16" in client.get(PLAN).content.decode()
+    assert "15/16" in client.get(PLAN).content.decode()
     before = caching.analysis_of(plan)
     assert caching.analysis_of(plan) is before
     trial = plan.handouts.first().trial
@@ -211,7 +243,7 @@ def test_a_correction_and_a_void_are_seen_at_once(plan, owner, bench, carry_out,
     after = caching.analysis_of(plan)
     assert sum(a.success.successes for a in after.arms) != sum(a.success.successes for a in before.arms)
     voids.trial_void(user=bench.operator, trial=plan.handouts.last().trial, reason="a camera had moved")
-    assert caching.analysis_of(plan).n == 15
+    assert caching.analysis_of(plan).n == 14
     Checkpoint.objects.filter(name="pi0-new").update(name="renamed")
     plan.refresh_from_db()
     assert "renamed" in {arm.checkpoint for arm in caching.analysis_of(plan).arms}
@@ -283,7 +315,7 @@ def test_queries_do_not_grow_with_trials(plan, owner, carry_out, as_):
     few = asked()
     carry_out(plan, 10)
     assert asked() == few
-    assert max(few) <= 44
+    assert max(few) <= 45
 
 
 def test_the_report_comes_as_an_archive(revealed, as_, viewer):
@@ -343,8 +375,8 @@ def test_without_pictures_nothing_is_judged(plan, carry_out, as_):
         preview_folder(episode.uuid).rmdir()
     for page in ("rate", "prefer"):
         text = client.get(f"/result/{page}/").content.decode()
-        assert "Of what is left for you there are no pictures on this machine" in text
-        assert "Passed over, without pictures on this machine" in text
+        assert "What is left for you has no pictures on this machine" in text
+        assert "Skipped, because they have no pictures on this machine" in text
     Episode.objects.update(frames=9)
     for episode in Episode.objects.all():
         journal_folder(episode.uuid).mkdir(parents=True)
@@ -379,7 +411,7 @@ def test_the_planner_answers_and_names_what_is_not_allowed(as_, viewer):
     text = client.get("/result/planner/?rate=0.5&better=0.7").content.decode()
     for word in ("fixed", "anytime", "group sequential late", "group sequential early"):
         assert word in text
-    for query in ("rate=2", "rate=x", "rate=0.5&better=0.5", "stations=0"):
+    for query in ("rate=2", "rate=x", "rate=0.5&better=0.5", "stations=0", "comparing=each"):
         wrong = client.get(f"/result/planner/?{query}")
         assert wrong.status_code == 400
         assert 'role="alert"' in wrong.content.decode()
@@ -411,3 +443,20 @@ def test_a_smoothness_that_is_measured_later_is_shown(revealed, as_, viewer):
     Episode.objects.filter(pk=missing.pk).update(smoothness=-9.0)
     after = [arm.smoothness for arm in caching.analysis_of(revealed).arms]
     assert (before.n, sorted(found.n for found in after)) == (6, [6, 7])
+
+
+def test_a_draft_says_what_a_freeze_makes_of_it(bench, owner, as_):
+    from evaweb.plans.models import Plan
+
+    draft = Plan.objects.create(name="drafted", title="Drafted", owner=owner, repetitions=3)
+    draft.checkpoints.set([bench.checkpoint])
+    draft.positions.set(bench.scene.positions.all())
+    text = as_(owner).get("/result/plans/drafted/1/").content.decode()
+    assert "0/0" not in text
+    assert "none yet: a draft" in text
+    assert "Continue this draft" in text
+    assert "/freeze/" not in text
+    steps = as_(owner).get("/result/plans/drafted/1/draft/").content.decode()
+    assert "2 positions × 3 × 1 checkpoint" in steps
+    assert "Freeze “Drafted”, version 1?" in steps
+    assert "Only an amended version changes them" in steps

@@ -1,9 +1,11 @@
 """A result that travels: what the reveal kept, as text, LaTeX and SVG, at an address that does not change."""
 
+import json
 import re
 from xml.etree import ElementTree
 
 import pytest
+from django.db import transaction
 from django.test import Client
 
 from evaweb.plans.design import at_the_reveal
@@ -13,6 +15,7 @@ from evaweb.results.presentation.citing import citation
 from evaweb.results.presentation.latex import escaped, foreign
 from evaweb.results.presentation.wording import p_words
 from evaweb.trials import services
+from evaweb.trials.models import Checkpoint, Evaluation
 from tests.evaweb.trials import builders
 
 FORMS = {"txt": "text/plain", "tex": "application/x-tex", "svg": "image/svg+xml"}
@@ -66,7 +69,7 @@ def test_letters_that_need_another_latex_are_named():
 
 
 def test_the_sentence_names_the_design_and_the_table_has_n_rate_interval_and_score(revealed):
-    cited = citation(revealed, "https://lab/x")
+    cited = citation(revealed)
     assert cited.text["sentence"].startswith(cited.sentence)
     assert cited.sentence.startswith(("pi0-new succeeded more often than", "No significant difference"))
     assert "Design: fixed, one test at the end, 8 pairs foreseen, alpha 0.05" in cited.text["sentence"]
@@ -82,14 +85,14 @@ def test_the_sentence_names_the_design_and_the_table_has_n_rate_interval_and_sco
 
 
 def test_the_figure_needs_nothing_beside_it(revealed):
-    svg = citation(revealed, "https://lab/x").svg
+    svg = citation(revealed).svg
     root = ElementTree.fromstring(svg)
     tags = {each.tag.removeprefix("{http://www.w3.org/2000/svg}") for each in root.iter()}
     assert tags <= {"svg", "title", "desc", "rect", "g", "text", "path"}
     assert not any({"class", "style", "href", "id"} & set(each.attrib) for each in root.iter())
     colours = {each.get(name) for each in root.iter() for name in ("fill", "stroke")} - {None, "none"}
     assert all(re.fullmatch(r"#(\w\w)\1\1", colour) for colour in colours)
-    assert svg == citation(revealed, "https://lab/x").svg
+    assert svg == citation(revealed).svg
 
 
 def test_what_is_corrected_later_changes_no_byte(revealed, bench, client, address):
@@ -108,9 +111,62 @@ def test_what_is_corrected_later_changes_no_byte(revealed, bench, client, addres
     page = client.get(address).content.decode()
     assert "Scores were corrected after the reveal" in page
     assert told["headline"] in page
-    assert (told["digest"], told["pairs"]) == (revealed.at_reveal["digest"], revealed.at_reveal["pairs"])
+    assert (told["digest"], told["blocks"]) == (revealed.at_reveal["digest"], revealed.at_reveal["blocks"])
     assert told["key"] == bytes(revealed.key).hex()
     assert told["later"] == "/api/v1/plans/blocks/1/integrity"
+
+
+def test_neither_the_labs_name_nor_that_of_who_revealed_changes_it(
+    revealed, owner, client, address, settings
+):
+    settings.ALLOWED_HOSTS = ["*"]
+    digest = revealed.at_reveal["digest"]
+    places = [*(f"{address}result.{form}" for form in FORMS), f"/api/v1/results/frozen/{digest}"]
+    before = [client.get(place).content for place in places]
+    assert f"digest {digest}: {address}\n" in before[0].decode()
+    owner.username = "olga-married"
+    owner.save()
+    assert [client.get(place, HTTP_HOST="other.lab:9999").content for place in places] == before
+    assert client.get(places[-1]).json()["revealed_by"] == "olga"
+
+
+def test_what_is_cited_is_of_the_first_reveal_whatever_backup_was_put_back(owner, bench, client, carry_out):
+    new = Checkpoint.objects.create(name="pi0-new", policy={})
+    draft = Plan.objects.create(
+        name="back", title="Back", owner=owner, repetitions=1, first=new, second=bench.checkpoint
+    )
+    draft.checkpoints.set([new, bench.checkpoint])
+    draft.positions.set(bench.scene.positions.all())
+    with transaction.atomic():
+        plan = plan_freeze(user=owner, plan=Plan.objects.get(pk=draft.pk))
+        carry_out(plan, 4)
+        first = plan_reveal(user=owner, plan=plan)
+        digest = first.at_reveal["digest"]
+        places = [f"/api/v1/results/frozen/{digest}"]
+        places += [f"/result/frozen/{digest}/result.{form}" for form in FORMS]
+        shown = [client.get(place).content for place in places]
+        transaction.set_rollback(True)  # the backup is from before it was frozen
+    Evaluation.objects.create(name="back", version=1)  # as the trials on the disk make it
+    root = builders.user("root", "admin")
+    plan = plan_freeze(user=root, plan=Plan.objects.get(pk=draft.pk))
+    again = plan_reveal(user=root, plan=plan)
+    assert (again.at_reveal, again.key == first.key) == (first.at_reveal, False)
+    assert [client.get(place).content for place in places] == shown
+    told = json.loads(shown[0])
+    assert (told["key"], told["revealed_by"]) == (bytes(first.key).hex(), "olga")
+    page = client.get(f"/result/frozen/{digest}/").content.decode()
+    assert told["key"] in page
+    assert told["commitment"] in page
+    assert again.commitment not in page
+
+
+def test_a_reveal_from_before_its_key_was_kept_is_cited_with_the_plans_own(revealed):
+    kept = {
+        name: value for name, value in revealed.at_reveal.items() if name not in ("by", "commitment", "key")
+    }
+    told = citation(revealed).document
+    revealed.at_reveal = kept
+    assert citation(revealed).document == told
 
 
 def test_a_correction_of_points_alone_is_said_too(revealed, bench, client, address):
@@ -198,7 +254,8 @@ def test_a_p_below_all_that_is_told_has_one_sign():
 
 
 def test_a_reveal_that_kept_its_pairs_alone_is_cited_by_them(revealed):
-    revealed.at_reveal = {name: revealed.at_reveal[name] for name in ("pairs", "digest", "at")}
-    rows = {row.checkpoint: row.cells for row in citation(revealed, "https://lab/x").rows}
+    pairs = [[value for _, value in sorted(block)] for block in revealed.at_reveal["blocks"]]
+    revealed.at_reveal = {"pairs": pairs, **{name: revealed.at_reveal[name] for name in ("digest", "at")}}
+    rows = {row.checkpoint: row.cells for row in citation(revealed).rows}
     assert rows["pi0-new"][1:3] == ("8", "6")
     assert rows["pi0-new"][4] == "–"

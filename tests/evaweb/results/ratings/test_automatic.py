@@ -12,7 +12,7 @@ from evaweb.episodes.publishing import success_of
 from evaweb.episodes.reconcile import reconcile
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job, JobStatus
-from evaweb.jobs.services import work
+from evaweb.jobs.services import cancel, try_again, work
 from evaweb.plans.models import Plan, PlanEvent
 from evaweb.plans.services import plan_reveal
 from evaweb.results import job_kinds
@@ -23,7 +23,7 @@ from evaweb.results.ratings import automatic, judging
 from evaweb.results.ratings.stills import CAMERAS, OF_EACH, sample, stills_of
 from evaweb.results.reports.reporting import numbers_of
 from evaweb.results.reports.tables import outcome_pages
-from evaweb.trials import services, voids
+from evaweb.trials import services
 from evaweb.trials.models import Milestone, Score, Trial
 from tests.evaweb.results.judges.server import http, message, said, serving
 from tests.evaweb.trials import builders
@@ -44,12 +44,19 @@ def admin(db):
     return builders.user("alma", "admin")
 
 
+@pytest.fixture(scope="module")
+def filming(tmp_path_factory):
+    made = tmp_path_factory.mktemp("filming") / "top.mp4"
+    movie(made, pictures=12)
+    return made.read_bytes()
+
+
 @pytest.fixture
-def filmed(plan, carry_out):
+def filmed(plan, carry_out, filming):
     """A plan carried out and not revealed, of whose trials there are videos of one camera."""
     carry_out(plan, 16)
     for handout in plan.handouts.all():
-        movie(preview_folder(handout.trial.episode_id) / "top.mp4", pictures=12)
+        (preview_folder(handout.trial.episode_id) / "top.mp4").write_bytes(filming)
     return plan
 
 
@@ -87,7 +94,7 @@ def chat(admin):
 
 def asked(plan, owner, name):
     automatic.judge_ask(user=owner, plan=plan, name=name)
-    work("lab")
+    work("gpu")
     return Job.objects.filter(kind="judge").order_by("-pk").first()
 
 
@@ -186,12 +193,12 @@ def test_a_server_that_was_never_allowed_or_moved_since_is_not_spoken_to(filmed,
         with serving(SAID) as other:
             automatic.judge_ask(user=owner, plan=filmed, name="seer")
             AutomaticJudge.objects.update(address=other.address)
-            work("lab")
+            work("gpu")
             assert other.heard == []
         AutomaticJudge.objects.update(address=server.address)
         automatic.judge_forbid(user=admin, judge=judge)
         Job.objects.update(not_before=None)
-        work("lab")
+        work("gpu")
         assert server.heard == []
     job = Job.objects.get(kind="judge")
     assert (job.attempts, "is not allowed" in job.error) == (2, True)
@@ -232,6 +239,14 @@ def test_who_may_allow_and_who_may_ask(truth, owner, admin, bench, chat):
     assert [one.name for one in automatic.judges_ready()] == ["truth"]
 
 
+def test_who_may_not_ask_a_judge_does_not_repeat_what_was_asked(truth, owner, admin, bench):
+    job = automatic.judge_ask(user=owner, plan=truth, name="truth")
+    cancel(user=owner, job=job)
+    with pytest.raises(NotAllowed, match="this needs an admin"):
+        try_again(user=bench.operator, job=job)
+    assert try_again(user=admin, job=job).status == JobStatus.QUEUED
+
+
 def test_each_trial_is_shown_to_a_version_once_however_often_it_is_asked_or_dies(
     filmed, owner, chat, monkeypatch
 ):
@@ -262,7 +277,7 @@ def test_a_judge_that_fails_itself_keeps_nothing_and_is_named_by_the_job(filmed,
         assert (server.heard, Judgement.objects.count()) == ([], 0)
         monkeypatch.setenv("EVA_JUDGE_KEY", "sk-1")
         Job.objects.update(not_before=None)
-        work("lab")
+        work("gpu")
     assert Judgement.objects.count() == 16
 
 
@@ -283,7 +298,7 @@ def test_a_trial_that_counts_no_longer_when_the_answer_comes_is_not_judged(filme
     first = filmed.handouts.order_by("number").first().trial
 
     def shown(episode):
-        voids.trial_void(user=bench.operator, trial=first, reason="the camera had moved")
+        Trial.objects.filter(pk=first.pk).update(status="voided")
         return stills_of(episode)
 
     monkeypatch.setattr(automatic, "stills_of", shown)
@@ -367,7 +382,7 @@ def test_before_the_reveal_it_works_and_nobody_sees_what_it_says(filmed, owner, 
         assert "Ask this judge" in client.get(page).content.decode()
         answer = client.post(reverse("result-judge", args=["blocks", 1]), {"judge": "seer"})
         assert (answer.status_code, answer["Location"]) == (302, page)
-        work("lab")
+        work("gpu")
     assert Judgement.objects.count() == 16
     for user in (owner, admin, bench.operator):
         client.force_login(user)

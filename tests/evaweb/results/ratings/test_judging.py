@@ -9,11 +9,12 @@ from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.blinding_rules import look
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
-from evaweb.results.analysis.agreement import agreement_of, preferences_of
-from evaweb.results.models import Preference, Rating
+from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
+from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.ratings import judging
 from evaweb.trials import services
-from evaweb.trials.models import Checkpoint
+from evaweb.trials.corrections import trial_failure
+from evaweb.trials.models import Checkpoint, Milestone
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import unguarded
 
@@ -94,6 +95,29 @@ def test_a_clock_that_was_set_back_leaves_the_first_score(plan, carry_out, rater
         judging.rate(user=rater, plan=plan, code=trial.handout.code, milestones=bench.ticks(True, True, True))
         Rating.objects.update(at=trial.verdict.scored_at - timedelta(hours=1))
     assert agreement_of(plan)["success"]["same"] == trial.verdict.success
+
+
+@pytest.fixture
+def held_twice(bench):
+    """Two milestones of the same words, as in scenes from before they were refused."""
+    Milestone.objects.filter(scene=bench.scene, text="lifted").update(text="held")
+
+
+def test_milestones_of_the_same_words_are_held_each_against_itself(held_twice, plan, carry_out, rater, bench):
+    carry_out(plan, 16)
+    trial = judging.to_rate(rater).found.trial
+    ticks = bench.ticks(*(row.reached for row in trial.verdict.outcomes.all()))
+    judging.rate(user=rater, plan=plan, code=trial.handout.code, milestones=ticks)
+    said = [[row.text, row.reached, float(row.reached)] for row in trial.verdict.outcomes.all()]
+    Judgement.objects.create(trial=trial, judge="seer", version="1", milestones=said)
+    found, (judge,) = agreement_of(plan)["milestones"], judges_of(plan)
+    assert {text: (row["n"], row["same"]) for text, row in found.items()} == {
+        "held": (1, 1),
+        "held (2)": (1, 1),
+        "on the plate": (1, 1),
+    }
+    assert list(judge["milestones"]) == list(found)
+    assert (judge["calibration"]["n"], judge["calibration"]["brier"]) == (3, 0)
 
 
 def test_who_must_not_rate_is_told_why(plan, owner, carry_out, bench, rater):
@@ -219,7 +243,7 @@ def test_what_has_no_pictures_is_passed_over_and_named(plan, carry_out, rater, b
     assert judging.to_rate(rater).found is None  # it is empty
     Episode.objects.filter(pk=first.trial.episode_id).update(frames=100)  # its preview may come yet
     assert judging.to_rate(rater)[::2] == (first, ())
-    with pytest.raises(Conflict, match=f"nobody can judge {first.code}: There is no preview of it yet"):
+    with pytest.raises(Conflict, match=f"nobody can judge {first.code}: There is no preview yet"):
         judging.rate(user=rater, plan=plan, code=first.code, milestones=bench.ticks(True, True, True))
     assert Rating.objects.count() == 0
 
@@ -264,3 +288,32 @@ def test_a_name_or_a_note_that_cannot_be_kept_is_refused(plan, carry_out, rater,
         judging.rate(**said, failure="a\x00b")
     with pytest.raises(EvaError, match="'missed' but the trial is a success"):
         judging.rate(**said, failure="missed")
+
+
+def test_who_may_be_asked_to_rate_a_trial_rates_it_before_they_say_why_it_failed(
+    plan, carry_out, rater, bench
+):
+    carry_out(plan, 16)
+    sample = judging.sample_of(plan)
+    failed = plan.handouts.filter(trial__verdict__success=False)
+    other = failed.exclude(slot__index__in=sample).first()
+    asked = failed.filter(slot__index__in=sample).first()
+    trial_failure(user=rater, trial=other.trial, failure="slid")  # nobody rates it again
+    with pytest.raises(NotAllowed, match="that may be you: rate it first"):
+        trial_failure(user=rater, trial=asked.trial, failure="slid")
+    form = {"user": rater, "trial": asked.trial, "reason": "not dropped"}
+    as_scored = dict(asked.trial.verdict.outcomes.values_list("milestone_id", "reached"))
+    with pytest.raises(NotAllowed, match="that may be you: rate it first"):
+        services.trial_score(**form, milestones=as_scored, failure="slid")
+    trial_failure(user=bench.operator, trial=asked.trial, failure="fell")  # who ran it is not asked
+    assert judging.to_rate(rater).left == len(sample)
+    judging.rate(user=rater, plan=plan, code=asked.code, milestones=bench.ticks(True, False, False))
+    assert trial_failure(user=rater, trial=asked.trial, failure="slid").rater == rater
+
+
+def test_a_trial_without_pictures_is_asked_of_nobody_and_its_failure_corrected_by_anybody(
+    plan, carry_out, rater
+):
+    carry_out(plan, 16, pictures=False)
+    failed = plan.handouts.filter(trial__verdict__success=False, slot__index__in=judging.sample_of(plan))
+    assert trial_failure(user=rater, trial=failed.first().trial, failure="slid").failure == "slid"

@@ -5,6 +5,7 @@ import random
 
 import pytest
 
+from evaweb.results.analysis.agreement import agreement, by_words
 from evaweb.results.analysis.analysis import analyse
 from evaweb.results.analysis.outcomes import Interruption, Outcome
 from evaweb.results.reports.document import analysis_document
@@ -41,6 +42,8 @@ def outcomes(checkpoints, n, scenes, seed):
                     labels=("one", "two", "three"),
                     smoothness=-chance.uniform(2, 9) if chance.random() < 0.8 else None,
                     commanded=-3.0 if name == 0 else -chance.uniform(2, 9),
+                    operator=chance.choice(("ann", "bob")),
+                    station=f"bench-{scene}",
                     failure_phase="" if ok else chance.choice(["", "grasp", "place"]),
                 )
             )
@@ -52,6 +55,7 @@ def as_rows(runs):
         Trial(
             r.order,
             r.block,
+            r.order,
             r.checkpoint,
             r.scene,
             r.position,
@@ -64,6 +68,8 @@ def as_rows(runs):
             r.smoothness,
             r.commanded,
             r.failure_phase,
+            r.operator,
+            r.station,
         )
         for r in runs
     ]
@@ -75,15 +81,15 @@ def as_rows(runs):
 )
 def test_both_ways_come_to_the_same(checkpoints, n, scenes, seed):
     runs = outcomes(checkpoints, n, scenes, seed)
-    primary = ("c0", "c1") if checkpoints > 1 else None
+    planned = {1: [], 4: [("c3", "c0"), ("c1", "c0")]}.get(checkpoints, [("c0", "c1")])
     broken = [Interruption(9000, "c0", "s0", 1, 12.5)]
     limits = {} if seed == 2 else {f"s{scene}": 25.0 + 10 * scene for scene in range(1, scenes)}
-    analysis = analyse(runs, broken, primary=primary, limits=limits)
+    analysis = analyse(runs, broken, planned=planned, limits=limits)
     shown = json.loads(json.dumps(analysis_document(analysis)))
-    rows = [*as_rows(runs), Trial(9000, "x", "c0", "s0", 1, "interrupted", False, 0.0, 12.5, "", ())]
+    rows = [*as_rows(runs), Trial(9000, "x", 0, "c0", "s0", 1, "interrupted", False, 0.0, 12.5, "", ())]
     plan = {
         "stopping": {"alpha": 0.05},
-        "comparison": list(primary) if primary else None,
+        "comparisons": planned,
         "scenes": [{"name": f"s{scene}", "time_limit_s": limits.get(f"s{scene}")} for scene in range(scenes)],
     }
     wrong = [(where, problem) for where, problem in differences(shown, numbers(rows, plan), "") if problem]
@@ -110,6 +116,9 @@ def test_preferences_come_to_the_same(seed):
     assert (mine["tie"], mine["order"], mine["order_z"]) == pytest.approx(
         (lab.tie, lab.order, lab.order_z), abs=1e-6
     )
+    same = [(name, name, "tie", 1.0) for name in names]  # two trials of one checkpoint, in random order
+    assert judged.preferences(rows + same) == mine
+    assert judged.preferences(same) is None
 
 
 @pytest.mark.parametrize(
@@ -133,6 +142,25 @@ def test_agreement_comes_to_the_same():
     assert mine["kappa"] == pytest.approx(cohen_kappa(pairs))
     assert mine["ac1"] == pytest.approx(gwet_ac1(pairs))
     assert mine["alpha"] == pytest.approx(krippendorff_alpha([[float(a), float(b)] for a, b in pairs]))
+
+
+def test_neither_takes_one_word_for_agreement():
+    same = [(True, True)] * 9
+    shown = agreement(same)
+    assert (shown["kappa"], shown["ac1"], shown["alpha"]) == (None, 1.0, None)
+    assert not any(problem for _, problem in differences(shown, judged.agreement(same), ""))
+    against = [(True, False)] * 9
+    assert not any(problem for _, problem in differences(agreement(against), judged.agreement(against), ""))
+    assert (judged.score_alpha([(0.5, 0.5)] * 9), judged.score_alpha([(0.5, 0.5), (1.0, 1.0)])) == (None, 1.0)
+
+
+def test_milestones_of_the_same_words_are_told_apart_by_both():
+    said = [("held", 1), ("held (2)", 2), ("held", 3), ("on the plate", 4)]
+    assert (
+        by_words(said)
+        == judged.by_words(said)
+        == {"held": 1, "held (2)": 2, "held (3)": 3, "on the plate": 4}
+    )
 
 
 def test_letters_and_holm_come_to_the_same():

@@ -7,18 +7,25 @@ import sys
 import pytest
 from django.core.management import CommandError, call_command
 
+from evaweb.errors import Conflict
 from evaweb.plans import pictures
+from evaweb.plans.allocation import hand_out
 from evaweb.plans.canonical import digest
 from evaweb.plans.models import Achieved, Plan, Reference
+from evaweb.plans.services import plan_freeze, plan_reveal
 from evaweb.results.analysis.agreement import comparisons_of
 from evaweb.results.analysis.caching import analysis_of
 from evaweb.results.models import Judgement
+from evaweb.results.presentation.headline import headline
 from evaweb.results.ratings import judging
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.recompute.sealed import faults
 from evaweb.results.reports.reporting import seal_of, write_report
 from evaweb.trials import services
+from evaweb.trials.corrections import trial_failure
+from evaweb.trials.models import Checkpoint
 from tests.evaweb.plans.lab import jpeg
+from tests.evaweb.played import played
 from tests.evaweb.trials import builders
 
 
@@ -30,9 +37,17 @@ def recompute(folder):
 
 @pytest.fixture
 def report(revealed, tmp_path, bench):
+    played("report", lambda: _reported(revealed, tmp_path, bench))
+    return tmp_path / "report"
+
+
+def _reported(revealed, tmp_path, bench):
     rater = builders.user("rita")
     for index, handout in enumerate(revealed.handouts.filter(slot__index__in=judging.sample_of(revealed))):
-        milestones = bench.ticks(True, True, index % 2 == 0)
+        last = (
+            index % 2 == 0 if index else not handout.trial.scores.latest("pk").success
+        )  # which trials they are is drawn: one differs
+        milestones = bench.ticks(True, True, last)
         judging.rate(user=rater, plan=revealed, code=handout.code, milestones=milestones)
     for index in range(8):
         pair, _ = judging.to_prefer(rater, [revealed])[:2]
@@ -46,7 +61,6 @@ def report(revealed, tmp_path, bench):
     for number, handout in enumerate(revealed.handouts.order_by("number")):
         judged_by_machine(handout.trial, number)
     call_command("eval_report", "blocks", "--out", str(tmp_path / "report"))
-    return tmp_path / "report"
 
 
 def judged_by_machine(trial, number):
@@ -164,7 +178,7 @@ def forged(report, change):
     """What the program says of a seal whose reveal was changed, with a digest that fits."""
     data = report / "data"
     seal, plan = (json.loads((data / name).read_text("utf-8")) for name in ("seal.json", "plan.json"))
-    held = {name: seal["at_reveal"][name] for name in ("pairs", "arms")}
+    held = {name: seal["at_reveal"][name] for name in ("blocks", "arms")}
     change(held)
     seal["at_reveal"] |= {**held, "digest": digest({"plan": digest(plan), **held})}
     (data / "seal.json").write_text(json.dumps(seal), "utf-8")
@@ -172,8 +186,11 @@ def forged(report, change):
 
 
 def test_pairs_of_the_reveal_that_were_forged_with_their_digest_are_found(report):
-    said = forged(report, lambda held: held.update(pairs=[[two, one] for one, two in held["pairs"]]))
-    assert "the pairs of the reveal are not those of the scores that stood then" in said
+    said = forged(
+        report,
+        lambda held: held.update(blocks=[[[1 - arm, v] for arm, v in block] for block in held["blocks"]]),
+    )
+    assert "the blocks of the reveal are not those of the scores that stood then" in said
 
 
 def test_sums_of_the_reveal_that_were_forged_with_their_digest_are_found(report):
@@ -183,6 +200,93 @@ def test_sums_of_the_reveal_that_were_forged_with_their_digest_are_found(report)
     said = forged(report, change)
     assert "the sums of pi0-block at the reveal are not those of the scores that stood then" in said
     assert "sums of pi0-new" not in said
+
+
+@pytest.mark.parametrize("gone", ["at_reveal", "blocks", "arms"])
+def test_a_reveal_that_was_taken_out_is_missed(report, gone):
+    path = report / "data" / "seal.json"
+    seal = json.loads(path.read_text("utf-8"))
+    if gone == "at_reveal":
+        seal["at_reveal"] = None
+    else:
+        held = {name: seal["at_reveal"][name] for name in ("blocks", "arms") if name != gone}
+        plan = json.loads((report / "data" / "plan.json").read_text("utf-8"))
+        seal["at_reveal"] = {
+            **held,
+            "at": seal["at_reveal"]["at"],
+            "digest": digest({"plan": digest(plan), **held}),
+        }
+    path.write_text(json.dumps(seal), "utf-8")
+    found = recompute(report)
+    assert found.returncode == 1
+    said = found.stdout + found.stderr
+    assert "the reveal kept no" in said or ("contradict each other" in said and "blocks" not in held)
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    ("name", "broken", "said"),
+    [
+        ("trials.csv", lambda text: text[: len(text) // 2].rpartition(",")[0], "trials.csv: row"),
+        ("scores.csv", lambda text: text.rstrip("\n") + ",,,\n", "scores.csv: row"),
+        ("scores.csv", lambda text: text + "1," + "x" * 140_000 + "\n", "field larger than field limit"),
+        ("ratings.csv", None, "a file of data/ cannot be read"),
+        (
+            "plan.json",
+            lambda text: json.dumps({**json.loads(text), "stopping": None}),
+            "contradict each other",
+        ),
+        ("numbers.json", lambda text: "[" * 100_000, "contradict each other"),
+    ],
+)
+def test_what_is_broken_is_told_in_a_sentence(report, name, broken, said):
+    path = report / "data" / name
+    if broken is None:
+        path.unlink()
+    else:
+        path.write_text(broken(path.read_text("utf-8")), "utf-8")
+    found = recompute(report)
+    assert (found.returncode, "Traceback" in found.stderr) == (1, False)
+    assert said in found.stdout
+
+
+def test_letters_are_those_of_a_plan_that_compared_all(bench, owner, tmp_path):
+    three = [
+        bench.checkpoint,
+        *(Checkpoint.objects.create(name=name, policy={}) for name in ("pi0-new", "pi0-z")),
+    ]
+    drafted = Plan.objects.create(
+        name="three",
+        title="Three",
+        owner=owner,
+        repetitions=8,
+        stopping="evidence",
+        comparing="all",
+        drop_arms=True,
+    )
+    drafted.checkpoints.set(three)
+    drafted.positions.set(bench.scene.positions.all())
+    plan = plan_freeze(user=owner, plan=drafted)
+    while plan.state == "frozen":
+        try:
+            trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+        except Conflict:
+            break
+        builders.over(trial, 9.0)
+        ok = trial.checkpoint.name == "pi0-new" or (
+            trial.checkpoint.name == "pi0-z" and trial.number % 2 == 0
+        )
+        services.trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, ok, ok))
+        plan.refresh_from_db()
+    plan_reveal(user=owner, plan=Plan.objects.get(pk=plan.pk))
+    plan.refresh_from_db()
+    call_command("eval_report", "three", "--out", str(tmp_path / "report"))
+    path = tmp_path / "report" / "data" / "numbers.json"
+    numbers = json.loads(path.read_text("utf-8"))
+    assert numbers["letters"] == dict(headline(plan).letters)
+    assert recompute(tmp_path / "report").returncode == 0
+    path.write_text(json.dumps({**numbers, "letters": dict.fromkeys(numbers["letters"], "a")}), "utf-8")
+    assert "letters.pi0-block: 'a' is shown" in recompute(tmp_path / "report").stdout
 
 
 @pytest.mark.parametrize(("column", "value"), [("success", None), ("score", "0.125"), ("trial", "99999")])
@@ -239,6 +343,25 @@ def test_the_checklist_says_what_the_record_says(revealed):
     assert kept["Every trial on record"].record == "16 of 16 trials that count have a recording"
     assert kept["A second, blind rater"].kept == "no"
     assert kept["Question and comparison before the first trial"].kept == "yes"
+
+
+def test_scores_are_kept_where_only_categories_of_failures_were_corrected(revealed, bench):
+    def kept():
+        (item,) = (
+            item
+            for item in checklist(revealed, analysis_of(revealed))
+            if item.practice == "Scores kept as they were given"
+        )
+        return item
+
+    trial = revealed.handouts.filter(trial__verdict__success=False).first().trial
+    trial_failure(user=bench.operator, trial=trial, failure="slid")
+    assert kept().kept == "yes"
+    assert kept().record.startswith("0 corrections, each a row of its own")
+    assert kept().record.endswith("failure categories alone corrected 1 times, 1 of them after the reveal")
+    ticks = bench.ticks(True, True, True)
+    services.trial_score(user=bench.operator, trial=trial, milestones=ticks, reason="on the video")
+    assert (kept().kept, kept().record[:14]) == ("no", "1 corrections,")
 
 
 REGION = {"name": "block", "at": [0.1, 0.2, 0.1, 0.1], "match": 0.41, "dx": None, "dy": None, "words": "gone"}

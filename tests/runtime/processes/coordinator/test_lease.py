@@ -146,3 +146,26 @@ def test_who_holds_it_keeps_it_until_it_ends_unless_a_higher_epoch_or_its_own_wo
         gave_up = act == "give_up" and (holder, epoch) == (before.holder, before.epoch)
         taken = act == "claim" and epoch > before.epoch
         assert gave_up or taken
+
+
+def test_a_lease_is_lost_only_by_silence(lease):
+    assert not lease.lost(10.0)
+    lease.claim("anna", 0, 10.0)
+    assert not lease.lost(14.9)
+    assert lease.lost(15.0)
+    lease.claim("anna", 0, 20.0)
+    lease.give_up("anna", 2, 21.0)
+    assert not lease.lost(30.0)
+
+
+def test_a_lease_whose_page_was_hidden_last_is_not_lost(lease):
+    lease.claim("anna", 0, 10.0)
+    lease.hide("ben", 1, 11.0)
+    assert lease.lost(15.0)
+    lease.claim("anna", 0, 20.0)
+    lease.hide("anna", 2, 21.0)
+    assert not lease.lost(25.0)
+    lease.claim("anna", 0, 30.0)
+    lease.hide("anna", 3, 31.0)
+    lease.renew("anna", 3, 32.0)
+    assert lease.lost(37.0)

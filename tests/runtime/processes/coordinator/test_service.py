@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from uuid import uuid4
 import pytest
 import zmq
 
-from runtime.ipc.bus import GREEDY, Endpoints, Key
+from runtime.ipc.bus import GREEDY, Endpoints, Key, Subscriber
 from runtime.ipc.messages import Ack, Command, decode, encode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
@@ -230,3 +231,47 @@ def test_a_press_whose_uuid_was_anothers_is_pressed(bench: Bench) -> None:
     press = Command(stop.uuid, "estop", user="ann", holder=PAGE)
     assert bench.ask(bench.client(), press).status == "accepted"
     assert bench.coordinator.shared.estop is EStop.LATCHED
+
+
+def test_streams_that_nobody_reads_are_not_made_and_who_begins_to_read_has_them_at_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+    monkeypatch.setattr(bench.service, "_poses", lambda: made.append("poses") or {"poses": 1})
+    monkeypatch.setattr(bench.service, "_joints", lambda: made.append("joints") or {"joints": 1})
+    for _ in range(3):
+        bench.service.serve(0.0)
+        bench.station.go(10)
+    assert made == []
+    assert bench.service.until_due() == float("inf")
+    where = Endpoints(bench.folder).read("coordinator")["state"]
+    with closing(Subscriber(bench.context, where, "poses", "state")) as reader:
+        found: dict[str, Any] = {}
+        for _ in range(PATIENCE):
+            bench.service.serve(0.01)
+            found |= reader.receive(0.0)
+            if len(found) == 2:
+                break
+        assert found["poses"] == {"poses": 1}
+        assert found["state"]["state"] == str(bench.coordinator.session.state)
+        assert bench.service.until_due() < 0.1
+    assert set(made) == {"poses"}
+
+
+def test_a_station_rests_until_somebody_can_command_it_or_something_goes_on(bench: Bench) -> None:
+    bench.station.reach(SessionState.IDLE)
+    now, lease = bench.coordinator.people.now(), bench.coordinator.lease
+    held = lease.current(now)  # by who plays the operator in lockstep
+    assert held is not None
+    assert not bench.coordinator.rests
+    assert lease.give_up(held.holder, held.epoch, now) == ""
+    assert bench.coordinator.rests
+    epoch = lease.epoch + 1
+    claim = Command(str(uuid4()), "lease_claim", user="ann", holder=PAGE, epoch=epoch, role="operator")
+    assert bench.ask(bench.client(), claim, signed=True).status == "accepted"
+    assert not bench.coordinator.rests
+    give_up = replace(claim, uuid=str(uuid4()), kind="lease_give_up")
+    assert bench.ask(bench.client(), give_up, signed=True).status == "accepted"
+    assert bench.coordinator.rests
+    bench.station.running(5)
+    assert not bench.coordinator.rests

@@ -23,6 +23,16 @@ class Looking:
         self.previews, self._dim = Previews(made), made.robot.dim
         self._socket, self.previews._publisher = self.previews._publisher, self  # type: ignore[assignment]
         self._shown: list[tuple[str, bytes]] = []
+        self.topics = {"camera/"}
+        self.begun: list[str] = []
+
+    def hear(self) -> list[str]:
+        begun, self.begun = self.begun, []
+        self.topics.update(begun)
+        return begun
+
+    def wanted(self, stream: str) -> bool:
+        return stream.startswith(tuple(self.topics))
 
     def publish(self, stream: str, jpeg: bytes) -> None:
         self._shown.append((stream, jpeg))
@@ -74,3 +84,23 @@ def test_one_that_only_stands_in_further_observations_is_not_shown_again(looking
 def test_more_than_are_wanted_are_not_shown(looking: Looking) -> None:
     shown = [len(looking.seen(1.0 + number / 30, 1.0 + number / 30)) for number in range(8)]
     assert shown == [1, 0, 1, 0, 1, 0, 1, 0]
+
+
+def test_what_nobody_looks_at_is_not_made_and_who_begins_to_look_sees_it_at_once(
+    looking: Looking, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looking.topics = set()
+    with monkeypatch.context() as broken:
+        broken.delattr(simplejpeg, "encode_jpeg")
+        assert looking.seen(1.0, 1.0) == []
+        assert not looking.previews.wanted()
+    looking.begun = ["camera/cam_high"]
+    assert looking.previews.wanted()
+    assert len(looking.seen(1.001, 1.0)) == 1
+
+
+def test_another_that_begins_to_look_is_shown_what_is_not_due(looking: Looking) -> None:
+    assert looking.seen(1.0, 1.0)
+    looking.begun = ["camera/cam"]
+    assert looking.seen(1.001, 1.0)
+    assert looking.seen(1.002, 1.0) == []

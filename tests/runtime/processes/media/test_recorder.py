@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -158,6 +159,16 @@ def test_a_row_has_the_observation_and_the_action_of_its_tick(desk: Desk) -> Non
     assert row.qvel is not None
     assert row.captured == {"joints": 2.0, CAMERA: 2.0}
     assert (row.pictures[CAMERA] == 2).all()
+
+
+def test_what_a_simulated_bench_says_is_in_the_rows_in_which_it_is_something_new(desk: Desk) -> None:
+    lies = {"blocks": [[0.1, 0.2, 0.02, 0.0]], "plate": [0.3, 0.1], "reset": "a"}
+    moved = {**lies, "blocks": [[0.1, 0.2, 0.05, 0.0]]}
+    for sequence, truth in enumerate((lies, lies, moved, None, moved), start=2):
+        desk.see(sequence, truth=truth)
+        desk.tick(sequence, sequence=sequence)
+    said = [row.bench and json.loads(row.bench)["blocks"][0][2] for row in desk.journal.rows]
+    assert said == [0.02, None, 0.05, None, None]
 
 
 def test_where_nothing_was_sent_the_measured_joints_are_the_action(desk: Desk) -> None:

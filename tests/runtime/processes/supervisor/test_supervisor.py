@@ -7,6 +7,7 @@ import pytest
 from runtime.config.loader import load
 from runtime.core.errors import SetupError, TransportError
 from runtime.ipc.bus import Endpoints
+from runtime.link.key_files import known_lab_path
 from runtime.processes.supervisor import supervisor
 from runtime.processes.supervisor.supervisor import Supervisor
 from runtime.station.checks import checked_spec
@@ -22,11 +23,13 @@ def started(monkeypatch):
     """What was started in place of each process, in order."""
     made = []
     real = subprocess.Popen
-    modules = {**supervisor._MODULES, "channel": "runtime.clients.channel"}
+    modules = {**supervisor._MODULES, "channel": supervisor._CHANNEL, "link": supervisor._LINK}
+    modules |= {"panel": supervisor._PANEL}
 
     class Started(real):
         commands = dict.fromkeys(
-            ("guard", "reception", "media", "control", "coordinator", "headless", "channel"), WAITS
+            ("guard", "reception", "media", "control", "coordinator", "headless", "channel", "link", "panel"),
+            WAITS,
         )
 
         def __init__(self, arguments, **options):
@@ -37,7 +40,7 @@ def started(monkeypatch):
 
     monkeypatch.setattr(supervisor.subprocess, "Popen", Started)
     monkeypatch.setattr(supervisor.signal, "signal", lambda *_: None)
-    monkeypatch.setattr(supervisor, "_POLL_S", 0.005)
+    monkeypatch.setattr(supervisor, "_LOOK_S", 0.005)
     monkeypatch.delenv("EVA_LOG_LEVEL", raising=False)
     made_commands = Started.commands
     yield made, made_commands
@@ -78,15 +81,34 @@ def test_a_family_that_gives_up_takes_its_driver_with_it(station, started):
     assert all_ended(made)
 
 
-def test_a_control_channel_that_dies_does_not_end_the_family_and_ends_with_it(tmp_path, started):
+@pytest.mark.parametrize(
+    ("companion", "setting"), [("channel", "control_channel.enabled=true"), ("panel", "panel.port=0")]
+)
+def test_a_companion_that_dies_does_not_end_the_family_and_ends_with_it(
+    tmp_path, started, companion, setting
+):
     made, commands = started
-    sets = [f'data_dir="{tmp_path}"', "control_channel.enabled=true"]
-    commands["channel"], commands["headless"] = DIES, ["sh", "-c", "sleep 0.3; exit 4"]
+    sets = [f'data_dir="{tmp_path}"', setting]
+    commands[companion], commands["headless"] = DIES, ["sh", "-c", "sleep 0.3; exit 4"]
     assert Supervisor(checked_spec(load(DEMO, sets))).run(headless=True) == 4
     names = [child.process for child in made]
-    assert names == ["guard", "reception", "media", "control", "coordinator", "channel", "headless"]
-    commands["channel"] = WAITS
+    assert names == ["guard", "reception", "media", "control", "coordinator", companion, "headless"]
+    commands[companion] = WAITS
     assert Supervisor(checked_spec(load(DEMO, sets))).run(headless=True) == 4
+    assert all_ended(made)
+
+
+def test_a_station_that_is_enrolled_meanwhile_is_linked_and_the_link_ends_with_it(tmp_path, started):
+    made, commands = started
+    spec = checked_spec(load(DEMO, [f'data_dir="{tmp_path}"']))
+    enrolled, linked = known_lab_path(spec.deployment.station_dir), tmp_path / "linked"
+    commands["link"] = ["sh", "-c", f"touch '{linked}'; exec cat"]
+    # As `python -m runtime.keys enrol` does, once the family is up; it ends when its link has begun.
+    ending = f"touch '{enrolled}'; until [ -e '{linked}' ]; do sleep 0.01; done; exit 4"
+    commands["headless"] = ["sh", "-c", ending]
+    assert Supervisor(spec).run(headless=True) == 4
+    names = [child.process for child in made]
+    assert names == ["guard", "reception", "media", "control", "coordinator", "headless", "link"]
     assert all_ended(made)
 
 

@@ -398,6 +398,46 @@ def test_every_command_needs_the_lease(kind):
     assert bench.effects.done == []
 
 
+@pytest.mark.parametrize(
+    ("state", "kind", "after"),
+    [
+        (S.RUNNING, "stop", S.READY),
+        (S.RUNNING, "halt", S.HOLDING),
+        (S.SETTING_UP, "stop", S.IDLE),
+        (S.HOLDING, "stop", S.READY),
+    ],
+)
+def test_the_panel_stops_whoever_holds_the_lease_and_does_nothing_else(state, kind, after):
+    bench = Bench(state)
+    at_the_panel = {"holder": "panel:127.0.0.1", "role": "local"}
+    assert bench.give("resume", **at_the_panel).reason == "anna holds the lease"
+    assert bench.give(kind, **at_the_panel | {"role": "operator"}).reason == "anna holds the lease"
+    assert bench.give(kind, **at_the_panel).status == "accepted"
+    assert bench.session.state is after
+
+
+def test_a_run_that_nobody_commands_takes_stops_of_everybody_and_no_other_command():
+    bench = Bench(S.RUNNING)
+    bench.clock.advance(5.0)
+    assert bench.session.observe(H.HOLDER_LOST, "nobody commands")
+    assert (bench.session.state, bench.session.reason) == (S.RUNNING, "nobody commands")
+    assert bench.effects.done == []
+    refused = {bench.give(kind, holder="ben").reason for kind in COMMANDS if kind not in STOPPING}
+    assert refused == {"nobody holds the lease: claim it first"}
+    assert bench.give("halt", holder="ben").status == "accepted"
+    assert bench.give("stop", holder="ben").reason == "nobody holds the lease: claim it first"
+
+
+def test_who_claims_a_run_that_nobody_commands_has_it_as_it_goes_on():
+    bench = Bench(S.RUNNING)
+    bench.clock.advance(5.0)
+    bench.session.observe(H.HOLDER_LOST, "nobody commands")
+    assert bench.give("lease_claim", holder="ben").status == "accepted"
+    assert (bench.session.state, bench.session.reason) == (S.RUNNING, "")
+    assert bench.give("stop").reason == "ben holds the lease"
+    assert bench.give("stop", holder="ben").status == "accepted"
+
+
 def test_of_two_commanders_only_the_newer_epoch_commands():
     bench = Bench(S.READY)
     assert bench.give("lease_claim", holder="ben", epoch=0).status == "refused"
@@ -423,6 +463,16 @@ def test_keeping_a_lease_makes_nothing_stale():
     bench.give("lease_renew")
     bench.give("lease_claim")
     assert bench.session.handle(decided).status == "accepted"
+
+
+@pytest.mark.parametrize("state", list(S))
+def test_a_hidden_page_keeps_its_lease_while_nothing_moves(state):
+    bench = Bench(state)
+    ack = bench.give("lease_renew", args={"hidden": True})
+    if state.meaning.moving:
+        assert ack.reason == "the page of the lease's holder is hidden while the robot moves"
+    assert ack.status == ("refused" if state.meaning.moving else "accepted")
+    assert bench.give("lease_renew").status == "accepted"
 
 
 def test_a_lease_can_be_claimed_by_who_knows_nothing_yet():

@@ -1,0 +1,157 @@
+"""Sentences in other languages: one that a test makes, because none ships."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from django.test import Client
+
+from evaweb import languages
+from evaweb.console.feed import History
+from evaweb.stations.runtime_client import wire_to
+from runtime.core.sentences import Pattern, fixed, told
+from runtime.processes.coordinator.session.transitions import SessionEvent
+
+STATIC = Path(__file__).parents[2] / "static"
+NODE = shutil.which("node")
+WHY = fixed("test.languages.why", "it is late")
+HELD = Pattern("test.languages.held", "{holder!r} holds it for {seconds:.1f} s, {percent:g} %: {why:.6}")
+WORDS = {
+    "test.languages.why": "es ist spät",
+    "test.languages.held": "{{{percent:g} %}} {seconds:.2f} s hält {holder!r} es, weil {why}",
+    "test.languages.wrong": "{no_such}",
+    "lease.held_by": "{holder} hat die Station",
+    "stations.leases.nobody_has": "niemand hat {station}",
+    "session.changed": "von {before} nach {after}, weil {reason}",
+    "state.disconnected": "getrennt",
+    "state.idle": "in Ruhe",
+    "state.idle.label": "in Ruhe",
+    "health.connected": "Bilder kommen an",
+    "session.not_allowed": "{command} geht nicht, solange {state} ({reason}); möglich: {allowed}",
+}
+
+
+@pytest.fixture
+def german(settings, tmp_path):
+    """A language of a folder of its own."""
+    settings.LANGUAGES_DIR = tmp_path
+    (tmp_path / "de.json").write_text(json.dumps({"name": "Deutsch", "sentences": WORDS}), "utf-8")
+    (tmp_path / "README.md").write_text("no language")
+    return languages.language("de")
+
+
+def shown_by_node(rows):
+    """How the pages' script shows each row, once that language is spoken."""
+    if NODE is None:
+        pytest.skip("Node is not installed: the page's modules are not run")
+    script = (
+        f"const s = await import({json.dumps((STATIC / 'site' / 'sentences.js').as_uri())});"
+        f"const e = await import({json.dumps((STATIC / 'console/live/event_words.js').as_uri())});"
+        "const given = JSON.parse((await import('node:fs')).readFileSync(0, 'utf8'));"
+        "const show = (row) => row.kind ? e.sentence(row) : row.sentences ? s.localized(row) : s.sentence(row);"
+        "const before = given.rows.map(show); s.speak(given.words);"
+        "console.log(JSON.stringify([before, given.rows.map(show)]));"
+    )
+    done = subprocess.run(
+        [NODE, "--input-type=module", "-e", script],
+        input=json.dumps({"rows": rows, "words": WORDS}),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        (
+            HELD(holder="ann", seconds=2.345, percent=12.5, why=WHY),
+            "{12.5 %} 2.35 s hält 'ann' es, weil es ist spät",
+        ),
+        (HELD(holder="o'neil", seconds=2, percent=3, why="so"), None),
+        (WHY, "es ist spät"),
+        (fixed("test.languages.unknown", "no words for it"), "no words for it"),
+        (Pattern("test.languages.wrong", "so {much}")(much=1), "so 1"),
+        ("a text without an id", "a text without an id"),
+    ],
+)
+def test_server_and_page_say_the_same(german, said, words):
+    here = languages.translated(said, german)
+    english, there = shown_by_node([told(said)])
+    assert english == [said]
+    if words is None:  # how each quotes a quote is its own
+        assert there[0].startswith("{3 %} 2.00 s hält")
+        assert here.startswith("{3 %} 2.00 s hält")
+    else:
+        assert (here, there[0]) == (words, words)
+    assert languages.translated(said, None) == said
+
+
+def test_files_that_are_no_language_are_not_offered(german, tmp_path, caplog):
+    (tmp_path / "fr.json").write_text("{", "utf-8")
+    (tmp_path / "it.json").write_text('{"name": "Italiano", "sentences": {"a.b": 3}}', "utf-8")
+    (tmp_path / "NO-code.json").write_text("{}")
+    assert [one.code for one in languages.offered()] == ["de"]
+    assert "fr.json" in caplog.text
+    for code in ("de", "fr", "../de", ""):
+        request = SimpleNamespace(COOKIES={languages.COOKIE: code})
+        assert (languages.chosen(request) is not None) is (code == "de")
+
+
+def test_english_alone_is_shipped_and_no_choice_is_shown(client, ann):
+    client.force_login(ann)
+    assert languages.offered() == []
+    assert b"data-language" not in client.get("/").content
+    assert client.get("/languages/de.json").status_code == 404
+
+
+def test_who_has_chosen_is_refused_in_words(german, live, ann):
+    client = Client()
+    client.force_login(ann)
+    page = client.get("/").content.decode()
+    assert 'value="de" data-language-choice' in page
+    assert 'data-languages="/languages/_.json"' in page
+    assert client.get("/languages/de.json").json() == {"name": "Deutsch", "sentences": WORDS}
+    client.cookies[languages.COOKIE] = "de"
+    assert 'data-language="de"' in client.get("/").content.decode()
+    refused = client.post(
+        f"/api/v1/stations/{live.name}/lease", {"action": "request", "page": "p1"}, "application/json"
+    )
+    said = refused.json()
+    assert (refused.status_code, said["id"]) == (409, "stations.leases.nobody_has")
+    assert said["error"] == f"nobody has {live}: take it"
+    english, there = shown_by_node([{**said, "text": said["error"]}])
+    assert (english[0], there[0]) == (said["error"], f"niemand hat {live}")
+
+
+@pytest.mark.django_db(transaction=True)
+def test_a_stations_event_refusal_and_state_are_shown_in_words(german, live, runtime, ann):
+    runtime.enter(SessionEvent.CONNECTED, fixed("health.connected", "observations arrive: set up"))
+    (event,) = wire_to(live.name).events_since(0)[1]
+    assert (event["text"], event["id"]) == (
+        "disconnected -> idle: observations arrive: set up",
+        "session.changed",
+    )
+    snapshot = wire_to(live.name).status()
+
+    english, there = shown_by_node([event, snapshot])
+    assert english[0] == "disconnected → idle: observations arrive: set up"
+    assert there[0] == "von getrennt nach in Ruhe, weil Bilder kommen an"
+    assert english[1]["reason"] == snapshot["reason"] == "observations arrive: set up"
+    assert (there[1]["reason"], there[1]["state_is"]["label"]) == ("Bilder kommen an", "in Ruhe")
+    assert there[1]["state"] == "idle"
+
+
+def test_events_of_another_version_lose_what_is_no_sentence(live, runtime):
+    runtime.say("held", "so it is")
+    row = {"number": 2, "kind": "held", "text": "x", "id": "No Id", "arguments": {"a": []}, "data": {}}
+    runtime.do(lambda: runtime.events._events.append(row))
+
+    boot, rows = wire_to(live.name).events_since(0)
+    assert [sorted(row) for row in rows][-1] == ["data", "kind", "number", "text"]
+    assert History().extended(boot, rows).rows[-1]["text"] == "x"
