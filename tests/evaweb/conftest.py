@@ -10,15 +10,16 @@ from uuid import uuid4
 import pytest
 from django.conf import settings
 from django.contrib.auth.models import Group, User
-from django.core.management.color import no_style
 from django.db import Error, connections
 from django.test import TransactionTestCase
+from pytest_django import DjangoDbBlocker
 
 from evaweb.errors import NotFound
 from evaweb.stations import commands
 from evaweb.stations.models import Command, Station
 from evaweb.trials import selectors as trial_selectors
 from tests import migrated
+from tests.evaweb.as_migrated import CHECK, AsMigrated
 from tests.evaweb.stand_in import StandIn
 from tests.evaweb.trials import builders
 
@@ -63,31 +64,32 @@ def django_db_keepdb(django_db_modify_db_settings: None) -> bool:
     return database.vendor == "sqlite"
 
 
-_NEVER_CHANGED = {
-    "django_content_type",
-    "auth_permission",
-    "trials_failureterm",
-    "reviews_segmentlabel",
-}  # of every database alike
+@pytest.fixture(scope="session")
+def django_db_setup(
+    request: pytest.FixtureRequest, django_db_setup: None, django_db_blocker: DjangoDbBlocker
+) -> Iterator[None]:
+    """After a test with transactions Django empties all tables; tests count on what migrations wrote into some."""
+    with django_db_blocker.unblock():
+        kept = AsMigrated()
 
-
-@pytest.fixture(scope="session", autouse=True)
-def _what_migrations_wrote_is_not_written_again() -> Iterator[None]:
-    """Django empties every table after a test with transactions, and then writes that again, which takes longer."""
-
-    def empty(case: type[TransactionTestCase]) -> None:
-        for name in case._databases_names(include_mirrors=False):
-            database = connections[name]
-            tables = database.introspection.django_table_names(only_existing=True, include_views=False)
-            statements = database.ops.sql_flush(no_style(), sorted(set(tables) - _NEVER_CHANGED))
-            if database.vendor == "postgresql":  # whose tables guard against being emptied, too
-                role = "SET session_replication_role = "
-                statements = [f"{role}replica", *statements, f"{role}DEFAULT"]
-            database.ops.execute_sql_flush(statements)
+    def check() -> None:
+        with django_db_blocker.unblock():
+            kept.check()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TransactionTestCase, "_fixture_teardown", empty)
+        patch.setattr(TransactionTestCase, "_fixture_teardown", lambda case: kept.empty())
+        request.config.stash[CHECK] = check
         yield
+        del request.config.stash[CHECK]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
+    """A test that left the database without what migrations wrote is named: others would fail in its place."""
+    try:
+        return (yield)
+    finally:
+        item.config.stash.get(CHECK, lambda: None)()
 
 
 def person(name: str, *groups: str) -> User:

@@ -27,7 +27,7 @@ _PEOPLE = {
     "auth_user",
     "auth_user_groups",
     "django_session",
-}  # may be others where no act made any
+}  # may be others where no act made any, but for those that its rows refer to
 _acts: dict[Hashable, list[_Act]] = defaultdict(list)
 
 
@@ -44,12 +44,14 @@ class _Act:
     before: State
     rows: Rows  # added or changed
     files: Files  # likewise
+    people: Rows  # those that `rows` refer to and that were there
 
     def fits(self, now: State) -> bool:
         """Whether it would begin as it did."""
         ours = now.rows.keys() - (_PEOPLE - self.rows.keys())
         alike = all(now.rows[table] == self.before.rows[table] for table in ours)
-        return alike and now.files == self.before.files
+        known = all(now.rows[table].items() >= rows.items() for table, rows in self.people.items())
+        return alike and known and now.files == self.before.files
 
     @transaction.atomic
     def lay_down(self) -> None:
@@ -99,7 +101,21 @@ def played(name: Hashable, act: Callable[[], object]) -> None:
     here = str(settings.DATA_DIR)
     assert here not in repr(rows), f"{name} writes the data folder of its test into a row"
     assert not [path for path, (_, told) in files.items() if told and here.encode() in told], name
-    _acts[name].append(_Act(now, rows, files))
+    _acts[name].append(_Act(now, rows, files, _people(rows, now)))
+
+
+def _people(rows: Rows, before: State) -> Rows:
+    """What of `before` these rows refer to in tables that may have others where they are laid down."""
+    found: dict[str, dict[Any, tuple[Any, ...]]] = defaultdict(dict)
+    for model in apps.get_models(include_auto_created=True):
+        for at, field in enumerate(model._meta.concrete_fields):
+            table = field.related_model._meta.db_table if field.related_model else ""
+            if table not in _PEOPLE:
+                continue
+            for row in rows.get(model._meta.db_table, {}).values():
+                if row[at] in before.rows[table]:
+                    found[table][row[at]] = before.rows[table][row[at]]
+    return found
 
 
 def state() -> State:

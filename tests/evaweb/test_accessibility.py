@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 from django.conf import settings
 from django.contrib.admin import site
-from django.core.management import call_command
 from django.test import Client
 from django.urls import reverse
 from playwright.sync_api import sync_playwright
@@ -16,7 +15,6 @@ from tests.e2e.lab import CHROMIUM, NO_CHROMIUM, browsing
 from tests.evaweb.blind_lab import Lab
 from tests.evaweb.crawling import addresses
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
-from tests.evaweb.unguarded import unguarded
 
 pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -30,9 +28,7 @@ def lab(live, runtime, ann, recorded, tmp_path, monkeypatch):  # noqa: F811
     for stage in ("handed", "running", "failed", "scored", "closed"):
         getattr(lab, stage)()
     lab.plan = plan_reveal(user=lab.owner, plan=lab.plan)
-    yield lab
-    with unguarded("plans", "trials", "results"):
-        call_command("flush", verbosity=0, interactive=False, inhibit_post_migrate=True)
+    return lab
 
 
 def pages(lab, client):

@@ -7,7 +7,6 @@ everything that the live socket sends is read. An address with a parameter that 
 from __future__ import annotations
 
 import pytest
-from django.core.management import call_command
 from django.test import Client
 from django.urls import reverse
 
@@ -35,11 +34,7 @@ def _data(settings, tmp_path, monkeypatch):
 @pytest.fixture
 def lab(live, runtime, ann, recorded, settings):  # noqa: F811
     """A frozen plan of olga's, a runtime that says secrets, a scene, and an operator."""
-    yield Lab(live, runtime, ann, recorded["finished"], settings.DATA_DIR)
-    with unguarded(
-        "plans", "trials", "results"
-    ):  # what the database refuses to remove is in the way of the next test
-        call_command("flush", verbosity=0, interactive=False, inhibit_post_migrate=True)
+    return Lab(live, runtime, ann, recorded["finished"], settings.DATA_DIR)
 
 
 STAGES = ("before", "handed", "running", "failed", "scored", "closed")

@@ -1,7 +1,10 @@
 import pytest
+from django.contrib.auth.models import Group, User
 
+from evaweb.roles import Role, role_of
 from evaweb.stations.models import Station
 from tests.evaweb.played import played, state
+from tests.evaweb.trials import builders
 
 
 @pytest.fixture(autouse=True)
@@ -63,6 +66,29 @@ def test_in_another_state_it_is_played_anew(tmp_path):
     Station.objects.update(name="other")
     played("a third act", done)
     assert sorted(Station.objects.values_list("name", flat=True)) == ["one", "other"]
+
+
+def test_where_those_are_gone_whom_it_refers_to_it_is_played_anew():
+    def done():
+        builders.user("ann", "operator")
+
+    played("of people", done)
+    User.objects.all().delete()
+    Group.objects.all().delete()
+    Group.objects.create(name="viewer")
+    played("of people", done)
+    assert role_of(User.objects.get()) is Role.OPERATOR
+
+
+def test_people_whom_it_does_not_refer_to_may_be_others():
+    def done():
+        Station.objects.create(name="one", robot="agilex_piper")
+
+    played("of nobody", done)
+    Station.objects.all().delete()
+    builders.user("somebody", "operator")
+    played("of nobody", lambda: pytest.fail("it was played again"))
+    assert Station.objects.get().name == "one"
 
 
 def test_an_act_that_removes_or_names_its_folder_is_refused(tmp_path):

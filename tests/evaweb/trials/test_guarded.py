@@ -9,7 +9,6 @@ from evaweb.episodes.models import Episode
 from evaweb.trials import lifecycle, services, voids
 from evaweb.trials.models import FailureTerm, MilestoneOutcome, Score, Trial, TrialStatus
 from tests.evaweb.trials import builders
-from tests.evaweb.unguarded import unguarded
 
 
 @pytest.fixture
@@ -44,17 +43,8 @@ def test_a_score_is_neither_changed_nor_removed(scored):
     assert Score.objects.get(trial=trial).success
 
 
-@pytest.fixture
-def emptied(transactional_db):
-    """Afterwards what the database refuses to remove is gone: it is in the way of the next test."""
-    yield
-    with unguarded("trials"):
-        Trial.objects.update(verdict=None)
-        for model in (MilestoneOutcome, Score, Trial):
-            model.objects.all().delete()
-
-
-def test_a_database_with_guarded_scores_is_brought_up_to_date_and_guarded_again(emptied):
+@pytest.mark.django_db(transaction=True)
+def test_a_database_with_guarded_scores_is_brought_up_to_date_and_guarded_again():
     score = builders.bench().scored(success=False).verdict
     call_command("migrate", "trials", "0006_void_requests", verbosity=0)
     call_command("migrate", verbosity=0)

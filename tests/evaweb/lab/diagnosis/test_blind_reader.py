@@ -3,14 +3,12 @@
 import zipfile
 
 import pytest
-from django.core.management import call_command
 
 from evaweb.blinding import sight_of
 from evaweb.lab.diagnosis import bundle
 from evaweb.plans.blinding_rules import look
 from tests.evaweb.blind_lab import NAMES, SECRETS, Lab
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
-from tests.evaweb.unguarded import unguarded
 
 pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -28,9 +26,7 @@ def lab(live, runtime, ann, recorded, settings, tmp_path):  # noqa: F811
     made = Lab(live, runtime, ann, recorded["finished"], settings.DATA_DIR)
     (tmp_path / "logs").mkdir(exist_ok=True)
     (tmp_path / "logs" / f"policy-{SECRETS[0]}.log").write_text(f"serving {SECRETS[0]}\n")
-    yield made
-    with unguarded("plans", "trials", "results"):
-        call_command("flush", verbosity=0, interactive=False, inhibit_post_migrate=True)
+    return made
 
 
 def told(folder, user):
