@@ -2,10 +2,10 @@
 
 import { config } from "../console/live/config.js";
 import { post, RequestFailed } from "../site/api.js";
+import { otherPresses } from "../site/presses.js";
 import { armWords, big, discarding, leaderWords, subject, Twice, whyNotDiscard, whyNotLabel, whyNotStart } from "./moments.js";
 import { gamepads } from "./pads.js";
 
-const ASK_MS = 4000; // for which "again to discard" stands
 const SETTLE_MS = 600; // a Start that took the place of Stop is not yet pressed by the hand that pressed Stop
 const REST_MS = 10000; // for the robot to be at rest before it is recorded again
 const QUEUE_MS = 2000;
@@ -15,7 +15,7 @@ export class CollectPanel {
   #store;
   #commands;
   #busy = "";
-  #twice = new Twice(ASK_MS);
+  #twice = new Twice(() => this.#commands.say("Not pressed again: nothing was done", "pressed"));
   #seen = ""; // the newest episode that this page knows of
   #closed = ""; // the newest that is on disk
   #older = ""; // one after which a start was pressed that did not take: it is not the newest attempt
@@ -33,6 +33,7 @@ export class CollectPanel {
     document.body.addEventListener("htmx:afterSettle", () => this.draw());
     store.on("second", () => this.#follow());
     store.on("changed", (what) => what.some((name) => OF_SESSIONS.includes(name)) && this.refresh());
+    otherPresses((target) => target.closest?.("[data-collect]"), () => this.#unasked()); // before a pedal's keys are heard
     gamepads((action) => this.#pressed(action));
     this.draw();
   }
@@ -60,6 +61,7 @@ export class CollectPanel {
     const { snapshot } = this.#store;
     const { collect } = snapshot ?? {};
     this.#notice(collect);
+    this.#twice.about(this.#asked);
     document.getElementById("collects-nothing").hidden = !snapshot || Boolean(collect);
     const task = document.querySelector("[data-session-uuid]")?.dataset.task;
     write("prompt", task ? `“${task}”` : "No session is open.");
@@ -139,16 +141,23 @@ export class CollectPanel {
     document.querySelector(place)?.click();
   }
 
+  /** Something was pressed that is none of these buttons. */
+  #unasked() {
+    this.#twice.clear();
+    this.draw();
+  }
+
   #clicked(event) {
     const button = event.target.closest("[data-collect]");
     if (!button) return;
-    const what = button.dataset.collect;
+    const { collect: what, result } = button.dataset;
+    this.#twice.about(this.#asked);
+    if (!this.#twice.asks(result ?? what)) this.#twice.clear();
     if (what === "big" && this.#kind === "run" && !("settling" in button.dataset)) this.#older = this.#episode;
     if (button.getAttribute("aria-disabled") === "true") {
       this.#commands.say(`${nameOf(button)}: ${button.title}`, "refused");
       return;
     }
-    if (!["discard", "rerecord", "label"].includes(what)) this.#twice.clear();
     const stops = what === "big" && this.#kind === "stop";
     if (this.#busy && !stops) this.#commands.say(`${nameOf(button)}: not yet, ${this.#busy} is on its way`, "refused");
     else this.#do(what, button);
@@ -181,6 +190,11 @@ export class CollectPanel {
 
   get #episode() {
     return subject(this.#store.snapshot?.collect, this.#seen);
+  }
+
+  /** What a question is about: session and episode, until that is discarded. */
+  get #asked() {
+    return [this.session, this.#episode, whyNotDiscard(this.#store.snapshot ?? {}, this.#episode)].join();
   }
 
   #give(kind, args = {}) {

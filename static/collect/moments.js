@@ -72,31 +72,39 @@ export function step(snapshot, opened) {
   return last && !last.result && !last.discarded ? "result" : "record";
 }
 
-/** Something that cannot be taken back is asked about once: true where it was asked within `forMs` before. */
+/** Something that cannot be taken back is asked about once: that stands until it is pressed again, or anything else is. */
 export class Twice {
   #what = "";
-  #until = -Infinity;
+  #about = "";
+  #forgotten;
 
-  constructor(forMs, now = () => performance.now()) {
-    this.forMs = forMs;
-    this.now = now;
+  /** `forgotten(what)` hears of a question that was not answered. */
+  constructor(forgotten) {
+    this.#forgotten = forgotten;
+  }
+
+  /** What is asked about from now on: a question about anything else is forgotten. */
+  about(subject) {
+    if (subject !== this.#about) this.clear();
+    this.#about = subject;
   }
 
   /** Whether `what` is being asked about at the moment. */
   asks(what) {
-    return this.#what === what && this.now() < this.#until;
+    return what !== "" && this.#what === what;
   }
 
   /** Press for `what`; true where that was the second time. */
   press(what) {
     const again = this.asks(what);
     this.#what = again ? "" : what;
-    this.#until = this.now() + this.forMs;
     return again;
   }
 
   /** Forget what was asked. */
   clear() {
+    const what = this.#what;
     this.#what = "";
+    if (what) this.#forgotten(what);
   }
 }

@@ -1,5 +1,6 @@
 // A gamepad at the Collect page: looked at while the page is visible, its buttons shown and changed. A pedal's key, too.
 
+import { PRESSED } from "../site/presses.js";
 import { ACTIONS, assigned, buttonName, delivered, Presses, restored, whyNotKey } from "./pad_buttons.js";
 
 const KEY = "eva-pad";
@@ -50,13 +51,11 @@ export function gamepads(press) {
   }
 
   function pressed(button) {
-    if (changing) {
-      keep(assigned(mapping, changing, button));
-      return;
-    }
-    const action = Object.keys(mapping).find((one) => mapping[one] === button);
-    part("said").textContent = `${buttonName(button, pads()[0]?.mapping)}: ${action ? ACTIONS[action].name : "does nothing"}`;
+    const action = !changing && Object.keys(mapping).find((one) => mapping[one] === button);
+    if (changing) keep(assigned(mapping, changing, button));
+    else part("said").textContent = `${buttonName(button, pads()[0]?.mapping)}: ${action ? ACTIONS[action].name : "does nothing"}`;
     if (action) press(action);
+    else window.dispatchEvent(new Event(PRESSED));
   }
 
   function keyed(event) {

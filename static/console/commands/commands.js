@@ -2,7 +2,9 @@
 
 import { post, RequestFailed } from "../../site/api.js";
 import { uuid } from "../../site/identity.js";
+import { otherPresses } from "../../site/presses.js";
 import { config } from "../live/config.js";
+import { Asking } from "./asking.js";
 import { refusal } from "./reasons.js";
 import { answered, STOPPING, Stops } from "./stops.js";
 import { verb } from "../live/words.js";
@@ -18,6 +20,7 @@ export class Commands {
   #stops;
   #newest = new Map(); // kind of a stop -> uuid of the one that was pressed last
   #unknown = ""; // uuid of the stop whose unknown outcome the line says
+  #asking = null; // the Resume that is asked again
 
   constructor(store, socket, way) {
     this.#store = store;
@@ -29,6 +32,7 @@ export class Commands {
     });
     store.on("ack", (ack) => ack.kind !== "estop" && this.acknowledged(ack));
     document.addEventListener("click", (event) => this.#clicked(event));
+    otherPresses((target) => target.closest?.('[data-command="resume"]'), () => this.#askNoMore());
     store.on(["snapshot", "link", "open", "second"], () => this.gate());
     for (const moment of ["htmx:afterSwap", "htmx:afterSettle"]) document.body.addEventListener(moment, () => this.gate());
     this.gate();
@@ -52,7 +56,8 @@ export class Commands {
     const stops = STOPPING.includes(kind);
     if (stops) this.#newest.set(kind, command.uuid);
     try {
-      const answer = await (stops ? this.#stops.give(command) : post(config.api.commands, command));
+      const answer = await (stops ? this.#stops.give(command) : kind === "resume" ? this.#ask(name, command) : post(config.api.commands, command));
+      if (!answer) return null; // another press has ended it, and it was said
       if (!stops || this.#newest.get(kind) === command.uuid) this.say(`${name}: ${answer.status}`, "accepted");
       return answer;
     } catch (error) {
@@ -60,6 +65,24 @@ export class Commands {
       if (stops && error.unknown) this.#unknown = command.uuid;
       return null;
     }
+  }
+
+  /** Give a command that is asked again while a process of the station is starting. */
+  async #ask(name, command) {
+    const { boot, sequence, epoch } = command;
+    const holds = () => {
+      const { fresh, lease, snapshot } = this.#store;
+      return fresh && lease === "mine" && this.#store.epoch === epoch && snapshot.boot === boot && snapshot.sequence === sequence;
+    };
+    this.#asking = new Asking({ holds, waits: (process) => this.say(`${name}: waiting for the process ${process}, trying again …`, "pressed") });
+    // Under a uuid of its own each time: the station answers one that it knows as it did the first time.
+    return this.#asking.answer(() => post(config.api.commands, { ...command, uuid: uuid() }));
+  }
+
+  /** Something else was pressed. */
+  #askNoMore() {
+    const refused = this.#asking?.end();
+    if (refused) this.fail(verb("resume"), refused);
   }
 
   /** The acknowledgement of a stop or pause came over the socket. */

@@ -12,6 +12,7 @@ from evaweb.stations import commands
 from evaweb.stations.models import Command, Lease, Station
 from evaweb.stations.runtime_client import NoAnswer
 from evaweb.trials.models import Checkpoint, Trial
+from runtime.processes.coordinator import operations
 from tests.evaweb.api.conftest import Rest
 from tests.evaweb.trials.builders import BOOT
 
@@ -51,6 +52,13 @@ def test_commands_answer_with_what_became_of_them(rest, bench, wire):
     wire.fault = NoAnswer("bench-1 has not answered home in time")
     status, answer = command(rest, "home")
     assert (status, answer["status"]) == (504, "unknown")
+
+
+def test_a_refusal_has_the_id_that_the_station_gave_it(rest, bench, wire):
+    wire.status_word, wire.reason = "refused", operations._FAMILY_STARTING(process="media")
+    status, answer = command(rest, "resume")
+    assert (status, answer["id"]) == (409, "operations.family_starting")
+    assert answer["arguments"] == {"process": "media"}
 
 
 def test_a_trial_goes_through_set_up_and_run(rest, bench, wire):

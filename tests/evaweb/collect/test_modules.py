@@ -85,18 +85,84 @@ def test_the_step_to_do_is_the_result_until_somebody_has_said_it() -> None:
     assert call("step", {**standing("idle"), "collect": COLLECT}, "s") == "setup"
 
 
-def test_what_cannot_be_taken_back_is_asked_once_and_not_for_long() -> None:
-    program = """
-    let now = 0;
-    const twice = new m.Twice(4000, () => now);
-    const pressed = [twice.press("discard"), twice.press("discard"), twice.press("discard")];
-    now = 5000;
-    pressed.push(twice.press("discard"), twice.press("rerecord"), twice.press("rerecord"));
-    twice.press("discard");
-    twice.clear();
-    return [...pressed, twice.press("discard")];
+def twice(body: str) -> Any:
+    """What `body` returns, and what was forgotten of the questions that it asked."""
+    return run(
+        MOMENTS,
+        "const forgotten = []; const twice = new m.Twice((what) => forgotten.push(what));"
+        f"const found = (() => {{ {body} }})(); return [found, forgotten];",
+    )
+
+
+def test_what_cannot_be_taken_back_is_asked_once_however_long_that_stands() -> None:
+    pressed = """
+    const pressed = [twice.press("discard")];
+    performance.now = () => 1e9;
+    return [...pressed, twice.asks("discard"), twice.press("discard"), twice.asks("discard"), twice.press("discard")];
     """
-    assert run(MOMENTS, program) == [False, True, False, False, False, True, False]
+    assert twice(pressed) == [[False, True, True, False, False], []]
+
+
+def test_another_question_takes_its_place() -> None:
+    pressed = 'return ["discard", "rerecord", "discard"].map((what) => twice.press(what));'
+    assert twice(pressed) == [[False, False, False], []]
+
+
+def test_after_anything_else_it_is_asked_anew() -> None:
+    pressed = 'twice.press("discard"); twice.clear(); twice.clear(); return twice.press("discard");'
+    assert twice(pressed) == [False, ["discard"]]
+
+
+def test_a_question_never_carries_over_to_another_episode_or_back() -> None:
+    pressed = """
+    twice.about("a"); twice.press("discard"); twice.about("a");
+    const stands = twice.asks("discard");
+    twice.about("b"); twice.about("a");
+    return [stands, twice.press("discard")];
+    """
+    assert twice(pressed) == [[True, False], ["discard"]]
+
+
+# Keys as keys.js has them, `d` being ours; `other` counts the presses that are somebody else's.
+WINDOW = """
+const heard = [];
+globalThis.window = {
+  addEventListener: (kind, take, options) => heard.push({ kind, take, capture: Boolean(options?.capture) }),
+};
+const tell = (kind, event) => {
+  for (const first of [true, false]) {
+    for (const one of heard) if (one.kind === kind && one.capture === first) one.take(event);
+  }
+};
+const [ours, theirs] = [{ ours: true }, { ours: false }];
+const click = (target) => tell("click", { target });
+window.addEventListener("keydown", ({ key }) => (key === "d" ? click(ours) : key === "h" && click(theirs)));
+let other = 0;
+m.otherPresses((target) => target.ours, () => (other += 1));
+const press = (key, target = theirs, repeat = false) => tell("keydown", { key, target, repeat });
+"""
+
+
+@pytest.mark.parametrize(
+    ("pressed", "others"),
+    [
+        ("press('d')", False),
+        ("click(ours)", False),
+        ("press('d'); press('d', theirs, true)", False),  # held
+        ("press('Enter', ours); click(ours)", False),
+        ("press('h')", True),
+        ("press('x')", True),
+        ("press('Escape')", True),
+        ("press('x', ours)", True),
+        ("click(ours); press('x')", True),
+        ("click(theirs)", True),
+        ("tell(m.PRESSED, {})", True),  # a pad
+    ],
+)
+def test_keys_fingers_and_pads_are_presses_and_those_of_ones_own_button_are_no_other(
+    pressed: str, others: bool
+) -> None:
+    assert run("../site/presses.js", WINDOW + pressed + "; return other > 0;") is others
 
 
 def looks(*frames: list[dict[str, Any]]) -> list[list[int]]:

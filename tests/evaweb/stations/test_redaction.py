@@ -5,6 +5,7 @@ import pytest
 from evaweb.blinding import EVERYTHING, HIDDEN
 from evaweb.stations import redaction
 from runtime.core.sentences import Pattern, identity, plain, within
+from runtime.processes.coordinator import operations
 
 LOST = Pattern("test.redaction.lost", "{url} did not answer")(url="ws://alder:8000")
 STATE = Pattern("test.redaction.state", "running -> holding: {reason}")
@@ -41,6 +42,11 @@ def test_id_and_arguments_go_with_the_text_that_they_are_of(kind, text, kept):
     # what says more than its text is no argument of that text
     more = {**row, "arguments": {**row["arguments"], "url": "ws://alder:8000"}}
     assert "alder" not in str(redaction.events([more], EVERYTHING))
+
+
+def test_a_refusal_while_a_process_is_starting_keeps_the_id_by_which_pages_ask_again():
+    starting = operations._FAMILY_STARTING(process="media")
+    assert identity(EVERYTHING.told(starting)) == identity(starting)
 
 
 def test_of_a_snapshot_those_sentences_are_left_that_are_shown_whole():

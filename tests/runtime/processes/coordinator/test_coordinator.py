@@ -175,6 +175,24 @@ def test_a_process_that_was_restarted_and_says_nothing_yet_is_not_told_to_be_sil
     station.close()
 
 
+def test_resume_is_refused_under_an_id_of_its_own_while_a_process_is_starting(tmp_path: Path) -> None:
+    station = Station(stubbed(tmp_path)).running(60)
+    station.shared.beat("media", 0.0)  # as the supervisor does before it starts one anew
+    beat = station.shared.beat
+    station.shared.beat = lambda name, now: None if name == "media" else beat(name, now)
+    station.go(3)
+    refused = station._handle("resume")
+    assert (refused.status, refused.id) == (
+        "refused",
+        "operations.family_starting",
+    )  # by which pages ask again
+    assert refused.arguments == {"process": "media"}
+    station.shared.beat = beat
+    station.go(3)
+    station.command("resume")
+    station.close()
+
+
 def test_the_snapshot_says_how_the_last_run_ended(tmp_path: Path) -> None:
     station = Station(stubbed(tmp_path, run={"duration_s": 0.5}))
     station.running(30)
