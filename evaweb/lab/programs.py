@@ -122,20 +122,20 @@ def lockstep(
     assignments: Sequence[str],
     robot: str,
     policies: Mapping[str, tuple[Sequence[str], int]],
-    bench: Sequence[str],
+    options: Sequence[str],
 ) -> Program:
     """A station, its simulated bench and its policy servers in one process on a virtual clock.
 
-    `policies`: by name, the options of each and its port, 0 for a free one; it announces their addresses. `bench`:
-    options of the bench.
+    `policies`: by name, the options of each and its port, 0 for a free one; it announces their addresses. `options`:
+    those of the bench, and --paced.
     """
     sets = [part for assignment in assignments for part in ("--set", assignment)]
     served = [
         part
-        for name, (options, port) in policies.items()
-        for part in ("--serve", shlex.join(_serving(name, robot, options, port)))
+        for name, (skill, port) in policies.items()
+        for part in ("--serve", shlex.join(_serving(name, robot, skill, port)))
     ]
-    arguments = ("-m", "runtime.sim.lockstep", deployment, *sets, *served, *bench)
+    arguments = ("-m", "runtime.sim.lockstep", deployment, *sets, *served, *options)
     return Program(f"station-{_stem(deployment)}", arguments, announces=True, patience_s=15.0)
 
 

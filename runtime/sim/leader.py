@@ -26,6 +26,7 @@ from runtime.sim.node import positive, run, start_pose
 from runtime.sim.pick_place import PickPlace, Skill
 from runtime.sim.script import Script, Waving
 from runtime.sim.sockets import address, bound
+from runtime.teleoperators.base import Leader
 from runtime.transports import zmq as node
 from runtime.transports.node_source import NodeSource
 
@@ -69,6 +70,42 @@ class SimulatedLeader:
         return msgpack_arrays.pack(
             {"t": now, "state": {name: part.astype(np.float32) for name, part in parts}}
         )
+
+
+class AttachedLeader(Leader):
+    """A simulated leader within the station's own process, for lockstep: at each observation it says where it is."""
+
+    def __init__(self, robot: Robot, clock: Clock, simulated: SimulatedLeader) -> None:
+        super().__init__(robot, clock)
+        self._simulated = simulated
+
+    @property
+    def name(self) -> str:
+        return "the simulated leader"
+
+    def connect(self) -> None:
+        """There is nothing to open."""
+
+    def see(self, observation: Observation) -> None:
+        """The bench and the robot now."""
+        now = self._clock.now()
+        self._simulated.see(observation, now)
+        self._take(self._simulated.at(now), now)
+
+    def close(self) -> None:
+        """There is nothing to release."""
+
+
+def demonstrator(
+    robot: Robot, task: str, seed: int, behaviour: str = "pick_place", start: str = "home"
+) -> SimulatedLeader:
+    """Who shows the robot the task, by the script of that behaviour; before it sees the bench at the pose `start`."""
+    rate = robot.control_rate
+    horizon = round(_HORIZON_S * rate)
+    script: Script = Waving(robot, horizon, rate, seed)
+    if behaviour == "pick_place":
+        script = PickPlace(robot, horizon, rate, Skill(seed=seed))
+    return SimulatedLeader(robot, script, task, rate, start_pose(robot, start))
 
 
 class Publishing:
@@ -132,13 +169,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     clock = MonotonicClock()
     try:
         robot = robots.load(options.robot, options.groups)
-        rate = robot.control_rate
-        horizon = round(_HORIZON_S * rate)
-        script: Script = Waving(robot, horizon, rate, options.seed)
-        if options.behaviour == "pick_place":
-            script = PickPlace(robot, horizon, rate, Skill(seed=options.seed))
         source = node.source(node.Config(sub_endpoint=options.obs_endpoint, simulated=True), robot, clock)
-        leader = SimulatedLeader(robot, script, options.task, rate, start_pose(robot, options.start_pose))
+        leader = demonstrator(robot, options.task, options.seed, options.behaviour, options.start_pose)
         publishing = Publishing(leader, source, options.endpoint, clock)
         with contextlib.closing(publishing):
             source.connect()

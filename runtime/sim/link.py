@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -30,8 +30,15 @@ class Link(Source, Sink):
     own gate, and the check of its messages.
     """
 
-    def __init__(self, node: Node, robot: Robot, clock: Clock) -> None:
-        self._node, self._clock = node, clock
+    def __init__(
+        self,
+        node: Node,
+        robot: Robot,
+        clock: Clock,
+        seen: Callable[[Observation], None] = lambda observation: None,
+    ) -> None:
+        """`seen` is given every observation too: somebody else looks at the bench."""
+        self._node, self._clock, self._seen = node, clock, seen
         self._messages = NodeMessages(robot, "bgr", frozenset(), MESSAGE_LIMIT)
         self._commands: list[bytes] = []
         self._sequence = 0
@@ -53,7 +60,7 @@ class Link(Source, Sink):
         commands, self._commands = self._commands, []
         frame = self._messages.read(self._node.exchange(commands, seconds))
         streams = ("joints", *(() if frame.eef is None else ("eef",)), *frame.pictures)
-        return Observation(
+        observation = Observation(
             sequence=self._sequence,
             arrived=now,
             captured=MappingProxyType(dict.fromkeys(streams, frame.stamp)),
@@ -62,6 +69,8 @@ class Link(Source, Sink):
             eef=frame.eef,
             truth=frame.truth,
         )
+        self._seen(observation)
+        return observation
 
     def send(self, command: RobotCommand) -> None:
         """The node obeys it when it is looked at next."""

@@ -2,7 +2,8 @@
 
 Node, bench, policy servers and station are one process and have one time; people, pages and programs find the station
 as they find any other. With the same seeds the same commands in the same order give the same course, to the tick, on
-any machine however busy it is. A run ends by itself once the bench's own truth has said success for a second.
+any machine however busy it is. A run ends by itself once the bench's own truth has said success for a second; with
+--paced, the station is no faster than life and nothing ends a run but what ends a real one.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +24,12 @@ from runtime.core import environment
 from runtime.core import logs as log
 from runtime.core.clock import Clock, VirtualClock
 from runtime.core.errors import RuntimeFault, SetupError
+from runtime.processes.coordinator.builders import make_policy
 from runtime.processes.lockstep.lockstep import Peers
 from runtime.processes.lockstep.server import ServedLockstep
 from runtime.processes.reception.process import make_source
 from runtime.sim import serve, standin, surroundings
+from runtime.sim.leader import AttachedLeader, demonstrator
 from runtime.sim.link import Link
 from runtime.sim.node import Node
 from runtime.sim.node import parser as node_parser
@@ -56,30 +60,37 @@ class Rested:
 
 
 def linked(made: StationSpec, clock: Clock, around: Surroundings, options: argparse.Namespace) -> Peers:
-    """A simulated node in this process in the place of the transport; SetupError where the deployment declares none."""
+    """A simulated node in this process in the place of the transport, and a simulated leader in that of the leader.
+
+    SetupError where the deployment declares no simulated node.
+    """
     transport = made.deployment.transport
     if not made.capabilities.resets_bench or transport.kind != "zmq":
         raise SetupError(
             f"transport.kind = {transport.kind!r} with a bench in lockstep; allowed: zmq with simulated = true"
         )
-    link = Link(Node(made.robot, options, clock, around), made.robot, clock)
+    leader = AttachedLeader(made.robot, clock, demonstrator(made.robot, made.deployment.task, options.seed))
+    link = Link(Node(made.robot, options, clock, around), made.robot, clock, leader.see)
     return Peers(
-        source=lambda spec, clock: make_source(spec, clock, lambda *of: link), sink=lambda spec, clock: link
+        source=lambda spec, clock: make_source(spec, clock, lambda *of: link),
+        sink=lambda spec, clock: link,
+        policy=partial(make_policy, leader=lambda spec, clock: leader),
     )
 
 
 def station(
-    path: Path, assignments: Sequence[str], clock: VirtualClock, *bench_options: str
+    path: Path, assignments: Sequence[str], clock: VirtualClock, *bench_options: str, paced: bool = False
 ) -> ServedLockstep:
     """The station of a deployment at its bench, which has the options of a simulated node; RuntimeFault where it
-    cannot be.
+    cannot be. A paced one is no faster than life, and the bench's truth ends none of its runs.
     """
     made = checked_spec(loader.load(path, assignments))
     given = ("--robot", made.robot.name, "--bench", "tabletop", *bench_options)
     options = node_parser().parse_args(given)
     around = surroundings.surroundings(made.robot, options)
     peers = linked(made, clock, around, options)
-    return ServedLockstep(made, clock, Rested(around.truth, clock), peers=peers)
+    over = (lambda running: "") if paced else Rested(around.truth, clock)
+    return ServedLockstep(made, clock, over, peers=peers, paced=paced)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -96,6 +107,9 @@ def parser() -> argparse.ArgumentParser:
         default=[],
         metavar="LINE",
         help="a policy server of this process, as a command line of runtime.sim.serve; the first is the deployment's",
+    )
+    line.add_argument(
+        "--paced", action="store_true", help="no faster than life, and a run ends as at a real bench"
     )
     line.add_argument("--width", type=int, default=640, help="of each picture")
     line.add_argument("--height", type=int, default=480)
@@ -119,7 +133,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 urls[str(given.name or len(urls))] = str(server.start()["url"])
             own = [f'policy.url="{url}"' for url in [*urls.values()][:1]] + (_PATIENT if urls else [])
             bench = ("--seed", options.seed, "--width", options.width, "--height", options.height)
-            served = station(options.deployment, [*own, *options.assignments], clock, *map(str, bench))
+            served = station(
+                options.deployment, [*own, *options.assignments], clock, *map(str, bench), paced=options.paced
+            )
             stack.enter_context(closing(served))
             standin.announce({"policies": urls}, options.ready_file)
             served.serve(told.is_set)

@@ -20,6 +20,7 @@ PATIENT = {
 }
 SMALL = "--pictures=400x300"  # less processor time; those of --once and of tests/crash are whole
 SETS = [SMALL, *(f"--set={key}={value}" for key, value in PATIENT.items())]
+LOCKSTEP = ["--lockstep", SMALL, "--set=bus.preview_rate=5", "--set=lease.ttl_s=20"]  # the web is in real time
 FIRST, LAST = (
     "test_story",
     ("test_plan", "test_plan_wizard", "test_lifetime"),
@@ -52,8 +53,8 @@ def pytest_runtest_teardown(item, nextitem):
 
 @pytest.fixture(scope="session")
 def patient(tmp_path_factory):
-    """A lab with more people and a dead checkpoint, which is not in a hurry."""
-    running["patient"] = lab = Demo(tmp_path_factory.mktemp("patient"), *SETS).start().people()
+    """A lab with more people and a dead checkpoint, whose station's time waits for a slow machine."""
+    running["patient"] = lab = Demo(tmp_path_factory.mktemp("patient"), *LOCKSTEP).start().people()
     return lab
 
 

@@ -2,7 +2,9 @@
 
 Its time passes as fast as the machine can while it sets up or the policy drives, and stands still while it is ready,
 while the policy is asked and while an episode is being closed: nothing that is recorded depends on how long those
-took. Leases, and for how long a command is valid, are of the people's own time, which goes on.
+took. A paced one is no faster than life in any state, as people expect it, and only stands still while the policy is
+asked and while an episode is being closed. Leases, and for how long a command is valid, are of the people's own time,
+which goes on.
 """
 
 from __future__ import annotations
@@ -90,8 +92,10 @@ class ServedLockstep(Lockstep):
         over: Over = lambda running: "",
         people: Clock | None = None,
         peers: Peers | None = None,
+        paced: bool = False,
     ) -> None:
         settings = spec.deployment
+        self._paced = paced
         if settings.control_channel.enabled:
             raise SetupError("control_channel.enabled = true in lockstep, which has none; allowed: false")
         self._people = people or MonotonicClock()
@@ -159,13 +163,15 @@ class ServedLockstep(Lockstep):
         """True if time stands still: nothing needs it, or the policy or a closing episode is waited for."""
         if self._asking.begin() or self.media.closing:
             return True
-        if self.coordinator.session.state not in (SessionState.IDLE, SessionState.READY):
+        if self._paced or self.coordinator.session.state not in (SessionState.IDLE, SessionState.READY):
             return False
         moving = bytes(self.shared.control.read()["behaviour"]) == b"motion"
         return not (moving or self.coordinator.runs.alone or self.shared.rings["orders"].waiting)
 
     def _fast(self) -> bool:
         """True if ticks need no pace: no operator is waited for, to see them as they happen."""
+        if self._paced:
+            return False
         state, run = self.coordinator.session.state, self.coordinator.run
         if state is SessionState.RUNNING:
             return run is None or run.mode not in _ON_DEMAND

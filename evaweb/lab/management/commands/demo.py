@@ -37,6 +37,11 @@ _DEPLOYMENTS = settings.BASE_DIR / "deployments"
 _MOST = 2000  # trials of --evaluate: a day and more
 _STATION, _ROBOT = "bench-1", "agilex_piper"
 _STEPS = 3  # beside those of any lab: bench, station, plan
+_COLLECTS = (
+    'collection.source="relay"',
+    'collection.dataset="tabletop_demonstrations"',
+    'collection.leader.kind="zmq"',
+)
 
 
 class Command(BaseCommand):
@@ -79,6 +84,11 @@ class Command(BaseCommand):
         parser.add_argument(
             "--collect", action="store_true", help="the bench collects too, led by a simulated leader"
         )
+        parser.add_argument(
+            "--lockstep",
+            action="store_true",
+            help="bench, policies, leader and station in one process, whose time waits for a slow machine",
+        )
         parser.add_argument("--seed", type=int, default=1, help="of the bench and of the policies")
         simulated_options(parser)
         parser.add_argument("--position", type=int, default=1, help="with --once: the position of the scene")
@@ -112,7 +122,8 @@ class Command(BaseCommand):
     def _up(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> tuple[str, list[Login]]:
         with lab.progress.step("the simulated bench and its policies"):
             seed.demo_scene()
-            bench = (self._lockstep if options["evaluate"] else self._bench)(lab, deployment, options)
+            in_lockstep = options["evaluate"] or options["lockstep"]
+            bench = (self._lockstep if in_lockstep else self._bench)(lab, deployment, options)
         url = lab.up([bench])
         with lab.progress.step("accounts and a plan"):
             roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
@@ -128,7 +139,9 @@ class Command(BaseCommand):
         robot, how = options["robot"], benches_of(options)
         policies = {name: (how.skill(name), known_port(name)) for name in POLICIES}
         assignments = [f'robot="{robot}"', f'data_dir="{settings.DATA_DIR}"', *options["set"]]
-        program = programs.lockstep(str(deployment), assignments, robot, policies, how.options)
+        assignments += _COLLECTS if options["collect"] else ()
+        paced = () if options["evaluate"] else ("--paced",)  # people see it as they see a real bench
+        program = programs.lockstep(str(deployment), assignments, robot, policies, (*how.options, *paced))
         for name, url in lab.processes.start(program)["policies"].items():
             seed.demo_checkpoint(name=name, description=POLICIES[name][0], policy={"url": url})
         return Bench(deployment, assignments, runs=True)
@@ -151,12 +164,7 @@ class Command(BaseCommand):
         ]
         if options["collect"]:
             leader = lab.processes.start(programs.leader(robot, node["obs_endpoint"], how.seed))
-            assignments += [
-                'collection.source="relay"',
-                'collection.dataset="tabletop_demonstrations"',
-                'collection.leader.kind="zmq"',
-                f'collection.leader.endpoint="{leader["endpoint"]}"',
-            ]
+            assignments += [*_COLLECTS, f'collection.leader.endpoint="{leader["endpoint"]}"']
         return Bench(deployment, assignments)
 
     def _plan(self, name: str, title: str, use: str, repetitions: int, **design: str) -> Plan:
@@ -248,8 +256,10 @@ def _check(options: Mapping[str, Any]) -> None:
     if count is not None and options["once"]:
         raise CommandError("--evaluate with --once: name one of them")
     if count is not None and options["collect"]:
+        raise CommandError("--evaluate with --collect: nobody collects meanwhile; leave one out")
+    if count is not None and options["lockstep"]:
         raise CommandError(
-            "--evaluate with --collect: its bench is in lockstep, a leader is not; leave one out"
+            "--evaluate with --lockstep: it is in lockstep, and faster than life; leave one out"
         )
 
 
