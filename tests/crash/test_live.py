@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -26,13 +25,16 @@ def lab(tmp_path_factory, shared):
     made.close()
 
 
-def watched(subscriber, seconds):
-    """Every stream's contents of a while."""
+def watched(subscriber, names, number):
+    """Every stream's contents, until each of these has come so often."""
     seen = {}
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
+
+    def enough():
         for name, content in subscriber.receive(0.1).items():
             seen.setdefault(name, []).append(content)
+        return all(len(seen.get(name, ())) > number for name in names)
+
+    eventually(enough, 10, f"{number} of each of {', '.join(names)}")
     return seen
 
 
@@ -41,17 +43,19 @@ def test_every_stream_of_a_run_is_live_and_the_pictures_are_jpegs_of_preview_siz
     cameras = Endpoints(lab.data / "stations" / "demo").read("media")["cameras"]
     pictures = Subscriber(zmq.Context.instance(), cameras, "camera/")
     streams = lab.client.subscribe("state", "joints", "poses")
-    seen, shown = watched(streams, 1.5), watched(pictures, 1.5)
+    seen = watched(streams, ("state", "joints", "poses"), 10)
+    shown = watched(
+        pictures, [f"camera/{name}" for name in ("cam_high", "cam_left_wrist", "cam_right_wrist")], 10
+    )
     streams.close()
     pictures.close()
     states = [status for status in seen["state"] if status["state"] == "running"]
-    assert len(states) > 5
+    assert len(states) > 1
     assert states[-1]["run"]["elapsed"] > states[0]["run"]["elapsed"]
     assert np.abs(seen["joints"][-1]["commanded"] - seen["joints"][0]["commanded"]).max() > 0
     assert seen["poses"][-1].shape == (2, 16)
     assert np.isfinite(seen["poses"][-1]).all()
     assert sorted(shown) == ["camera/cam_high", "camera/cam_left_wrist", "camera/cam_right_wrist"]
-    assert all(len(frames) > 10 for frames in shown.values())
     lab.client.command("stop")
     picture = simplejpeg.decode_jpeg(shown["camera/cam_high"][-1])
     assert picture.shape == (240, 320, 3)

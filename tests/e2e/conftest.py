@@ -12,6 +12,7 @@ PATIENT = {
     "control.heartbeat_timeout_s": 10,
     "control.orphan_hold_s": 0.5,  # each lab waits for it at its end
     "control.starvation_hold_s": 10,
+    "recording.heartbeat_timeout_s": 20,
     "faults.patience_s": 20,
     "safety.following_error": 3,
     "safety.joint_age_s": 5,
@@ -19,6 +20,11 @@ PATIENT = {
     "lease.ttl_s": 20,
 }
 SETS = [f"--set={key}={value}" for key, value in PATIENT.items()]
+# Of a lab whose programs may be killed: starvation, patience and leases strike there, what a slow machine does not.
+SHARED = {
+    name: PATIENT[name] for name in PATIENT if name.partition(".")[0] in ("control", "safety", "recording")
+}
+SHARED |= {"control.starvation_hold_s": 1, "lease.ttl_s": 10}
 FIRST, LAST = (
     "test_story",
     ("test_plan", "test_lifetime"),
@@ -55,9 +61,12 @@ def patient(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def shared(tmp_path_factory):
-    """A lab as users have it, with more people and a dead checkpoint, whose programs may be killed."""
-    folder, patience = tmp_path_factory.mktemp("shared"), "--set=lease.ttl_s=10"  # a page may be kept waiting
-    running["shared"] = lab = Demo(folder, patience, EVA_JOB_STALE_S="6").start().people()
+    """A lab with more people and a dead checkpoint, whose programs may be killed."""
+    folder, sets = (
+        tmp_path_factory.mktemp("shared"),
+        [f"--set={key}={value}" for key, value in SHARED.items()],
+    )
+    running["shared"] = lab = Demo(folder, *sets, EVA_JOB_STALE_S="6").start().people()
     return lab
 
 
