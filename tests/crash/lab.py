@@ -18,7 +18,13 @@ from tests.processes import eventually
 ROOT = Path(__file__).parents[2]
 ROBOT = "agilex_piper"
 FREE = "tcp://127.0.0.1:0"
-AGES = ("safety.joint_age_s=1.0", "safety.picture_age_s=2.0")  # of a machine that is busy with something else
+UNHURRIED = (  # deadlines that must not strike because a machine is slow; a test of one of them gives its own
+    "control.heartbeat_timeout_s=10.0",
+    "recording.heartbeat_timeout_s=20.0",
+    "safety.joint_age_s=5.0",
+    "safety.picture_age_s=10.0",
+    "lease.ttl_s=20.0",
+)
 
 
 def seen_since(status, moment):
@@ -87,7 +93,7 @@ class Lab:
             "recording.export=false",
             "bus.preview_rate=0",
             "control.orphan_hold_s=0.2",
-            *AGES,
+            *UNHURRIED,
             *assignments,
         ]
         sets = [part for setting in settings for part in ("--set", setting)]

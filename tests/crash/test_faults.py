@@ -153,6 +153,7 @@ def test_a_stale_command_is_refused_and_a_repeated_one_gets_its_first_answer(sta
     assert client.status()["state"] == "idle"  # and nothing else
 
 
+@pytest.mark.story
 def test_the_e_stop_works_while_main_is_stuck_and_outlives_a_restart_of_the_station(station):
     lab = station.running(0.5)
     main, episode = lab.pids()["coordinator"], lab.client.status()["recording"]["uuid"]

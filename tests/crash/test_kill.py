@@ -38,7 +38,7 @@ def test_a_second_supervisor_for_the_same_station_is_refused(station):
     assert station.answers()["state"] == "idle"
 
 
-@pytest.mark.parametrize("state", ["idle", "recording"])
+@pytest.mark.parametrize("state", ["idle", pytest.param("recording", marks=pytest.mark.story)])
 def test_a_killed_process_is_restarted_and_nothing_moves_until_set_up_again(station, state):
     station.rest(kills=len(FAMILY))
     for process in FAMILY:
@@ -111,7 +111,7 @@ def test_a_recording_without_a_run_is_never_left_half_open_by_a_kill(station, pr
     assert {path.name for path in set(lab.episodes()) - others} == {alone, run}
 
 
-@pytest.mark.parametrize("state", ["idle", "recording"])
+@pytest.mark.parametrize("state", ["idle", pytest.param("recording", marks=pytest.mark.story)])
 def test_nothing_is_left_ten_seconds_after_the_supervisor_was_killed(lab, state):
     lab.up("control.orphan_hold_s=2.0")
     if state == "recording":

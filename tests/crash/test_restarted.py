@@ -91,7 +91,7 @@ def within_limits(targets):
     return bool(np.isfinite(targets).all()) and not (limits.outside(np.array(targets)) > 1e-5).any()
 
 
-@pytest.mark.parametrize("what", ["run", "motion"])
+@pytest.mark.parametrize("what", [pytest.param("run", marks=pytest.mark.story), "motion"])
 def test_a_control_that_is_killed_while_the_robot_moves_goes_on_holding_where_that_was(tapped, what):
     lab, tap = tapped
     lab.rest(kills=1)

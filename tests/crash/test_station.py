@@ -13,7 +13,7 @@ import threading
 import pytest
 
 from runtime.recording.reader import open_episode
-from tests.crash.lab import AGES, ROOT
+from tests.crash.lab import ROOT, UNHURRIED
 from tests.processes import alive, eventually
 
 pytestmark = pytest.mark.slow
@@ -171,7 +171,7 @@ def headless(lab, *assignments):
         f'policy.url="{server["url"]}"',
         f'data_dir="{lab.data}"',
         "recording.min_free_bytes=0",
-        *AGES,
+        *UNHURRIED,
         *assignments,
     ]
     sets = [part for setting in settings for part in ("--set", setting)]

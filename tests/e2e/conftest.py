@@ -12,6 +12,7 @@ PATIENT = {
     "control.heartbeat_timeout_s": 10,
     "control.orphan_hold_s": 0.5,  # each lab waits for it at its end
     "control.starvation_hold_s": 10,
+    "recording.heartbeat_timeout_s": 20,
     "faults.patience_s": 20,
     "safety.following_error": 3,
     "safety.joint_age_s": 5,
@@ -21,6 +22,11 @@ PATIENT = {
 SMALL = "--pictures=400x300"  # less processor time; those of --once and of tests/crash are whole
 SETS = [SMALL, *(f"--set={key}={value}" for key, value in PATIENT.items())]
 LOCKSTEP = ["--lockstep", SMALL, "--set=bus.preview_rate=5", "--set=lease.ttl_s=20"]  # the web is in real time
+# Of a lab whose programs may be killed: starvation, patience and leases strike there, what a slow machine does not.
+SHARED = {
+    name: PATIENT[name] for name in PATIENT if name.partition(".")[0] in ("control", "safety", "recording")
+}
+SHARED |= {"control.starvation_hold_s": 1, "lease.ttl_s": 10}
 FIRST, LAST = (
     "test_story",
     ("test_plan", "test_plan_wizard", "test_lifetime"),
@@ -60,9 +66,12 @@ def patient(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def shared(tmp_path_factory):
-    """A lab as users have it, with more people and a dead checkpoint, whose programs may be killed."""
-    folder, patience = tmp_path_factory.mktemp("shared"), "--set=lease.ttl_s=10"  # a page may be kept waiting
-    running["shared"] = lab = Demo(folder, SMALL, patience, EVA_JOB_STALE_S="6").start().people()
+    """A lab with more people and a dead checkpoint, whose programs may be killed."""
+    folder, sets = (
+        tmp_path_factory.mktemp("shared"),
+        [f"--set={key}={value}" for key, value in SHARED.items()],
+    )
+    running["shared"] = lab = Demo(folder, SMALL, *sets, EVA_JOB_STALE_S="6").start().people()
     return lab
 
 

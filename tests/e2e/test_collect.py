@@ -99,6 +99,7 @@ def ann(browser, demo):
     bench.close()
 
 
+@pytest.mark.story
 def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(ann, demo):
     page = ann.page
     ann.key("Shift+T")

@@ -103,6 +103,7 @@ def test_preview_shows_a_chunk_that_is_cancelled_or_committed(ready):
     ready.says("[data-mode=phase]", "waiting for you")
 
 
+@pytest.mark.story
 def test_strategy_and_prompt_are_switched_while_the_robot_moves(ready):
     page = ready.page
     ready.keys("6")
@@ -127,6 +128,7 @@ def test_strategy_and_prompt_are_switched_while_the_robot_moves(ready):
     assert ready.snapshot()["state"] == "running"
 
 
+@pytest.mark.story
 def test_by_hand_the_target_is_shown_first_and_moves_the_robot_when_sent(ready):
     page = ready.page
     before = ready.joints()
@@ -222,6 +224,7 @@ def test_a_first_action_that_is_far_is_warned_of_and_approached(ready):
     assert ready.snapshot()["first_action"]["far"] is False
 
 
+@pytest.mark.story
 def test_space_is_a_focused_controls_and_escape_closes_what_is_open_before_it_stops(ready):
     page = ready.page
 

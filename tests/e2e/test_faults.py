@@ -155,6 +155,7 @@ def test_a_browser_that_stops_reading_costs_the_others_nothing(demo, bench, peop
     bench.draws(10)
 
 
+@pytest.mark.story
 def test_while_the_database_is_locked_pictures_go_on_and_the_e_stop_works(demo, bench):
     trial = bench.running()
     with demo.locked():
@@ -209,6 +210,7 @@ def test_a_policy_server_that_dies_mid_run_is_tried_again_until_it_is_back_or_pa
     whole(bench, trial)
 
 
+@pytest.mark.story
 def test_a_viewer_stops_the_robot_and_only_the_operator_releases_it(bench, people):
     with page_of(people["visitor"]) as watching:
         assert watching.estop("a hand in the way")["status"] == "done"

@@ -52,6 +52,7 @@ def released(lab, page):
     page.at_rest()
 
 
+@pytest.mark.story
 def test_what_a_browser_keeps_goes_over_https_alone_and_pages_press_at_their_own_address(lab, page):
     cookies = {cookie["name"]: cookie for cookie in page.context.cookies()}
     assert sorted(name.rpartition("_")[0] for name in cookies) == ["eva_csrf", "eva_session"]
@@ -71,6 +72,7 @@ def test_the_log_has_the_address_of_the_person_and_not_of_the_proxy(lab, page):
     )
 
 
+@pytest.mark.story
 def test_a_command_and_a_press_go_through_it(lab, page):
     page.take_again()
     page.page.click("#estop")

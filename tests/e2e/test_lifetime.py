@@ -76,6 +76,7 @@ def test_a_second_lab_on_the_same_data_is_refused_and_the_first_goes_on(demo):
     assert visitor(demo, "operator").get("me")["username"] == "operator"
 
 
+@pytest.mark.story
 def test_ctrl_c_ends_everything_and_a_second_start_keeps_trials_under_new_passwords(demo):
     operator = visitor(demo, "operator")
     with page_of(operator) as page:
@@ -99,6 +100,7 @@ def test_ctrl_c_ends_everything_and_a_second_start_keeps_trials_under_new_passwo
     tidy(visitor(demo, "admin"))
 
 
+@pytest.mark.story
 def test_the_end_of_all_follows_from_the_kill_of_the_supervisor(demo):
     everyone = demo.everyone()
     assert len(everyone) > len(demo.pids)

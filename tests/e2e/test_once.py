@@ -93,6 +93,7 @@ def read(dataset):
     return json.loads(done.stdout)
 
 
+@pytest.mark.story
 def test_a_complete_trial_is_reported(first):
     assert {"trial", "success", "score", "duration_s", "episode", "frames", "control"} <= set(first)
     assert first["success"] is True
@@ -102,6 +103,7 @@ def test_a_complete_trial_is_reported(first):
     assert first["duration_s"] > 5
 
 
+@pytest.mark.story
 def test_its_episode_says_what_was_tried_by_whom_and_where(first, folder):
     episode = folder / "data" / "episodes" / first["episode"]
     manifest = json.loads((episode / "manifest.json").read_text())
@@ -118,6 +120,7 @@ def test_its_episode_says_what_was_tried_by_whom_and_where(first, folder):
     )  # of the recording, to the frame; what was held left out
 
 
+@pytest.mark.story
 def test_its_score_is_on_the_disk_before_any_database(first, folder):
     lines = (folder / "data" / "scores" / f"{first['episode']}.jsonl").read_text().splitlines()
     assert len(lines) == 1
@@ -127,6 +130,7 @@ def test_its_score_is_on_the_disk_before_any_database(first, folder):
     assert [milestone["reached"] for milestone in score["milestones"]] == [True] * 4
 
 
+@pytest.mark.story
 def test_a_taken_port_is_named_and_its_holder_lives(folder):
     with socket.create_server(("127.0.0.1", 0)) as holder:
         port = holder.getsockname()[1]
@@ -148,6 +152,7 @@ def test_a_taken_port_is_named_and_its_holder_lives(folder):
             assert call.recv(1) == b""
 
 
+@pytest.mark.story
 def test_two_blind_trials_are_made_revealed_and_compared(evaluated):
     found, done = evaluated
     trials = found["trials"]
@@ -171,6 +176,7 @@ def test_two_blind_trials_are_made_revealed_and_compared(evaluated):
     assert not any(trial["checkpoint"] in done.stderr for trial in trials)
 
 
+@pytest.mark.story
 def test_other_trials_on_the_same_data_come_after_the_first(first, evaluated, places, folder):
     assert min(trial["trial"] for trial in evaluated[0]["trials"]) > first["trial"]
     assert [dataset for dataset, _, _ in places] == [first["dataset"]] * 2
@@ -179,6 +185,7 @@ def test_other_trials_on_the_same_data_come_after_the_first(first, evaluated, pl
     assert len(list(outcomes)) == 3
 
 
+@pytest.mark.story
 def test_a_second_process_that_knows_only_the_format_reads_all(first, places, folder):
     found = read(folder / "data" / first["dataset"])
     assert found["broken"] == []

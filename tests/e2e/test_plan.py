@@ -71,6 +71,7 @@ def drawn(operator):
     page.locator("[data-camera=cam_high] canvas.region-over").wait_for()
 
 
+@pytest.mark.story
 def test_trials_of_a_blind_plan_are_made_through_the_tab(operator, patient):
     page = operator.page
     operator.at_rest()

@@ -39,7 +39,7 @@ def operator(browser, patient):
     page.close()
 
 
-@pytest.mark.parametrize("kind", ["recording", "dataset"])
+@pytest.mark.parametrize("kind", ["recording", pytest.param("dataset", marks=pytest.mark.story)])
 def test_it_is_set_up_approached_and_run_to_its_last_row(operator, patient, recorded, kind):
     places, actions = recorded
     page = operator.open(places[kind]).page

@@ -36,6 +36,7 @@ def reviewer(browser, patient):
     page.close()
 
 
+@pytest.mark.story
 def test_an_episode_is_reviewed_by_keyboard_and_the_next_one_comes(reviewer, patient, brought):
     newer, older = brought
     keys, page = reviewer.page.keyboard, reviewer.page

@@ -100,6 +100,7 @@ def pressed(demo, page):
     assert latched(demo) is not None
 
 
+@pytest.mark.story
 def test_a_press_arrives_while_the_web_stands_still_and_is_written_down_once(demo, page):
     before = set(demo.rows(PRESSES))
     with suspended(demo.pid("serve")):
@@ -111,6 +112,7 @@ def test_a_press_arrives_while_the_web_stands_still_and_is_written_down_once(dem
     assert page.errors == []
 
 
+@pytest.mark.story
 def test_a_press_arrives_while_the_process_for_stops_is_gone_and_pages_know_its_port_all_along(demo, page):
     said = page.page.get_attribute(AREA, "data-stops")
     with suspended(demo.child.pid):

@@ -56,6 +56,7 @@ def trial(operator):
     return seen
 
 
+@pytest.mark.story
 def test_three_cameras_and_the_robot_are_seen_before_anything_is_pressed(trial):
     assert trial["cameras"] == 3
     assert share(trial["idle"]["overhead"], wood) > 0.3
@@ -64,12 +65,14 @@ def test_three_cameras_and_the_robot_are_seen_before_anything_is_pressed(trial):
     assert share(trial["idle"]["scene"], wood) > 0.05
 
 
+@pytest.mark.story
 def test_the_robot_moves_in_the_pictures_and_in_3d(trial):
     assert share(trial["ready"]["overhead"], orange) > 0.002
     for pane in ("overhead", "scene"):
         assert moved(trial["ready"][pane], trial["carried"][pane]) > 0.01
 
 
+@pytest.mark.story
 def test_the_score_is_kept_with_its_words(trial):
     kept = trial["trial"]
     assert (kept["success"], kept["score"]) == (True, 1.0)
@@ -78,6 +81,7 @@ def test_the_score_is_kept_with_its_words(trial):
     assert kept["duration_s"] > 5
 
 
+@pytest.mark.story
 def test_result_shows_the_trial_with_its_video(trial, operator):
     page = operator.open("/result/").page
     row = page.locator("tr", has_text="scored").first
@@ -101,6 +105,7 @@ def test_result_shows_the_trial_with_its_video(trial, operator):
     assert share(pixels(video), wood) > 0.2
 
 
+@pytest.mark.story
 def test_the_episode_plays_back_on_one_clock(trial, operator):
     page = operator.open(f"/replay/{trial['trial']['episode']}/").page
     videos = page.locator("video")
@@ -152,6 +157,7 @@ def test_space_on_a_page_that_is_not_a_stations_stops_no_robot(trial, operator):
     assert operator.api(f"stations/{STATION}")["snapshot"]["state"] != "faulted"
 
 
+@pytest.mark.story
 def test_the_dataset_has_the_episode(trial, operator):
     episode = operator.api(f"episodes/{trial['trial']['episode']}")
     found = eventually(

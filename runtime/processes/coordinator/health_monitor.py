@@ -97,8 +97,8 @@ class HealthMonitor:
 
     def absent(self) -> str:
         """A sibling that gives no sign of life, "" where all do: what it is sent would be lost."""
-        now, within = self._clock.now(), self._plan.deployment.control.heartbeat_timeout_s
-        return next((name for name in SIBLINGS if not self._page.alive(name, now, within)), "")
+        now, within = self._clock.now(), self._plan.deployment.heartbeat_timeout_s
+        return next((name for name in SIBLINGS if not self._page.alive(name, now, within(name))), "")
 
     def missing_cameras(self) -> list[str]:
         """Cameras that have not sent a picture yet."""

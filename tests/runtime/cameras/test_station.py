@@ -141,6 +141,7 @@ def test_the_set_up_fails_by_name_where_a_camera_is_gone(tmp_path: Path) -> None
         assert f"camera {CAMERA} ({film}) is lost: not a video" in session.reason
 
 
+@pytest.mark.lab
 @pytest.mark.slow
 def test_a_real_station_runs_with_a_camera_over_rtsp(tmp_path: Path) -> None:
     """Processes, node, policy server and camera are all real but for the robot."""

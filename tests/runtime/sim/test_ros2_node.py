@@ -52,6 +52,7 @@ def test_a_robot_that_is_none_is_an_error_in_words(capsys: pytest.CaptureFixture
     assert "nosuch" in capsys.readouterr().err
 
 
+@pytest.mark.lab
 @pytest.mark.slow
 def test_a_pick_and_place_trial_runs_over_ros_2(start: Start, tmp_path: Path) -> None:
     with free_domain() as domain:
@@ -66,7 +67,10 @@ def test_a_pick_and_place_trial_runs_over_ros_2(start: Start, tmp_path: Path) ->
             f"transport.domain={domain}", f'policy.url="{server.ready["url"]}"', f'data_dir="{tmp_path}"',
             "run.duration_s=24", "recording.enabled=false",
             "safety.joint_age_s=5.0", "safety.picture_age_s=5.0",
-            "control.heartbeat_timeout_s=10.0",  # however busy the machine is
+            # However busy the machine is: only what ROS does to a trial may fail it.
+            "control.heartbeat_timeout_s=10.0", "control.starvation_hold_s=10.0", "faults.patience_s=20.0",
+            "recording.heartbeat_timeout_s=20.0",
+            "safety.following_error=3.0", "transport.stalled_after_s=10.0",
         ]  # fmt: skip
         line = [sys.executable, "-m", "runtime", str(ROOT / "deployments/ros2_r1_lite.toml"), "--headless"]
         done = subprocess.run(

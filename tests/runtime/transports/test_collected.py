@@ -188,12 +188,14 @@ def relayed(ways: dict[str, Any], mode: str = "absolute") -> dict[str, Any]:
     return {"source": "relay", "leader": ways["leader"], "mode": mode, "max_age_s": PATIENCE_S}
 
 
+@pytest.mark.lab
 def test_over_zmq_a_leader_is_relayed(tmp_path: Path, start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     ways = waving(start, "agilex_piper")
     transport = {"kind": "zmq", **ways["node"]}
     moved(demonstration(tmp_path, monkeypatch, "agilex_piper", transport, relayed(ways)))
 
 
+@pytest.mark.lab
 def test_over_zmq_a_node_that_drives_itself_is_recorded(
     tmp_path: Path, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,6 +213,7 @@ def led(kind: str, leader: Waving, **link: Any) -> dict[str, Any]:
     return {"source": "relay", "leader": leader_of, "mode": "relative", "max_age_s": PATIENCE_S}
 
 
+@pytest.mark.lab
 def test_over_ros_2_a_leader_is_relayed(
     tmp_path: Path, start: Start, monkeypatch: pytest.MonkeyPatch, domain: int
 ) -> None:
@@ -223,6 +226,7 @@ def test_over_ros_2_a_leader_is_relayed(
         moved(demonstration(tmp_path, monkeypatch, "r1_lite", transport, collection))
 
 
+@pytest.mark.lab
 @needs_ros1
 def test_over_ros_1_a_leader_is_relayed(
     tmp_path: Path, start: Start, monkeypatch: pytest.MonkeyPatch, ros_master: RosMaster

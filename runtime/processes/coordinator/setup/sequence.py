@@ -312,9 +312,9 @@ class SetUp:
 
     def _require_family(self) -> None:
         """An order to a control that is still starting would be lost, and without a guard it only holds."""
-        within = self._plan.deployment.control.heartbeat_timeout_s
+        within = self._plan.deployment.heartbeat_timeout_s
         for process in SIBLINGS:
-            if not self._page.alive(process, self._clock.now(), within):
+            if not self._page.alive(process, self._clock.now(), within(process)):
                 raise SetupError(_SILENT(process=process))
 
     def _go_home(self) -> None:

@@ -63,6 +63,7 @@ def test_who_is_ended_before_there_is_a_port_ends(tmp_path, monkeypatch):
         Endpoints(tmp_path).read("channel")
 
 
+@pytest.mark.lab
 @pytest.mark.slow
 def test_a_station_starts_its_channel_again_where_it_dies_and_takes_it_along(tmp_path):
     sets = [f'data_dir="{tmp_path}"', "control_channel.enabled=true", "control_channel.port=0"]

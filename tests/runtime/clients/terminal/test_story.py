@@ -126,7 +126,7 @@ def ctl(lab):
     return made
 
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.lab]
 
 
 def joints_of(lab):
