@@ -65,11 +65,12 @@ labs: setup-dev ## every other whole lab, one after the other, and properties wi
 	$(PY) -m pytest -n 0 -m "lab" || labs=$$?; \
 	$(PY) -m pytest -n auto --dist loadfile -m "hypothesis and not story and not lab" --hypothesis-profile=random && exit $$labs
 
-lint: setup-dev ## ruff, mypy, and the contracts of .importlinter
+lint: setup-dev ## ruff, mypy, the contracts of .importlinter, and how tests wait
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
 	$(VENV)/bin/lint-imports --no-logo
+	$(PY) -m tests.lint.waits
 
 format: setup-dev ## let ruff format and mend
 	$(PY) -m ruff check --fix .

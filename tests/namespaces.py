@@ -10,6 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from uuid import uuid4
 
+from tests.processes import PATIENCE_S
+
 _DOCUMENT = Path(__file__).parents[1] / "docs" / "administrator.md"
 _SUBNET = "10.77.0"
 
@@ -87,4 +89,4 @@ def _firewall() -> str:
 
 
 def _run(*words: str, said: str | None = None) -> None:
-    subprocess.run(words, input=said, check=True, capture_output=True, text=True, timeout=60)
+    subprocess.run(words, input=said, check=True, capture_output=True, text=True, timeout=PATIENCE_S)

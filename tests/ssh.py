@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 SSHD = shutil.which("sshd") or shutil.which("/usr/sbin/sshd")
 _PRIVILEGE_SEPARATION = Path("/run/sshd")  # a server of root wants it; the service of a system makes it
@@ -70,7 +70,7 @@ class SshServer:
         with (self.folder / "log").open("ab") as log:
             begun = log.tell()
             self._process = subprocess.Popen([SSHD, "-D", "-e", "-f", self._configuration], stderr=log)
-        eventually(lambda: "Server listening" in self.log(begun), 10, f"an SSH server: {self.log()}")
+        eventually(lambda: "Server listening" in self.log(begun), f"an SSH server: {self.log()}")
         return self
 
     def log(self, begun: int = 0) -> str:
@@ -90,7 +90,7 @@ class SshServer:
         children = f"/proc/{process.pid}/task/{process.pid}/children"
         sessions = [int(pid) for pid in Path(children).read_text().split()]
         process.terminate()
-        process.wait(10)
+        process.wait(PATIENCE_S)
         for pid in sessions:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGTERM)

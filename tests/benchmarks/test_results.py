@@ -46,7 +46,6 @@ def test_a_share_is_one_of_the_values():
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_a_small_lab_is_measured_on_sqlite(tmp_path):
     found = results._measured(tmp_path / "data", {}, plans=2, trials=80)
     assert set(found["pages"]) == set(results.PAGES)

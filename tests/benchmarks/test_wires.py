@@ -23,10 +23,10 @@ from runtime.core.errors import SetupError
 from runtime.core.plugins import variants
 from runtime.sim import camera_server
 from runtime.sim.pictures import Scene, frame_number
+from tests.processes import PATIENCE_S
 
 PIPER = robots.load("agilex_piper")
 SCENE = Scene(PIPER, 480, 640)
-PATIENCE = 20.0
 
 
 class Ticking:
@@ -71,8 +71,8 @@ def test_a_relay_counts_the_bytes_of_each_way_and_leaves_no_thread() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening, Relay(listening.getsockname()[1]) as relay:
         client = socket.create_connection(("127.0.0.1", relay.port))
         server, _ = listening.accept()
-        client.settimeout(PATIENCE)
-        server.settimeout(PATIENCE)
+        client.settimeout(PATIENCE_S)
+        server.settimeout(PATIENCE_S)
         with client, server:
             client.sendall(b"x" * 1000)
             assert len(server.recv(1000, socket.MSG_WAITALL)) == 1000

@@ -15,7 +15,7 @@ import zmq
 
 from runtime.clients.channel.message import LARGEST
 from runtime.ipc.session_state import SessionState
-from tests.processes import eventually
+from tests.processes import PATIENCE_MS, eventually
 from tests.runtime.clients.channel.bench import Bench, Script
 
 MESSAGES: dict[str, tuple[list[bytes], str]] = {
@@ -113,7 +113,7 @@ def test_a_peer_that_is_no_req_socket_is_answered_in_its_own_form(bench: Bench, 
         peer.linger = 0
         peer.connect(bench.channel)
         peer.send(b'{"query": "status"}')
-        assert peer.poll(10_000)
+        assert peer.poll(PATIENCE_MS)
         (answer,) = peer.recv_multipart()
         assert json.loads(answer)["ok"] is True
 
@@ -133,7 +133,7 @@ def test_a_script_that_never_reads_its_answers_is_not_kept_for(bench: Bench, scr
         assert script.query("status")["state"] == "idle"
         before = process.memory_info().rss
         ask(10_000)
-        eventually(lambda: asked(script), 60, "an answer for somebody else")
+        eventually(lambda: asked(script), "an answer for somebody else")
         assert process.memory_info().rss - before < 60e6
 
 
@@ -155,7 +155,7 @@ def test_scripts_that_are_gone_before_their_answer_leave_nothing_behind(
             gone.send(b'{"query": "frame"}')
     assert script.query("status")["state"] == "idle"
     few = before + 20  # both ends of five, and what is being closed
-    eventually(lambda: len(process.net_connections("tcp")) <= few, 20, "their connections gone")
+    eventually(lambda: len(process.net_connections("tcp")) <= few, "their connections gone")
 
 
 def test_a_flood_of_faults_from_many_keeps_nobody_from_a_stop(bench: Bench, script: Script) -> None:

@@ -20,13 +20,12 @@ from runtime.sim import arrays
 from runtime.sim.node import Node, parser, run
 from runtime.transports import zmq as link
 from runtime.transports.node_source import NodeSource
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 ROBOT = robots.load("ur5e")
 HOME = ROBOT.poses["home"].astype(np.float32)
 AWAY = np.clip(HOME + 0.2, ROBOT.lower + 0.01, ROBOT.upper - 0.01).astype(np.float32)
 FREE = ["--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0"]
-PATIENCE = 20.0  # s until a test gives up
 CLOCK = MonotonicClock()
 
 pytestmark = pytest.mark.usefixtures("no_thread_is_left")
@@ -63,7 +62,7 @@ class Bench:
         return np.asarray(self.seen().qpos)
 
     def seen(self) -> Any:
-        return eventually(lambda: self.source.receive(0.1), PATIENCE, "an observation: the node has ended")
+        return eventually(lambda: self.source.receive(0.1), "an observation: the node has ended")
 
     def refused(self, reason: str) -> int:
         self.seen()
@@ -76,11 +75,11 @@ class Bench:
             client.send(command(target, **fields))
             return bool(np.abs(self.stands() - target).max() < 0.01)
 
-        eventually(there, PATIENCE, "the robot at its target")
+        eventually(there, "the robot at its target")
 
     def close(self) -> None:
         self._told.set()
-        self._thread.join(PATIENCE)
+        self._thread.join(PATIENCE_S)
         self.source.close()
         self.node.close()
         for socket in self._clients:
@@ -138,7 +137,7 @@ def test_a_faulty_message_moves_nothing_and_is_refused_by_name(bench: Bench, fau
         client.send(payload())
         return bench.refused(reason)
 
-    eventually(refused, PATIENCE, reason)
+    eventually(refused, reason)
     assert set(bench.source.status.refused) == {reason}
     assert bench.source.status.holding is True
     np.testing.assert_array_equal(bench.stands(), before)
@@ -150,11 +149,10 @@ def test_a_client_that_dies_leaves_a_robot_that_holds(bench: Bench) -> None:
     client = bench.client()
     eventually(
         lambda: client.send(command()) or (bench.seen() and bench.source.status.holding is False),
-        PATIENCE,
         "motion",
     )
     client.close(linger=0)
-    eventually(lambda: bench.seen() and bench.source.status.holding, PATIENCE, "holding")
+    eventually(lambda: bench.seen() and bench.source.status.holding, "holding")
     before = bench.stands()
     np.testing.assert_array_equal(bench.stands(), before)
 
@@ -168,7 +166,7 @@ def test_of_two_clients_one_rules_and_the_other_is_told_whom_the_node_obeys(benc
         second.send(command(HOME, master="second"))
         return bench.refused("other_master")
 
-    eventually(refused, PATIENCE, "other_master")
+    eventually(refused, "other_master")
     assert np.abs(bench.stands() - AWAY).max() < 0.01
     assert bench.source.why("node_refused.other_master") == (
         "several clients command the node, which obeys first alone"
@@ -194,7 +192,7 @@ def test_what_was_sent_while_the_node_stood_still_is_stale(bench: Bench) -> None
         client.send(command(HOME))
     time.sleep(0.5)  # longer than a command may be old
     bench.paused.clear()
-    eventually(lambda: bench.refused("stale"), PATIENCE, "stale")
+    eventually(lambda: bench.refused("stale"), "stale")
     np.testing.assert_allclose(bench.stands(), stood, atol=1e-3)
     bench.moved_by(client, HOME)  # what is sent now is obeyed
 
@@ -208,7 +206,7 @@ def test_a_client_whose_clock_jumps_is_obeyed(bench: Bench, jump: float) -> None
         client.send(command(HOME, t=time.monotonic() + jump))
         return bool(np.abs(bench.stands() - HOME).max() < 0.01)
 
-    eventually(there, PATIENCE, "home")
+    eventually(there, "home")
     assert bench.source.status.refused == {}
 
 
@@ -221,7 +219,7 @@ def test_a_flood_of_noise_keeps_nobody_from_being_heard(bench: Bench) -> None:
         client.send(command(AWAY))
         return bool(np.abs(bench.stands() - AWAY).max() < 0.01)
 
-    eventually(there, PATIENCE, "the robot at its target")
+    eventually(there, "the robot at its target")
     assert len(bench.source.status.refused) < 8, "one name each, however many"
 
 
@@ -250,6 +248,6 @@ def test_our_own_client_reads_in_the_acknowledgement_which_of_its_commands_was_o
             bench.seen()
             return bench.source.status.ack
 
-        first = eventually(acknowledged, PATIENCE, "an acknowledgement")
-        eventually(lambda: (acknowledged() or 0) > first, PATIENCE, "a later one")
+        first = eventually(acknowledged, "an acknowledgement")
+        eventually(lambda: (acknowledged() or 0) > first, "a later one")
         assert bench.source.status.master == sink.master

@@ -55,7 +55,7 @@ def test_our_command_is_an_existing_clients_with_two_fields_after_it() -> None:
             sink.send(RobotCommand(np.zeros(2, np.float32), 0, 1.5))
             return node.recv() if node.poll(20) else None
 
-        payload = eventually(sent, 10, "a command")
+        payload = eventually(sent, "a command")
     assert payload[:1] == b"\x85"
     assert payload[1:].startswith(COMMAND[1:])
     assert list(msgpack.unpackb(payload)) == ["t", "action", "target", "master", "seq"]
@@ -68,7 +68,7 @@ def test_our_words_are_an_existing_clients_with_two_fields_after_them() -> None:
             sink.tell("hil_start", {"mode": "relative"})
             return node.recv() if node.poll(20) else None
 
-        payload = eventually(sent, 10, "a word")
+        payload = eventually(sent, "a word")
     assert payload[:1] == b"\x86"
     assert payload[1:].startswith(HIL_START[1:])
 
@@ -225,5 +225,5 @@ def test_our_client_hears_an_existing_node_that_sends_its_cameras_apart() -> Non
                 node.send(msgpack.packb({"t": now, "images": {"cam_high": picture}, "state": state}))
                 return source.receive(0.05)
 
-            assert set(eventually(found, 10, "a frame").pictures) == {c.key for c in ROBOT.cameras}
-            assert eventually(found, 10, "another").qpos.shape == (14,)
+            assert set(eventually(found, "a frame").pictures) == {c.key for c in ROBOT.cameras}
+            assert eventually(found, "another").qpos.shape == (14,)

@@ -25,11 +25,10 @@ from runtime.core.types import Conditioning
 from runtime.sim import faults
 from runtime.sim.faults import Fault
 from tests.conformance.policies_served import PROTOCOLS, WEBSOCKETS, Served, protocol
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.policies.peers import seen, serving
 
 DEADLINE = 0.4  # s, where only a deadline ends the waiting; else what is wrong is noticed at once
-PATIENCE = 30.0  # s until a test gives up
 WAITING = {"mute_on_connect", "mute_on_infer", "late_reply"}
 Faults = dict[str, tuple[type[PolicyError], str]]
 
@@ -137,7 +136,7 @@ def fault_of(text: str, served: Served) -> tuple[Fault, float]:
     name, _, argument = text.partition(":")
     if argument and name != "late_reply":
         argument = str(int(argument) + served.first)
-    return Fault(name, argument), DEADLINE if name in WAITING else PATIENCE
+    return Fault(name, argument), DEADLINE if name in WAITING else PATIENCE_S
 
 
 @pytest.mark.parametrize(("name", "fault"), [(name, fault) for name in FAULTS for fault in FAULTS[name]])
@@ -161,7 +160,7 @@ def test_a_fault_is_one_named_error_and_one_helpful_sentence_in_time(
                 policy.infer(seen(served.robot))
             except PolicyError as failure:
                 told.append(failure)
-            assert time.monotonic() - began < PATIENCE, "it hung"
+            assert time.monotonic() - began < PATIENCE_S, "it hung"
     assert told, "the fault was not noticed"
     assert (error is PolicyError) != isinstance(told[0], PolicyLostError)
     with pytest.raises(error, match=says):
@@ -235,7 +234,7 @@ def test_a_reset_while_an_answer_is_in_flight_leaves_both_right(name: str) -> No
         asking.start()
         with contextlib.suppress(PolicyLostError):
             policy.reset()
-        asking.join(PATIENCE)
+        asking.join(PATIENCE_S)
         assert found == [True]
         assert served.begins_at(policy, 0.2)
 
@@ -243,7 +242,9 @@ def test_a_reset_while_an_answer_is_in_flight_leaves_both_right(name: str) -> No
 @on_every_protocol
 def test_closing_frees_whoever_waits_and_may_be_done_twice(name: str) -> None:
     served = protocol(name)
-    with served.served(Fault("mute_on_infer", str(served.first + 1)), inference_deadline=PATIENCE) as policy:
+    with served.served(
+        Fault("mute_on_infer", str(served.first + 1)), inference_deadline=PATIENCE_S
+    ) as policy:
         assert served.begins_at(policy, 0.1)
         failed: list[Exception] = []
 
@@ -258,7 +259,7 @@ def test_closing_frees_whoever_waits_and_may_be_done_twice(name: str) -> None:
         waiting.join(0.1)
         policy.close()
         policy.close()
-        waiting.join(PATIENCE)
+        waiting.join(PATIENCE_S)
         assert not waiting.is_alive()
         assert len(failed) == 1
         with pytest.raises(PolicyError, match="closed"):
@@ -297,7 +298,7 @@ def test_a_server_is_left_with_a_close_frame(end: str) -> None:
             policy.connect()
         if end == "closed":
             policy.close()
-        eventually(lambda: ended, PATIENCE, "the end of the first conversation")
+        eventually(lambda: ended, "the end of the first conversation")
     assert isinstance(ended[0], ConnectionClosedOK), ended[0]
 
 

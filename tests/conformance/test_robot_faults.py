@@ -15,9 +15,8 @@ from runtime.core.errors import TransportError
 from runtime.core.types import Observation
 from runtime.transports.base import Source
 from tests.conformance.robots_played import TRANSPORTS, Played, mark_of, played
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
-PATIENCE = 20.0  # s until a test gives up
 IDLE_FRAMES = 1000
 
 pytestmark = pytest.mark.usefixtures("no_thread_is_left")
@@ -37,10 +36,10 @@ def seen(robot: Played, mark: int, source: Source | None = None, fault: str = ""
         robot.play(mark, fault)
         began = time.monotonic()
         observation = (source or robot.source).receive(0.05)
-        assert time.monotonic() - began < PATIENCE, "it hung"
+        assert time.monotonic() - began < PATIENCE_S, "it hung"
         return observation if observation is not None and mark_of(observation) == mark else None
 
-    return eventually(found, PATIENCE, f"a frame with mark {mark}")
+    return eventually(found, f"a frame with mark {mark}")
 
 
 def said(robot: Played, words: str, act: Callable[[], object] = lambda: None) -> str:
@@ -53,7 +52,7 @@ def said(robot: Played, words: str, act: Callable[[], object] = lambda: None) ->
         told.extend(event.text for event in robot.source.news())
         return next((text for text in told if words in text), "")
 
-    return eventually(found, PATIENCE, f"news with {words!r}; told: {told}")
+    return eventually(found, f"news with {words!r}; told: {told}")
 
 
 CASES = [
@@ -75,7 +74,7 @@ def test_a_fault_is_counted_by_name_and_the_next_frame_comes(robot: Played, faul
         robot.source.news()
         return robot.source.faults().get(name, 0) >= (1 if name.startswith("stalled") else 2)
 
-    eventually(counted, PATIENCE, name)
+    eventually(counted, name)
     assert words in robot.source.why(name)
     seen(robot, 3)
 
@@ -198,7 +197,7 @@ def test_who_waits_is_let_go_when_it_is_closed_and_it_can_be_connected_again(rob
     waiting = threading.Thread(target=wait)
     waiting.start()
     robot.source.close()
-    waiting.join(PATIENCE)
+    waiting.join(PATIENCE_S)
     assert not waiting.is_alive()
     robot.source.connect()
     seen(robot, 4)

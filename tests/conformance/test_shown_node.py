@@ -20,7 +20,6 @@ from runtime.transports import zmq as link
 from tests.processes import eventually
 
 ROBOT = robots.load("ur5e")
-PATIENCE = 30.0  # s until a test gives up
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "transports.md").read_text("utf-8")
 SECTION = DOCUMENT.partition("\n## Execution nodes over ZMQ\n")[2].partition("\n## ")[0]
 PORTS = ("5555", "5556")
@@ -63,7 +62,7 @@ def test_the_shown_node_stands_at_home_and_goes_where_it_is_told() -> None:
         source.connect()
         sink.connect()
 
-        first = eventually(lambda: source.receive(0.1), PATIENCE, "an observation")
+        first = eventually(lambda: source.receive(0.1), "an observation")
         np.testing.assert_allclose(first.qpos, ROBOT.poses["home"], atol=1e-3)
 
         def arrived() -> bool:
@@ -71,5 +70,5 @@ def test_the_shown_node_stands_at_home_and_goes_where_it_is_told() -> None:
             seen = source.receive(0.1)
             return seen is not None and np.array_equal(seen.qpos, goal)
 
-        eventually(arrived, PATIENCE, "the goal")
+        eventually(arrived, "the goal")
         assert set(source.faults()) <= {"frames_lost"}

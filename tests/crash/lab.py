@@ -13,7 +13,7 @@ from runtime.clients.client import StationClient
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.bus import Endpoints
 from runtime.processes.supervisor.supervisor import MOST_RESTARTS
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 ROOT = Path(__file__).parents[2]
 ROBOT = "agilex_piper"
@@ -35,9 +35,6 @@ def seen_since(status, moment):
 
 class Lab:
     """A node, a policy server and a station in a folder of its own."""
-
-    patience = 60.0  # for whatever the station does in its own time [s]
-    ending = 15.0  # for its end [s]
 
     def __init__(self, folder: Path, addresses=None):
         """`addresses` are of a node and a policy server that outlive it; what it starts itself takes their places."""
@@ -104,7 +101,7 @@ class Lab:
         )
         self.killed = 0
         self.client = StationClient(self.data / "stations" / "demo", holder="test")
-        eventually(self.answers, self.patience, "the station answers")
+        eventually(self.answers, "the station answers")
         return self
 
     def answers(self):
@@ -115,7 +112,7 @@ class Lab:
 
     def answers_again(self):
         """Wait for a station that was hurt; the lease is held again, which ends with a coordinator that is killed."""
-        eventually(self.answers, 10, "the station answers again")
+        eventually(self.answers, "the station answers again")
         self.client.claim()
 
     def up(self, *assignments):
@@ -138,20 +135,20 @@ class Lab:
         if not self.supervisor:
             return self.up()
         self.client.claim()
-        self.client.wait(lambda status: seen_since(status, begun), self.patience)
+        self.client.wait(lambda status: seen_since(status, begun), PATIENCE_S)
         for kind in ("release", "stop"):
             if kind in self.client.status()["allowed"]:
                 self.client.command(kind)
         self.reach("idle", "ready")
-        self.client.wait(lambda status: not status["recording"]["uuid"], self.patience)
+        self.client.wait(lambda status: not status["recording"]["uuid"], PATIENCE_S)
         while self.client.status()["state"] != "idle":
             self.client.command("setup")
             self.client.command("stop")  # which cancels it
         self.client.give_up()
         return self
 
-    def reach(self, *states, seconds=None):
-        return self.client.wait(lambda status: status["state"] in states, seconds or self.patience)
+    def reach(self, *states):
+        return self.client.wait(lambda status: status["state"] in states, PATIENCE_S)
 
     def ready(self, **asked):
         self.client.command("setup", **asked)
@@ -163,9 +160,7 @@ class Lab:
         """A run that has moved the arm for a while, after a set-up as asked."""
         self.ready(**asked)
         self.client.command("run")
-        self.client.wait(
-            lambda s: s["run"]["elapsed"] >= seconds and s["policy"]["answers"] > 3, self.patience
-        )
+        self.client.wait(lambda s: s["run"]["elapsed"] >= seconds and s["policy"]["answers"] > 3, PATIENCE_S)
         return self
 
     def pids(self):
@@ -187,10 +182,10 @@ class Lab:
     def episodes(self):
         return sorted((self.data / "episodes").glob("*"))
 
-    def outcome(self, episode="*", seconds=12):
+    def outcome(self, episode="*"):
         """The outcome of an episode, where there is only one of that."""
         (path,) = eventually(
-            lambda: list((self.data / "episodes").glob(f"{episode}/outcome.json")), seconds, "an outcome"
+            lambda: list((self.data / "episodes").glob(f"{episode}/outcome.json")), "an outcome"
         )
         return json.loads(path.read_text())
 
@@ -200,12 +195,12 @@ class Lab:
             self.client.close()
         if self.supervisor and self.supervisor.poll() is None:
             self.supervisor.send_signal(signal.SIGTERM)
-            self.supervisor.wait(self.ending)
+            self.supervisor.wait(PATIENCE_S)
         self.supervisor = self.client = None
 
     def close(self):
         self.end()
         for child in self.children.values():
             child.stdin.close()
-            child.wait(10)
+            child.wait(PATIENCE_S)
         self.children.clear()

@@ -8,7 +8,7 @@ import pytest
 from runtime.clients.client import Refused
 from runtime.recording.reader import open_episode
 from tests.crash.lab import Lab
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 
@@ -75,12 +75,12 @@ def test_policies_are_exchanged_over_real_sockets_and_never_two_are_connected(be
 def test_a_policy_that_is_exchanged_while_it_is_asked_is_cut_off(bench):
     set_up(bench)
     bench.client.command("run")
-    bench.client.wait(lambda s: s["policy"]["answers"] > 3, 60)
+    bench.client.wait(lambda s: s["policy"]["answers"] > 3, PATIENCE_S)
     bench.client.command("stop")  # with a request under way
     set_up(bench, policy={"url": bench.other})
     assert connections(bench) == [port(bench.other)]
     bench.client.command("run")
-    status = bench.client.wait(lambda s: s["policy"]["answers"] > 3, 60)
+    status = bench.client.wait(lambda s: s["policy"]["answers"] > 3, PATIENCE_S)
     assert status["policy"]["latency_p50_ms"] > 35
     bench.client.command("stop")
 
@@ -113,7 +113,7 @@ def test_places_that_the_bench_does_not_have_end_the_set_up_with_what_the_node_s
 
 def test_a_node_that_is_not_declared_simulated_is_not_believed(lab):
     lab.node("--bench", "tabletop").up("transport.detect_frozen=false")
-    status = eventually(lambda: _with_faults(lab), 10, "the fault")
+    status = eventually(lambda: _with_faults(lab), "the fault")
     assert status["link"]["faults"]["truth_ignored"] == 1
     assert (status["truth"], status["simulated"]) == ({}, False)
     with pytest.raises(Refused, match="the transport is not declared simulated"):

@@ -15,7 +15,7 @@ from runtime.core.errors import TransportError
 from runtime.policies.tunnel.process import free_port
 from runtime.recording.reader import open_episode
 from tests.crash.lab import ROBOT
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 
@@ -28,11 +28,11 @@ def assert_setup_fails(lab, *words, **asked):
         assert word in status["reason"], status["reason"]
 
 
-def assert_holds(lab, *words, seconds=15):
-    status = lab.reach("holding", seconds=seconds)
+def assert_holds(lab, *words):
+    status = lab.reach("holding")
     for word in words:
         assert word in status["reason"], status["reason"]
-    behaviour = lab.client.wait(lambda s: s["control"]["behaviour"] == "hold", 60)
+    behaviour = lab.client.wait(lambda s: s["control"]["behaviour"] == "hold", PATIENCE_S)
     assert behaviour["control"]["engaged"]
     return status
 
@@ -54,7 +54,7 @@ def served(station):
     yield station, by
     server = station.children.pop("failing")
     server.stdin.close()
-    server.wait(10)
+    server.wait(PATIENCE_S)
 
 
 def test_policy_server_mute_on_connect(served):
@@ -111,7 +111,7 @@ def test_node_restarted_with_a_smaller_clock_is_noticed_and_seen_again(station):
     station.reach("disconnected")
     station.node("--clock-offset", "-100000")
     station.reach("idle")
-    eventually(lambda: len(station.events("source_clock_backwards")) > told, 5, "the event")
+    eventually(lambda: len(station.events("source_clock_backwards")) > told, "the event")
     assert station.client.status()["link"]["ages"]["joints"] < 0.5
     station.ready()
     station.children.pop("node").kill()
@@ -146,8 +146,8 @@ def test_a_stale_command_is_refused_and_a_repeated_one_gets_its_first_answer(sta
     assert (again.status, again.sequence) == (first.status, first.sequence)
     assert client.status()["run"]["number"] == runs
     lab.kill("coordinator")
-    eventually(lab.answers, 10, "a new coordinator")
-    eventually(lambda: client.status()["state"] == "idle", 15, "the end of the run")
+    eventually(lab.answers, "a new coordinator")
+    eventually(lambda: client.status()["state"] == "idle", "the end of the run")
     replayed = client._command("run", 2.0, identity=identity)
     assert replayed.status == "accepted"  # its first answer, from the journal
     assert client.status()["state"] == "idle"  # and nothing else
@@ -188,7 +188,7 @@ def test_a_stall_of_half_a_second_is_no_burst(station):
     time.sleep(0.5)
     os.kill(control, signal.SIGCONT)
     before = lab.client.status()["run"]["elapsed"]
-    lab.client.wait(lambda s: s["run"]["elapsed"] > before + 1.0 or s["state"] != "running", 60)
+    lab.client.wait(lambda s: s["run"]["elapsed"] > before + 1.0 or s["state"] != "running", PATIENCE_S)
     assert lab.client.status()["control"]["missed"] - missed >= 10
     lab.client.command("stop")
     lab.outcome(episode)
@@ -220,17 +220,17 @@ def small_disk(station):
 def test_a_full_disk_ends_the_recording_with_a_sentence_and_holds_the_robot(small_disk):
     lab = small_disk.running(0.5)
     media = lab.pids()["media"]
-    assert_holds(lab, "disk full while writing", "bytes free", seconds=60)
+    assert_holds(lab, "disk full while writing", "bytes free")
     assert lab.pids()["media"] == media
     episode = open_episode(lab.episodes()[0])
     assert episode.frames > 15
     lab.client.command("stop")
     lab.reach("ready")
-    status = lab.client.wait(lambda s: s["recording"]["unclosed"], 15)
+    status = lab.client.wait(lambda s: s["recording"]["unclosed"], PATIENCE_S)
     assert "disk full while writing" in status["recording"]["unclosed"][episode.path.name]
     assert not (episode.path / "outcome.json").exists()
     subprocess.run(["mount", "-o", "remount,size=8m", str(lab.data / "episodes")], check=True)
-    lab.client.wait(lambda s: not s["recording"]["unclosed"], 60)
+    lab.client.wait(lambda s: not s["recording"]["unclosed"], PATIENCE_S)
     whole = open_episode(episode.path)
     assert whole.outcome["status"] == "failed"
     assert whole.frames >= episode.frames
@@ -255,13 +255,13 @@ def test_a_file_that_may_not_grow_ends_the_recording_and_holds_the_robot(station
 def test_an_expiring_lease_makes_the_robot_hold_and_its_holder_may_resume(lab):
     lab.up("lease.ttl_s=2.5").running(0.5)
     # nobody renews
-    eventually(lambda: lab.client.status()["state"] == "holding", 5, "the end of the lease")
+    eventually(lambda: lab.client.status()["state"] == "holding", "the end of the lease")
     assert "lease" in lab.client.status()["reason"]
-    eventually(lambda: lab.client.status()["control"]["behaviour"] == "hold", 15, "the hold")
+    eventually(lambda: lab.client.status()["control"]["behaviour"] == "hold", "the hold")
     lab.client.command("resume")
-    lab.client.wait(lambda s: s["state"] == "running" and s["control"]["remaining"] > 0, 60)
+    lab.client.wait(lambda s: s["state"] == "running" and s["control"]["remaining"] > 0, PATIENCE_S)
     lab.client.command("stop")
-    episode = open_episode(eventually(lambda: lab.outcome() and lab.episodes()[0], 10, "an episode"))
+    episode = open_episode(eventually(lambda: lab.outcome() and lab.episodes()[0], "an episode"))
     sources = episode.rows["control_source"].to_pylist()
     assert {"policy", "hold"} <= set(sources)
 

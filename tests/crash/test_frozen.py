@@ -3,15 +3,15 @@
 import pytest
 
 from runtime.recording.reader import open_episode
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 
 
 def test_a_frozen_camera_makes_control_hold_and_is_named(lab):
     lab.node("--freeze-camera", "cam_high").up("setup.observation_timeout_s=1.0", "safety.picture_age_s=2.0")
-    eventually(lambda: lab.events("source_frozen_cam_high"), 10, "the event")
-    ages = lab.client.wait(lambda s: s["link"]["ages"]["cam_high"] > 2.0, 60)["link"]["ages"]
+    eventually(lambda: lab.events("source_frozen_cam_high"), "the event")
+    ages = lab.client.wait(lambda s: s["link"]["ages"]["cam_high"] > 2.0, PATIENCE_S)["link"]["ages"]
     assert ages["cam_left_wrist"] < 0.5
     assert ages["joints"] < 0.5
     lab.client.command("setup")

@@ -8,7 +8,7 @@ import pytest
 
 from runtime.recording.reader import open_episode
 from tests.crash.lab import ROOT, seen_since
-from tests.processes import alive, eventually
+from tests.processes import PATIENCE_S, alive, eventually
 
 pytestmark = pytest.mark.slow
 FAMILY = ("control", "coordinator", "reception", "media", "guard")
@@ -53,23 +53,23 @@ def one_is_killed(lab, process, state):
     before, episode = lab.pids(), lab.client.status()["recording"]["uuid"]
     killed_at = time.time()
     lab.kill(process)
-    eventually(lambda: lab.pids()[process] != before[process], 10, f"a restart of {process}")
+    eventually(lambda: lab.pids()[process] != before[process], f"a restart of {process}")
     restarted_at = time.monotonic()
     lab.answers_again()
     step = lab.client.status()["control"]["step"]
     # else a set-up ends with the link that is lost yet, or with joints that a new control has not seen for long enough
-    lab.client.wait(lambda s: seen_since(s, restarted_at) and s["control"]["step"] > step + 10, 15)
-    lab.reach("idle", seconds=15)
+    lab.client.wait(lambda s: seen_since(s, restarted_at) and s["control"]["step"] > step + 10, PATIENCE_S)
+    lab.reach("idle")
     assert before | {process: 0} == lab.pids() | {process: 0}
     if state == "recording":
         readable_to_the_last_second(lab, killed_at, episode)
-        held = lab.client.wait(lambda s: s["control"]["behaviour"] == "hold", 60)
+        held = lab.client.wait(lambda s: s["control"]["behaviour"] == "hold", PATIENCE_S)
         assert held["control"]["engaged"], process
 
 
 def recording(lab, episode):
     """Some rows of that episode are recorded; the count is that of the one before until media has told of it."""
-    lab.client.wait(lambda s: s["recording"]["uuid"] == episode and s["recording"]["rows"] > 15, 30)
+    lab.client.wait(lambda s: s["recording"]["uuid"] == episode and s["recording"]["rows"] > 15, PATIENCE_S)
 
 
 @pytest.mark.parametrize(
@@ -87,12 +87,12 @@ def test_a_recording_without_a_run_is_never_left_half_open_by_a_kill(station, pr
     alone = lab.client.command("record_start").data["episode"]
     recording(lab, alone)
     recorded = lab.data / "episodes" / alone
-    eventually(lambda: open_episode(recorded).frames > 10, 15, "what is counted is on the disk too")
+    eventually(lambda: open_episode(recorded).frames > 10, "what is counted is on the disk too")
     before = lab.pids()
     lab.kill(process)
-    eventually(lambda: lab.pids()[process] != before[process], 10, "a restart")
+    eventually(lambda: lab.pids()[process] != before[process], "a restart")
     lab.answers_again()
-    lab.reach("idle", seconds=15)
+    lab.reach("idle")
     lab.ready()
     if process == "guard":  # it held nothing of the recording
         assert lab.client.status()["recording"]["uuid"] == alone
@@ -103,7 +103,7 @@ def test_a_recording_without_a_run_is_never_left_half_open_by_a_kill(station, pr
     found = {}
     for episode in (alone, run):
         folder = lab.data / "episodes" / episode
-        eventually((folder / "outcome.json").exists, 15, f"the outcome of {episode}")
+        eventually((folder / "outcome.json").exists, f"the outcome of {episode}")
         found[episode] = open_episode(folder)
         assert found[episode].frames > 10
     assert (found[alone].outcome["status"], found[run].outcome["status"]) == (status, "finished")
@@ -122,6 +122,6 @@ def test_nothing_is_left_ten_seconds_after_the_supervisor_was_killed(lab, state)
     if state == "recording":
         time.sleep(1.0)
         assert alive(pids["control"])  # it is holding
-    eventually(lambda: not any(map(alive, pids.values())), 10, "the end of the family")
+    eventually(lambda: not any(map(alive, pids.values())), "the end of the family")
     if state == "recording":
         readable_to_the_last_second(lab, killed_at)

@@ -12,7 +12,7 @@ import zmq
 
 from runtime.ipc.bus import Endpoints, Subscriber
 from tests.crash.lab import ROOT, Lab
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +34,7 @@ def watched(subscriber, names, number):
             seen.setdefault(name, []).append(content)
         return all(len(seen.get(name, ())) > number for name in names)
 
-    eventually(enough, 10, f"{number} of each of {', '.join(names)}")
+    eventually(enough, f"{number} of each of {', '.join(names)}")
     return seen
 
 
@@ -66,7 +66,7 @@ def test_events_are_numbered_without_gaps_and_can_be_fetched_later(lab):
     closed = len(lab.events("episode_closed"))
     lab.running(0.3)
     lab.client.command("stop")
-    eventually(lambda: len(lab.events("episode_closed")) > closed, 10, "the episode")
+    eventually(lambda: len(lab.events("episode_closed")) > closed, "the episode")
     events = lab.client.events_since(0)
     assert [event["number"] for event in events] == list(range(1, len(events) + 1))
     middle = events[len(events) // 2]["number"]
@@ -92,13 +92,13 @@ def test_a_terminal_sets_up_runs_and_stops_a_station(lab):
     assert setup.returncode == 0, err
     assert "READY" in out
     run = ctl("run")
-    eventually(lambda: lab.client.status()["run"]["elapsed"] > 0.5, 15, "a run")
+    eventually(lambda: lab.client.status()["run"]["elapsed"] > 0.5, "a run")
     second = ctl("record", "start")
     _, refused = second.communicate()
     assert second.returncode == 1
     assert "record_start is not allowed while running" in refused
     os.kill(run.pid, signal.SIGINT)  # Ctrl-C stops the run
-    assert run.wait(15) == 0
+    assert run.wait(PATIENCE_S) == 0
     assert lab.client.status()["state"] == "ready"
     (episode,) = {folder.name for folder in lab.episodes()} - before
     assert lab.outcome(episode)["status"] == "finished"

@@ -12,7 +12,7 @@ from benchmarks.fuzzing.bodies import body
 from runtime.core import msgpack_arrays
 from runtime.safety.settings import SafetySettings
 from tests.crash.lab import FREE, ROBOT, Lab
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 PERIOD = 1 / 30
@@ -101,13 +101,13 @@ def test_a_control_that_is_killed_while_the_robot_moves_goes_on_holding_where_th
         lab.client.command("run")
     else:
         lab.client.command("run", mode="manual")
-        lab.client.wait(lambda status: "move" in status["allowed"], lab.patience)
+        lab.client.wait(lambda status: "move" in status["allowed"], PATIENCE_S)
         lab.client.command("move", pose="ready")
-    eventually(tap.moves, 20, "a motion")
+    eventually(tap.moves, "a motion")
     lab.kill("control")
-    eventually(lambda: len(tap.controls) == 2, 20, "a restarted control")
+    eventually(lambda: len(tap.controls) == 2, "a restarted control")
     lab.reach("idle")
-    eventually(lambda: len(tap.targets) >= 60, 10, "commands of the restarted control")
+    eventually(lambda: len(tap.targets) >= 60, "commands of the restarted control")
     (old, new) = tap.controls.values()
     assert within_limits(old)
     # The last command of the old one may have been lost on its way, or not written down: one tick's way apart at most.

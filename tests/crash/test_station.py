@@ -25,7 +25,7 @@ def leftover(lab, *names):
     episode = lab.data / "episodes" / lab.client.status()["recording"]["uuid"]
     pids = lab.pids().values()
     lab.kill("supervisor")
-    eventually(lambda: not any(map(alive, pids)), 10, "the end of the family")
+    eventually(lambda: not any(map(alive, pids)), "the end of the family")
     lab.client.close()
     (episode / "outcome.json").unlink()
     copies = [episode.with_name(name) for name in names]
@@ -44,7 +44,7 @@ def test_leftovers_that_cannot_be_repaired_do_not_keep_the_station_from_starting
     station.station()
     station.reach("idle")
     for episode in good:
-        eventually((episode / "outcome.json").exists, 10, "the repair of the others")
+        eventually((episode / "outcome.json").exists, "the repair of the others")
         assert open_episode(episode).frames > 5
     for bad in (manifest, events):
         assert not (bad / "outcome.json").exists()
@@ -57,10 +57,10 @@ def test_leftovers_that_cannot_be_repaired_do_not_keep_the_station_from_starting
 def test_many_leftovers_do_not_delay_the_start(station):
     episodes = leftover(station, *(f"22222222-2222-4222-8222-{number:012}" for number in range(50)))
     station.station()
-    station.reach("idle", seconds=10)
+    station.reach("idle")
     station.ready()
     media = station.pids()["media"]
-    eventually(lambda: all((episode / "outcome.json").exists() for episode in episodes), 30, "all repairs")
+    eventually(lambda: all((episode / "outcome.json").exists() for episode in episodes), "all repairs")
     assert station.pids()["media"] == media
 
 
@@ -101,7 +101,7 @@ def test_a_process_is_restarted_although_the_disk_is_full_and_found_when_there_i
                 file.write(bytes(4096))
         lab.kill(process)
         text = f"clients cannot find the process {process} until the disk takes its file"
-        eventually(lambda text=text: text in log.read_text(), 10, "the sentence in the log")
+        eventually(lambda text=text: text in log.read_text(), "the sentence in the log")
         assert lab.supervisor.poll() is None
         filler.unlink()
         eventually(

@@ -55,7 +55,7 @@ def bystander(ssh_server):
         "127.0.0.1",
     ]
     with subprocess.Popen(line, stdin=subprocess.DEVNULL) as process:
-        eventually(lambda: len(ssh_server.sessions()) == 1, 10, "its connection")
+        eventually(lambda: len(ssh_server.sessions()) == 1, "its connection")
         yield process
         assert process.poll() is None
         process.terminate()
@@ -75,7 +75,7 @@ def test_no_tunnel_outlives_what_was_killed(station, ssh_server, bystander, vict
     assert alive(ssh)
     for process in victims:
         lab.kill(process)
-    eventually(lambda: not alive(ssh), 10, "the end of ssh")
+    eventually(lambda: not alive(ssh), "the end of ssh")
     if victims == ["coordinator"]:  # another one makes its own at the next set-up
         lab.answers_again()
         lab.reach("idle")

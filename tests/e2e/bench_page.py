@@ -2,7 +2,7 @@
 
 from tests.e2e.lab import STATION
 from tests.e2e.pixels import pixels
-from tests.processes import eventually
+from tests.processes import PATIENCE_MS, eventually
 
 
 class BenchPage:
@@ -14,7 +14,7 @@ class BenchPage:
             viewport=size, ignore_https_errors=True, **{"color_scheme": "dark", **screen}
         )
         self.page = self.context.new_page()
-        self.page.set_default_timeout(90_000)  # of a busy machine, as in tests.processes
+        self.page.set_default_timeout(PATIENCE_MS)  # of a busy machine, as in tests.processes
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("console", lambda said: said.type == "error" and self.errors.append(said.text))
@@ -36,12 +36,12 @@ class BenchPage:
         """The one word of the status bar."""
         return self.page.locator(".status-state .state").inner_text().strip().upper()
 
-    def reaches(self, word, seconds=60):
-        eventually(lambda: word in self.state(), seconds, f"the status bar says {word}, not {self.state()}")
+    def reaches(self, word):
+        eventually(lambda: word in self.state(), f"the status bar says {word}, not {self.state()}")
 
     def at_rest(self):
         """The page shows a station that can be set up."""
-        eventually(lambda: self.state() in ("IDLE", "READY"), 60, "the status bar says IDLE or READY")
+        eventually(lambda: self.state() in ("IDLE", "READY"), "the status bar says IDLE or READY")
 
     def take(self):
         self.page.click("[data-lease=claim]")
@@ -51,7 +51,7 @@ class BenchPage:
         """Have the station, whether its lease has ended meanwhile or is that of a page which was closed."""
         whose = [self.page.locator(f"[data-lease-when={lease}]") for lease in ("mine", "elsewhere", "free")]
         mine, elsewhere, _ = whose
-        eventually(lambda: any(one.is_visible() for one in whose), 30, "the page knows who has the station")
+        eventually(lambda: any(one.is_visible() for one in whose), "the page knows who has the station")
         if elsewhere.is_visible():
             self.page.click("[data-lease=move]")
             mine.wait_for()
@@ -79,7 +79,7 @@ class BenchPage:
         """Every camera pane has a picture that is not stale."""
         panes = self.page.locator(".camera")
         live = self.page.locator(".camera:not([data-stale])")
-        eventually(lambda: panes.count() == live.count() > 0, 30, "all cameras show fresh pictures")
+        eventually(lambda: panes.count() == live.count() > 0, "all cameras show fresh pictures")
         return panes.count()
 
     def camera(self, key):

@@ -7,7 +7,6 @@ from tests.e2e.lab import STATION
 from tests.processes import eventually
 
 MODE_KEYS = {"sim": "1", "step": "2", "preview": "3", "continuous": "4", "manual": "5"}
-SOON_S = 30
 
 
 class ByHand(BenchPage):
@@ -20,10 +19,10 @@ class ByHand(BenchPage):
         for key in pressed:
             self.page.keyboard.press(key)
 
-    def says(self, part, words, seconds=SOON_S):
+    def says(self, part, words):
         """The part of the page says these words."""
         place = self.page.locator(part)
-        eventually(lambda: words in place.inner_text(), seconds, f"{part} says {words!r}")
+        eventually(lambda: words in place.inner_text(), f"{part} says {words!r}")
 
     def quiet(self, part):
         self.page.locator(part).wait_for(state="hidden")
@@ -34,7 +33,7 @@ class ByHand(BenchPage):
         self.at_rest()
         began = self.snapshot()["sequence"]
         self.press("setup")
-        eventually(lambda: self.snapshot()["sequence"] > began + 1, 60, "the set-up has begun and ended")
+        eventually(lambda: self.snapshot()["sequence"] > began + 1, "the set-up has begun and ended")
         self.reaches("READY")
         self.at_the_pose()
 
@@ -46,7 +45,7 @@ class ByHand(BenchPage):
             shown = self.joints()
             return bool(shown) and shown == pytest.approx(home[: len(shown)], abs=0.02)
 
-        eventually(there, SOON_S, f"the page shows the robot at {home}")
+        eventually(there, f"the page shows the robot at {home}")
 
     def run_in(self, mode):
         """Choose the mode and begin."""
@@ -70,7 +69,7 @@ class ByHand(BenchPage):
                 self.page.wait_for_timeout(200)
             return self.moved_from(before)
 
-        eventually(moved, 3 * SOON_S, "the committed chunk is executed")
+        eventually(moved, "the committed chunk is executed")
 
     def stop(self):
         self.press("stop")

@@ -21,7 +21,12 @@ PATIENT = {
 }
 SMALL = "--pictures=400x300"  # less processor time; those of --once and of tests/crash are whole
 SETS = [SMALL, *(f"--set={key}={value}" for key, value in PATIENT.items())]
-LOCKSTEP = ["--lockstep", SMALL, "--set=bus.preview_rate=5", "--set=lease.ttl_s=20"]  # the web is in real time
+LOCKSTEP = [
+    "--lockstep",
+    SMALL,
+    "--set=bus.preview_rate=5",
+    "--set=lease.ttl_s=20",
+]  # the web is in real time
 # Of a lab whose programs may be killed: starvation, patience and leases strike there, what a slow machine does not.
 SHARED = {
     name: PATIENT[name] for name in PATIENT if name.partition(".")[0] in ("control", "safety", "recording")

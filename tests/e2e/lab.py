@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 
 from tests import migrated
-from tests.processes import alive, eventually
+from tests.processes import PATIENCE_S, alive, eventually
 
 ROOT = Path(__file__).parents[2]
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
@@ -61,7 +61,7 @@ class Demo:
             return ready.exists()
 
         try:
-            eventually(up, 90, "the demo is up")
+            eventually(up, "the demo is up")
         except BaseException:
             self.child.kill()  # all that it started ends with it
             raise
@@ -114,7 +114,7 @@ class Demo:
         """End it as a person would; returns the exit code."""
         if self.runs:
             self.child.send_signal(number)
-        code = self.child.wait(60)
+        code = self.child.wait(PATIENCE_S)
         self.output.close()
         return code
 

@@ -20,7 +20,7 @@ def handed(operator):
             operator.page.wait_for_timeout(1000)
         return code.is_visible()
 
-    eventually(there, 30, "the next trial is handed out")
+    eventually(there, "the next trial is handed out")
     operator.reaches("READY")
     operator.page.locator("#steps[data-set-up=yes]").wait_for()
     return shown(operator)

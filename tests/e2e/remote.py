@@ -7,10 +7,9 @@ import pytest
 
 from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
 from tests.e2e.lab import STATION
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 SCENE, SKILLED = "block-on-plate", "pick-place-40k"
-_SOON_S, _MOTION_S = 20.0, 60.0
 
 
 def visitor(demo, username, password=None):
@@ -49,11 +48,11 @@ class Page(LivePage):
 
     def take(self):
         self.claim()
-        self.wait(lambda state: state["lease"]["epoch"] == self.epoch, _SOON_S, "having the station")
+        self.wait(lambda state: state["lease"]["epoch"] == self.epoch, PATIENCE_S, "having the station")
 
     def state(self):
         """The newest state."""
-        return self.wait(lambda state: True, _SOON_S, "any state")
+        return self.wait(lambda state: True, PATIENCE_S, "any state")
 
     def command(self, kind, trial=None):
         """As a page's operator gives it, who does as a refusal says that it passes by itself."""
@@ -65,7 +64,7 @@ class Page(LivePage):
                 if "try again in a moment" not in str(refusal):
                     raise
 
-        return eventually(given, _SOON_S, f"{kind} is taken")
+        return eventually(given, f"{kind} is taken")
 
     def prepare(self, checkpoint=SKILLED, position=1):
         """The id of a new trial."""
@@ -77,11 +76,11 @@ class Page(LivePage):
 
         def ready():
             self.command("setup", trial)
-            state = self.wait(lambda state: state["state"] != "setting_up", _MOTION_S, "setting up")
+            state = self.wait(lambda state: state["state"] != "setting_up", PATIENCE_S, "setting up")
             assert state["state"] == "ready" or was_late(state["reason"]), state["reason"]
             return state["state"] == "ready"
 
-        eventually(ready, _MOTION_S, "ready")
+        eventually(ready, "ready")
 
     def running(self, checkpoint=SKILLED):
         """The id of a trial that has just begun to run."""
@@ -102,7 +101,7 @@ class Page(LivePage):
             recorded = recording["uuid"] == state["run"]["uuid"] and recording["rows"] > 0  # else no episode
             return state["state"] == "running" and self.status(trial) == "running" and recorded
 
-        eventually(moves, _SOON_S, f"trial {trial} runs; the station is {self.state()['reason']}")
+        eventually(moves, f"trial {trial} runs; the station is {self.state()['reason']}")
 
     def resume(self, trial):
         self.command("resume", trial)
@@ -110,14 +109,14 @@ class Page(LivePage):
 
     def holds(self, trial):
         """The reason for which the station holds, once the trial is paused as well."""
-        reason = self.wait(lambda state: state["state"] == "holding", _SOON_S, "holding")["reason"]
-        eventually(lambda: self.status(trial) == "paused", _SOON_S, f"trial {trial} is paused")
+        reason = self.wait(lambda state: state["state"] == "holding", PATIENCE_S, "holding")["reason"]
+        eventually(lambda: self.status(trial) == "paused", f"trial {trial} is paused")
         return reason
 
     def stop(self, trial):
         """Press Stop; the trial waits to be scored."""
         self.command("stop", trial)
-        eventually(lambda: self.status(trial) == "ended", _SOON_S, f"trial {trial} has ended")
+        eventually(lambda: self.status(trial) == "ended", f"trial {trial} has ended")
 
     def score(self, trial, reached=False):
         milestones = self.visitor.get(f"scenes/{SCENE}")["milestones"]
@@ -130,7 +129,7 @@ class Page(LivePage):
                 if "on the disk yet" not in str(refusal):
                     raise
 
-        return eventually(scored, _SOON_S, f"the recording of trial {trial} is on the disk")
+        return eventually(scored, f"the recording of trial {trial} is on the disk")
 
     def status(self, trial):
         return self.trial(trial)["status"]
@@ -159,7 +158,7 @@ class Page(LivePage):
         def answered():
             return [said for said in self.told if said.get("uuid") == identity]
 
-        return eventually(answered, _SOON_S, "the e-stop is answered")[0]
+        return eventually(answered, "the e-stop is answered")[0]
 
     def renewals(self):
         """How the runtime has answered to the page's signs of life."""
@@ -167,12 +166,12 @@ class Page(LivePage):
 
     def renewed(self):
         """Whether this page still has the station, by the answer to its first sign of life."""
-        return eventually(self.renewals, _SOON_S, "an answer to a renewal")[0]["ok"]
+        return eventually(self.renewals, "an answer to a renewal")[0]["ok"]
 
     def draws(self, frames):
         """So many more frames arrive."""
         wanted = self.frames + frames
-        eventually(lambda: self.frames >= wanted, _SOON_S, f"{frames} more frames")
+        eventually(lambda: self.frames >= wanted, f"{frames} more frames")
 
     def say(self, message):
         """Over the live socket."""
@@ -192,7 +191,7 @@ def opened(visitor, page=""):
         except VisitFailed:  # nobody listens yet
             return None
 
-    return eventually(tried, 60, "the web opens a live page")
+    return eventually(tried, "the web opens a live page")
 
 
 @contextmanager
@@ -208,18 +207,18 @@ def page_of(visitor):
 def tidy(admin):
     """Leave the station ready or idle, nobody's, without an open trial."""
     with page_of(admin) as page:
-        page.wait(lambda state: state["state"] != "disconnected", _SOON_S, "the station")
+        page.wait(lambda state: state["state"] != "disconnected", PATIENCE_S, "the station")
         facts = admin.get(f"stations/{STATION}")
         if facts["trial"] is None and not facts["lease"]["holder"] and facts["snapshot"]["state"] in _AT_REST:
             return
         taken = {"action": "take", "page": page.page, "reason": "the next test begins"}
         page.epoch = admin.post(f"stations/{STATION}/lease", taken)["epoch"]
-        page.wait(lambda state: state["lease"]["epoch"] == page.epoch, _SOON_S, "having the station")
+        page.wait(lambda state: state["lease"]["epoch"] == page.epoch, PATIENCE_S, "having the station")
         state = page.state()["state"]
         if state not in _AT_REST:
             page.command("release" if state == "faulted" else "stop")
-        page.wait(lambda state: state["state"] in _AT_REST, _SOON_S, "the station at rest")
-        eventually(lambda: _finished(admin), _SOON_S, "no trial is open")
+        page.wait(lambda state: state["state"] in _AT_REST, PATIENCE_S, "the station at rest")
+        eventually(lambda: _finished(admin), "no trial is open")
         admin.post(f"stations/{STATION}/lease", {"action": "give_up", "page": page.page})
         page.epoch = 0
 

@@ -17,6 +17,8 @@ import struct
 import sys
 import time
 
+from tests.processes import PATIENCE_MS, PATIENCE_S
+
 PORTS = range(1, 65536)
 _AT_ONCE = 256
 _LAST_S = 2.0  # for what is late
@@ -74,7 +76,7 @@ def web(origin, paths):
     host, _, port = origin.partition(":")
     found = {}
     for path in paths:
-        call = http.client.HTTPConnection(host, int(port), timeout=60)
+        call = http.client.HTTPConnection(host, int(port), timeout=PATIENCE_S)
         call.request("GET", path)
         answer = call.getresponse()
         found[path] = [answer.status, (answer.headers["Location"] or "").partition("?")[0]]
@@ -86,8 +88,8 @@ def link(host, port):
     """What strangers get at a port of the link."""
     import zmq
 
-    with socket.create_connection((host, port), 60) as call:
-        call.settimeout(60)
+    with socket.create_connection((host, port), PATIENCE_S) as call:
+        call.settimeout(PATIENCE_S)
         call.sendall(b"GET / HTTP/1.1\r\nHost: lab\r\n\r\n" + b"\0" * 64)
         got = b""
         try:
@@ -104,7 +106,7 @@ def link(host, port):
             asking.curve_serverkey = zmq.curve_keypair()[0]
         asking.connect(f"tcp://{host}:{port}")
         asking.send_multipart([b"hello", b"{}"])
-        messages.append(len(asking.recv_multipart()) if asking.poll(3000) else 0)
+        messages.append(len(asking.recv_multipart()) if asking.poll(PATIENCE_MS) else 0)
         asking.close()
     return {"http": got.hex(), "messages": messages}
 

@@ -9,7 +9,7 @@ from tests.e2e.pixels import pixels, share
 from tests.e2e.remote import SKILLED, tidy, visitor
 from tests.processes import eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 TAGS = 40  # rows of pixels at the top of the plot, where sentences may stand that count seconds
 
 
@@ -35,7 +35,7 @@ class Live(BenchPage):
         for _ in range(3):
             self.press("setup")
             self.reaches("SETTING UP")
-            eventually(lambda: "SETTING UP" not in self.state(), 90, "the set-up ends")
+            eventually(lambda: "SETTING UP" not in self.state(), "the set-up ends")
             if "READY" in self.state():
                 return
         raise AssertionError(f"it is not set up: {self.page.locator('[data-show=stage]').inner_text()}")
@@ -44,13 +44,13 @@ class Live(BenchPage):
         """Run in a mode."""
         self.page.locator(f"input[name=mode][value={mode}]").locator("..").click()
         self.press("run")
-        eventually(self.moves, 60, f"it runs in mode {mode}")
+        eventually(self.moves, f"it runs in mode {mode}")
 
     def moves(self):
         """Whether it runs; resumed where this machine was late."""
         if "HOLDING" in self.state() and self.page.locator("[data-command=resume]:visible:enabled").count():
             self.press("resume")
-            eventually(lambda: "HOLDING" not in self.state(), 20, "it goes on")
+            eventually(lambda: "HOLDING" not in self.state(), "it goes on")
         return "RUNNING" in self.state()
 
     def control(self):
@@ -105,18 +105,18 @@ def test_a_proposed_chunk_is_a_ghost_until_it_is_cancelled(bench):
     before = bench.blue()
     bench.runs("preview")
     bench.press("step")
-    eventually(lambda: "proposed" in bench.tag("chunk"), 30, "the scene names the proposed chunk")
-    eventually(lambda: bench.blue() > before + 0.002, 20, "the ghost leaves the robot")
+    eventually(lambda: "proposed" in bench.tag("chunk"), "the scene names the proposed chunk")
+    eventually(lambda: bench.blue() > before + 0.002, "the ghost leaves the robot")
     bench.press("cancel")
-    eventually(lambda: not bench.tag("chunk"), 10, "nothing is proposed any more")
+    eventually(lambda: not bench.tag("chunk"), "nothing is proposed any more")
     bench.stops()
 
 
 def test_in_simulation_the_scene_and_the_curves_say_which_robot_is_which(bench):
     bench.runs("sim")
-    eventually(lambda: "simulated robot" in bench.tag("simulated"), 20, "the simulated robot is named")
-    eventually(lambda: "executed by the simulated robot" in bench.tag("simulated"), 20, "so are its curves")
-    eventually(lambda: bench.blue() > 0.005, 30, "the simulated robot is drawn where it goes")
+    eventually(lambda: "simulated robot" in bench.tag("simulated"), "the simulated robot is named")
+    eventually(lambda: "executed by the simulated robot" in bench.tag("simulated"), "so are its curves")
+    eventually(lambda: bench.blue() > 0.005, "the simulated robot is drawn where it goes")
     bench.stops()
 
 
@@ -125,7 +125,7 @@ def test_a_target_is_a_ghost_and_moves_nothing(bench):
     before = bench.blue()
     bench.page.keyboard.press("7")
     bench.page.select_option("#pose", "home")
-    eventually(lambda: "target" in bench.tag("aim"), 20, "the scene names the target")
+    eventually(lambda: "target" in bench.tag("aim"), "the scene names the target")
     assert bench.blue() > before + 0.005
     assert (bench.state(), bench.control()["behaviour"]) == ("READY", said)
 
@@ -136,28 +136,26 @@ def test_chunks_are_seen_in_the_curves_which_stand_still_while_the_data_goes_on(
     bench.press("tune")
     bench.runs("continuous")
     plot = bench.page.locator("#curves .u-over")
+    eventually(lambda: bench.moves() and columns(pixels(plot), band) > 10, "bands stand where chunks overlap")
     eventually(
-        lambda: bench.moves() and columns(pixels(plot), band) > 10, 60, "bands stand where chunks overlap"
-    )
-    eventually(
-        lambda: bench.moves() and columns(pixels(plot), hairline) >= 5, 60, "hairlines stand between chunks"
+        lambda: bench.moves() and columns(pixels(plot), hairline) >= 5, "hairlines stand between chunks"
     )
     bench.page.click("#curves-pause")
-    eventually(lambda: "paused" in bench.tag("paused"), 5, "the page says that the curves are paused")
+    eventually(lambda: "paused" in bench.tag("paused"), "the page says that the curves are paused")
     stood, chunk = pixels(plot), bench.chunk
     assert columns(stood, band) >= 3
     assert columns(stood, hairline) >= 3
     ticks = bench.control()["ticks"]
-    eventually(lambda: bench.control()["ticks"] > ticks + 45, 30, "the run goes on")
+    eventually(lambda: bench.control()["ticks"] > ticks + 45, "the run goes on")
     assert np.array_equal(pixels(plot)[TAGS:], stood[TAGS:])
     assert bench.chunk == chunk
     bench.page.click("#curves-pause")
-    eventually(lambda: bench.moves() and bench.chunk > chunk, 30, "the curves go on")
+    eventually(lambda: bench.moves() and bench.chunk > chunk, "the curves go on")
 
 
 def test_the_cursor_names_the_chunk_that_led_then(bench):
     box = bench.page.locator("#curves .u-over").bounding_box()
-    newest = eventually(lambda: bench.moves() and max(0, bench.chunk), 30, "the newest chunk is named")
+    newest = eventually(lambda: bench.moves() and max(0, bench.chunk), "the newest chunk is named")
     bench.page.click("#curves-pause")
 
     def older():
@@ -168,7 +166,7 @@ def test_the_cursor_names_the_chunk_that_led_then(bench):
                 return True
         return False
 
-    eventually(older, 10, "an older chunk is named")
+    eventually(older, "an older chunk is named")
     bench.page.mouse.move(5, 5)
     bench.page.click("#curves-pause")
 
@@ -177,7 +175,7 @@ def test_latencies_and_delays_are_distributions_with_their_number(bench):
     bench.page.keyboard.press("9")
     for figure in ("latency", "delay"):
         shown = bench.page.locator(f"#figures [data-figure={figure}]")
-        eventually(lambda shown=shown: "(n = " in shown.inner_text(), 10, f"{figure} is measured")
+        eventually(lambda shown=shown: "(n = " in shown.inner_text(), f"{figure} is measured")
         assert shown.locator("rect.bar").count() >= 1
         assert shown.locator("line").count() == 2
     assert "p99.9" in bench.page.locator("#figures").inner_text()

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from runtime.recording.reader import open_episode
+from tests.processes import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 READER = ROOT / "tests" / "conformance" / "read_lerobot_v21.py"
@@ -66,7 +67,10 @@ def test_the_arm_has_moved_and_its_pictures_with_it(demo):
 def test_a_second_process_that_knows_only_the_format_agrees(demo):
     result = demo[1]
     read = subprocess.run(
-        [sys.executable, str(READER), result["dataset_path"]], capture_output=True, text=True, timeout=60
+        [sys.executable, str(READER), result["dataset_path"]],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
     )
     assert read.returncode == 0, read.stderr
     found = json.loads(read.stdout)

@@ -17,9 +17,9 @@ from runtime.clients.client import StationClient
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import DEAD, STATION, WIDE
 from tests.e2e.remote import SKILLED, opened, page_of, refusal, tidy, visitor, was_late
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def station(people):
 def bench(people, station):
     """The operator's page, who has the station."""
     with page_of(people["operator"]) as page:
-        page.wait(lambda state: state["state"] != "disconnected", 60, "the station")
+        page.wait(lambda state: state["state"] != "disconnected", PATIENCE_S, "the station")
         page.take()
         yield page
 
@@ -91,11 +91,11 @@ def test_a_worker_that_is_killed_right_after_a_score_publishes_the_episode_once(
     bench.score(trial)
     episode = bench.trial(trial)["episode"]
     jobs = "SELECT status FROM jobs_job WHERE key = ? AND status IN ('running', 'done')"
-    eventually(lambda: demo.rows(jobs, f"publish:{episode}"), 60, "the dataset is being written")
+    eventually(lambda: demo.rows(jobs, f"publish:{episode}"), "the dataset is being written")
     os.kill(demo.pid("worker"), signal.SIGKILL)
-    placed = eventually(lambda: placed_at(bench, episode), 90, "the episode is in the dataset")
+    placed = eventually(lambda: placed_at(bench, episode), "the episode is in the dataset")
     waiting = "SELECT key FROM jobs_job WHERE status IN ('queued', 'running')"
-    eventually(lambda: not demo.rows(waiting), 90, "the worker has nothing left to do")
+    eventually(lambda: not demo.rows(waiting), "the worker has nothing left to do")
     meta = demo.data / placed["dataset"] / "meta"
     lines = [json.loads(line) for line in (meta / "eva_episodes.jsonl").read_text().splitlines()]
     assert [line["episode_index"] for line in lines if line["uuid"] == episode] == [placed["dataset_index"]]
@@ -136,7 +136,7 @@ def test_a_web_that_stays_away_leaves_a_robot_that_holds_until_the_operator_resu
     station = StationClient(demo.data / "stations" / STATION)
     with closing(station), suspended(demo.child.pid):  # who would start the web again
         os.kill(demo.pid("serve"), signal.SIGKILL)
-        held = station.wait(lambda s: s["state"] == "holding" and not s["lease"]["holder"], 30)
+        held = station.wait(lambda s: s["state"] == "holding" and not s["lease"]["holder"], PATIENCE_S)
         assert "lease" in held["reason"] or was_late(held["reason"])
     with closing(opened(bench.visitor, bench.page)) as page:
         assert page.holds(trial) == held["reason"]
@@ -161,18 +161,18 @@ def test_while_the_database_is_locked_pictures_go_on_and_the_e_stop_works(demo, 
     with demo.locked():
         bench.draws(20)
         renewals = len(bench.renewals())
-        eventually(lambda: len(bench.renewals()) > renewals + 1, 20, "the lease is renewed")
+        eventually(lambda: len(bench.renewals()) > renewals + 1, "the lease is renewed")
         assert bench.renewals()[-1]["ok"]
         answer = bench.estop()
         assert answer["status"] == "done", answer
-        bench.wait(lambda state: state["state"] == "faulted", 20, "the e-stop")
+        bench.wait(lambda state: state["state"] == "faulted", PATIENCE_S, "the e-stop")
         assert bench.status(trial) == "running"  # nobody could write it down
-    eventually(lambda: bench.status(trial) == "interrupted", 30, "the trial is known as interrupted")
+    eventually(lambda: bench.status(trial) == "interrupted", "the trial is known as interrupted")
     row = "SELECT status FROM stations_command WHERE uuid = ?"
     pressed = UUID(answer["uuid"]).hex
-    eventually(lambda: demo.rows(row, pressed) == [("done",)], 30, "the e-stop is written down")
+    eventually(lambda: demo.rows(row, pressed) == [("done",)], "the e-stop is written down")
     bench.command("release")
-    bench.wait(lambda state: state["state"] == "idle", 20, "released")
+    bench.wait(lambda state: state["state"] == "idle", PATIENCE_S, "released")
 
 
 def test_an_unknown_checkpoint_is_refused_with_what_there_is(bench):
@@ -185,7 +185,7 @@ def test_an_unknown_checkpoint_is_refused_with_what_there_is(bench):
 def test_a_policy_that_nobody_serves_ends_the_set_up_with_its_address(bench):
     trial = bench.prepare(checkpoint=DEAD)
     bench.command("setup", trial)
-    state = bench.wait(lambda state: state["state"] != "setting_up", 60, "the end of the set-up")
+    state = bench.wait(lambda state: state["state"] != "setting_up", PATIENCE_S, "the end of the set-up")
     assert state["state"] == "idle"
     assert "ws://127.0.0.1:1" in state["reason"]
     assert bench.status(trial) == "prepared"
@@ -195,7 +195,9 @@ def test_a_policy_that_nobody_serves_ends_the_set_up_with_its_address(bench):
 def test_a_policy_server_that_dies_mid_run_is_tried_again_until_it_is_back_or_patience_ends(demo, bench):
     trial = bench.running()
     os.kill(demo.pid(SKILLED), signal.SIGKILL)
-    lost = bench.wait(lambda s: s["policy"]["lost"] or s["state"] == "holding", 20, "the policy is lost")
+    lost = bench.wait(
+        lambda s: s["policy"]["lost"] or s["state"] == "holding", PATIENCE_S, "the policy is lost"
+    )
     answers = lost["policy"]["answers"]
 
     def goes_on():
@@ -204,7 +206,7 @@ def test_a_policy_server_that_dies_mid_run_is_tried_again_until_it_is_back_or_pa
                 bench.command("resume", trial)
         return bench.state()["state"] == "running" and bench.state()["policy"]["answers"] > answers
 
-    eventually(goes_on, 40, "the policy answers again")
+    eventually(goes_on, "the policy answers again")
     bench.goes_on(trial)
     bench.stop(trial)
     whole(bench, trial)
@@ -214,11 +216,11 @@ def test_a_policy_server_that_dies_mid_run_is_tried_again_until_it_is_back_or_pa
 def test_a_viewer_stops_the_robot_and_only_the_operator_releases_it(bench, people):
     with page_of(people["visitor"]) as watching:
         assert watching.estop("a hand in the way")["status"] == "done"
-        bench.wait(lambda state: state["state"] == "faulted", 20, "the e-stop")
+        bench.wait(lambda state: state["state"] == "faulted", PATIENCE_S, "the e-stop")
         assert "HTTP 403" in refusal(lambda: watching.press("release"))
     assert "a hand in the way" in bench.state()["estop"]
     bench.command("release")
-    bench.wait(lambda state: state["state"] == "idle", 20, "released")
+    bench.wait(lambda state: state["state"] == "idle", PATIENCE_S, "released")
 
 
 @pytest.fixture(scope="module")
@@ -244,7 +246,7 @@ def test_the_page_says_which_policy_does_not_answer_and_lets_one_choose_again(co
     page.check("input[name=position][value='1']")
     page.click("[data-prepare]")
     step = page.locator("[data-step=setup]")
-    eventually(lambda: "ws://127.0.0.1:1: start it" in step.inner_text(), 60, "the step says what to do")
+    eventually(lambda: "ws://127.0.0.1:1: start it" in step.inner_text(), "the step says what to do")
     assert commanding.state() == "IDLE"
     page.click("[data-abandon]")
     page.locator("#checkpoint-choice").wait_for()
@@ -277,7 +279,7 @@ def suspended(pid):
 def deaf(visitor):
     """A browser that has opened the live page with everything on it and reads nothing of it."""
     address = urlsplit(visitor.url)
-    with socket.create_connection((address.hostname, address.port), 10) as connection:
+    with socket.create_connection((address.hostname, address.port), PATIENCE_S) as connection:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         lines = (
             f"GET /ws/stations/{STATION}?page={os.urandom(8).hex()} HTTP/1.1",
@@ -308,9 +310,7 @@ def whole(page, trial):
         recorded = episode["status"] == "finished" and facts["duration_s"] == episode["duration_s"]
         return recorded and facts["truth"] is not None
 
-    eventually(
-        agree, 30, f"trial {trial} is as long as its recording, and the bench has said how it was left"
-    )
+    eventually(agree, f"trial {trial} is as long as its recording, and the bench has said how it was left")
 
 
 def placed_at(page, episode):

@@ -9,7 +9,7 @@ from tests.e2e.lab import STATION, WIDE
 from tests.processes import eventually
 from tests.runtime.quality import built
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 PHONE = {"width": 390, "height": 844}
 MOVING = ("Home: ", "Set up:", "Stop: ", "Pause: ", "Hand: x", "Arm", "Next chunk", "Send the robot")
 
@@ -120,7 +120,7 @@ def test_a_phone_finds_and_home_fits_it(browser, patient):
     page.locator(".bar-user summary").tap()
     page.get_by_label("Light").check()
     eventually(
-        lambda: page.locator("html").get_attribute("data-theme") == "light", 10, "it is light at the bench"
+        lambda: page.locator("html").get_attribute("data-theme") == "light", "it is light at the bench"
     )
     assert ann.errors == []
     ann.close()

@@ -12,9 +12,9 @@ import pytest
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.conftest import SETS
 from tests.e2e.lab import ROOT, WIDE, environment
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.slow
 STATION = "bench-1"
 
 
@@ -31,7 +31,7 @@ class EmptyLab:
                 stdout=output,
                 stderr=output,
             )
-        eventually(lambda: "type this code" in self.said(), 120, "the lab is up and shows its code")
+        eventually(lambda: "type this code" in self.said(), "the lab is up and shows its code")
         self.url = re.search(r"EVA Web is at (http://\S+?)/?\s", self.said())[1]
         self.code = re.search(r"type this code: +(\S+)", self.said())[1]
         self.passwords = {}  # of accounts that are made on the pages
@@ -42,7 +42,7 @@ class EmptyLab:
 
     def end(self):
         self.child.send_signal(signal.SIGINT)
-        return self.child.wait(60)
+        return self.child.wait(PATIENCE_S)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,6 @@ def scores_a_first_trial(person):
     pictures = page.locator("[data-live-picture]")
     eventually(
         lambda: pictures.evaluate_all("all => all.length && all.every(one => one.naturalWidth > 0)"),
-        60,
         "each camera shows a picture",
     )
     person.press_button("Confirm the cameras")
@@ -138,7 +137,7 @@ def scores_a_first_trial(person):
     person.take_again()
     person.at_rest()
     person.press("setup")
-    person.reaches("READY", 120)
+    person.reaches("READY")
     person.menu("First steps")
     person.step("Create a first scene")
     person.press_button("Create the starter scene")
@@ -146,13 +145,13 @@ def scores_a_first_trial(person):
     person.follow("Open Eval")
     person.take_again()
     hint = page.locator("#tour [data-tour]")
-    eventually(lambda: "press Set up" in hint.inner_text(), 30, "the page says what comes next")
+    eventually(lambda: "press Set up" in hint.inner_text(), "the page says what comes next")
     page.click("[data-prepare]")
-    person.reaches("READY", 120)
+    person.reaches("READY")
     person.press("run")
     person.reaches("RUNNING")
     clock = page.locator(".status-clock")
-    eventually(lambda: re.search(r"[1-9]\d$", clock.inner_text().strip()), 120, "the run goes on")
+    eventually(lambda: re.search(r"[1-9]\d$", clock.inner_text().strip()), "the run goes on")
     assert "Press Stop" in hint.inner_text()
     person.press("stop")
     person.reaches("READY")
@@ -175,11 +174,9 @@ def says_why_it_failed(person):
     person.follow("Result")
     person.follow("Failures")
     card = page.locator("[data-trial]")
-    eventually(
-        lambda: page.reload() and card.locator("video").count(), 90, "the worker has prepared its video"
-    )
+    eventually(lambda: page.reload() and card.locator("video").count(), "the worker has prepared its video")
     assert card.locator("[data-why]").inner_text() == "not said"
-    eventually(lambda: card.locator("video").evaluate("one => one.played.length > 0"), 60, "the clip plays")
+    eventually(lambda: card.locator("video").evaluate("one => one.played.length > 0"), "the clip plays")
     card.locator("h3").click()
     for key, why in (("g", "grasp"), ("d", "grasp: dropped"), ("m", "grasp: missed")):
         keys.press(key)

@@ -7,7 +7,7 @@ from tests.e2e.lab import WIDE
 from tests.processes import eventually
 from tests.runtime.quality import built
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 MAKE = """
 from django.contrib.auth.models import User
 from evaweb.episodes.models import Episode
@@ -53,7 +53,7 @@ def test_trials_are_rated_again_and_compared_from_their_videos_without_the_first
     page.get_by_role("link", name="Rate again").click()
     for left in (2, 1):
         page.get_by_text(f"{left} left for you").wait_for()
-        eventually(lambda: page.reload() and ready.is_visible(), 90, "its videos can be watched")
+        eventually(lambda: page.reload() and ready.is_visible(), "its videos can be watched")
         assert "success" not in page.locator("form.judge-form .check").first.inner_text()
         keys.press("ArrowRight")
         page.locator("[data-player-time]", has_text=f"{1 / built.FPS:.2f} of").wait_for()

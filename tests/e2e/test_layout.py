@@ -8,7 +8,7 @@ from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, TABLET, WIDE
 from tests.e2e.remote import tidy, visitor
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.slow
 SIZES = [WIDE, {"width": 1280, "height": 800}, TABLET, {"width": 820, "height": 1180}]
 TABS = ["eval", "debug", "collect"]
 FAULTS = (Path(__file__).parent / "layout_faults.js").read_text("utf-8")

@@ -12,9 +12,9 @@ from websockets.sync.client import connect
 from evaweb.lab.visitor import Visitor
 from tests.e2e.lab import ROOT, STATION, left
 from tests.e2e.remote import page_of, refusal, tidy, visitor
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_a_page_of_another_site_does_not_get_the_live_socket(demo):
 def test_a_viewer_watches_and_commands_nothing(demo):
     watching = visitor(demo, "visitor")
     with page_of(watching) as page:
-        page.wait(lambda state: state["state"] != "disconnected", 60, "the station")
+        page.wait(lambda state: state["state"] != "disconnected", PATIENCE_S, "the station")
         for ask in (page.claim, lambda: page.press("setup"), page.prepare, lambda: page.press("release")):
             sentence = refusal(ask)
             assert "HTTP 403" in sentence
@@ -67,7 +67,7 @@ def test_a_second_lab_on_the_same_data_is_refused_and_the_first_goes_on(demo):
         env=demo.environment,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE_S,
     )
     assert second.returncode != 0
     assert f"process {demo.child.pid}" in second.stderr
@@ -80,7 +80,7 @@ def test_a_second_lab_on_the_same_data_is_refused_and_the_first_goes_on(demo):
 def test_ctrl_c_ends_everything_and_a_second_start_keeps_trials_under_new_passwords(demo):
     operator = visitor(demo, "operator")
     with page_of(operator) as page:
-        page.wait(lambda state: state["state"] != "disconnected", 60, "the station")
+        page.wait(lambda state: state["state"] != "disconnected", PATIENCE_S, "the station")
         first = page.prepare()
     operator.post(f"trials/{first}/abandon", {"reason": "the lab is closed"})
     everyone, old = demo.everyone(), demo.passwords["operator"]
@@ -95,7 +95,7 @@ def test_ctrl_c_ends_everything_and_a_second_start_keeps_trials_under_new_passwo
     kept = operator.get(f"trials/{first}")
     assert (kept["status"], kept["reason"]) == ("abandoned", "the lab is closed (operator)")
     with page_of(operator) as page:
-        page.wait(lambda state: state["state"] != "disconnected", 60, "the station")
+        page.wait(lambda state: state["state"] != "disconnected", PATIENCE_S, "the station")
         assert page.prepare() == first + 1
     tidy(visitor(demo, "admin"))
 
@@ -105,4 +105,4 @@ def test_the_end_of_all_follows_from_the_kill_of_the_supervisor(demo):
     everyone = demo.everyone()
     assert len(everyone) > len(demo.pids)
     assert demo.end(signal.SIGKILL) == -signal.SIGKILL
-    eventually(lambda: not left(everyone), 20, "all processes have ended")
+    eventually(lambda: not left(everyone), "all processes have ended")

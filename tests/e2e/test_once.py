@@ -11,9 +11,9 @@ import pytest
 
 from tests.e2e.conftest import SETS
 from tests.e2e.lab import ROOT, environment
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = pytest.mark.slow
 READER = ROOT / "tests" / "conformance" / "read_lerobot_v21.py"
 MANAGE = [sys.executable, "manage.py", "demo"]
 
@@ -55,7 +55,7 @@ def first(folder):
 @pytest.fixture(scope="module")
 def evaluated(folder, first):
     """Two trials of a blind plan on the same data, and what was said of them."""
-    return run(folder, "--evaluate", "2", *SETS[1:], timeout=350)
+    return run(folder, "--evaluate", "2", *SETS[1:], timeout=PATIENCE_S)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def places(folder, evaluated):
         return None if None in [index for _, index, _ in found] else found
 
     with working(folder):
-        return eventually(published, 60, "the episodes are in a dataset")
+        return eventually(published, "the episodes are in a dataset")
 
 
 @contextmanager
@@ -87,7 +87,7 @@ def working(folder):
 def read(dataset):
     """The dataset by its format alone."""
     done = subprocess.run(
-        [sys.executable, str(READER), str(dataset)], capture_output=True, text=True, timeout=60
+        [sys.executable, str(READER), str(dataset)], capture_output=True, text=True, timeout=PATIENCE_S
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -140,13 +140,13 @@ def test_a_taken_port_is_named_and_its_holder_lives(folder):
             env=environment(folder / "elsewhere"),
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=PATIENCE_S,
         )
         assert done.returncode not in (0, None)
         assert f"127.0.0.1:{port}" in done.stderr
         assert "--port" in done.stderr
         assert "Traceback" not in done.stderr
-        with socket.create_connection(("127.0.0.1", port), 5) as call:
+        with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as call:
             answer, _ = holder.accept()
             answer.close()
             assert call.recv(1) == b""

@@ -10,11 +10,11 @@ from django.urls import Resolver404, resolve
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
 from tests.e2e.pixels import share, white
-from tests.processes import eventually
+from tests.processes import PATIENCE_MS, eventually
 from tests.runtime.datasets.foreign import Plan, write
 from tests.runtime.quality import built
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.slow
 ROBOT = "agilex_piper"
 SEEDS = (
     "/",
@@ -92,13 +92,13 @@ class Watched(BenchPage):
         note = self.page.locator("#scene-note")
         if note.count():
             told = lambda: note.is_hidden() or not note.inner_text().startswith("Loading")  # noqa: E731
-            eventually(told, 30, f"{path} has drawn its scene, or said why not")
+            eventually(told, f"{path} has drawn its scene, or said why not")
 
         def settled():
             self.page.evaluate(DRAWN)
             return not self.under_way
 
-        eventually(settled, 30, f"{path} has all that it asks for, and is drawn: {self.under_way}")
+        eventually(settled, f"{path} has all that it asks for, and is drawn: {self.under_way}")
         return self
 
     def links(self):
@@ -121,7 +121,7 @@ class Watched(BenchPage):
 
     def shows(self, path):
         """Whether it answers with a page, and not with a file to keep."""
-        answer = self.page.request.get(self.demo.url + path, timeout=120_000)
+        answer = self.page.request.get(self.demo.url + path, timeout=PATIENCE_MS)
         kind, name = answer.headers["content-type"], answer.headers.get("content-disposition", "")
         assert "default-src 'self'" in answer.headers["content-security-policy"], path
         return kind.startswith("text/html") and "attachment" not in name
@@ -208,7 +208,6 @@ def test_no_cache_keeps_a_video_and_it_is_sought_in_all_the_same(browser, filled
     page.page.keyboard.press("End")
     eventually(
         lambda: video.evaluate("(one) => !one.seeking && one.readyState >= 2 && one.currentTime > 3"),
-        30,
         "its end is shown",
     )
     assert page.errors == []

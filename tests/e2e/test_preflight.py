@@ -6,7 +6,7 @@ from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import DEAD, ROOT, STATION, WIDE
 from tests.processes import eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 SERVED = "pick-place-40k"
 _RESTING = f"""
 from evaweb.stations.models import Station
@@ -29,10 +29,9 @@ def flown(bench, checkpoint):
     page = bench.page
     page.select_option("#checkpoint-choice", checkpoint)
     page.locator("[data-preflight-ask]").click()
-    eventually(lambda: page.locator("#outcome").inner_text().startswith("Preflight: "), 30, "it is pressed")
+    eventually(lambda: page.locator("#outcome").inner_text().startswith("Preflight: "), "it is pressed")
     eventually(
         lambda: page.locator("#outcome").inner_text() not in ("Preflight: pressed …", "Preflight: under way"),
-        90,
         "the preflight is over",
     )
     return page.locator("[data-preflight-result]").inner_text()
@@ -73,5 +72,5 @@ def test_the_worker_asks_where_the_station_does_not_run(bench, patient):
     )
     assert asked.get("by") == "worker", asked
     address = f"preflights/{asked['id']}"
-    eventually(lambda: bench.api(address)["status"] != "running", 90, "the worker has asked")
+    eventually(lambda: bench.api(address)["status"] != "running", "the worker has asked")
     assert bench.api(address)["verdict"] == "port_closed"

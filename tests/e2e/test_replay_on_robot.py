@@ -6,12 +6,12 @@ import pytest
 
 from runtime.datasets.journal import read_journal
 from runtime.datasets.published import publish
-from tests.e2e.by_hand import SOON_S, ByHand
+from tests.e2e.by_hand import ByHand
 from tests.e2e.lab import STATION, WIDE
 from tests.processes import eventually
 from tests.runtime.quality import built
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 ROBOT, ROWS = "agilex_piper", 45
 AWAY = 0.4  # rad, of the first joint, so that there is a way to the first row
 
@@ -44,7 +44,7 @@ def test_it_is_set_up_approached_and_run_to_its_last_row(operator, patient, reco
     places, actions = recorded
     page = operator.open(places[kind]).page
     on_robot = page.get_by_role("link", name="Run on the robot")
-    eventually(on_robot.is_visible, 60, "the episode is prepared")
+    eventually(on_robot.is_visible, "the episode is prepared")
     on_robot.click()
     page.locator(f"[data-station={STATION}] a").click()
     page.locator("#replay").wait_for()
@@ -59,13 +59,13 @@ def test_it_is_set_up_approached_and_run_to_its_last_row(operator, patient, reco
 
     before = operator.snapshot()["last_run"]
     operator.press("run")
-    eventually(lambda: operator.snapshot()["last_run"] != before, SOON_S, "the run is over")
+    eventually(lambda: operator.snapshot()["last_run"] != before, "the run is over")
     run = operator.snapshot()["last_run"]
     assert "are over" in run["reason"]
     operator.reaches("READY")
     count = len(operator.joints())
     last = pytest.approx(actions[-1, :count], abs=0.02)
-    eventually(lambda: operator.joints() == last, SOON_S, f"the page shows the robot at {last}")
+    eventually(lambda: operator.joints() == last, f"the page shows the robot at {last}")
     played = executed(patient.data / "episodes" / run["uuid"])
     assert played[:, first].max() == pytest.approx(actions[:, first].max(), abs=0.01)
     assert played[-1] == pytest.approx(actions[-1], abs=1e-3)
@@ -73,5 +73,5 @@ def test_it_is_set_up_approached_and_run_to_its_last_row(operator, patient, reco
 
 def executed(folder):
     """The actions [N, D] of the run that was recorded there."""
-    eventually((folder / "outcome.json").exists, SOON_S, "its recording has ended")
+    eventually((folder / "outcome.json").exists, "its recording has ended")
     return read_journal(folder).finite_vectors("action")

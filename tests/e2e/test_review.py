@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from tests.e2e.bench_page import BenchPage
-from tests.e2e.by_hand import SOON_S
 from tests.e2e.lab import WIDE
 from tests.processes import eventually
 from tests.runtime.quality import built
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 ROBOT = "agilex_piper"
 
 
@@ -46,7 +45,6 @@ def test_an_episode_is_reviewed_by_keyboard_and_the_next_one_comes(reviewer, pat
             and reviewer.api(f"episodes/{uuid}/reviews")["quality"]
             for uuid in brought
         ),
-        90,
         "both are prepared and checked",
     )
     reviewer.open("/replay/?review=unreviewed&quality=flagged")
@@ -59,7 +57,7 @@ def test_an_episode_is_reviewed_by_keyboard_and_the_next_one_comes(reviewer, pat
     assert (band["x"] - axis["x"]) / axis["width"] == pytest.approx(40 / built.FRAMES, abs=0.01)
     assert band["width"] / axis["width"] == pytest.approx(20 / built.FRAMES, abs=0.01)
     keys.press("g")
-    eventually(lambda: "row 40 of" in page.locator("#time").inner_text(), 10, "the flag's first row is shown")
+    eventually(lambda: "row 40 of" in page.locator("#time").inner_text(), "the flag's first row is shown")
     page.locator("#flag-here", has_text="cam_high is black").wait_for()
 
     keys.press("[")
@@ -74,10 +72,10 @@ def test_an_episode_is_reviewed_by_keyboard_and_the_next_one_comes(reviewer, pat
     keys.press("n")
     keys.type("dark <b>for a moment</b>")
     keys.press("Enter")
-    eventually(lambda: page.locator("#history-count").inner_text() == "History 1", 10, "the note is kept")
+    eventually(lambda: page.locator("#history-count").inner_text() == "History 1", "the note is kept")
     assert page.locator("#review-state").inner_text() == "unreviewed"
     keys.press("f")
-    eventually(lambda: page.locator("#review-state").inner_text() == "fail by ann", 10, "the verdict stands")
+    eventually(lambda: page.locator("#review-state").inner_text() == "fail by ann", "the verdict stands")
     keys.press("?")
     page.locator("#review-keys").wait_for()
     keys.press("Escape")
@@ -99,7 +97,7 @@ def test_an_episode_is_reviewed_by_keyboard_and_the_next_one_comes(reviewer, pat
     page.locator("#flags-count", has_text="Clean").wait_for()
     assert older in page.url
     keys.press("p")
-    eventually(lambda: page.locator("#review-state").inner_text() == "pass by ann", 10, "the verdict stands")
+    eventually(lambda: page.locator("#review-state").inner_text() == "pass by ann", "the verdict stands")
     reviewer.open("/replay/?review=unreviewed")
     assert page.locator(f"[data-episode='{newer}'], [data-episode='{older}']").count() == 0
 
@@ -133,7 +131,7 @@ IN_SIGHT = """(places) => places.filter((place) => {
 
 def played(reviewer, uuid):
     """The page of an episode, once it can be played."""
-    eventually(lambda: reviewer.api(f"episodes/{uuid}")["previewed_at"], 90, "the episode is prepared")
+    eventually(lambda: reviewer.api(f"episodes/{uuid}")["previewed_at"], "the episode is prepared")
     page = reviewer.open(f"/replay/{uuid}/").page
     page.locator("#curves .u-over").wait_for()
     page.locator("#segment-vocabulary button").first.wait_for()
@@ -174,7 +172,6 @@ def test_cameras_come_first_and_one_of_them_is_enlarged_while_all_follow_the_poi
             )
             == 3
         ),
-        SOON_S,
         "each camera shows what is there",
     )
     assert f"row {built.FRAMES // 2}" in page.locator("#hover").inner_text()
@@ -200,15 +197,13 @@ def test_parts_are_marked_by_a_key_drawn_and_moved_by_pointer_and_keyboard(revie
     for _ in range(5):
         keys.press("ArrowRight")
     keys.press("2")  # ends
-    eventually(
-        lambda: marked() == [("approach", 0, 4), ("grasp", 5, 10)], SOON_S, "two parts follow each other"
-    )
+    eventually(lambda: marked() == [("approach", 0, 4), ("grasp", 5, 10)], "two parts follow each other")
     end = page.get_by_role("slider", name="Last row of grasp")
     end.focus()
     for _ in range(3):
         keys.press("ArrowRight")
-    eventually(lambda: marked()[1] == ("grasp", 5, 13), SOON_S, "its end is three rows later")
-    eventually(lambda: end.get_attribute("aria-valuenow") == "13", SOON_S, "the page says so")
+    eventually(lambda: marked()[1] == ("grasp", 5, 13), "its end is three rows later")
+    eventually(lambda: end.get_attribute("aria-valuenow") == "13", "the page says so")
     assert "row 13 of" in page.locator("#time").inner_text()  # the picture of that row is shown
     end.evaluate("(one) => one.blur()")
 
@@ -221,7 +216,7 @@ def test_parts_are_marked_by_a_key_drawn_and_moved_by_pointer_and_keyboard(revie
     page.locator("#segment-form").wait_for()
     keys.type("place <it>")
     keys.press("Enter")
-    eventually(lambda: len(marked()) == 3, SOON_S, "what was drawn is kept")
+    eventually(lambda: len(marked()) == 3, "what was drawn is kept")
     label, first, last = marked()[2]
     assert label == "place <it>"
     assert (first / built.FRAMES, last / built.FRAMES) == (
@@ -236,7 +231,7 @@ def test_parts_are_marked_by_a_key_drawn_and_moved_by_pointer_and_keyboard(revie
     page.mouse.move(*at(0.08), steps=4)
     page.mouse.up()
     starts = lambda: {label: first for label, first, _ in marked()}  # noqa: E731
-    eventually(lambda: starts()["place <it>"] < 13, SOON_S, "its first row is where it was put")
+    eventually(lambda: starts()["place <it>"] < 13, "its first row is where it was put")
     page.locator(".lane-overlap").wait_for()
     page.reload()
     page.locator(".lane-overlap").wait_for()
@@ -262,7 +257,7 @@ def test_twenty_episodes_are_reviewed_with_one_key_each(reviewer, patient, twent
     count = "SELECT COUNT(*) FROM episodes_episode WHERE previewed_at IS NOT NULL AND uuid IN ({})"
     asked = count.format(", ".join("?" * TWENTY))
     bare = [uuid.replace("-", "") for uuid in twenty]
-    eventually(lambda: patient.rows(asked, *bare) == [(TWENTY,)], 180, "all are prepared")
+    eventually(lambda: patient.rows(asked, *bare) == [(TWENTY,)], "all are prepared")
     reviewer.open("/replay/?review=unreviewed")
     page.locator(f"[data-episode='{twenty[0]}'] a").first.click()
     took = []

@@ -9,7 +9,7 @@ from tests.e2e.lab import STATION, WIDE
 from tests.e2e.remote import tidy, visitor
 from tests.processes import eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+pytestmark = pytest.mark.slow
 TITLE = "Block beside the plate"
 
 
@@ -82,7 +82,6 @@ def test_a_scene_is_laid_by_dragging_and_offered_at_the_bench(admin):
             [re.split(r"\n", text)[0] for text in seen.all_inner_texts()] == texts
             and "required for success" in seen.nth(1).inner_text()
         ),
-        60,
         "the preview shows both milestones as they are",
     )
     assert page.locator("#preview kbd", has_text=re.compile("^[12]$")).count() == 2

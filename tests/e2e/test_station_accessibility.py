@@ -6,7 +6,7 @@ from tests.e2e.axe import themed, violations
 from tests.e2e.by_hand import ByHand
 from tests.e2e.lab import STATION, WIDE
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("theme", ["dark", "light"])

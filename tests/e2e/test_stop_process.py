@@ -14,7 +14,7 @@ from tests.e2e.remote import tidy, visitor
 from tests.e2e.test_faults import suspended
 from tests.processes import alive, eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 AREA = "#estop-area"
 PRESSES = "SELECT uuid, status FROM stations_command WHERE kind = 'estop'"
 ANSWERS = """
@@ -106,8 +106,8 @@ def test_a_press_arrives_while_the_web_stands_still_and_is_written_down_once(dem
     with suspended(demo.pid("serve")):
         pressed(demo, page)
     page.reaches("FAULTED")
-    eventually(lambda: set(demo.rows(PRESSES)) - before, 30, "the press is written down")
-    eventually(lambda: not list((demo.data / "unwritten").iterdir()), 30, "nothing waits to be written")
+    eventually(lambda: set(demo.rows(PRESSES)) - before, "the press is written down")
+    eventually(lambda: not list((demo.data / "unwritten").iterdir()), "nothing waits to be written")
     assert [status for _, status in set(demo.rows(PRESSES)) - before] == ["done"]
     assert page.errors == []
 
@@ -118,11 +118,11 @@ def test_a_press_arrives_while_the_process_for_stops_is_gone_and_pages_know_its_
     with suspended(demo.child.pid):
         gone = demo.pid("stops")
         os.kill(gone, signal.SIGKILL)
-        eventually(lambda: not alive(gone), 20, "it has ended")
+        eventually(lambda: not alive(gone), "it has ended")
         pressed(demo, page)
         page.page.reload()
         assert page.page.get_attribute(AREA, "data-stops") == said
-    eventually(lambda: page.page.evaluate(ANSWERS), 60, "the lab has started it again where it was")
+    eventually(lambda: page.page.evaluate(ANSWERS), "the lab has started it again where it was")
     assert demo.pid("stops") != gone
     page.page.reload()
     page.page.locator(f"{AREA}[data-second-way]").wait_for()
@@ -132,7 +132,7 @@ def test_a_press_arrives_after_the_web_was_killed_and_before_it_is_there_again(d
     with suspended(demo.child.pid):
         gone = demo.pid("serve")
         os.kill(gone, signal.SIGKILL)
-        eventually(lambda: not alive(gone), 20, "it has ended")
+        eventually(lambda: not alive(gone), "it has ended")
         pressed(demo, page)
     page.reaches("FAULTED")  # over the web, which the lab has started again where it was
 
@@ -143,12 +143,12 @@ def test_presses_of_one_second_are_written_down_though_the_process_for_stops_is_
     before = set(demo.rows(PRESSES))
     with suspended(demo.pid("serve")), demo.locked():
         sent = [page.page.evaluate(ALONE, str(uuid4())) for _ in range(3)]
-        eventually(lambda: foreseen(demo) == len(sent), 20, "all are on the disk")
+        eventually(lambda: foreseen(demo) == len(sent), "all are on the disk")
         os.kill(demo.pid("stops"), signal.SIGKILL)
     answered = {UUID(one["uuid"]) for one in sent if one["status"] == "done"}
     assert len(answered) == len(sent)
-    eventually(lambda: written(demo, before) == len(sent), 60, "all presses are in the record")
-    eventually(lambda: page.page.evaluate(ANSWERS), 60, "the lab has started it again where it was")
+    eventually(lambda: written(demo, before) == len(sent), "all presses are in the record")
+    eventually(lambda: page.page.evaluate(ANSWERS), "the lab has started it again where it was")
 
 
 def test_a_page_whose_session_has_ended_still_presses(demo, page):

@@ -10,7 +10,7 @@ from tests.evaweb.s3_server import Server, why_no_server
 from tests.processes import eventually
 from tests.runtime.quality import built
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 PLAYS = "all => all.length > 0 && all.every((video) => video.readyState >= 2 && !video.error)"
 
 
@@ -37,21 +37,17 @@ def test_videos_play_from_the_store_as_the_policy_of_pages_allows(browser, store
     uuid = built.record_of(root, "agilex_piper", started_wall=time.time(), station="bench-1").name
     stored.python("from evaweb.episodes.reconcile import reconcile; reconcile()")
     preview = stored.data / "previews" / uuid
-    eventually(
-        lambda: (preview / "stored.json").exists() and not list(preview.glob("*.mp4")), 90, "the store"
-    )
+    eventually(lambda: (preview / "stored.json").exists() and not list(preview.glob("*.mp4")), "the store")
     page = BenchPage(browser, stored, "ann", WIDE)
     try:
         asked = []
         page.page.on("request", lambda request: asked.append(request.url))
         page.open(f"/replay/{uuid}/")
-        eventually(lambda: page.page.eval_on_selector_all("video[data-camera]", PLAYS), 30, "every camera")
+        eventually(lambda: page.page.eval_on_selector_all("video[data-camera]", PLAYS), "every camera")
         origin = f"http://127.0.0.1:{stored.server.port}/"
         assert any(url.startswith(origin) and "X-Amz-Signature=" in url for url in asked)
         page.page.keyboard.press("End")
-        eventually(
-            lambda: page.page.eval_on_selector_all("video[data-camera]", PLAYS), 30, "the last picture"
-        )
+        eventually(lambda: page.page.eval_on_selector_all("video[data-camera]", PLAYS), "the last picture")
         assert page.errors == []
     finally:
         page.close()

@@ -11,7 +11,7 @@ from tests.e2e.lab import STATION, WIDE
 from tests.e2e.pixels import moved, orange, pixels, share, white, wood
 from tests.processes import eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 CHECKPOINT = "pick-place-40k"
 
 
@@ -41,9 +41,9 @@ def trial(operator):
     seen["ready"] = {"overhead": operator.camera("cam_high"), "scene": operator.scene()}
     operator.press("run")
     operator.reaches("RUNNING")
-    eventually(lambda: operator.truth()["milestones"]["lifted"], 60, "the block is lifted")
+    eventually(lambda: operator.truth()["milestones"]["lifted"], "the block is lifted")
     seen["carried"] = {"overhead": operator.camera("cam_high"), "scene": operator.scene()}
-    eventually(lambda: operator.truth()["success"], 60, "the block lies on the plate")
+    eventually(lambda: operator.truth()["success"], "the block lies on the plate")
     page.keyboard.press("s")
     operator.reaches("READY")
     page.locator("#score").wait_for()
@@ -51,7 +51,7 @@ def trial(operator):
         check.check()
     page.fill("#note", "first try, <b>gripper</b> a little late")
     page.locator("button[form=score]").click()
-    eventually(lambda: operator.api("trials")["items"][0]["status"] == "scored", 20, "the trial is scored")
+    eventually(lambda: operator.api("trials")["items"][0]["status"] == "scored", "the trial is scored")
     seen["trial"] = operator.api("trials")["items"][0]
     return seen
 
@@ -90,18 +90,15 @@ def test_result_shows_the_trial_with_its_video(trial, operator):
     operator.open(f"/result/trials/{trial['trial']['id']}/")
     eventually(
         lambda: operator.api(f"episodes/{trial['trial']['episode']}")["previewed_at"],
-        60,
         "the videos are there",
     )
     page.reload()
     assert "<b>gripper</b>" in page.locator("main").inner_text()
     video = page.locator("video").first
     video.scroll_into_view_if_needed()
-    eventually(
-        lambda: video.evaluate("v => v.readyState >= 2 && v.duration > 5"), 30, "the video can be played"
-    )
+    eventually(lambda: video.evaluate("v => v.readyState >= 2 && v.duration > 5"), "the video can be played")
     video.evaluate("v => { v.currentTime = 0.8 * v.duration }")
-    eventually(lambda: video.evaluate("v => !v.seeking && v.readyState >= 2"), 30, "the video jumps")
+    eventually(lambda: video.evaluate("v => !v.seeking && v.readyState >= 2"), "the video jumps")
     assert share(pixels(video), wood) > 0.2
 
 
@@ -109,7 +106,7 @@ def test_result_shows_the_trial_with_its_video(trial, operator):
 def test_the_episode_plays_back_on_one_clock(trial, operator):
     page = operator.open(f"/replay/{trial['trial']['episode']}/").page
     videos = page.locator("video")
-    eventually(lambda: videos.count() == 3, 30, "three videos")
+    eventually(lambda: videos.count() == 3, "three videos")
 
     def together():
         times = videos.evaluate_all(
@@ -118,12 +115,12 @@ def test_the_episode_plays_back_on_one_clock(trial, operator):
         return min(times) > 3 and max(times) - min(times) < 0.5  # the robot is on its way by then
 
     scene = page.locator(".replay-scene, #scene").first
-    eventually(lambda: share(pixels(scene), white) > 0.003, 30, "the robot is drawn")
+    eventually(lambda: share(pixels(scene), white) > 0.003, "the robot is drawn")
     before = pixels(scene)
     page.keyboard.press("Space")
-    eventually(together, 30, "the videos play together")
+    eventually(together, "the videos play together")
     page.keyboard.press("Space")
-    eventually(lambda: moved(before, pixels(scene)) > 0.002, 10, "the robot is drawn where it is by now")
+    eventually(lambda: moved(before, pixels(scene)) > 0.002, "the robot is drawn where it is by now")
     assert page.locator("canvas").count() >= 2
 
 
@@ -135,7 +132,7 @@ def test_the_playback_says_whose_step_it_is_and_gives_the_streams_away(trial, op
     box = over.bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     page.mouse.move(x, y)
-    eventually(lambda: "delay" in told.inner_text(), 30, "the chunk under the pointer is told")
+    eventually(lambda: "delay" in told.inner_text(), "the chunk under the pointer is told")
     found = re.search(
         r"chunk (\d+) · (\w+)delay \d+ steps? \(\d+ ms\)rows \d+ to \d+ of \d+", told.inner_text()
     )
@@ -162,7 +159,6 @@ def test_the_dataset_has_the_episode(trial, operator):
     episode = operator.api(f"episodes/{trial['trial']['episode']}")
     found = eventually(
         lambda: operator.api(f"episodes/{episode['uuid']}")["dataset_index"] is not None,
-        60,
         "it is published",
     )
     assert found

@@ -13,9 +13,9 @@ from evaweb.lab.visitor import Visitor
 from tests.e2e.lab import STATION
 from tests.e2e.remote import opened, page_of, refusal, tidy
 from tests.e2e.two_webs import in_turn, second_web
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.slow
 LEASES = "SELECT holder, ended_at IS NULL FROM stations_lease WHERE epoch = ?"
 COMMANDS = "SELECT count(*), count(DISTINCT uuid) FROM stations_command WHERE kind = ?"
 
@@ -58,13 +58,13 @@ def test_a_trial_is_run_watched_stopped_and_scored_though_each_request_meets_ano
     served = dict(lab.proxy.served)
     trial = bench.running()
     with page_of(lab.visitor("visitor")) as watching:
-        watching.wait(lambda state: state["state"] == "running", 20, "the run is seen")
+        watching.wait(lambda state: state["state"] == "running", PATIENCE_S, "the run is seen")
         assert watching.state()["lease"]["epoch"] == bench.epoch
         assert "HTTP 403" in refusal(lambda: watching.press("stop"))
     bench.stop(trial)
     bench.score(trial)
     told = len(bench.renewals())
-    eventually(lambda: len(bench.renewals()) > told, 20, "its lease is renewed further on")
+    eventually(lambda: len(bench.renewals()) > told, "its lease is renewed further on")
     assert all(said["ok"] for said in bench.renewals())
     assert all(lab.proxy.served[port] > served[port] for port in lab.proxy.ports), lab.proxy.served
     total, different = lab.demo.rows(COMMANDS, "run")[0]
@@ -81,9 +81,9 @@ def test_an_estop_by_either_way_is_seen_by_pages_of_both_processes(lab, bench, w
             address = f"stations/{STATION}/estop"
             assert one.visitor.post(address, {"why": "a hand in the way"})["status"] == "done"
         for page in (bench, one, other):
-            page.wait(lambda state: state["estop"], 20, "the e-stop is shown")
+            page.wait(lambda state: state["estop"], PATIENCE_S, "the e-stop is shown")
     bench.command("release")
-    bench.wait(lambda state: state["state"] == "idle", 20, "released")
+    bench.wait(lambda state: state["state"] == "idle", PATIENCE_S, "released")
 
 
 def test_a_station_is_asked_for_and_handed_over_between_pages_of_two_processes(lab, bench):
@@ -94,7 +94,7 @@ def test_a_station_is_asked_for_and_handed_over_between_pages_of_two_processes(l
         given = {"action": "hand_over", "page": bench.page, "request": asked}
         ann.epoch = bench.visitor.post(lease, given)["epoch"]
         bench.epoch = 0
-        ann.wait(lambda state: state["lease"]["epoch"] == ann.epoch, 20, "ann has the station")
+        ann.wait(lambda state: state["lease"]["epoch"] == ann.epoch, PATIENCE_S, "ann has the station")
         assert ann.renewed()
         ((holder, is_open),) = lab.demo.rows(LEASES, ann.epoch)
         assert (holder, is_open) == (f"web:ann:{ann.page}", 1)
@@ -116,7 +116,7 @@ def test_who_logs_out_at_one_process_is_nobody_at_the_other(lab):
 def test_a_page_whose_process_is_killed_goes_on_at_the_other_with_its_lease(lab, bench):
     trial = bench.running()
     os.kill(lab.second.pid, signal.SIGKILL)
-    lab.second.wait(30)
+    lab.second.wait(PATIENCE_S)
     with closing(opened(lab.visitor("operator"), bench.page)) as again:
         again.epoch = bench.epoch
         bench.epoch = 0

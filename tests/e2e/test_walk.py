@@ -15,9 +15,9 @@ from tests.e2e.planned import handed, saved, shown, stopped
 from tests.e2e.walk import NAMES, PLAN, ROBOTS, SETUP, Desk, Walk, documented
 from tests.evaweb.crawling import named
 from tests.namespaces import why_no_namespaces
-from tests.processes import eventually
+from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.slow
 CUT = ROBOTS[2]
 TELLING = re.compile(rf"{'|'.join(NAMES)}|127\.0\.0\.1:900", re.IGNORECASE)
 OPEN = {"/login/", "/healthz"}  # to somebody without a session, and what lies below /static/
@@ -47,7 +47,7 @@ def walk(tmp_path_factory):
 def built(browser, walk, code):
     """What the document has the administrator do, page after page and computer after computer."""
     page = browser.new_page()
-    page.set_default_timeout(90_000)
+    page.set_default_timeout(PATIENCE_MS)
 
     def filled(path, button, **fields):
         page.goto(walk.url + path)
@@ -163,7 +163,7 @@ def test_a_blind_evaluation_goes_on_while_a_station_is_cut_off_and_counts_each_t
     assert found == {codes[0]: "running", **dict.fromkeys(codes[1:], "scored")}
 
     walk.network.plug(CUT)
-    eventually(lambda: cut.state() in ("HOLDING", "READY"), 60, "the station is back, without its operator")
+    eventually(lambda: cut.state() in ("HOLDING", "READY"), "the station is back, without its operator")
     cut.take_again()
     scored(cut, ticks=(1,))
     codes.append(runs(cut))
@@ -180,14 +180,14 @@ def test_a_blind_evaluation_goes_on_while_a_station_is_cut_off_and_counts_each_t
     recorded = {trial["episode"] for trial in trials}
     assert len(recorded) == len(trials)
     eventually(
-        lambda: recorded == {folder.name for folder in episodes.glob("*-*")}, 60, "the recordings have come"
+        lambda: recorded == {folder.name for folder in episodes.glob("*-*")}, "the recordings have come"
     )
     found = revealed(walk)
     assert {name: arm["n"] for name, arm in found["arms"].items()} == dict.fromkeys(NAMES, len(ROBOTS))
     report = walk.folder / "report"
     walk.run("lab", f"python manage.py eval_report {PLAN} --out {report}")
     again = subprocess.run(
-        [sys.executable, "-m", "recompute"], cwd=report, capture_output=True, text=True, timeout=180
+        [sys.executable, "-m", "recompute"], cwd=report, capture_output=True, text=True, timeout=PATIENCE_S
     )
     assert again.returncode == 0, again.stdout + again.stderr
 

@@ -11,6 +11,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from tests.processes import PATIENCE_S
+
 NAME = "localhost"
 _ESTOP = re.compile(rb"/api/v1/stations/[^/]+/estop$")
 _ALIVE_S = 1.0  # what answers no connection for so long is gone
@@ -44,7 +46,7 @@ def https(folder, web, stops):
 
     thread = threading.Thread(target=run)
     thread.start()
-    assert listens.wait(20)
+    assert listens.wait(PATIENCE_S)
     try:
         yield f"https://{NAME}:{port[0]}"
     finally:

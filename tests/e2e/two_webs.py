@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from urllib.parse import urlsplit
 
 from tests.e2e.lab import ROOT
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 
 @contextmanager
@@ -33,7 +33,7 @@ def second_web(demo):
     finally:
         if child.poll() is None:
             os.kill(child.pid, signal.SIGTERM)
-        child.wait(30)
+        child.wait(PATIENCE_S)
         child.stdout.close()
 
 
@@ -96,7 +96,7 @@ def in_turn(*urls_or_ports):
     thread = threading.Thread(target=run)
     thread.start()
     try:
-        eventually(lambda: bound, 20, "the proxy listens")
+        eventually(lambda: bound, "the proxy listens")
         yield proxy, f"http://127.0.0.1:{bound[0]}"
     finally:
         loop.call_soon_threadsafe(loop.stop)

@@ -12,7 +12,7 @@ from tests import migrated
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import CHROMIUM, ROOT, WIDE, environment
 from tests.namespaces import Network
-from tests.processes import eventually
+from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
 
 ROBOTS = ("bench-a", "bench-b", "bench-c")
 NAMES = ("alder-secret", "birch-secret")  # of the checkpoints, which nobody at a bench may see
@@ -100,7 +100,7 @@ class Desk(BenchPage):
         """One more window of the same person, with the same lists of what was seen and complained of."""
         made = copy.copy(self)
         made.page = self.context.new_page()
-        made.page.set_default_timeout(90_000)
+        made.page.set_default_timeout(PATIENCE_MS)
         made.page.on("pageerror", lambda error: made.errors.append(str(error)))
         made.page.on("console", lambda said: said.type == "error" and made.errors.append(said.text))
         made._watch()
@@ -155,7 +155,7 @@ class Walk:
         trusted, more = as_run(documented_inline("EVA_ALLOWED_HOSTS=10.0.0.7", "10.0.0.7", self.address))
         host = more[more.index("--host") :][:2]
         self.start("lab", [*words, *host], **gate, **trusted)
-        said = eventually(lambda: _FIRST.search(self.log("lab")), 90, f"the lab's code; {self.log('lab')}")
+        said = eventually(lambda: _FIRST.search(self.log("lab")), f"the lab's code; {self.log('lab')}")
         self.url = said["url"]
         return said["code"]
 
@@ -169,7 +169,7 @@ class Walk:
             input=said,
             capture_output=True,
             text=True,
-            timeout=180,
+            timeout=PATIENCE_S,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout
@@ -206,7 +206,7 @@ class Walk:
             str(ROOT / "tests" / "e2e" / "scan.py"),
             *words,
         ]
-        done = subprocess.run(found, cwd=ROOT, check=True, capture_output=True, text=True, timeout=180)
+        done = subprocess.run(found, cwd=ROOT, check=True, capture_output=True, text=True, timeout=PATIENCE_S)
         return json.loads(done.stdout)
 
     def log(self, name):
@@ -218,7 +218,7 @@ class Walk:
         try:
             for child in reversed(self.children.values()):
                 child.terminate()
-            ended = {name: child.wait(90) for name, child in self.children.items()}
+            ended = {name: child.wait(PATIENCE_S) for name, child in self.children.items()}
             for child in self.children.values():
                 child.stdin.close()
         finally:

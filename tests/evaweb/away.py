@@ -13,6 +13,7 @@ from asgiref.testing import ApplicationCommunicator
 
 from evaweb.asgi import application
 from evaweb.lock_wait import for_pages
+from tests.processes import PATIENCE_S
 
 
 async def answered(method: str, path: str, body: str, headers: dict[str, str]) -> dict[str, object]:
@@ -32,7 +33,7 @@ async def answered(method: str, path: str, body: str, headers: dict[str, str]) -
     }
     served = ApplicationCommunicator(application, scope)
     await served.send_input({"type": "http.request", "body": body.encode(), "more_body": False})
-    start, content = await served.receive_output(60), await served.receive_output(60)
+    start, content = await served.receive_output(PATIENCE_S), await served.receive_output(PATIENCE_S)
     named = {name.lower(): value.decode() for name, value in start["headers"]}
     return {"status": start["status"], "type": named[b"content-type"], "body": content["body"].decode()}
 

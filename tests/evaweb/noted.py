@@ -10,7 +10,7 @@ from tests.processes import eventually
 
 def settled() -> None:
     """Return when none waits any more."""
-    eventually(lambda: not commands.notes._waiting and not list(_files()), 20, "stops are written down")
+    eventually(lambda: not commands.notes._waiting and not list(_files()), "stops are written down")
 
 
 def _files():

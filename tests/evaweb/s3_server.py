@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from evaweb.environment import Bucket
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 KEY, SECRET = "TESTKEYTESTKEY", "a-secret-of-tests"
 
@@ -52,7 +52,7 @@ class Server:
         words = ("serve", "s3", "--addr", f"127.0.0.1:{self.port}", "--auth-key", f"{KEY},{SECRET}")
         where = ("--config", "/dev/null", "--vfs-cache-mode", "off", "--dir-cache-time", "0s")
         self._child = subprocess.Popen([rclone, *words, *where, str(self.folder)], stderr=self._log)
-        eventually(self._answers, 20.0, "the S3 server")
+        eventually(self._answers, "the S3 server")
 
     def bucket(self, secret: str = SECRET, prefix: str = "eva") -> Bucket:
         """What a lab is given of it."""
@@ -60,7 +60,7 @@ class Server:
 
     def end(self) -> None:
         self._child.terminate()
-        self._child.wait(30)
+        self._child.wait(PATIENCE_S)
 
     def close(self) -> None:
         self.end()

@@ -22,6 +22,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
 from runtime.processes.coordinator.session.transitions import STOPPING, GuardFacts, SessionEvent
+from tests.processes import PATIENCE_S
 
 DIM = 14
 _CHANGED = Pattern("session.changed", "{before} -> {after}: {reason}")  # as the coordinator says it
@@ -113,7 +114,7 @@ class StandIn:
         """Work in the thread of the runtime."""
         done = threading.Event()
         self._do.append((work, done))
-        assert done.wait(10)
+        assert done.wait(PATIENCE_S)
 
     def publish(self, stream: str, content: Mapping[str, Any]) -> None:
         """Publish it once."""

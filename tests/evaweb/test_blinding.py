@@ -22,7 +22,7 @@ from tests.evaweb.crawling import QUERIES, crawled, leaks, told_apart, whispers
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
 from tests.evaweb.unguarded import unguarded
 
-pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow]
 
 
 @pytest.fixture(autouse=True)

@@ -27,6 +27,7 @@ from evaweb.credentials import (
 )
 from evaweb.lookups import Lookups
 from evaweb.roles import Role
+from tests.processes import PATIENCE_S
 
 
 class Person:
@@ -63,7 +64,7 @@ class Base:
 
     def __call__(self, secret):
         self.questions.append(secret)
-        assert self.answers.wait(60)
+        assert self.answers.wait(PATIENCE_S)
         if self.fault:
             raise self.fault
         self.heard()
@@ -255,7 +256,7 @@ def test_of_several_credentials_one_that_is_remembered_presses_and_stops_at_once
 @pytest.mark.usefixtures("patient")
 def test_of_several_credentials_any_is_good_and_who_is_found_waits_for_no_other(known, base):
     hangs = threading.Event()
-    known.learn("slow", lambda secret: hangs.wait(60) and None)
+    known.learn("slow", lambda secret: hangs.wait(PATIENCE_S) and None)
     found = [("slow", "x"), ("key", "y"), ("key", "a")]
     assert run(known.presser(found, HERE)).username == "ann"
     hangs.set()
@@ -289,7 +290,7 @@ def test_who_is_remembered_when_their_time_is_over_presses_at_once_all_the_same(
         known.look(SESSION, "a")
     else:
         run(getattr(known, ask)(found, HERE))
-    known._check(SESSION, "a").result(60)
+    known._check(SESSION, "a").result(PATIENCE_S)
     base.answers.clear()
     assert run(known.presser(found, HERE)).username == "ann"
     assert (known.recall(SESSION, "a"), now[0]) == (None, 160.0)
@@ -314,7 +315,7 @@ def test_nobody_who_is_remembered_waits_behind_anybody_who_is_not(crowd, remembe
     now, closed = [100.0], threading.Event()
     known = Credentials(clock=lambda: now[0])
     users = {f"known {number}": Person("ann") for number in range(6)}
-    known.learn("key", lambda secret: users.get(secret) or (closed.wait(60) and None))
+    known.learn("key", lambda secret: users.get(secret) or (closed.wait(PATIENCE_S) and None))
     with mock.patch.object(module.connection, "close"):
         for secret in users:
             known.look("key", secret)
@@ -322,11 +323,11 @@ def test_nobody_who_is_remembered_waits_behind_anybody_who_is_not(crowd, remembe
         for share, number in crowd:
             known._check("key", f"made up {number}", share)
         for number in remembered:
-            fresh = known._check("key", f"known {number}").result(60)
+            fresh = known._check("key", f"known {number}").result(PATIENCE_S)
             assert (fresh.username, fresh.checked) == ("ann", now[0])
         asked = list(known._asked.values())
         closed.set()
-        assert all(answer.result(60) is None for answer in asked)
+        assert all(answer.result(PATIENCE_S) is None for answer in asked)
 
 
 @pytest.mark.usefixtures("patient")

@@ -12,6 +12,8 @@ from uuid import uuid4
 
 import pytest
 
+from tests.processes import PATIENCE_S
+
 AWAY = Path(__file__).parent / "away.py"
 TOKEN = {"authorization": f"Bearer eva_{'x' * 43}"}
 PAGE = {"cookie": f"eva_session_away={'a' * 32}", "accept": "text/html"}
@@ -40,7 +42,7 @@ def ask(database, tmp_path):
         environment["PYTHONPATH"] = os.pathsep.join(paths)
         command = [sys.executable, AWAY, json.dumps(questions)]
         done = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=200, check=True
+            command, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=True
         )
         return [json.loads(line) for line in done.stdout.splitlines()]
 

@@ -10,6 +10,7 @@ import pytest
 from django.core.exceptions import ImproperlyConfigured
 
 from evaweb import environment, private
+from tests.processes import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 
@@ -161,7 +162,9 @@ def test_networks_are_addresses_too(monkeypatch):
 def test_a_wrong_setting_ends_the_start_with_one_sentence(tmp_path):
     environ = {"EVA_DATA_DIR": str(tmp_path), "EVA_LOG_LEVEL": "LOUD"}
     command = [sys.executable, str(ROOT / "manage.py"), "check"]
-    ended = subprocess.run(command, env=environ, capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(
+        command, env=environ, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert ended.returncode == 1
     assert ended.stderr.startswith("cannot start: EVA_LOG_LEVEL = 'LOUD'; allowed:")
     assert "Traceback" not in ended.stderr

@@ -10,6 +10,7 @@ from django.contrib.auth.hashers import PBKDF2PasswordHasher, check_password, ma
 
 from evaweb import hashing
 from evaweb.hashing import Busy, QueuedHasher
+from tests.processes import PATIENCE_S
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def slow(monkeypatch):
     def encode(self, password, salt, iterations=None):
         threads.append(threading.current_thread().name)
         begun.release()
-        assert may_end.wait(20)
+        assert may_end.wait(PATIENCE_S)
         return password
 
     monkeypatch.setattr(PBKDF2PasswordHasher, "encode", encode)
@@ -42,14 +43,14 @@ def test_of_many_at_once_one_thread_hashes_and_the_last_are_sent_away(slow, monk
     monkeypatch.setattr(hashing, "_places", threading.BoundedSemaphore(3))
     with ThreadPoolExecutor(3) as people:
         waiting = [people.submit(QueuedHasher().encode, f"{number}", "salt") for number in range(3)]
-        assert begun.acquire(timeout=20)
+        assert begun.acquire(timeout=PATIENCE_S)
         while hashing._places._value:
             threading.Event().wait(0.01)
         with pytest.raises(Busy, match="try again"):
             QueuedHasher().encode("x", "salt")
         assert len(threads) == 1
         may_end.set()
-        assert {one.result(20) for one in waiting} == {"0", "1", "2"}
+        assert {one.result(PATIENCE_S) for one in waiting} == {"0", "1", "2"}
     assert {name.rpartition("_")[0] for name in threads} == {"passwords"}
 
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.lookups import Crowded, Lookups
+from tests.processes import PATIENCE_S
 
 
 class Held:
@@ -18,8 +19,8 @@ class Held:
     def __init__(self, most):
         self.lookups, self.done = Lookups(1, most), []
         self._free, begun = threading.Event(), threading.Event()
-        self._first = self.lookups.ask("first", lambda: begun.set() or self._free.wait(60))
-        assert begun.wait(60)
+        self._first = self.lookups.ask("first", lambda: begun.set() or self._free.wait(PATIENCE_S))
+        assert begun.wait(PATIENCE_S)
 
     def ask(self, share, name):
         return self.lookups.ask(share, lambda: self.done.append((share, name)))
@@ -48,8 +49,8 @@ def test_what_fails_fails_for_who_asked_alone():
     lookups = Lookups(1)
     failed, done = lookups.ask("a", lambda: 1 / 0), lookups.ask("a", lambda: 7)
     with pytest.raises(ZeroDivisionError):
-        failed.result(60)
-    assert done.result(60) == 7
+        failed.result(PATIENCE_S)
+    assert done.result(PATIENCE_S) == 7
 
 
 @given(st.lists(st.sampled_from("aaaaabcd"), max_size=60), st.integers(1, 12))

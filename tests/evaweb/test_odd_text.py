@@ -15,7 +15,7 @@ from evaweb.api.api import api
 from evaweb.headers import BARE
 from tests.evaweb.crawling import named
 
-pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow]
 ODD = {
     "nul": "%00",
     "long": "x" * 3000,

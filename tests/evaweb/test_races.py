@@ -20,6 +20,7 @@ from evaweb.trials import scene_writing
 from evaweb.trials.models import Checkpoint, Scene
 from evaweb.trials.scene_writing import SceneRefused, scene_write
 from tests.evaweb.conftest import person
+from tests.processes import PATIENCE_S
 
 TAKEN_NAME = IntegrityError("UNIQUE constraint failed: trials_scene.name")
 
@@ -30,7 +31,7 @@ def at_once(*acts: Callable[[], Any]) -> list[Any]:
 
     def do(place: int, act: Callable[[], Any]) -> None:
         try:
-            together.wait(60)
+            together.wait(PATIENCE_S)
             found[place] = act()
         except Exception as error:
             found[place] = error
@@ -41,7 +42,7 @@ def at_once(*acts: Callable[[], Any]) -> list[Any]:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(120)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
     return found
 
@@ -63,7 +64,7 @@ def test_of_two_new_scenes_of_one_name_made_at_one_moment_one_is_refused_with_th
             faults = check(*given)
             if not getattr(looks, "once", False):
                 looks.once = True
-                looked.wait(60)
+                looked.wait(PATIENCE_S)
             return faults
 
         monkeypatch.setattr(scene_writing, "_assigned", both)

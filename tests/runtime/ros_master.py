@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 PYTHON = "/usr/bin/python3"
 _IMPORTS = "import rospy, rosmaster, sensor_msgs.msg, geometry_msgs.msg"
@@ -62,7 +62,7 @@ class RosMaster:
             stdout=subprocess.DEVNULL,
             start_new_session=True,
         )
-        eventually(self._pid, 60, "a ROS master")
+        eventually(self._pid, "a ROS master")
 
     def kill(self) -> None:
         """The master is gone without a word; what roscore started beside it ends with it."""
@@ -71,7 +71,7 @@ class RosMaster:
         if pid:
             os.kill(pid, signal.SIGKILL)
         self._process.terminate()
-        self._process.wait(20)
+        self._process.wait(PATIENCE_S)
         self._process = None
 
     def close(self) -> None:

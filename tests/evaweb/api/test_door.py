@@ -29,7 +29,7 @@ from evaweb.stations.models import Command
 from runtime.ipc.session_state import SessionState
 from tests import presses
 from tests.evaweb.noted import settled
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.django_db(transaction=True)
 NAME, CSRF = lab.SESSION_COOKIE_NAME, lab.CSRF_COOKIE_NAME
@@ -96,13 +96,13 @@ def asked(method, path, body=None, *, token=None, cookie=None, of=application, *
         }
         served = ApplicationCommunicator(of, scope)
         await served.send_input({"type": "http.request", "body": sent, "more_body": False})
-        start = await served.receive_output(20)
+        start = await served.receive_output(PATIENCE_S)
         parts, more = [], True
         while more:
-            message = await served.receive_output(20)
+            message = await served.receive_output(PATIENCE_S)
             parts.append(message.get("body", b""))
             more = message.get("more_body", False)
-        await served.wait(20)
+        await served.wait(PATIENCE_S)
         told = {name.decode().lower(): value.decode() for name, value in start["headers"]}
         return start["status"], json.loads(b"".join(parts)), told
 
@@ -110,7 +110,7 @@ def asked(method, path, body=None, *, token=None, cookie=None, of=application, *
 
 
 def written(uuid):
-    eventually(lambda: Command.objects.filter(pk=uuid).exists(), 20, "it is written down")
+    eventually(lambda: Command.objects.filter(pk=uuid).exists(), "it is written down")
     return Command.objects.get(pk=uuid)
 
 
@@ -236,8 +236,8 @@ def test_who_has_no_turn_presses_unverified_stops_nothing_else_and_whoever_is_re
     """The database answers, and others from that address are before them."""
     assert post(f"{live.name}/estop", token=token)[0] == 200
     full, begun, turn = Lookups(1, most=1), threading.Event(), threading.Event()
-    full.ask("127.0.0.1", lambda: begun.set() or turn.wait(60))
-    assert begun.wait(60)
+    full.ask("127.0.0.1", lambda: begun.set() or turn.wait(PATIENCE_S))
+    assert begun.wait(PATIENCE_S)
     full.ask("127.0.0.1", lambda: None)
     monkeypatch.setattr(credentials, "_strangers", full)
     body = {"uuid": str(uuid4()), "kind": "halt", "page": "p1"}

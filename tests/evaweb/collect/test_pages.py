@@ -22,7 +22,7 @@ from runtime.recording.labels import Label, append
 from tests.evaweb.collect.conftest import Demonstrate, collecting
 from tests.evaweb.stand_in import StandIn
 from tests.evaweb.trials.builders import Wire
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.django_db
 NASTY, ESCAPED = "<script>alert(1)</script>", "&lt;script&gt;alert(1)&lt;/script&gt;"
@@ -144,11 +144,11 @@ def test_a_station_says_by_itself_that_it_collects_and_that_it_does_no_more(
     def says(collect: dict[str, Any] | None) -> None:
         runtime.collect = collect
         wanted = collect is not None
-        eventually(lambda: Station.objects.get(pk=live.pk).collects is wanted, 20, f"the row says {wanted}")
+        eventually(lambda: Station.objects.get(pk=live.pk).collects is wanted, f"the row says {wanted}")
 
     try:
         says(json.loads(json.dumps(collecting())))
         says(None)
     finally:
         scribe.end()
-        scribe._thread.join(15)
+        scribe._thread.join(PATIENCE_S)

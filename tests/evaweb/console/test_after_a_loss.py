@@ -15,7 +15,7 @@ from runtime.ipc.messages import Command
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.session.transitions import SessionEvent
 from tests.processes import eventually
-from tests.runtime.link.linked import STATION, WAIT_S, Lab, Robot, allowed
+from tests.runtime.link.linked import STATION, Lab, Robot, allowed
 
 pytestmark = pytest.mark.django_db(transaction=True)
 
@@ -98,7 +98,7 @@ def test_what_happened_during_a_loss_is_written_down_when_the_link_is_back(lab, 
     web()
     robot.station.say("command", "before the loss", uuid="")
     before = robot.station.events.newest
-    eventually(lambda: Station.objects.get(pk=station.pk).last_event == before, WAIT_S, "what was before")
+    eventually(lambda: Station.objects.get(pk=station.pk).last_event == before, "what was before")
     assert Lease.objects.get(station=station).ended_at is None
     seen = list(told)
     robot.hang_up()
@@ -106,17 +106,17 @@ def test_what_happened_during_a_loss_is_written_down_when_the_link_is_back(lab, 
     newest = happens(robot)
     assert told == seen
     robot.dial()
-    eventually(lambda: Station.objects.get(pk=station.pk).last_event == newest, WAIT_S, "what was missed")
+    eventually(lambda: Station.objects.get(pk=station.pk).last_event == newest, "what was missed")
     assert told == [*seen, *counted(robot, before)]
     assert told[-3:] == [(newest - 42, "state"), (newest - 1, "command"), (newest, "episode_closed")]
-    eventually(lambda: Lease.objects.get(station=station).ended_at, WAIT_S, "the end of the lease")
+    eventually(lambda: Lease.objects.get(station=station).ended_at, "the end of the lease")
 
 
 def test_a_lab_whose_gate_and_web_were_down_too_misses_nothing_and_doubles_nothing(lab, robot, told, web):
     station = Station.objects.create(name=STATION, robot="agilex_piper")
     first = web()
     before = robot.station.events.newest
-    eventually(lambda: Station.objects.get(pk=station.pk).last_event == before, WAIT_S, "what was before")
+    eventually(lambda: Station.objects.get(pk=station.pk).last_event == before, "what was before")
     first.end()
     first._thread.join()
     port, second_port = lab.gate.port, lab.gate.second_port
@@ -126,7 +126,7 @@ def test_a_lab_whose_gate_and_web_were_down_too_misses_nothing_and_doubles_nothi
     lab.begin(port, second_port)
     lab.linked()
     web()
-    eventually(lambda: Station.objects.get(pk=station.pk).last_event == newest, WAIT_S, "what was missed")
+    eventually(lambda: Station.objects.get(pk=station.pk).last_event == newest, "what was missed")
     assert told == counted(robot, before)
     assert len(set(told)) == len(told)
 
@@ -154,5 +154,5 @@ def test_a_link_that_flaps_while_things_happen_doubles_nothing(lab, robot, told,
         ended.set()
         busy.join()
     newest = robot.station.events.newest
-    eventually(lambda: Station.objects.get(pk=station.pk).last_event == newest, WAIT_S, "all of it")
+    eventually(lambda: Station.objects.get(pk=station.pk).last_event == newest, "all of it")
     assert told == counted(robot, 0)

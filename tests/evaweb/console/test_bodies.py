@@ -15,6 +15,7 @@ from evaweb.console.bodies import MEMBER, STRANGER, bound_of
 from evaweb.headers import BARE
 from evaweb.plans.references import LARGEST
 from tests.evaweb.console.test_serve import MANAGE, served
+from tests.processes import PATIENCE_S
 
 LAB = "bodies"  # its id
 NAME = f"eva_session_{LAB}"
@@ -80,7 +81,7 @@ def sessions(folder, port):
 def asked(port, path, *headers, body=b"", method="POST"):
     """What is answered to these headers and as much of the body; read until the other side ends it."""
     lines = (f"{method} {path} HTTP/1.1", "Host: 127.0.0.1", "Connection: close", *headers, "", "")
-    with socket.create_connection(("127.0.0.1", port), 20) as connection:
+    with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as connection:
         connection.sendall("\r\n".join(lines).encode() + body)
         answer = b"".join(iter(lambda: connection.recv(65536), b""))
     head, _, content = answer.partition(b"\r\n\r\n")
@@ -204,7 +205,7 @@ def test_what_follows_a_stop_over_its_connection_is_bounded_as_ever(port, method
     head = b"%s %s HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: %d\r\nCookie: a=%s\r\n\r\n"
     body = b"{}" if method == b"POST" else b""
     sent = head % (method, b"/api/v1/stations/bench-1/estop", len(body), b"x" * 65_536) + body
-    with socket.create_connection(("127.0.0.1", port), 20) as connection:
+    with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as connection:
         connection.sendall(sent + head % (b"GET", b"/api/v1/me", 0, b"x" * 20_000))
         answer = b"".join(iter(lambda: connection.recv(65536), b""))
     assert (answer.count(b"HTTP/1.1 401"), answer.count(b"HTTP/1.1 431")) == (1, 1)
@@ -212,6 +213,6 @@ def test_what_follows_a_stop_over_its_connection_is_bounded_as_ever(port, method
 
 @pytest.mark.slow
 def test_a_line_that_is_no_request_is_refused_with_a_word(port):
-    with socket.create_connection(("127.0.0.1", port), 20) as connection:
+    with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as connection:
         connection.sendall(b"nonsense\r\n")
         assert connection.recv(65536).startswith(b"HTTP/1.1 400 ")

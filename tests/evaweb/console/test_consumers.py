@@ -28,7 +28,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.session.transitions import SessionEvent
 from tests import presses
 from tests.evaweb.noted import settled
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.django_db(transaction=True)
 ALL = ["state", "joints", "poses", "camera/cam_high"]
@@ -51,7 +51,7 @@ class Page:
             cookie = await asyncio.to_thread(_cookie, self._user)
             self._headers.append((b"cookie", f"{settings.SESSION_COOKIE_NAME}={cookie}".encode()))
         self._socket = WebsocketCommunicator(application, self._path, self._headers)
-        return (await self._socket.connect(timeout=10))[0]
+        return (await self._socket.connect(timeout=PATIENCE_S))[0]
 
     async def open(self):
         assert await self.connected()
@@ -60,7 +60,7 @@ class Page:
     async def refused(self):
         """The code with which the socket is closed right after it was opened."""
         assert await self.connected()
-        return (await self._socket.receive_output(10))["code"]
+        return (await self._socket.receive_output(PATIENCE_S))["code"]
 
     async def say(self, **message):
         await self._socket.send_to(text_data=json.dumps(message))
@@ -286,7 +286,7 @@ async def _written(*uuids):
 def _in_the_database(uuids):
     try:
         settled()
-        eventually(lambda: Command.objects.filter(pk__in=uuids).count() == len(uuids), 20, "they are written")
+        eventually(lambda: Command.objects.filter(pk__in=uuids).count() == len(uuids), "they are written")
     finally:
         connections.close_all()
 
@@ -822,8 +822,8 @@ def test_a_page_that_has_no_turn_to_be_looked_up_presses_unverified_and_halts_no
 
     monkeypatch.setattr(consumers, "_admitted", gone)
     full, begun, turn = Lookups(1, most=1), threading.Event(), threading.Event()
-    full.ask("nowhere", lambda: begun.set() or turn.wait(60))
-    assert begun.wait(60)
+    full.ask("nowhere", lambda: begun.set() or turn.wait(PATIENCE_S))
+    assert begun.wait(PATIENCE_S)
     full.ask("nowhere", lambda: None)
     monkeypatch.setattr(credentials, "_strangers", full)
 

@@ -14,7 +14,7 @@ from evaweb.console.feed import Feeds, History
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, Lease, Station
 from runtime.processes.coordinator.session.transitions import SessionEvent
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 
 class Services:
@@ -40,7 +40,7 @@ class Services:
 
     def wait(self, reached):
         with self.news:
-            assert self.news.wait_for(reached, 15), (self.trials, self.episodes)
+            assert self.news.wait_for(reached, PATIENCE_S), (self.trials, self.episodes)
 
 
 @pytest.fixture
@@ -117,13 +117,13 @@ def scribe(live, runtime, transactional_db):
     made = Scribe(runtime.name, Feeds())
     yield made
     made.end()
-    made._thread.join(15)
+    made._thread.join(PATIENCE_S)
     assert not made._thread.is_alive()
 
 
 def until(reached):
     """Wait for what another thread writes into the database."""
-    eventually(reached, 20, "a row")
+    eventually(reached, "a row")
 
 
 @pytest.mark.django_db(transaction=True)
@@ -204,7 +204,7 @@ def test_two_web_processes_write_the_same_and_nothing_twice_in_the_row(live, run
     until(lambda: Station.objects.get(pk=live.pk).last_event == 20)
     for one in both:
         one.end()
-        one._thread.join(15)
+        one._thread.join(PATIENCE_S)
     numbers = [number for _, number, _ in services.trials]
     assert set(numbers) == set(range(1, 21))
 
@@ -217,7 +217,7 @@ def test_a_chronicle_finds_stations_that_are_added_later(runtime, services):
     runtime.say("state", "hello")
     services.wait(lambda: services.trials == [(runtime.boot, 1, "state")])
     made.end()
-    made._thread.join(15)
+    made._thread.join(PATIENCE_S)
     for scribe in made._scribes.values():
-        scribe._thread.join(15)
+        scribe._thread.join(PATIENCE_S)
     connection.close()

@@ -11,6 +11,7 @@ from evaweb.console.feed import EVENTS_KEPT, Feed, History, Link
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.session.transitions import SessionEvent
 from tests.evaweb.stand_in import before_an_upgrade
+from tests.processes import PATIENCE_S
 
 
 class Ear:
@@ -27,7 +28,9 @@ class Ear:
 
     def wait(self, wanted):
         with self._news:
-            assert self._news.wait_for(lambda: any(wanted(*one) for one in self.heard), 10), self.heard[-5:]
+            assert self._news.wait_for(lambda: any(wanted(*one) for one in self.heard), PATIENCE_S), (
+                self.heard[-5:]
+            )
             return next(one for one in self.heard if wanted(*one))
 
     def forget(self):

@@ -8,6 +8,7 @@ from channels.testing import WebsocketCommunicator
 from evaweb.asgi import application
 from evaweb.console.consumers import NO_STATION
 from tests.evaweb.console.test_consumers import Page, run
+from tests.processes import PATIENCE_S
 
 pytestmark = pytest.mark.django_db(transaction=True)
 ODD = ["x" * 3000, "\x00", "\udc80", "🤖" * 100, "\n"]
@@ -19,8 +20,8 @@ def test_where_there_is_none(path):
         address = f"/ws/{quote(path, errors='surrogateescape')}"
         headers = [(b"origin", b"http://localhost"), (b"host", b"localhost")]
         socket = WebsocketCommunicator(application, address, headers)
-        assert (await socket.connect(timeout=10))[0]
-        assert (await socket.receive_output(10))["code"] == NO_STATION
+        assert (await socket.connect(timeout=PATIENCE_S))[0]
+        assert (await socket.receive_output(PATIENCE_S))["code"] == NO_STATION
 
     run(scenario())
 
@@ -30,7 +31,7 @@ def test_of_a_station_that_cannot_be(name, vera):
     async def scenario():
         page = Page(quote(name, errors="surrogateescape"), vera)
         assert await page.connected()
-        closed = await page._socket.receive_output(10)
+        closed = await page._socket.receive_output(PATIENCE_S)
         assert closed["code"] == NO_STATION
         assert len(closed["reason"].encode()) <= 123
 

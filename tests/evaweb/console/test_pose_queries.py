@@ -15,6 +15,7 @@ from evaweb.roles import Role
 from evaweb.stations.models import Station
 from evaweb.stations.robot_geometry import looks_of
 from runtime.ipc.messages import Ack
+from tests.processes import PATIENCE_S
 
 Q = [0.1] * 14
 PIPER = looks_of("agilex_piper")
@@ -80,7 +81,7 @@ class Page:
         assert (station, looks) == ("bench-1", PIPER)
         self.asked.append(args["n"])
         self.begun.set()
-        assert self.go.wait(10)
+        assert self.go.wait(PATIENCE_S)
         if args["n"] < 0:
             raise ValueError("broken")
         return {"ok": True}

@@ -23,7 +23,7 @@ import pytest
 from evaweb.console.server import _address
 from evaweb.listening import PortTaken, listen
 from tests import migrated
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 MANAGE = Path(__file__).parents[3] / "manage.py"
 
@@ -77,7 +77,7 @@ def test_it_serves_and_ends_with_its_lifeline(tmp_path):
         with urllib.request.urlopen(f"{address['url']}/healthz") as answer:
             assert answer.read() == b"ok\n"
         process.stdin.close()
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE_S) == 0
 
 
 @pytest.mark.slow
@@ -94,7 +94,7 @@ def test_it_ends_when_it_is_told(tmp_path):
     with served(tmp_path) as (process, address):
         assert address["port"] > 0
         process.send_signal(signal.SIGTERM)
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE_S) == 0
 
 
 @pytest.mark.slow
@@ -108,13 +108,13 @@ def test_connections_that_ask_for_nothing_keep_nobody_out_and_are_closed(tmp_pat
     try:
         with served(tmp_path, path=tmp_path) as (_, address):
             for _ in range(1100):
-                half_open.append(socket.create_connection(("127.0.0.1", address["port"]), timeout=20))
+                half_open.append(socket.create_connection(("127.0.0.1", address["port"]), timeout=PATIENCE_S))
                 half_open[-1].sendall(b"POST /api/v1/stations/bench/estop HTTP/1.1\r\nHost: ")
             request = urllib.request.Request(
                 f"{address['url']}/api/v1/stations/bench/estop", b"{}", method="POST"
             )
             with pytest.raises(urllib.error.HTTPError) as refused:
-                urllib.request.urlopen(request, timeout=60)
+                urllib.request.urlopen(request, timeout=PATIENCE_S)
             assert (refused.value.code, "error" in json.load(refused.value)) == (401, True)
             with pytest.raises(ConnectionResetError):  # the oldest has made place
                 half_open[0].recv(1)
@@ -134,10 +134,10 @@ def test_the_process_for_stops_answers_says_where_it_is_and_ends_with_its_lifeli
         asked = ((estop, {}, 401), (f"{address['url']}/login/", {}, 404), (address["url"], upgrade, 404))
         for url, headers, status in asked:
             with pytest.raises(urllib.error.HTTPError) as refused:
-                urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=60)
+                urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=PATIENCE_S)
             assert (refused.value.code, next(iter(json.load(refused.value)))) == (status, "error")
         process.stdin.close()
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE_S) == 0
         assert not said.exists()
 
 
@@ -150,9 +150,9 @@ def test_an_e_stop_whose_sender_dies_in_the_middle_of_its_body_is_pressed(tmp_pa
         head = "POST /api/v1/stations/bench/{} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {}\r\n"
         body = b'Content-Length: 99\r\n\r\n{"why": "half of'
         for path in ("commands", "estop"):
-            with socket.create_connection(("127.0.0.1", address["port"]), 20) as dies:
+            with socket.create_connection(("127.0.0.1", address["port"]), PATIENCE_S) as dies:
                 dies.sendall(head.format(path, token).encode() + body)
-        eventually(lambda: _presses(tmp_path) == [("estop", {"why": "pressed"})], 20, "it is pressed")
+        eventually(lambda: _presses(tmp_path) == [("estop", {"why": "pressed"})], "it is pressed")
 
 
 @pytest.mark.slow
@@ -175,7 +175,9 @@ def _asked_as(token, url, path, kind, body):
     headers = {"Authorization": f"Bearer {token}", "Content-Type": kind}
     where = f"{url}/api/v1/stations/bench/{path}"
     try:
-        with urllib.request.urlopen(urllib.request.Request(where, body, headers), timeout=60) as answer:
+        with urllib.request.urlopen(
+            urllib.request.Request(where, body, headers), timeout=PATIENCE_S
+        ) as answer:
             return answer.status, answer.read()
     except urllib.error.HTTPError as refused:
         with refused:

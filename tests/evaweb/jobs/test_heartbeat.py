@@ -7,6 +7,7 @@ import threading
 from django.db import OperationalError
 
 from evaweb.jobs.heartbeat import Heartbeat, Lapse
+from tests.processes import PATIENCE_S
 
 
 def test_it_beats_until_the_block_is_left_also_after_an_error() -> None:
@@ -22,7 +23,7 @@ def test_it_beats_until_the_block_is_left_also_after_an_error() -> None:
         return True
 
     with Heartbeat(beat, 0.001):
-        assert enough.wait(20)
+        assert enough.wait(PATIENCE_S)
     counted = len(beats)
     assert counted >= 4
     assert not [thread for thread in threading.enumerate() if thread.name == "heartbeat"]
@@ -31,7 +32,7 @@ def test_it_beats_until_the_block_is_left_also_after_an_error() -> None:
 def test_it_stops_where_the_job_is_not_ours_any_more() -> None:
     beats: list[int] = []
     with Heartbeat(lambda: bool(beats.append(1)), 0.001) as heart:
-        heart._thread.join(20)
+        heart._thread.join(PATIENCE_S)
         assert beats == [1]
 
 
@@ -42,17 +43,17 @@ def test_it_lapses_where_no_beat_arrives_and_only_then() -> None:
         raise OperationalError("the server closed the connection")
 
     with Heartbeat(beat, 0.01, Lapse(0.05, lapsed.set)):
-        assert lapsed.wait(20)
+        assert lapsed.wait(PATIENCE_S)
     again = threading.Event()
     with Heartbeat(lambda: True, 0.001, Lapse(3600.0, again.set)):
         pass
     assert not again.is_set()
     for timer in [one for one in threading.enumerate() if isinstance(one, threading.Timer)]:
-        timer.join(20)
+        timer.join(PATIENCE_S)
         assert not timer.is_alive()
 
 
 def test_it_lapses_at_once_where_the_job_is_anothers() -> None:
     lapsed = threading.Event()
     with Heartbeat(lambda: False, 0.001, Lapse(3600.0, lapsed.set)):
-        assert lapsed.wait(20)
+        assert lapsed.wait(PATIENCE_S)

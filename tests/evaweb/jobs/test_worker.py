@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests import migrated
+from tests.processes import PATIENCE_S
 
 ROOT = Path(__file__).parents[3]
 pytestmark = pytest.mark.slow
@@ -67,7 +68,7 @@ class Lab:
             env=self.environment,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=PATIENCE_S,
             check=False,
         )
         assert done.returncode == 0, done.stderr
@@ -100,7 +101,7 @@ class Lab:
 
     def job(self) -> tuple[str, int, int]:
         """Status, attempts and deaths of the job."""
-        with sqlite3.connect(self.folder / "eva.sqlite3", timeout=20) as database:
+        with sqlite3.connect(self.folder / "eva.sqlite3", timeout=PATIENCE_S) as database:
             found = database.execute(
                 "select status, attempts, deaths from jobs_job where key = 'wait'"
             ).fetchone()
@@ -130,7 +131,7 @@ def test_a_job_asked_for_before_the_worker_and_with_no_broker_is_done_and_the_li
     assert os.getpriority(os.PRIO_PROCESS, worker.pid) == 19
     assert worker.stdin is not None
     worker.stdin.close()
-    assert worker.wait(30) == 0
+    assert worker.wait(PATIENCE_S) == 0
 
 
 def test_told_to_end_it_finishes_its_job_or_puts_it_back_and_after_a_kill_another_one_takes_it(
@@ -141,7 +142,7 @@ def test_told_to_end_it_finishes_its_job_or_puts_it_back_and_after_a_kill_anothe
     first = lab.worker()
     lab.until(lab.begun.exists, "the job begins")
     first.send_signal(signal.SIGTERM)
-    assert first.wait(30) == 0
+    assert first.wait(PATIENCE_S) == 0
     assert lab.job() == ("queued", 0, 0), "it was put back as if it had never been claimed"
 
     lab.begun.unlink()
@@ -157,5 +158,5 @@ def test_told_to_end_it_finishes_its_job_or_puts_it_back_and_after_a_kill_anothe
     lab.until(lab.begun.exists, "the job is swept and begins once more")
     third.send_signal(signal.SIGTERM)
     lab.hold.unlink()
-    assert third.wait(30) == 0
+    assert third.wait(PATIENCE_S) == 0
     assert lab.job() == ("done", 0, 1)

@@ -10,6 +10,7 @@ import pytest
 from evaweb.lab import lifetime
 from evaweb.lab.lab import a_lab
 from evaweb.lab.processes import LabError
+from tests.processes import PATIENCE_S
 
 
 def test_a_taken_port_names_the_option_and_leaves_its_holder_alone():
@@ -106,7 +107,7 @@ def test_each_way_to_end_a_lab_lets_it_end_in_order_and_a_second_one_changes_not
     assert lab.stdout.readline() == "ending\n"
     for another in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         lab.send_signal(another)
-    assert lab.communicate("\n", timeout=20) == ("ended\n", None)
+    assert lab.communicate("\n", timeout=PATIENCE_S) == ("ended\n", None)
     assert lab.returncode == 0
 
 
@@ -116,4 +117,4 @@ def test_a_lab_that_is_to_outlive_its_terminal_does(ending):
     lab.send_signal(signal.SIGTERM)
     assert lab.stdout.readline() == "ending\n"
     lab.send_signal(signal.SIGHUP)
-    assert lab.communicate("\n", timeout=20) == ("ended\n", None)
+    assert lab.communicate("\n", timeout=PATIENCE_S) == ("ended\n", None)

@@ -9,7 +9,7 @@ import pytest
 from evaweb.lab import programs
 from evaweb.lab.processes import LabError, Processes, Program, processor_s
 from evaweb.listening import PortTaken, listen
-from tests.processes import alive, eventually
+from tests.processes import PATIENCE_S, alive, eventually
 
 ANSWERS = """
 import socket, sys
@@ -43,11 +43,11 @@ def test_what_dies_is_started_again_where_it_was(processes):
     processes.start(again)
     before = processes.pids()["one"]
     os.kill(before, signal.SIGKILL)
-    eventually(lambda: not alive(before), 20, "its end")
+    eventually(lambda: not alive(before), "its end")
     processes.watch()
     assert processes.pids()["one"] != before
     written = processes._logs / "one.log"
-    eventually(lambda: "here here first" in written.read_text(), 20, "it announces itself again")
+    eventually(lambda: "here here first" in written.read_text(), "it announces itself again")
 
 
 def test_a_port_of_ours_is_never_free_and_who_calls_is_answered_by_the_next_process(processes):
@@ -57,10 +57,10 @@ def test_a_port_of_ours_is_never_free_and_who_calls_is_answered_by_the_next_proc
         processes.start(Program("one", arguments, announces=True, patience_s=0.1, descriptors=(descriptor,)))
         before = processes.pids()["one"]
         os.kill(before, signal.SIGKILL)
-        eventually(lambda: not alive(before), 20, "its end")
+        eventually(lambda: not alive(before), "its end")
         with pytest.raises(PortTaken, match="cannot listen"):
             listen(*address)
-        with socket.create_connection(address, 20) as caller:
+        with socket.create_connection(address, PATIENCE_S) as caller:
             processes.watch()
             assert caller.recv(4) == b"here"
 
@@ -76,7 +76,7 @@ def test_what_dies_too_often_rests_and_takes_nobody_with_it(processes, caplog):
             "one ended with 1, 6 times within a minute: next try in 30 s; the disk is on fire" in caplog.text
         )
 
-    eventually(rests, 20, "it rests")
+    eventually(rests, "it rests")
     one = processes.pids()["one"]
     processes.watch()
     assert processes.pids() == {"one": one, "two": two}
@@ -104,7 +104,7 @@ def test_one_that_is_getting_ready_is_looked_at_while_others_are_watched(process
     processes.start(Program("one", ("-c", WAITS)))
     before = processes.pids()
     os.kill(before["one"], signal.SIGKILL)
-    eventually(lambda: not alive(before["one"]), 20, "its end")
+    eventually(lambda: not alive(before["one"]), "its end")
     processes.watch()
     assert processes.pids()["one"] != before["one"]
 
@@ -114,7 +114,7 @@ def test_one_that_is_getting_ready_is_looked_at_while_others_are_watched(process
         except StopIteration as done:
             return done.value
 
-    assert eventually(ready, 20, "it announces itself") == {"url": "here there"}
+    assert eventually(ready, "it announces itself") == {"url": "here there"}
     assert processes.pids()["slow"] == before["slow"]
 
 
@@ -168,7 +168,7 @@ def test_one_that_is_dropped_holds_up_nobody_and_is_killed_when_its_time_is_over
         processes.watch()
         return not processes.ending()
 
-    eventually(ended, 20, "its end")
+    eventually(ended, "its end")
     assert not alive(one)
     assert caplog.text.count("one does not end by itself: killed") == 1
 
@@ -193,10 +193,10 @@ def test_they_end_with_us_even_when_we_are_killed(tmp_path):
 
     parent = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parents[3])
     written = tmp_path / "pid"
-    eventually(lambda: written.exists() and written.read_text(), 20, "the pid of the child")
+    eventually(lambda: written.exists() and written.read_text(), "the pid of the child")
     parent.kill()
     parent.wait()
-    eventually(lambda: not alive(int(written.read_text())), 20, "the end of the child")
+    eventually(lambda: not alive(int(written.read_text())), "the end of the child")
     assert parent.returncode == -signal.SIGKILL
 
 

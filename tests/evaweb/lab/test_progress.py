@@ -17,7 +17,7 @@ def test_a_step_that_lasts_is_not_silent(monkeypatch):
     monkeypatch.setattr(progress, "_DOT_EVERY_S", 0.01)
     said = []
     with Progress(said.append, 1).step("the database"):
-        eventually(lambda: said.count(".") > 2, 5, "dots")
+        eventually(lambda: said.count(".") > 2, "dots")
     assert said[-1] == "\n"
 
 
@@ -30,6 +30,6 @@ def test_a_terminal_that_is_gone_holds_nothing_up(monkeypatch):
         raise OSError("gone")
 
     with Progress(write, 1).during("ending"):
-        eventually(lambda: tried.count(".") > 1, 5, "dots")
+        eventually(lambda: tried.count(".") > 1, "dots")
     assert tried[0] == "ending "
     assert tried[-1] == "\n"

@@ -11,6 +11,8 @@ from django.conf import settings
 from django.db import OperationalError, transaction
 from django.db.utils import ConnectionHandler
 
+from tests.processes import PATIENCE_S
+
 _PATIENCE_S = (
     10.0  # of the one that waits: enough for the other on a busy machine, spent in full only where it fails
 )
@@ -49,7 +51,7 @@ def test_a_thread_that_has_the_database_never_waits_for_those_that_wait_for_it(d
         waiting = threading.Thread(target=wait_for_it)
         with transaction.atomic():
             waiting.start()
-            assert refused.wait(60)
+            assert refused.wait(PATIENCE_S)
             time.sleep(
                 _SOON_S
             )  # nothing tells that the other is in its wait; where it is not yet, nothing is shown

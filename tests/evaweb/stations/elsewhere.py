@@ -13,6 +13,7 @@ from django.db import connection
 
 from tests.evaweb.stand_in import StandIn
 from tests.namespaces import Network
+from tests.processes import PATIENCE_S
 from tests.sources import ROOT
 
 
@@ -84,7 +85,7 @@ class Elsewhere:
             env=self._environment,
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=PATIENCE_S,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout
@@ -98,7 +99,7 @@ class Elsewhere:
         """End a process as a power cut does."""
         child = self._children.pop(name)
         child.kill()
-        child.wait(60)
+        child.wait(PATIENCE_S)
         for pipe in (child.stdin, child.stdout):
             pipe.close()
 
@@ -126,7 +127,7 @@ class Elsewhere:
         for child in self._children.values():
             child.stdin.close()
         for child in self._children.values():
-            child.wait(60)
+            child.wait(PATIENCE_S)
             child.stdout.close()
         self.station.end()
         self.net.close()

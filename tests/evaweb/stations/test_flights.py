@@ -8,6 +8,7 @@ import pytest
 
 from evaweb.stations import flights
 from evaweb.stations.flights import Flights, TooMany
+from tests.processes import PATIENCE_S
 
 
 class Slow:
@@ -20,43 +21,43 @@ class Slow:
         self.times += 1
         answer = self.times
         self.begun.release()
-        assert self.may_end.acquire(timeout=20)
+        assert self.may_end.acquire(timeout=PATIENCE_S)
         return answer
 
 
 def test_a_flood_of_presses_is_answered_by_the_one_under_way_and_makes_one_more():
     all_of_them, slow = Flights("press"), Slow()
     first = all_of_them.ask("dead", slow, identity=0, shared=True)
-    assert slow.begun.acquire(timeout=20)
+    assert slow.begun.acquire(timeout=PATIENCE_S)
     flood = [all_of_them.ask("dead", slow, identity=number, shared=True) for number in range(1, 1500)]
     slow.may_end.release()
-    assert {answer.result(20) for answer in (first, *flood)} == {1}
-    assert slow.begun.acquire(timeout=20), "one that came after the first was sent is not lost"
+    assert {answer.result(PATIENCE_S) for answer in (first, *flood)} == {1}
+    assert slow.begun.acquire(timeout=PATIENCE_S), "one that came after the first was sent is not lost"
     slow.may_end.release()
     last = all_of_them.ask("dead", lambda: 3, identity="later", shared=True)
-    assert last.result(20) in (2, 3)
+    assert last.result(PATIENCE_S) in (2, 3)
     assert slow.times == 2
 
 
 def test_a_stop_that_came_after_one_was_sent_is_sent_and_answered_itself():
     all_of_them, slow = Flights("stop"), Slow()
     first = all_of_them.ask("bench", slow, key="halt", identity="a")
-    assert slow.begun.acquire(timeout=20)
+    assert slow.begun.acquire(timeout=PATIENCE_S)
     again = all_of_them.ask("bench", slow, key="halt", identity="a")
     others = [all_of_them.ask("bench", slow, key="halt", identity=number) for number in range(100)]
     slow.may_end.release(2)
-    assert (first.result(20), again.result(20)) == (1, 1)
-    assert {answer.result(20) for answer in others} == {2}
+    assert (first.result(PATIENCE_S), again.result(PATIENCE_S)) == (1, 1)
+    assert {answer.result(PATIENCE_S) for answer in others} == {2}
 
 
 def test_a_dead_station_keeps_no_other_and_no_other_kind_waiting():
     all_of_them, slow = Flights("press"), Slow()
     hangs = all_of_them.ask("dead", slow, identity=0)
-    assert all_of_them.ask("alive", lambda: "pressed", identity=0).result(20) == "pressed"
-    assert all_of_them.ask("dead", lambda: "halted", key="halt", identity=0).result(20) == "halted"
+    assert all_of_them.ask("alive", lambda: "pressed", identity=0).result(PATIENCE_S) == "pressed"
+    assert all_of_them.ask("dead", lambda: "halted", key="halt", identity=0).result(PATIENCE_S) == "halted"
     assert not hangs.done()
     slow.may_end.release()
-    assert hangs.result(20) == 1
+    assert hangs.result(PATIENCE_S) == 1
 
 
 def test_one_station_has_so_many_under_way_and_another_its_own():
@@ -66,7 +67,7 @@ def test_one_station_has_so_many_under_way_and_another_its_own():
     with pytest.raises(TooMany, match="2 requests to bench are under way"):
         all_of_them.ask("bench", slow, key="c", identity=0)
     other = all_of_them.ask("other", lambda: "done", identity=0)
-    assert other.result(20) == "done"
+    assert other.result(PATIENCE_S) == "done"
     slow.may_end.release(2)
 
 
@@ -78,13 +79,13 @@ def test_what_fails_is_everybodys_answer_and_the_next_is_done():
         raise ValueError("broken")
 
     first = all_of_them.ask("bench", broken, identity="a")
-    assert slow.begun.acquire(timeout=20)
+    assert slow.begun.acquire(timeout=PATIENCE_S)
     second = all_of_them.ask("bench", lambda: "done", identity="b")
     first.cancel()
     slow.may_end.release()
-    assert second.result(20) == "done"
+    assert second.result(PATIENCE_S) == "done"
     with pytest.raises(ValueError, match="broken"):
-        first.result(20)
+        first.result(PATIENCE_S)
 
 
 def test_without_a_thread_a_robot_is_stopped_all_the_same(monkeypatch):

@@ -11,6 +11,7 @@ from evaweb.stations import robot_geometry as looks_module
 from evaweb.stations.robot_geometry import Looks, facts_of, groups_of, looks_of
 from runtime.kinematics.base import KinematicsError
 from runtime.sim.bench import tip_in_world
+from tests.processes import PATIENCE_S
 
 
 @pytest.mark.parametrize("name", robots.names())
@@ -27,7 +28,7 @@ def test_matrices_go_column_by_column(name):
 def test_until_the_kernels_are_there_numpy_says_the_same(name):
     looks = looks_of(name)
     q = np.random.default_rng(1).uniform(looks.robot.lower, looks.robot.upper, (2, 3, looks.robot.dim))
-    looks._links.result(60)
+    looks._links.result(PATIENCE_S)
     assert looks.compiled
     compiled = looks.poses(q)
     with pytest.MonkeyPatch.context() as patch:
@@ -38,7 +39,7 @@ def test_until_the_kernels_are_there_numpy_says_the_same(name):
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_joint_that_is_no_number_leaves_no_part_of_the_robot_anywhere(monkeypatch, compiled):
     looks = looks_of("agilex_piper")
-    looks._links.result(60)
+    looks._links.result(PATIENCE_S)
     monkeypatch.setattr(Looks, "compiled", compiled)
     q = np.zeros((3, 14))
     q[1, 13] = np.nan
@@ -58,7 +59,7 @@ def test_kernels_that_cannot_be_made_leave_the_robot_drawn(monkeypatch):
     monkeypatch.setattr(looks_module, "Links", broken)
     known = looks_of("agilex_piper")
     looks = Looks(known.robot, known.scene)
-    looks_module._kernels.submit(int).result(60)  # what was begun before is over
+    looks_module._kernels.submit(int).result(PATIENCE_S)  # what was begun before is over
     assert not looks.compiled
     assert looks.poses(np.zeros(14)).shape == (len(known.scene.parts), 16)
     assert said == ["no numba"]

@@ -155,7 +155,7 @@ def test_the_thread_survives_what_nobody_expects_and_keeps_the_note(kept, monkey
     notes, rows = Notes(kept.append), [halted(), halted(user="bob")]
     for row in rows:
         notes.note(row)
-    eventually(lambda: sorted(map(id, kept)) == sorted(map(id, rows)), 60, "both are written down")
+    eventually(lambda: sorted(map(id, kept)) == sorted(map(id, rows)), "both are written down")
     assert "RuntimeError: anything" in caplog.text
 
 

@@ -86,7 +86,6 @@ def test_a_halt_during_a_locked_database_is_carried_out_and_written_when_the_loc
     other.close()
     eventually(
         lambda: Command.objects.filter(kind="halt").exists() and not list(folder.iterdir()),
-        60,
         "the halt is written down",
     )
     found = Command.objects.get(kind="halt")
@@ -463,5 +462,5 @@ def test_the_thread_survives_whatever_happens_in_one_turn(monkeypatch, caplog):
     one = Unwritten(away)
     one.attempt = attempt
     one.look()
-    eventually(lambda: len(turns) == 3, 60, "it goes on")
+    eventually(lambda: len(turns) == 3, "it goes on")
     assert caplog.text.count("RuntimeError: anything") == 1, "one line for many"

@@ -417,7 +417,7 @@ def test_what_is_still_being_closed_is_scored_as_soon_as_a_row_of_it_is_on_the_d
     ):
         score(bench, trial)
     journal_of.append(row(0))
-    eventually(lambda: not unrecorded_because(episode=trial.episode), 10, "a row on the disk")
+    eventually(lambda: not unrecorded_because(episode=trial.episode), "a row on the disk")
     assert score(bench, trial).success is True
     journal_of.end(Outcome("finished", "stopped", 1.7e9))
 

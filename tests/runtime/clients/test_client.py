@@ -11,6 +11,7 @@ from runtime.ipc.messages import Ack, Command
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.session.machine import SessionMachine
+from tests.processes import PATIENCE_MS
 from tests.runtime.processes.coordinator.session.test_machine import Recorded
 
 
@@ -248,7 +249,7 @@ def test_the_estop_goes_to_the_guard_without_any_lease(client, station):
     pressed = []
 
     def answer():
-        assert guard.socket.poll(2000)
+        assert guard.socket.poll(PATIENCE_MS)
         address, command = guard.receive()
         pressed.append(command)
         guard.answer(address, Ack(command.uuid, "done", "obeyed"))

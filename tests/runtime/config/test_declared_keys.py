@@ -133,7 +133,6 @@ def excused(key: str) -> tuple[str, str] | None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)  # a whole check of types: a minute on a quiet machine
 def test_every_declared_key_is_read_by_what_it_is_for() -> None:
     silent = unread(reads_of(modules(), ROOT), Deployment, RobotTable, Robot, Group, Gripper)
     lies = []

@@ -13,7 +13,7 @@ from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.policies.tunnel.process import Ssh
 from runtime.preflight.__main__ import _asked_for
 from runtime.station import preflight_child as child
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 SHED = (
     "import os; from runtime.core import environment; before = os.getpid(); environment.shed(); "
@@ -24,7 +24,7 @@ SHED = (
 def test_a_program_that_was_started_with_secrets_goes_on_without_as_the_same_process():
     given = os.environ | dict.fromkeys((*WEB_ALONE, "EVA_JUDGE_MINE"), "canary") | {"KEPT": "this"}
     started = subprocess.Popen([sys.executable, "-c", SHED], env=given, stdout=subprocess.PIPE, text=True)
-    said, _ = started.communicate(timeout=60)
+    said, _ = started.communicate(timeout=PATIENCE_S)
     assert started.returncode == 0
     assert "canary" not in said
     assert said.endswith(" this\n")
@@ -88,7 +88,7 @@ def test_ssh_gets_what_it_needs_and_no_key_of_anybody(monkeypatch):
     ]
     ssh = Ssh(line, 1)
     try:
-        eventually(lambda: ssh.look() is not None, 60, "its end")
+        eventually(lambda: ssh.look() is not None, "its end")
         assert list(ssh.said) == ["False /run/agent"]
     finally:
         ssh.end()

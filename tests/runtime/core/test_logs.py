@@ -8,6 +8,7 @@ import threading
 import pytest
 
 from runtime.core import logs as log
+from tests.processes import PATIENCE_S
 
 PIPE_SIZE = 1031  # F_SETPIPE_SZ
 STUCK = """
@@ -93,7 +94,7 @@ def test_a_process_with_a_stuck_terminal_goes_on_and_ends():
         [sys.executable, "-c", STUCK], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     assert child.stdout.readline() == "went on\n"
-    assert child.wait(30) == 0  # although nobody has read its log
+    assert child.wait(PATIENCE_S) == 0  # although nobody has read its log
     child.stdout.close()
     child.stderr.close()
 

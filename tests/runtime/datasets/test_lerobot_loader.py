@@ -20,7 +20,7 @@ from runtime.datasets.reader import open_dataset
 from tests.runtime.datasets.foreign import Plan, column, shown, write
 from tests.runtime.datasets.small import picture, record, row
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # an import of torch, twice
+pytestmark = pytest.mark.slow  # an import of torch, twice
 LOADER = Path(__file__).parents[2] / "conformance" / "load_with_lerobot.py"
 READS = "from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION; print(CODEBASE_VERSION)"
 

@@ -10,6 +10,7 @@ import pytest
 
 from runtime.ipc.bells import Bell, bells
 from runtime.ipc.shared_state import WOKEN, EStop, SharedState, SharedStateLayout
+from tests.processes import PATIENCE_S
 
 LAYOUT = SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16)
 
@@ -59,7 +60,7 @@ def test_what_was_rung_before_the_wait_ends_it_once() -> None:
     bell = Bell.made()
     bell.ring()
     bell.ring()
-    bell.wait(60.0)  # or the test does not end
+    bell.wait(PATIENCE_S)  # or the test does not end
     assert not select.select([bell.descriptor], [], [], 0)[0]
     bell.close()
 
@@ -68,7 +69,7 @@ def test_an_inherited_bell_is_the_same_one() -> None:
     first, second = Bell.made(), Bell.made()
     _, inherited = bells(f"{first.descriptor},{second.descriptor}")
     inherited.ring()
-    second.wait(60.0)
+    second.wait(PATIENCE_S)
     assert not select.select([first.descriptor], [], [], 0)[0]
     first.close()
     second.close()

@@ -21,7 +21,7 @@ from runtime.ipc.bus import (
     Subscriber,
 )
 from runtime.ipc.messages import Ack, Command, Event, decode, encode
-from tests.processes import eventually
+from tests.processes import PATIENCE_MS, eventually
 
 PACE_S = 0.002  # between bursts: ZMQ looks only once a millisecond at what a reader has taken
 
@@ -47,12 +47,12 @@ def raw(context, server):
 
 
 def next_command(server):
-    assert server.socket.poll(2000)
+    assert server.socket.poll(PATIENCE_MS)
     return server.receive()
 
 
 def answer_to(raw):
-    assert raw.poll(2000)
+    assert raw.poll(PATIENCE_MS)
     return decode(raw.recv_multipart()[-1])
 
 
@@ -100,7 +100,7 @@ GARBAGE = {
 def test_garbage_is_answered_with_a_reason_and_the_next_command_is_served(server, raw, payload):
     raw.send(payload)
     raw.send(encode(Command("u", "run")))
-    assert server.socket.poll(2000)
+    assert server.socket.poll(PATIENCE_MS)
     received = server.receive() or next_command(server)
     refusal = answer_to(raw)
     assert (refusal.uuid, refusal.status) == ("", "refused")
@@ -158,7 +158,7 @@ def test_a_command_nobody_took_in_time_is_not_delivered_when_the_runtime_comes_u
     again = context.socket(zmq.ROUTER)
     again.bind(server.endpoint)
     client._socket.send(encode(Command("new", "stop")))
-    assert again.poll(2000)
+    assert again.poll(PATIENCE_MS)
     assert decode(again.recv_multipart()[-1]).uuid == "new"
     assert not again.poll(0)
 
@@ -225,7 +225,7 @@ def test_a_publisher_knows_what_is_read(context, publisher):
             begun.extend(publisher.hear())
             return publisher.wanted(stream) is wanted
 
-        eventually(asked, 30, f"{stream} is wanted: {wanted}")
+        eventually(asked, f"{stream} is wanted: {wanted}")
         return begun
 
     assert not publisher.wanted("state")
@@ -242,7 +242,7 @@ def test_what_is_no_subscription_is_passed_over(context, publisher):
     stranger.connect(publisher.endpoint)
     stranger.send(b"\x07what is this")
     stranger.send(b"\x01state")
-    eventually(lambda: publisher.hear() == ["state"] or publisher.wanted("state"), 30, "it is heard")
+    eventually(lambda: publisher.hear() == ["state"] or publisher.wanted("state"), "it is heard")
     assert publisher.topics == {"state"}
     stranger.close(linger=0)
 

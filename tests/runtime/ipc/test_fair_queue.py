@@ -17,6 +17,7 @@ from runtime.ipc.bus import GREEDY, TURN, CommandServer
 from runtime.ipc.estop_requests import kind_of
 from runtime.ipc.fair_queue import Turns
 from runtime.ipc.messages import Ack, Command, decode, encode
+from tests.processes import PATIENCE_MS, PATIENCE_S
 
 SHARE = 8
 STOPS = ("stop", "halt")
@@ -168,12 +169,12 @@ def test_each_connection_has_its_turn(bench: Bench) -> None:
         greedy.send(said("status", str(number)))
     bench.turns._share = 0
     while sum(map(len, bench.turns._waiting.values())) < GREEDY:
-        assert bench.server.socket.poll(20_000)
+        assert bench.server.socket.poll(PATIENCE_MS)
         bench.turns.take()
     bench.turns._share = SHARE
     assert len(bench.take()[1]) == SHARE
     modest.send(said("status", "modest"))
-    assert bench.server.socket.poll(20_000)
+    assert bench.server.socket.poll(PATIENCE_MS)
     assert "modest" in bench.take()[1] + bench.take()[1]
 
 
@@ -246,10 +247,10 @@ def test_more_half_open_peers_than_the_usual_limit_of_files_keep_nobody_out(benc
             peers.append(peer)
         client = bench.client()
         client.send(said("stop", "mine"))
-        assert bench.server.socket.poll(20_000)
+        assert bench.server.socket.poll(PATIENCE_MS)
         assert bench.turns_until("mine") == 1
         assert peers[0].recv(64)  # ZMQ's greeting
-        peers[0].settimeout(60)
+        peers[0].settimeout(PATIENCE_S)
         assert peers[0].recv(64) == b"", "it is let go"
     finally:
         for peer in peers:

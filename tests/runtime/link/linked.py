@@ -21,10 +21,9 @@ from runtime.link.station import StationLink
 from runtime.link.uploads import UploadSettings
 from runtime.link.wire import Enrolled
 from tests.evaweb.stand_in import StandIn
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 STATION = "bench-7"
-WAIT_S = 10.0
 
 
 def allowed(*keys: tuple[KeyPair, str], enrolling: bool = False) -> Allowed:
@@ -104,18 +103,18 @@ class Lab:
 
     def linked(self, station: str = STATION) -> None:
         """Wait until it is."""
-        eventually(lambda: station in self.gate.linked(), WAIT_S, f"{station} is linked")
+        eventually(lambda: station in self.gate.linked(), f"{station} is linked")
 
     def lost(self, station: str = STATION) -> None:
         """Wait until its link is."""
-        eventually(lambda: station not in self.gate.linked(), WAIT_S, f"{station} is lost")
+        eventually(lambda: station not in self.gate.linked(), f"{station} is lost")
 
     def ask(
         self,
         command: Command,
         place: tuple[str, str] = ("coordinator", "commands"),
         sign: bool = True,
-        timeout: float = 3 * WAIT_S,
+        timeout: float = PATIENCE_S,
     ) -> Ack:
         """The answer to a command that the web signs, or a program of its computer gives."""
         endpoint = str(Endpoints(self.folder()).read(place[0])[place[1]])
@@ -135,7 +134,7 @@ class Lab:
         endpoint = str(Endpoints(self.folder()).read(process)[socket])
         subscriber = Subscriber(zmq.Context.instance(), endpoint, stream)
         try:
-            return eventually(lambda: subscriber.receive(0.05), WAIT_S, stream)
+            return eventually(lambda: subscriber.receive(0.05), stream)
         finally:
             subscriber.close()
 

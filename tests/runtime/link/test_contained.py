@@ -12,8 +12,8 @@ from runtime.link import door, key_files, wire
 from runtime.link.admission import Admission, AllowList
 from runtime.link.line import dialled
 from runtime.link.wire import COMMANDS, RELEASE, STOPS, Ask, Beat, Bye, Hello, Welcome, read, write
-from tests.processes import eventually
-from tests.runtime.link.linked import STATION, WAIT_S, allowed
+from tests.processes import PATIENCE_MS, eventually
+from tests.runtime.link.linked import STATION, allowed
 
 OTHER = "bench-8"
 KEY = key_files.KeyPair.of(bytes(range(1, 33)))
@@ -24,7 +24,7 @@ CHALLENGE = b"c" * 16
 def dial(lab, linked):
     """Connections of another station of this lab, whose computer says what it likes."""
     lab.allowed.now = allowed((linked.key, STATION), (KEY, OTHER))
-    eventually(lambda: OTHER in lab.gate._streams.places, WAIT_S, "the other station")
+    eventually(lambda: OTHER in lab.gate._streams.places, "the other station")
     context = zmq.Context()
     yield lambda: dialled(context, f"tcp://127.0.0.1:{lab.gate.port}", lab.key.public, KEY)[0]
     context.destroy(linger=0)
@@ -38,7 +38,7 @@ def said(dealer, kind):
                 return message
         return None
 
-    return eventually(heard, 3 * WAIT_S, kind.__name__)
+    return eventually(heard, kind.__name__)
 
 
 def greeted(dial, role, *listening):
@@ -63,7 +63,7 @@ def pressed(lab, dial):
     client = CommandClient(zmq.Context.instance(), endpoint, Key(folder))
 
     def answer():
-        packed = eventually(client.packed_answer, 3 * WAIT_S, "the answer")
+        packed = eventually(client.packed_answer, "the answer")
         return decode(packed)
 
     def press():
@@ -97,7 +97,7 @@ def test_a_program_of_another_release_unlinks_no_station_that_is_linked(lab, dia
         older.send_multipart(write(Hello(RELEASE + 9, "9", OTHER, STOPS, b"older")))
         assert "they work one apart" in said(older, Bye).why
         lines[COMMANDS].send_multipart(write(wire.Answer(asked.number), b"whatever it likes"))
-        packed = eventually(client.packed_answer, WAIT_S, "the answer")
+        packed = eventually(client.packed_answer, "the answer")
         assert packed == b"whatever it likes"
     finally:
         client.close()
@@ -118,7 +118,7 @@ def test_a_message_of_nothing_but_parts_keeps_no_press_and_its_key_is_refused_fo
     assert lab.press().status == "done"
     again = dial()
     again.send_multipart(write(Hello(RELEASE, "0", OTHER, STOPS, b"hostile")))
-    assert not again.poll(1000)
+    assert not again.poll(PATIENCE_MS)
     lab.allowed._refused.clear()
     again = dial()
     again.send_multipart(write(Hello(RELEASE, "0", OTHER, STOPS, b"hostile")))
@@ -129,7 +129,7 @@ def test_a_message_without_an_end_is_cut_off_when_it_is_longer_than_a_greeting(l
     greeting = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"CURVE".ljust(20, b"\0") + bytes(32)
     with socket.create_connection(("127.0.0.1", lab.gate.port)) as endless:
         endless.sendall(greeting + b"\x06" + (1 << 20).to_bytes(8, "big") + bytes(40_000))
-        eventually(lambda: "without a whole message" in caplog.text, WAIT_S, "the end of it")
+        eventually(lambda: "without a whole message" in caplog.text, "the end of it")
     assert lab.press().status == "done"
 
 
@@ -140,9 +140,9 @@ def test_a_press_is_sent_again_also_while_the_coordinator_does_not_run(lab, dial
     assert said(stops, Ask).process == "guard"
     stops.close(linger=0)
     commands.close(linger=0)
-    eventually(lambda: lab.gate._remotes[OTHER].held, WAIT_S, "what is kept")
+    eventually(lambda: lab.gate._remotes[OTHER].held, "what is kept")
     stops, commands = (greeted(dial, role, "guard") for role in (STOPS, COMMANDS))
-    asked = eventually(lambda: asked_over(stops, commands), 3 * WAIT_S, "the press again")
+    asked = eventually(lambda: asked_over(stops, commands), "the press again")
     asked[0].send_multipart(write(wire.Answer(asked[1].number), encode(Ack("p1", "done"))))
     assert answer().status == "done"
 
@@ -161,7 +161,7 @@ def test_a_press_is_sent_again_where_a_new_connection_takes_the_place_of_its_own
     pressed()
     assert said(lines[STOPS], Ask).process == "guard"
     stops = greeted(dial, STOPS)
-    asked = eventually(lambda: asked_over(stops, lines[COMMANDS]), 3 * WAIT_S, "the press again")
+    asked = eventually(lambda: asked_over(stops, lines[COMMANDS]), "the press again")
     assert asked[1].process == "guard"
 
 

@@ -24,8 +24,8 @@ from runtime.link.wire import (
     read,
     write,
 )
-from tests.processes import eventually
-from tests.runtime.link.linked import STATION, WAIT_S, allowed
+from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
+from tests.runtime.link.linked import STATION, allowed
 
 OTHER = "bench-8"
 
@@ -50,7 +50,7 @@ class Hostile:
         return said if isinstance(said, Welcome) else None
 
     def said(self):
-        assert self.dealer.poll(int(3 * WAIT_S * 1000)), "the lab says nothing"
+        assert self.dealer.poll(PATIENCE_MS), "the lab says nothing"
         return read(self.dealer.recv_multipart())[0]
 
     def is_cut_off(self):
@@ -73,7 +73,7 @@ def hostile(lab, linked):
 @pytest.fixture
 def hostile_streams(lab, linked):
     lab.allowed.now = allowed((linked.key, STATION), (key_files.KeyPair.of(bytes(range(1, 33))), OTHER))
-    eventually(lambda: OTHER in lab.gate._streams.places, WAIT_S, "the other station")
+    eventually(lambda: OTHER in lab.gate._streams.places, "the other station")
     made = Hostile(lab, lab.gate.second_port)
     yield made
     made.close()
@@ -106,14 +106,14 @@ def test_bytes_that_are_no_handshake_end_nothing(lab, linked):
 def test_who_says_nothing_that_can_be_read_or_not_who_it_is_is_cut_off(lab, hostile, frames):
     hostile.dealer.send_multipart(frames)
     assert isinstance(hostile.said(), Bye)
-    eventually(hostile.is_cut_off, WAIT_S, "the end of the connection")
+    eventually(hostile.is_cut_off, "the end of the connection")
     assert lab.press().status == "done"
 
 
 def test_a_message_that_is_too_large_costs_its_sender_the_connection(lab, hostile):
     assert hostile.greet(STOPS)
     hostile.dealer.send(b"x" * (LARGEST_ANSWER + 1))
-    eventually(hostile.is_cut_off, WAIT_S, "the end of the connection")
+    eventually(hostile.is_cut_off, "the end of the connection")
     assert lab.press().status == "done"
 
 
@@ -132,7 +132,7 @@ def test_a_flood_is_cut_off_and_keeps_nobody_elses_press(lab, hostile, caplog, s
 
     assert not flooded()
     assert lab.press().status == "done"
-    eventually(flooded, WAIT_S, "the end of the connection")
+    eventually(flooded, "the end of the connection")
     assert f"{word} a second; allowed" in caplog.text
     assert lab.press().status == "done"
 
@@ -159,7 +159,7 @@ def test_streams_that_nobody_has_asked_for_are_cut_off(lab, linked, hostile_stre
     assert hostile_streams.greet(STATE)
     for _ in range(40):
         hostile_streams.dealer.send_multipart(write(Bundle(["state"]), b"x"))
-    eventually(hostile_streams.is_cut_off, WAIT_S, "the end of the connection")
+    eventually(hostile_streams.is_cut_off, "the end of the connection")
     assert lab.hears("coordinator", "state", "state")
 
 
@@ -172,7 +172,7 @@ def test_a_stream_of_another_name_is_published_nowhere(lab, linked, hostile_stre
         assert isinstance(hostile_streams.said(), Credit)
         names = ["camera/cam_high", "State", "../x", "state\n", "x" * 50, "", "state"]
         hostile_streams.dealer.send_multipart(write(Bundle(names), *[name.encode() for name in names]))
-        assert subscriber.poll(int(3 * WAIT_S * 1000))
+        assert subscriber.poll(PATIENCE_MS)
         assert subscriber.recv_multipart() == [b"state", b"state"]
     finally:
         subscriber.close(linger=0)
@@ -181,7 +181,7 @@ def test_a_stream_of_another_name_is_published_nowhere(lab, linked, hostile_stre
 def test_who_connects_and_says_nothing_is_let_go(lab, linked, monkeypatch):
     monkeypatch.setattr("runtime.link.door._NAMED_S", 0.5)
     with socket.create_connection(("127.0.0.1", lab.gate.port)) as raw:
-        raw.settimeout(3 * WAIT_S)
+        raw.settimeout(PATIENCE_S)
         with contextlib.suppress(ConnectionResetError):
             while raw.recv(4096):
                 pass

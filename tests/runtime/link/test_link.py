@@ -14,8 +14,8 @@ from runtime.ipc.messages import Command
 from runtime.ipc.station_lock import Taken, take
 from runtime.link import key_files
 from runtime.link.wire import RELEASE, Hello
-from tests.processes import eventually
-from tests.runtime.link.linked import STATION, WAIT_S, Robot, allowed
+from tests.processes import PATIENCE_S, eventually
+from tests.runtime.link.linked import STATION, Robot, allowed
 
 
 def command(kind, **fields):
@@ -74,7 +74,7 @@ def test_a_press_while_the_link_is_lost_goes_on_where_it_comes_back_soon(lab, li
     lab.lost()
     assert lab.press().status == "failed"
     linked.dial()
-    eventually(lambda: linked.station.pressed, WAIT_S, "the press")
+    eventually(lambda: linked.station.pressed, "the press")
 
 
 def test_a_command_is_not_carried_out_after_the_link_came_back(lab, linked):
@@ -112,8 +112,8 @@ def test_a_gate_that_is_restarted_is_dialled_again(lab, linked):
 
 def test_a_key_that_is_withdrawn_is_cut_off_and_let_in_no_more(lab, linked):
     lab.allowed.now = allowed()
-    eventually(lambda: _said(Endpoints(lab.folder()), "withdrawn"), WAIT_S, "the word")
-    eventually(lambda: _is_free(lab.folder()), WAIT_S, "the name, for another station")
+    eventually(lambda: _said(Endpoints(lab.folder()), "withdrawn"), "the word")
+    eventually(lambda: _is_free(lab.folder()), "the name, for another station")
     with pytest.raises(TransportError):
         Endpoints(lab.folder()).read("guard")
 
@@ -129,7 +129,7 @@ def _is_free(folder):
 def test_a_name_that_a_station_of_the_labs_computer_has_is_refused(lab, robot):
     with take(lab.folder()) as lock:
         robot.dial()
-        eventually(lambda: _refusal(lab), WAIT_S, "the refusal")
+        eventually(lambda: _refusal(lab), "the refusal")
         assert "runs on the lab's own computer" in _refusal(lab)
         lock.close()
     lab.linked()
@@ -145,7 +145,7 @@ def test_a_station_cannot_claim_anothers_name(lab, linked, tmp_path, caplog):
     lab.allowed.now = allowed((linked.key, STATION), (thief.key, "bench-8"))
     try:
         thief.dial()
-        eventually(lambda: "not known here with this key" in caplog.text, WAIT_S, "the refusal")
+        eventually(lambda: "not known here with this key" in caplog.text, "the refusal")
         assert lab.press().status == "done"
         assert len({one.uuid for one in linked.station.pressed}) == 1
         assert thief.station.pressed == []
@@ -157,7 +157,7 @@ def test_releases_further_apart_are_refused_by_a_sentence_that_names_both(lab, r
     monkeypatch.setattr("runtime.link.line.Hello", lambda release, *rest: Hello(release + 2, *rest))
     robot.dial()
     endpoints = Endpoints(lab.folder())
-    why = eventually(lambda: _said(endpoints, "release"), WAIT_S, "the refusal")
+    why = eventually(lambda: _said(endpoints, "release"), "the refusal")
     assert f"the lab has release {RELEASE} of the link" in why
     assert f"the computer of {STATION} release {RELEASE + 2}" in why
 
@@ -173,7 +173,7 @@ def _said(endpoints, word):
 def test_an_unknown_key_is_let_in_for_nothing_and_its_computer_is_told(lab, robot, caplog):
     lab.allowed.now = allowed((key_files.KeyPair.of(bytes(range(32))), STATION))
     robot.dial()
-    eventually(lambda: "the lab knows no such key" in caplog.text, WAIT_S, "the refusal")
+    eventually(lambda: "the lab knows no such key" in caplog.text, "the refusal")
     assert lab.gate.linked() == set()
 
 
@@ -181,4 +181,4 @@ def test_a_link_of_which_a_part_cannot_begin_ends_as_a_whole(robot, monkeypatch)
     """Else it would go on without its connection for stops, and nobody would start it again."""
     monkeypatch.setattr("runtime.link.station.Relay", lambda *given: 1 / 0)
     robot.dial()
-    assert robot.link.failed.wait(WAIT_S)
+    assert robot.link.failed.wait(PATIENCE_S)

@@ -28,7 +28,7 @@ from runtime.link.wire import (
     Welcome,
     write,
 )
-from tests.processes import eventually
+from tests.processes import PATIENCE_MS, eventually
 
 STATION = "bench-7"
 LAB, ROBOT = KeyPair.of(bytes(range(32))), KeyPair.of(bytes(range(1, 33)))
@@ -88,8 +88,8 @@ def greeted(line, door):
                 return arrival.route
         return b""
 
-    route = eventually(met, 10, "the greeting")
-    eventually(lambda: turned(line, door) and line.up, 10, "the welcome")
+    route = eventually(met, "the greeting")
+    eventually(lambda: turned(line, door) and line.up, "the welcome")
     return route
 
 
@@ -110,13 +110,13 @@ def test_what_was_asked_before_a_silence_is_never_read(line, door, clock):
     """It has arrived, and lies in the connection that is dropped: the robot was left alone meanwhile."""
     route = greeted(line, door)
     assert door.send(route, Ask(1, COORDINATOR, "commands"), b"a command")
-    assert line.socket.poll(30_000)
+    assert line.socket.poll(PATIENCE_MS)
     clock.now += LOST_S + 0.01
     assert line.turn() == []
     clock.now += 1.0
     second = greeted(line, door)
     assert door.send(second, Ask(2, COORDINATOR, "commands"), b"another")
-    heard = eventually(line.turn, 10, "the second command")
+    heard = eventually(line.turn, "the second command")
     assert [message.number for message, _ in heard] == [2]
 
 
@@ -129,7 +129,7 @@ def test_a_lab_that_nobody_answers_for_is_tried_less_and_less_often(door, clock)
         for _ in range(6):
             line.turn()
             clock.now += 2.1
-            eventually(lambda: line.turn() == [] and line.socket is None, 10, "the end of a try")
+            eventually(lambda: line.turn() == [] and line.socket is None, "the end of a try")
             pauses.append(round(line._again_at - clock.now, 3))
             clock.now = line._again_at
     finally:
@@ -184,7 +184,7 @@ def links(gate, clock, played):
         pass_time(gate, clock, 0.05)
         return gate.linked()
 
-    eventually(turn, 10, "the link")
+    eventually(turn, "the link")
 
 
 @pytest.fixture
@@ -211,7 +211,7 @@ def test_a_station_that_says_nothing_is_lost_within_its_time(gate, played, clock
         pass_time(gate, clock, 0 if gate.linked() == set() else LOST_S + 0.01)
         return gate.linked() == set()
 
-    eventually(lost, 10, "the loss")
+    eventually(lost, "the loss")
     endpoints = Endpoints(tmp_path / "stations" / STATION)
     assert "link to its computer is lost" in endpoints.read("link")["why"]
 
@@ -227,7 +227,7 @@ def test_which_processes_listen_is_heard_over_one_of_both_connections(gate, play
         assert gate.linked() == {STATION}
         return any(getattr(one.message, "listening", None) == [] for one in arrived)
 
-    eventually(heard, 10, "the beat")
+    eventually(heard, "the beat")
 
 
 def test_a_gate_that_was_kept_busy_hears_first_and_judges_then(gate, played, clock, monkeypatch):
@@ -236,7 +236,6 @@ def test_a_gate_that_was_kept_busy_hears_first_and_judges_then(gate, played, clo
     played.beat()
     eventually(
         lambda: arrived.extend(arrivals()) or len({one.route for one in arrived}) == 2,
-        10,
         "two signs of life",
     )
     for order in (arrived, arrived[::-1]):
@@ -248,7 +247,6 @@ def test_a_gate_that_was_kept_busy_hears_first_and_judges_then(gate, played, clo
 def test_a_station_of_which_one_connection_is_mute_is_lost(gate, played, clock):
     eventually(
         lambda: played.beat(COMMANDS) or pass_time(gate, clock, 0.05) or not gate.linked(),
-        10,
         "the end of the link",
     )
     assert gate._remotes[STATION].line(COMMANDS, clock.now) is not None
@@ -257,7 +255,7 @@ def test_a_station_of_which_one_connection_is_mute_is_lost(gate, played, clock):
 def test_another_program_with_the_same_key_takes_the_place_of_the_first(gate, played, clock):
     other = Played(gate, b"another session")
     try:
-        eventually(lambda: pass_time(gate, clock, 0.05) or not gate.linked(), 10, "the end of the first")
+        eventually(lambda: pass_time(gate, clock, 0.05) or not gate.linked(), "the end of the first")
         links(gate, clock, other)
         assert gate._remotes[STATION].session == b"another session"
     finally:

@@ -16,7 +16,7 @@ from runtime.link.wire import EPISODES
 from runtime.link.yielding import Throttle
 from tests.processes import eventually
 from tests.runtime.link.episodes import FILES, content, recorded, uuid_of
-from tests.runtime.link.linked import STATION, WAIT_S
+from tests.runtime.link.linked import STATION
 
 FAST = UploadSettings(rate=50e6)
 LAB_KEY = "ab" * 32
@@ -29,7 +29,7 @@ def receipt(robot, folder):
 
 
 def has_arrived(lab, robot, folder):
-    eventually(lambda: receipt(robot, folder), WAIT_S, "the lab's word that it has the episode")
+    eventually(lambda: receipt(robot, folder), "the lab's word that it has the episode")
     assert content(lab.data / "episodes" / folder.name) == content(folder)
 
 
@@ -59,7 +59,7 @@ def test_a_lab_that_ends_in_the_middle_goes_on_from_there(lab, robot):
     ports = lab.gate.port, lab.gate.second_port
     robot.dial(uploads=UploadSettings(rate=150e3))
     partly = lab.data / "episodes" / ".arriving" / STATION / folder.name / "front.mp4"
-    eventually(lambda: partly.exists() and partly.stat().st_size > 0, WAIT_S, "its first bytes")
+    eventually(lambda: partly.exists() and partly.stat().st_size > 0, "its first bytes")
     lab.end()
     here = partly.read_bytes()
     assert 0 < len(here) < FILES["front.mp4"]
@@ -73,7 +73,7 @@ def test_a_link_that_ends_in_the_middle_goes_on_from_there(lab, robot):
     folder = recorded(robot.data, STATION)
     robot.dial(uploads=UploadSettings(rate=150e3))
     partly = lab.data / "episodes" / ".arriving" / STATION / folder.name / "front.mp4"
-    eventually(lambda: partly.exists() and partly.stat().st_size > 0, WAIT_S, "its first bytes")
+    eventually(lambda: partly.exists() and partly.stat().st_size > 0, "its first bytes")
     inode = partly.stat().st_ino
     robot.hang_up()
     robot.dial(uploads=FAST)
@@ -103,12 +103,12 @@ def test_a_run_that_goes_on_is_waited_for_where_that_is_asked_for(lab, robot, wa
         waiting.turn(1)
         return waiting._line.up and waiting._runs._heard > waiting._runs._looked - 1.0
 
-    eventually(turned, WAIT_S, "the station's state")
+    eventually(turned, "the station's state")
     for _ in range(100):
         turned()
     assert not begun.exists()
     robot.station.do(lambda: robot.station.session._enter(SessionState.READY, "stopped"))
-    eventually(lambda: turned() and receipt(robot, folder), WAIT_S, "the episode")
+    eventually(lambda: turned() and receipt(robot, folder), "the episode")
 
 
 def test_a_lab_without_room_is_told_of_once_and_asked_again(lab, robot, caplog):
@@ -116,7 +116,7 @@ def test_a_lab_without_room_is_told_of_once_and_asked_again(lab, robot, caplog):
     (lab.data / "episodes").mkdir()
     recorded(lab.data, "bench-1", 9, uuid=folder.name)
     robot.dial(uploads=FAST)
-    eventually(lambda: "nothing is overwritten" in caplog.text, WAIT_S, "the lab's reason at the station")
+    eventually(lambda: "nothing is overwritten" in caplog.text, "the lab's reason at the station")
     assert receipt(robot, folder) is None
     assert folder.exists()
 
@@ -127,18 +127,18 @@ def test_labels_follow_their_episode_and_what_is_added_to_them(lab, robot):
     here.parent.mkdir()
     here.write_bytes(b"one\n")
     robot.dial(uploads=FAST)
-    eventually(lambda: there.exists() and there.read_bytes() == b"one\n", WAIT_S, "its labels")
+    eventually(lambda: there.exists() and there.read_bytes() == b"one\n", "its labels")
     here.write_bytes(b"one\ntwo\n")
-    eventually(lambda: there.read_bytes() == b"one\ntwo\n", WAIT_S, "the label that was added")
+    eventually(lambda: there.read_bytes() == b"one\ntwo\n", "the label that was added")
 
 
 def test_what_the_lab_has_compared_is_removed_at_home_where_that_is_asked_for(lab, robot):
     folder = recorded(robot.data, STATION)
     whole = content(folder)
     robot.dial(uploads=UploadSettings(rate=50e6, keep_days=0.0))
-    eventually(lambda: not folder.exists(), WAIT_S, "the removal")
+    eventually(lambda: not folder.exists(), "the removal")
     assert content(lab.data / "episodes" / folder.name) == whole
-    eventually(lambda: receipt(robot, folder)["removed"], WAIT_S, "the receipt")
+    eventually(lambda: receipt(robot, folder)["removed"], "the receipt")
     assert list((robot.data / "episodes").glob("*/*")) == []
 
 

@@ -214,7 +214,7 @@ def test_a_server_that_went_between_two_requests_is_lost() -> None:
         server.close()
         assert policy._link._socket is not None
         wire = policy._link._socket
-        eventually(lambda: not wire.poll(0, zmq.POLLOUT), 5, "the end of the connection")
+        eventually(lambda: not wire.poll(0, zmq.POLLOUT), "the end of the connection")
         with pytest.raises(PolicyGone, match="since the last request"):
             policy.infer(observation())
         with pytest.raises(PolicyLostError, match="no policy server listens"):

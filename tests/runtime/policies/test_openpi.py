@@ -38,6 +38,7 @@ from runtime.sim.faults import NONE, TOO_LARGE, Fault
 from runtime.sim.in_poses import InPoses
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.script import Waving
+from tests.processes import PATIENCE_S
 
 ROBOT = robots.load("agilex_piper")
 CAMERAS = tuple(camera.key for camera in ROBOT.cameras)
@@ -463,7 +464,9 @@ def test_a_name_that_can_be_no_host_is_said_to_be_unknown() -> None:
 
 def test_a_name_that_is_never_resolved_does_not_outlast_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
     ended = threading.Event()
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *given, **options: [None] * (not ended.wait(60)))
+    monkeypatch.setattr(
+        socket, "getaddrinfo", lambda *given, **options: [None] * (not ended.wait(PATIENCE_S))
+    )
     with (
         policy_at("ws://slow.invalid:8000", connect_deadline=0.2) as policy,
         pytest.raises(UnreachableError, match=r"was not reached within 0\.2 s"),
@@ -862,9 +865,9 @@ def test_close_unblocks_an_inference_that_waits_in_another_thread() -> None:
 
         thread = threading.Thread(target=ask)
         thread.start()
-        assert asked.wait(10)
+        assert asked.wait(PATIENCE_S)
         policy.close()
-        thread.join(10)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
         policy.close()
     assert "closed from our side" in str(errors[0])
@@ -887,8 +890,8 @@ def test_close_does_not_wait_for_a_handshake_and_ends_it() -> None:
             assert thread.is_alive()
         closing = threading.Thread(target=policy.close)
         closing.start()
-        closing.join(10)
-        thread.join(10)
+        closing.join(PATIENCE_S)
+        thread.join(PATIENCE_S)
         assert not closing.is_alive()
         assert not thread.is_alive()
     assert "closed from our side" in str(errors[0])
@@ -930,7 +933,7 @@ def test_close_ends_the_search_for_a_host_that_does_not_answer() -> None:
         thread.join(0.2)
         assert thread.is_alive()
         policy.close()
-        thread.join(10)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
     assert "closed from our side" in str(errors[0])
 
@@ -941,7 +944,7 @@ def test_close_returns_while_the_wire_is_in_use() -> None:
         with policy._lock:  # held by a call that cannot be woken, as by a host that does not answer
             closing = threading.Thread(target=policy.close)
             closing.start()
-            closing.join(10)
+            closing.join(PATIENCE_S)
             assert not closing.is_alive()
         policy.connect()
         assert row_zero_starts_at(policy.infer(observation(0.3)), 0.3)
@@ -1072,7 +1075,7 @@ def test_what_waits_before_a_question_answers_none(after: str) -> None:
         policy.connect()
         if after == "answer":
             policy.infer(observation(0.1))
-        assert there.wait(10)
+        assert there.wait(PATIENCE_S)
         with pytest.raises(UnsolicitedError, match="bytes that nobody had asked for"):
             policy.infer(observation(0.2))
         assert policy.infer(observation(0.3)).actions[0, 0] == np.float32(0.3)

@@ -19,6 +19,7 @@ from runtime.policies import starvla
 from runtime.policies.starvla import Config, StarvlaPolicy
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.starvla_server import Star, StarvlaServer
+from tests.processes import PATIENCE_S
 from tests.runtime.policies.peers import FRANKA, PIPER, Handler, seen, serving
 
 VECTORS = Path(__file__).parents[1] / "vectors"
@@ -379,9 +380,9 @@ def test_pings_go_out_while_nobody_asks_until_it_is_closed() -> None:
     with serving(converse) as url, policy_at(url, ping_every=0.02) as policy:
         policy.connect()
         (thread,) = [thread for thread in threading.enumerate() if thread.name == "starvla-ping"]
-        assert enough.wait(10)
+        assert enough.wait(PATIENCE_S)
         policy.close()
-        thread.join(10)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
     assert {message["type"] for message in pings} == {"ping"}
     assert len({message["request_id"] for message in pings}) == len(pings)

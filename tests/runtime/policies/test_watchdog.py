@@ -5,10 +5,10 @@ import threading
 import pytest
 
 from runtime.policies.watchdog import Watchdog
+from tests.processes import PATIENCE_S
 
 SOON = 0.02
 LONG = 60.0
-PATIENCE = 20.0
 
 
 class Watched:
@@ -35,7 +35,7 @@ def threads() -> list[threading.Thread]:
 
 def test_what_takes_too_long_is_cut_once_and_knows_it(watched: Watched) -> None:
     with watched.dog.watching(SOON) as was_cut:
-        assert watched.cut.wait(PATIENCE)
+        assert watched.cut.wait(PATIENCE_S)
     assert was_cut()
     assert watched.cuts == 1
 
@@ -44,7 +44,7 @@ def test_what_is_done_in_time_is_never_cut_and_the_next_one_is_after_its_own_tim
     with watched.dog.watching(LONG) as was_cut:
         assert not was_cut()
     with watched.dog.watching(SOON) as was_cut:
-        assert watched.cut.wait(PATIENCE), "it slept on until the first deadline"
+        assert watched.cut.wait(PATIENCE_S), "it slept on until the first deadline"
     assert watched.cuts == 1
 
 
@@ -58,7 +58,7 @@ def test_a_deadline_that_was_kept_does_not_cut_what_comes_after_it(watched: Watc
 
 def test_a_later_one_does_not_take_an_earlier_cut_for_its_own(watched: Watched) -> None:
     with watched.dog.watching(SOON):
-        assert watched.cut.wait(PATIENCE)
+        assert watched.cut.wait(PATIENCE_S)
     with watched.dog.watching(LONG) as was_cut:
         assert not was_cut()
 
@@ -69,7 +69,7 @@ def test_it_is_one_thread_for_all_and_none_after_the_end(watched: Watched) -> No
             assert len(threads()) == 1
     thread = threads()[0]
     watched.dog.end()
-    thread.join(PATIENCE)
+    thread.join(PATIENCE_S)
     assert not threads()
     assert watched.cuts == 0
 
@@ -78,7 +78,7 @@ def test_it_watches_again_after_its_end(watched: Watched) -> None:
     with watched.dog.watching(LONG):
         watched.dog.end()
     with watched.dog.watching(SOON) as was_cut:
-        assert watched.cut.wait(PATIENCE)
+        assert watched.cut.wait(PATIENCE_S)
         assert was_cut()
     watched.dog.end()
 

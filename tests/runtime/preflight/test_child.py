@@ -22,7 +22,7 @@ from runtime.ipc.command_arguments import PreflightRequest
 from runtime.policies.link import LEAVING, await_left
 from runtime.station import preflight_child as module
 from runtime.station.preflight_child import Preflights
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.policies.peers import FRANKA, serving
 from tests.runtime.preflight.bench import WIRES, planned, served
 
@@ -48,7 +48,7 @@ class Bench:
         self.preflights.start(PreflightRequest(id=id, **asked), OWN)
 
     def over(self, id: str = "one") -> dict[str, Any]:
-        assert self.preflights._kept[id].over.wait(30)
+        assert self.preflights._kept[id].over.wait(PATIENCE_S)
         return self.preflights.report(id)
 
 
@@ -58,7 +58,7 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     yield made
     made.preflights.close()
     for child in made.children:
-        assert child.wait(10) is not None
+        assert child.wait(PATIENCE_S) is not None
 
 
 def test_what_its_process_says_is_the_report(bench: Bench) -> None:
@@ -152,7 +152,7 @@ def flown(line: dict[str, Any]) -> tuple[dict[str, Any], int]:
     done.stdin.write(json.dumps(line).encode() + b"\n")
     done.stdin.flush()
     said = done.stdout.read()
-    code = done.wait(60)
+    code = done.wait(PATIENCE_S)
     done.stdin.close()
     done.stdout.close()
     return json.loads(said), code
@@ -177,7 +177,7 @@ def test_the_program_says_what_is_wrong_with_what_it_is_asked_and_ends_with_its_
     orphan = subprocess.Popen([sys.executable, "-m", "runtime.preflight", "--given"], stdin=reading)
     os.close(reading)
     os.close(writing)
-    assert orphan.wait(60) != 0
+    assert orphan.wait(PATIENCE_S) != 0
 
 
 @pytest.mark.slow
@@ -236,7 +236,7 @@ def test_the_program_leaves_a_server_with_a_close_frame() -> None:
 
     with serving(converse) as url:
         report, code = flown({"tree": dict(OWN.tree), "changes": {"policy": {"url": url}}, "deadline_s": 60})
-        eventually(lambda: ended, 30, "the end of the conversation")
+        eventually(lambda: ended, "the end of the conversation")
     assert (report["verdict"], code) == ("wrong_action_space", 1)
     assert isinstance(ended[0], ConnectionClosedOK), ended[0]
 

@@ -20,6 +20,7 @@ from runtime.preflight.report import Report, shown
 from runtime.preflight.subject import Subject, pictures
 from runtime.preflight.verdict import Stage, Verdict
 from runtime.station.preflight_child import patience
+from tests.processes import PATIENCE_S
 from tests.runtime.policies.peers import FRANKA
 from tests.runtime.preflight.bench import WIRES, planned
 
@@ -44,7 +45,7 @@ class Stub(Policy):
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         self.said.append("infer")
         self.seen.append(observation)
-        self.hangs.wait(30)
+        self.hangs.wait(PATIENCE_S)
         return ActionChunk(self.rows.astype(np.float32))
 
     def reset(self) -> None:

@@ -9,6 +9,7 @@ import pytest
 from benchmarks.start import PROGRAMS, loaded, started
 from runtime.ipc.session_state import SessionState
 from tests.crash.lab import Lab
+from tests.processes import PATIENCE_S
 from tests.sources import ROOT
 
 BASE = {"msgpack", "numpy", "zmq"}
@@ -64,7 +65,7 @@ def bench(folder):
     finally:
         for child in lab.children.values():
             child.stdin.close()
-            child.wait(lab.ending)
+            child.wait(PATIENCE_S)
 
 
 @pytest.fixture(scope="module")
@@ -78,11 +79,11 @@ def story(tmp_path_factory):
         ) as station:
             client = station.client
             client.command("setup")
-            states.append(client.wait(lambda seen: seen["state"] != SessionState.SETTING_UP, lab.patience))
+            states.append(client.wait(lambda seen: seen["state"] != SessionState.SETTING_UP, PATIENCE_S))
             client.command("run")
-            states.append(client.wait(lambda seen: seen["policy"]["answers"] > 3, lab.patience))
+            states.append(client.wait(lambda seen: seen["policy"]["answers"] > 3, PATIENCE_S))
             client.estop("a test")
-            states.append(client.wait(lambda seen: seen["state"] == SessionState.FAULTED, lab.patience))
+            states.append(client.wait(lambda seen: seen["state"] == SessionState.FAULTED, PATIENCE_S))
     return folder / "station", states
 
 

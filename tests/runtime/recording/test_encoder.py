@@ -8,6 +8,7 @@ import pytest
 from runtime.core.errors import RecordingError
 from runtime.recording.encoder import CameraEncoder
 from runtime.recording.video import FragmentedVideo
+from tests.processes import PATIENCE_S
 
 from .samples import HEIGHT, SETTINGS, WIDTH, numbered, numbers
 
@@ -57,7 +58,7 @@ def test_the_way_of_each_picture_to_the_muxer_is_measured_and_repeats_do_not_cou
     encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, SETTINGS)
     begun = time.monotonic()
     for k in range(3):
-        encoder.put(numbered(k), 5.0, captured=begun - 10.0)
+        encoder.put(numbered(k), PATIENCE_S, captured=begun - 10.0)
     encoder.put(None)
     encoder.finish()
     assert encoder.drain(time.monotonic() + 30.0)
@@ -70,7 +71,7 @@ def test_the_way_of_each_picture_to_the_muxer_is_measured_and_repeats_do_not_cou
 
 def test_pictures_whose_capture_is_unknown_give_no_such_figure(tmp_path: Path) -> None:
     encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, SETTINGS)
-    encoder.put(numbered(1), 5.0)
+    encoder.put(numbered(1), PATIENCE_S)
     encoder.finish()
     assert encoder.drain(time.monotonic() + 30.0)
     assert encoder.muxed_ms is None
@@ -88,7 +89,7 @@ class Held:
         def encode(video: FragmentedVideo, picture: np.ndarray | None) -> None:
             if video.frames == at:
                 self.reached.set()
-                assert self.free.wait(60.0)
+                assert self.free.wait(PATIENCE_S)
             real(video, picture)
 
         monkeypatch.setattr(FragmentedVideo, "encode", encode)
@@ -101,9 +102,9 @@ def test_one_that_is_too_far_behind_is_given_up_and_keeps_what_it_had(
     settings = SETTINGS.model_copy(update={"give_up_s": 1.0, "queue_frames": 2})
     encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, settings)
     for k in range(3):
-        encoder.put(numbered(k), 60.0)
-    encoder.put(numbered(3), 60.0)
-    assert held.reached.wait(60.0)
+        encoder.put(numbered(k), PATIENCE_S)
+    encoder.put(numbered(3), PATIENCE_S)
+    assert held.reached.wait(PATIENCE_S)
     put = 0
     while encoder.failure is None:
         encoder.put(numbered(4 + put))
@@ -121,7 +122,7 @@ def test_one_that_is_too_far_behind_is_given_up_and_keeps_what_it_had(
 def test_a_patient_caller_is_never_too_far_ahead(tmp_path: Path) -> None:
     settings = SETTINGS.model_copy(update={"give_up_s": 1.0, "queue_frames": 1})
     encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, settings)
-    assert all(encoder.put(numbered(k), 60.0) for k in range(100))
+    assert all(encoder.put(numbered(k), PATIENCE_S) for k in range(100))
     encoder.finish()
     assert encoder.drain(time.monotonic() + 60)
     encoder.file.close()
@@ -133,7 +134,7 @@ def test_what_waits_together_is_coded_as_a_run(tmp_path: Path, monkeypatch: pyte
     held = Held(monkeypatch, at=0)
     encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, SETTINGS)
     encoder.put(numbered(7))
-    assert held.reached.wait(60.0)
+    assert held.reached.wait(PATIENCE_S)
     assert not any(encoder.put(None) for _ in range(100))
     encoder.put(numbered(8))
     held.free.set()

@@ -18,7 +18,7 @@ from runtime.recording.reader import open_episode
 from runtime.recording.repair import repair
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.video import FragmentedVideo
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.recording.failing import fail_at
 
 from .samples import CAMERAS, HEIGHT, SETTINGS, WIDTH, chunk, manifest, numbers, row, tick, unended
@@ -46,7 +46,7 @@ class Stuck:
 
         def encode(video: FragmentedVideo, picture: np.ndarray | None) -> None:
             if threading.current_thread().name == f"encoder {camera}":
-                self.free.wait(60.0)
+                self.free.wait(PATIENCE_S)
             real(video, picture)
 
         monkeypatch.setattr(FragmentedVideo, "encode", encode)
@@ -381,9 +381,7 @@ def test_an_encoder_that_stands_still_is_given_up_while_all_else_is_recorded_on(
     assert journal._recording is not None
     healthy = journal._recording._encoders[CAMERAS[1]]._queue
     for k in range(60):
-        eventually(
-            lambda: healthy.waiting() < 10, 20.0, "the other camera keeps up"
-        )  # else it is given up too
+        eventually(lambda: healthy.waiting() < 10, "the other camera keeps up")  # else it is given up too
         journal.append(row(k, pictures={**row(k).pictures, CAMERAS[1]: None}))
     (loss,) = journal.losses()
     assert loss.camera == CAMERAS[0]

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from tests.processes import PATIENCE_S
+
 
 @dataclass
 class StandIn:
@@ -41,5 +43,5 @@ def start() -> Iterator[Start]:
         assert process.stdin is not None
         assert process.stdout is not None
         process.stdin.close()
-        process.wait(20)
+        process.wait(PATIENCE_S)
         process.stdout.close()

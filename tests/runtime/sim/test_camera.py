@@ -12,6 +12,7 @@ from runtime.sim.camera import main
 from runtime.sim.camera_server import FAULTS, picture
 from runtime.sim.mjpeg_server import MjpegServer
 from runtime.sim.rtsp_server import _payloads
+from tests.processes import PATIENCE_S
 
 MODULES = {"mjpeg": mjpeg, "rtsp": rtsp}
 
@@ -37,7 +38,7 @@ def test_the_command_serves_a_camera_until_its_lifeline_ends(kind):
     assert feed.read().picture.shape == (64, 96, 3)
     feed.close()
     child.stdin.close()
-    assert child.wait(10) == 0
+    assert child.wait(PATIENCE_S) == 0
     child.stdout.close()
 
 

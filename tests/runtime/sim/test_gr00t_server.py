@@ -24,6 +24,7 @@ from runtime.policies import gr00t
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.script import Script
 from runtime.station.spec import StationSpec
+from tests.processes import PATIENCE_MS
 from tests.runtime.sim.tabletop_station import HORIZON, pick_and_place, planned
 
 ROOT = Path(__file__).parents[3]
@@ -41,7 +42,7 @@ def asked(url: str, message: object) -> Any:
     try:
         wire.connect(url)
         wire.send(message if isinstance(message, bytes) else msgpack.packb(message))
-        assert wire.poll(15_000)
+        assert wire.poll(PATIENCE_MS)
         return wire.recv()
     finally:
         wire.close(linger=0)

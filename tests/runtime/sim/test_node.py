@@ -29,6 +29,7 @@ from runtime.transports.node_messages import NodeMessages
 from runtime.transports.node_sink import NodeSink
 from runtime.transports.node_source import NodeSource
 from runtime.transports.zmq import Config
+from tests.processes import PATIENCE_S
 
 ROBOT = robots.load("agilex_piper")
 HOME = ROBOT.poses["home"]
@@ -36,7 +37,6 @@ KEYS = [camera.key for camera in ROBOT.cameras]
 FREE = ["--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0"]
 SMALL = [*FREE, "--width", "96", "--height", "60"]
 PERIOD = 1 / 30
-PATIENCE = 15.0
 
 AWAY = np.clip(HOME + 0.2, ROBOT.lower, ROBOT.upper)
 
@@ -67,7 +67,7 @@ class Bench:
         for _ in range(count):
             self.clock.advance(PERIOD)
             self.node.tick(PERIOD)
-            assert self.frames.poll(int(PATIENCE * 1e3))
+            assert self.frames.poll(int(PATIENCE_S * 1e3))
             payload = self.frames.recv()
         return dict(msgpack_arrays.unpack(payload))
 
@@ -79,7 +79,7 @@ class Bench:
 
     def post(self, payload: bytes) -> None:
         self.commands.send(payload)
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + PATIENCE_S
         while payload not in self.inbox:
             assert time.monotonic() < deadline
             self.inbox += self.drain()
@@ -89,7 +89,7 @@ class Bench:
         return inbox
 
     def _join(self) -> None:
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + PATIENCE_S
         while not self.frames.poll(20):
             assert time.monotonic() < deadline
             self.node.tick(0.0)
@@ -351,7 +351,7 @@ def test_every_nth_message_is_cut() -> None:
         for _ in range(9):
             bench.clock.advance(PERIOD)
             bench.node.tick(PERIOD)
-            assert bench.frames.poll(int(PATIENCE * 1e3))
+            assert bench.frames.poll(int(PATIENCE_S * 1e3))
             try:
                 msgpack_arrays.unpack(bench.frames.recv())
             except CodecError:
@@ -443,7 +443,7 @@ def test_a_bench_can_have_more_blocks() -> None:
 def test_the_node_with_a_bench_is_one_that_the_link_understands(tabletop: Bench) -> None:
     tabletop.clock.advance(PERIOD)
     tabletop.node.tick(PERIOD)
-    assert tabletop.frames.poll(int(PATIENCE * 1e3))
+    assert tabletop.frames.poll(int(PATIENCE_S * 1e3))
     frame = NodeMessages(ROBOT, "bgr", frozenset(), 2**24).read(tabletop.frames.recv())
     assert frame.truth is not None
     assert frame.truth["success"] is False
@@ -511,7 +511,7 @@ def linked(ready: dict[str, Any]) -> Iterator[tuple[NodeSource, NodeSink]]:
 
 
 def observed(source: NodeSource, wanted: Callable[[Observation], bool]) -> Observation:
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         observation = source.receive(1.0)
         if observation is not None and wanted(observation):
@@ -579,13 +579,13 @@ def test_it_writes_its_addresses_and_ends_on_sigterm(start: Any, tmp_path: Path)
     assert json.loads(file.read_text()) == standin.ready
     assert list(tmp_path.iterdir()) == [file]
     standin.process.terminate()
-    assert standin.process.wait(PATIENCE) == 0
+    assert standin.process.wait(PATIENCE_S) == 0
 
 
 def test_it_ends_when_its_lifeline_ends(start: Any) -> None:
     process = start("runtime.sim.node", "--robot", "agilex_piper", *SMALL).process
     process.stdin.close()
-    assert process.wait(PATIENCE) == 0
+    assert process.wait(PATIENCE_S) == 0
 
 
 @pytest.mark.parametrize(
@@ -601,7 +601,10 @@ def test_it_ends_when_its_lifeline_ends(start: Any) -> None:
 )
 def test_a_wrong_option_ends_it_with_a_sentence(arguments: list[str], says: str) -> None:
     ended = subprocess.run(
-        [sys.executable, "-m", "runtime.sim.node", *arguments], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "runtime.sim.node", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
     )
     assert ended.returncode == 2
     assert says in ended.stderr

@@ -15,6 +15,7 @@ from runtime.core.errors import SetupError
 from runtime.recording.reader import open_episode
 from runtime.sim import ros1_modules
 from runtime.sim.ros1_node import Ros1Node, main, parser
+from tests.processes import PATIENCE_S
 from tests.runtime.ros_master import PYTHON, master, needs_ros1
 from tests.runtime.sim.conftest import StandIn, Start
 from tests.sources import ROOT
@@ -67,7 +68,7 @@ def test_a_master_that_is_not_there_is_an_error_in_words() -> None:
         probe.bind(("127.0.0.1", 0))
         uri = f"http://127.0.0.1:{probe.getsockname()[1]}"
     line = [sys.executable, "-m", "runtime.sim.ros1_node", "--robot", "agilex_piper", "--master", uri]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert f"no ROS master is at {uri}" in done.stderr
 

@@ -104,7 +104,7 @@ def test_all_its_numbers_are_the_robots(start: Start) -> None:
         source = ros2.source(ros2.Config(domain=domain, eef=True), robot, MonotonicClock())
         source.connect()
         try:
-            seen = eventually(lambda: source.receive(0.1), 10, "an observation")
+            seen = eventually(lambda: source.receive(0.1), "an observation")
         finally:
             source.close()
     np.testing.assert_allclose(seen.qpos, robot.poses["ready"], atol=1e-5)

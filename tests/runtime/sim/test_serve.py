@@ -24,11 +24,11 @@ from runtime.policies.pictures import fitted, laid_out
 from runtime.sim.bench import Layout
 from runtime.sim.gestures import Gesture
 from runtime.sim.layout import layout_of
+from tests.processes import PATIENCE_S
 from tests.runtime.sim.drawn_bench import drawn
 
 ROBOT = robots.load("agilex_piper")
 HOME = ROBOT.poses["home"]
-PATIENCE = 15.0
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def conversation(url: str) -> Iterator[ClientConnection]:
 
 
 def receive(connection: ClientConnection) -> dict[str, Any]:
-    answer = connection.recv(timeout=PATIENCE)
+    answer = connection.recv(timeout=PATIENCE_S)
     assert isinstance(answer, bytes)
     return dict(msgpack_arrays.unpack(answer))
 
@@ -81,12 +81,12 @@ def test_a_wrong_request_is_answered_by_a_traceback_and_code_1011(serve: Any) ->
         with conversation(url) as connection:
             receive(connection)
             connection.send(request(**changes))
-            text = connection.recv(timeout=PATIENCE)
+            text = connection.recv(timeout=PATIENCE_S)
             assert isinstance(text, str)
             assert "Traceback" in text
             assert "expected" in text
             with pytest.raises(ConnectionClosedError) as closed:
-                connection.recv(timeout=PATIENCE)
+                connection.recv(timeout=PATIENCE_S)
             assert closed.value.rcvd is not None
             assert closed.value.rcvd.code == 1011
 
@@ -94,7 +94,7 @@ def test_a_wrong_request_is_answered_by_a_traceback_and_code_1011(serve: Any) ->
 def test_healthz_answers_beside_the_websocket(serve: Any) -> None:
     port = serve().ready["port"]
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    with direct.open(f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE) as answer:
+    with direct.open(f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE_S) as answer:
         assert (answer.status, answer.read()) == (200, b"OK\n")
 
 
@@ -108,7 +108,7 @@ def test_a_server_that_dies_during_an_inference_is_gone_for_the_client(serve: An
         assert policy.infer(shown).actions.shape == (50, 14)
         with pytest.raises(PolicyGone, match="closed the connection"):
             policy.infer(shown)
-        assert standin.process.wait(PATIENCE) == 1
+        assert standin.process.wait(PATIENCE_S) == 1
         with pytest.raises(PolicyError, match="no policy server listens"):
             policy.infer(shown)
 
@@ -128,26 +128,26 @@ def test_it_writes_its_address_and_ends_on_sigterm(serve: Any, tmp_path: Path) -
     with conversation(standin.ready["url"]) as connection:
         receive(connection)
         standin.process.terminate()
-        assert standin.process.wait(PATIENCE) == 0
+        assert standin.process.wait(PATIENCE_S) == 0
 
 
 def test_it_ends_when_its_lifeline_ends(serve: Any) -> None:
     process = serve().process
     process.stdin.close()
-    assert process.wait(PATIENCE) == 0
+    assert process.wait(PATIENCE_S) == 0
 
 
 def test_a_port_that_is_taken_is_said_so(serve: Any) -> None:
     port = str(serve().ready["port"])
     arguments = ["-m", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--port", port]
-    ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60)
+    ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=PATIENCE_S)
     assert ended.returncode == 2
     assert f"cannot listen at 127.0.0.1:{port}" in ended.stderr
 
 
 def test_an_unknown_fault_names_the_known_ones() -> None:
     arguments = ["-m", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--fault", "boom"]
-    ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60)
+    ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=PATIENCE_S)
     assert ended.returncode == 2
     assert "'boom' is no fault; allowed: mute_on_connect" in ended.stderr
 
@@ -206,7 +206,7 @@ def test_the_chase_says_what_it_is_and_moves_only_for_a_block_that_it_sees(serve
 )
 def test_options_that_make_no_sense_are_refused(options: tuple[str, ...], said: str) -> None:
     arguments = ["-m", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--port", "0", *options]
-    ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=60)
+    ended = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=PATIENCE_S)
     assert ended.returncode == 2
     assert said in ended.stderr
 

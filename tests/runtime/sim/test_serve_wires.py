@@ -11,6 +11,7 @@ import pytest
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import PolicyError, PolicyGone
 from runtime.core.plugins import variants
+from tests.processes import PATIENCE_S
 from tests.runtime.policies.peers import FRANKA, seen
 
 ARENA = {"cameras": {"cam_high": "first", "cam_right_wrist": "second", "cam_left_wrist": "wrist"}}
@@ -61,6 +62,6 @@ def test_a_server_that_dies_is_gone_for_its_client(serve: Any) -> None:
         policy.infer(seen(FRANKA))
         with pytest.raises(PolicyGone, match="closed the connection"):
             policy.infer(seen(FRANKA))
-        assert standin.process.wait(15) == 1
+        assert standin.process.wait(PATIENCE_S) == 1
         with pytest.raises(PolicyError, match="no policy server listens"):
             policy.infer(seen(FRANKA))

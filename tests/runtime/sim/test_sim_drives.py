@@ -7,6 +7,7 @@ from runtime.core import msgpack_arrays
 from runtime.sim import drives
 from runtime.sim.drives import Drives, Switch
 from runtime.transports.node_messages import DRIVE_FAULTS_LIMIT
+from tests.processes import PATIENCE_MS
 
 GOOD = {"enabled": True, "faults": []}
 
@@ -57,7 +58,7 @@ def test_a_word_is_said_once_the_node_listens():
         node.bind("tcp://127.0.0.1:*")
         endpoint = node.getsockopt(zmq.LAST_ENDPOINT).rstrip(b"\0").decode()
         heard = []
-        thread = threading.Thread(target=lambda: heard.append(node.recv() if node.poll(10_000) else b""))
+        thread = threading.Thread(target=lambda: heard.append(node.recv() if node.poll(PATIENCE_MS) else b""))
         thread.start()
         assert drives.main(["fault", "--fault", "hot", "--action-endpoint", endpoint]) == 0
         thread.join()

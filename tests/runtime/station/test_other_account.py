@@ -19,6 +19,7 @@ from runtime.ipc.messages import Command, encode
 from runtime.ipc.shared_state import EStop
 from runtime.processes.coordinator.process import CommandService
 from runtime.processes.guard.process import Desk
+from tests.processes import PATIENCE_MS
 from tests.runtime.lockstep_station import Station, stubbed
 
 pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="to be another account one has to be root")
@@ -46,7 +47,7 @@ def asked(place: str, *commands: Command) -> list[str]:
         found = []
         for command in commands:
             wire.send(encode(command))
-            found.append(wire.recv().decode("latin-1") if wire.poll(20_000) else "no answer")
+            found.append(wire.recv().decode("latin-1") if wire.poll(PATIENCE_MS) else "no answer")
         return found
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from runtime.ipc.messages import Ack, Command
 from runtime.ipc.session_state import SessionState
+from tests.processes import PATIENCE_S
 from tests.runtime.lockstep_station import Station, stubbed
 
 CANARY = "the canary sings"
@@ -57,7 +58,7 @@ def heard(server: socket.socket) -> bytes:
     except BlockingIOError:
         return b""
     with connection:
-        connection.settimeout(5)
+        connection.settimeout(PATIENCE_S)
         return connection.recv(4096)
 
 

@@ -25,13 +25,12 @@ from runtime.transports import ros1, ros2
 from runtime.transports.ros import cdr, packed
 from runtime.transports.ros.messages import JointState, Wire
 from runtime.transports.ros.middleware import SENSOR_QUALITY, Middleware, Topic
+from tests.processes import PATIENCE_S
 from tests.runtime.lockstep_station import column
 from tests.runtime.ros_master import RosMaster, needs_ros1
 
 pytestmark = pytest.mark.slow
 SMALL = ("--width", "64", "--height", "48", "--lifeline")
-
-PATIENCE_S = 2.0  # the test's machine may be busy
 
 Start = Callable[..., dict[str, Any]]
 
@@ -69,7 +68,7 @@ def start() -> Iterator[Start]:
         process.stdin.close()
     for process in running:
         try:
-            process.wait(10)
+            process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

@@ -22,12 +22,11 @@ from runtime.core.types import Observation, RobotCommand
 from runtime.transports import ros1
 from runtime.transports.ros.source import RosSource
 from runtime.transports.ros.topics import GroupTopics, Topics
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.ros_master import RosMaster, needs_ros1
 
 ROBOT = robots.load("agilex_piper")
 HEAD, LEFT = "/camera_f/color/image_raw", "/puppet/joint_left"
-PATIENCE = 30.0  # s
 READY = ROBOT.poses["ready"].astype(np.float32)
 
 Node = Callable[..., "subprocess.Popen[bytes]"]
@@ -63,7 +62,7 @@ def _end(process: subprocess.Popen[bytes]) -> str:
         return ""
     process.stdin.close()
     said = process.stdout.read().decode()
-    process.wait(20)
+    process.wait(PATIENCE_S)
     process.stdout.close()
     return said
 
@@ -77,7 +76,7 @@ def listening(ros: RosMaster, robot: robots.Robot = ROBOT, **settings: Any) -> I
 
 
 def seen(source: RosSource) -> Observation:
-    return eventually(lambda: source.receive(0.1), PATIENCE, "an observation")
+    return eventually(lambda: source.receive(0.1), "an observation")
 
 
 def said(source: RosSource, *words: str) -> str:
@@ -87,7 +86,7 @@ def said(source: RosSource, *words: str) -> str:
         source.receive(0.05)
         return next((e.text for e in source.news() if all(word in e.text for word in words)), "")
 
-    return eventually(found, PATIENCE, f"news with {words}")
+    return eventually(found, f"news with {words}")
 
 
 def led(ros: RosMaster, source: RosSource, goal: np.ndarray, **settings: Any) -> None:
@@ -101,7 +100,7 @@ def led(ros: RosMaster, source: RosSource, goal: np.ndarray, **settings: Any) ->
             newest = source.receive(0.05)
             return newest is not None and bool(np.allclose(newest.qpos, goal, atol=0.01))
 
-        eventually(arrived, PATIENCE, "the goal")
+        eventually(arrived, "the goal")
 
 
 @needs_ros1
@@ -167,7 +166,7 @@ def test_grippers_with_topics_of_their_own_are_split_off_and_put_together(
                 newest = source.receive(0.05)
                 return newest is not None and bool(np.allclose(newest.qpos, goal, atol=0.01))
 
-            eventually(arrived, PATIENCE, "the goal")
+            eventually(arrived, "the goal")
     assert json.loads(_end(process).splitlines()[-1])["refused"] == 0
 
 
@@ -197,7 +196,7 @@ def test_a_robot_that_starts_again_is_seen_again(ros_master: RosMaster, node: No
     with listening(ros_master) as source:
         seen(source)
         first.kill()
-        first.wait(20)
+        first.wait(PATIENCE_S)
         said(source, "waiting for", f"left_arm joints ({LEFT}): nothing for")
         node()
         seen(source)
@@ -216,7 +215,6 @@ def test_a_topic_that_falls_silent_is_named_and_nothing_is_delivered(
         # A busy machine may have been silent before, and goes on after that; the topic does not.
         eventually(
             lambda: source.receive(0.05) is None and source.stalled().get("cam_high", 0) > 3,
-            PATIENCE,
             "silence",
         )
         assert source.receive(0.3) is None
@@ -266,7 +264,7 @@ def test_nobody_at_the_topics_is_said(ros_master: RosMaster, caplog: pytest.LogC
     sink.connect()
     with contextlib.closing(sink):
         unheard = dict.fromkeys(("/puppet/master_joint_left", "/puppet/master_joint_right"), "")
-        eventually(lambda: sink.unheard() == unheard, PATIENCE, "nobody who listens")
+        eventually(lambda: sink.unheard() == unheard, "nobody who listens")
 
 
 @needs_ros1

@@ -23,12 +23,11 @@ from runtime.transports.ros import rcl
 from runtime.transports.ros.middleware import Quality
 from runtime.transports.ros.source import RosSource
 from runtime.transports.ros.topics import GroupTopics, Topics
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 ROBOT = robots.load("r1_lite")
 HEAD = "/hdas/camera_head/right_raw/image_raw_color/compressed"
 LEFT = "/hdas/feedback_arm_left"
-PATIENCE = 20.0  # s
 
 Node = Callable[..., "subprocess.Popen[bytes]"]
 
@@ -74,7 +73,7 @@ def _end(process: subprocess.Popen[bytes]) -> str:
         return ""
     process.stdin.close()
     said = process.stdout.read().decode()
-    process.wait(20)
+    process.wait(PATIENCE_S)
     process.stdout.close()
     return said
 
@@ -88,7 +87,7 @@ def listening(domain: int, **settings: Any) -> Iterator[RosSource]:
 
 
 def seen(source: RosSource) -> Observation:
-    return eventually(lambda: source.receive(0.1), PATIENCE, "an observation")
+    return eventually(lambda: source.receive(0.1), "an observation")
 
 
 def said(source: RosSource, *words: str) -> str:
@@ -98,7 +97,7 @@ def said(source: RosSource, *words: str) -> str:
         assert source.receive(0.05) is None
         return next((e.text for e in source.news() if all(word in e.text for word in words)), "")
 
-    return eventually(found, PATIENCE, f"news with {words}")
+    return eventually(found, f"news with {words}")
 
 
 def test_observations_come_and_commands_arrive(domain: int, node: Node) -> None:
@@ -120,7 +119,7 @@ def test_observations_come_and_commands_arrive(domain: int, node: Node) -> None:
                 newest = source.receive(0.05)
                 return newest is not None and bool(np.allclose(newest.qpos, goal, atol=0.01))
 
-            eventually(arrived, PATIENCE, "the goal")
+            eventually(arrived, "the goal")
             assert sink.unheard() == {}
     assert json.loads(_end(process).splitlines()[-1])["refused"] == 0
 
@@ -130,8 +129,8 @@ def test_a_robot_that_starts_again_is_seen_again(domain: int, node: Node) -> Non
     with listening(domain) as source:
         seen(source)
         first.kill()
-        first.wait(20)
-        eventually(lambda: source.receive(0.2) is None, PATIENCE, "the end of what was on its way")
+        first.wait(PATIENCE_S)
+        eventually(lambda: source.receive(0.2) is None, "the end of what was on its way")
         said(source, "waiting for", f"left_arm joints ({LEFT}): nothing for")
         node()
         assert seen(source).sequence < seen(source).sequence
@@ -146,7 +145,7 @@ def test_a_topic_that_falls_silent_is_named_and_nothing_is_delivered(domain: int
             source.receive(0.05)
             return next((e.text for e in source.news() if "cam_high" in e.text), "")
 
-        sentence = eventually(stalled, PATIENCE, "the silence of cam_high")
+        sentence = eventually(stalled, "the silence of cam_high")
         assert sentence.startswith(f"waiting for cam_high ({HEAD}): nothing for ")
         assert source.receive(0.3) is None
         assert source.faults()["stalled_cam_high"] >= 1

@@ -20,11 +20,10 @@ from runtime.transports import zmq as link
 from runtime.transports.node_sink import NodeSink
 from runtime.transports.node_source import NodeSource
 from runtime.transports.zmq import Config
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 ROBOT = robots.load("agilex_piper")
 CAMERAS = tuple(camera.key for camera in ROBOT.cameras)
-PATIENCE = 10.0  # s until a test gives up
 
 
 class Node:
@@ -41,7 +40,7 @@ class Node:
     def say(self, payload: bytes) -> None:
         self.publisher.send(payload)
 
-    def hear(self, patience: float = PATIENCE) -> dict[str, Any] | None:
+    def hear(self, patience: float = PATIENCE_S) -> dict[str, Any] | None:
         if not self.subscriber.poll(int(patience * 1e3)):
             return None
         return dict(msgpack_arrays.unpack(self.subscriber.recv()))
@@ -52,7 +51,7 @@ class Node:
 
 
 def _bind(socket: zmq.Socket[bytes], endpoint: str) -> str:
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + PATIENCE_S
     while True:
         try:
             socket.bind(endpoint)
@@ -103,7 +102,7 @@ def frame(t: float, mark: int = 0, /, **changes: Any) -> bytes:
 
 def until_heard(node: Node, source: NodeSource, payload: Callable[[], bytes]) -> Observation:
     """Publish until the subscription has reached the node and a frame comes through."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         node.say(payload())
         observation = source.receive(0.05)
@@ -120,7 +119,7 @@ def joined(node: Node, source: NodeSource) -> None:
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
-    eventually(condition, PATIENCE, "what the wire does")
+    eventually(condition, "what the wire does")
 
 
 # Configuration
@@ -240,7 +239,7 @@ def test_a_thousand_frames_that_queued_while_nobody_read_give_the_newest_one(nod
             return source.status.master == "end"
 
         wait_for(ended)
-        first = source.receive(PATIENCE)
+        first = source.receive(PATIENCE_S)
         assert first is not None
         assert first.qpos[0] == 1000
         assert first.arrived - first.captured["joints"] < 5
@@ -275,7 +274,7 @@ def test_a_jump_of_the_nodes_clock_is_named_and_ages_nothing(node: Node, jump: f
         for offset in (0.0, jump):
             for mark in range(3):
                 node.say(frame(time.monotonic() + offset, mark))
-                observation = source.receive(PATIENCE)
+                observation = source.receive(PATIENCE_S)
                 assert observation is not None
                 assert 0 <= observation.arrived - observation.captured["joints"] < 0.25
         assert source.faults() == {name: 1}
@@ -386,7 +385,7 @@ def test_a_partial_message_right_after_a_complete_one_does_not_displace_it(node:
         joined(node, source)
         node.say(frame(time.monotonic(), 5))
         node.say(frame(time.monotonic(), 6, images={"cam_high": np.zeros((6, 8, 3), np.uint8)}))
-        observation = source.receive(PATIENCE)
+        observation = source.receive(PATIENCE_S)
         assert observation is not None
         assert observation.qpos[0] == 5
 
@@ -410,7 +409,7 @@ def test_an_unusable_optional_part_is_left_out_and_counted(
     with listening(node) as source:
         joined(node, source)
         node.say(frame(time.monotonic(), 3, **changes))
-        observation = source.receive(PATIENCE)
+        observation = source.receive(PATIENCE_S)
         assert observation is not None
         assert observation.qpos[0] == 3
         assert observation.eef is None
@@ -456,7 +455,7 @@ def test_two_readers_do_not_steal_each_others_frames(node: Node) -> None:
         joined(node, two)
         one.receive(0.2)
         node.say(frame(time.monotonic(), 42))
-        seen = [source.receive(PATIENCE) for source in (one, two)]
+        seen = [source.receive(PATIENCE_S) for source in (one, two)]
     assert [None if each is None else each.qpos[0] for each in seen] == [42, 42]
 
 
@@ -497,7 +496,7 @@ def test_an_error_in_the_reader_is_counted_and_the_next_frame_comes(
             node.say(frame(time.monotonic()))
             wait_for(lambda counted=counted: source.faults().get("reader_failed", 0) > counted)  # type: ignore[misc]
         node.say(frame(time.monotonic(), 7))
-        observation = source.receive(PATIENCE)
+        observation = source.receive(PATIENCE_S)
         assert observation is not None
         assert observation.qpos[0] == 7
         assert source.faults()["reader_failed"] == 2
@@ -531,7 +530,7 @@ def pictures(**values: int) -> dict[str, Any]:
 
 def received(node: Node, source: NodeSource, **values: int) -> Observation:
     node.say(frame(time.monotonic(), images=pictures(**values)))
-    observation = source.receive(PATIENCE)
+    observation = source.receive(PATIENCE_S)
     assert observation is not None
     return observation
 
@@ -577,7 +576,7 @@ def test_the_cameras_of_a_deployment_are_those_that_are_not_disabled() -> None:
 
 
 def send_until_heard(node: Node, sink: NodeSink, command: RobotCommand) -> dict[str, Any]:
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline:
         sink.send(command)
         heard = node.hear(0.05)

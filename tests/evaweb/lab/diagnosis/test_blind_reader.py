@@ -10,7 +10,7 @@ from evaweb.plans.blinding_rules import look
 from tests.evaweb.blind_lab import NAMES, SECRETS, Lab
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
 
-pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow]
 
 
 @pytest.fixture(autouse=True)

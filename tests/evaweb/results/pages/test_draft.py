@@ -13,6 +13,7 @@ from evaweb.results.analysis import power
 from evaweb.statistics.score_courses import Scores, score_course
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders
+from tests.processes import PATIENCE_S
 
 NEW = "/result/plans/new/"
 ON = {
@@ -307,7 +308,7 @@ def test_what_nobody_asks_for_any_more_is_given_up(monkeypatch):
 
     monkeypatch.setattr(power, "_steps", lambda asked: [step(asked) for _ in range(3)])
     desk.ask("ann", one, 0)
-    assert superseded.wait(60)
+    assert superseded.wait(PATIENCE_S)
     assert desk.ask("ann", other, 60).whole
     assert began == [6, 7, 7, 7]
     assert desk.ask("bob", one, 60).whole

@@ -15,10 +15,9 @@ from runtime.clients.client import StationClient
 from runtime.ipc.bus import CommandServer, Endpoints
 from runtime.ipc.messages import Ack
 from runtime.processes.coordinator.process import CommandService
-from tests.processes import eventually
+from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
 from tests.runtime.lockstep_station import Station, stubbed
 
-ANSWER_MS = 5000  # as the older channel's own script waits
 _TICK_S = 0.003  # ten times as fast as life
 
 
@@ -76,13 +75,13 @@ class Bench:
         self._open.append(made)
         return made
 
-    def reach(self, state, seconds=20.0):
-        eventually(lambda: self.station.state == state, seconds, f"{state}, not {self.station.state}")
+    def reach(self, state):
+        eventually(lambda: self.station.state == state, f"{state}, not {self.station.state}")
 
     def kept(self):
         """The lease has been renewed since."""
         began = self._until()
-        eventually(lambda: self._until() > began, 20.0, "the lease is renewed")
+        eventually(lambda: self._until() > began, "the lease is renewed")
 
     def _until(self):
         held = self.station.coordinator.lease.current(self.station.clock.now())
@@ -91,7 +90,7 @@ class Bench:
     def close(self):
         self._ended.set()
         for thread in self.threads:
-            thread.join(10)
+            thread.join(PATIENCE_S)
         for script in self._open:
             script.close()
         self._service.close()
@@ -115,7 +114,7 @@ class Script:
 
     def raw(self, *frames):
         self.socket.send_multipart(frames)
-        assert self.socket.poll(ANSWER_MS), f"no answer to {frames!r:.200}"
+        assert self.socket.poll(PATIENCE_MS), f"no answer to {frames!r:.200}"
         (answer,) = self.socket.recv_multipart()
         return json.loads(answer, parse_constant=_no_number)
 
@@ -130,9 +129,9 @@ class Script:
         assert answer["ok"], answer
         return answer["data"]
 
-    def result(self, answer, seconds=20.0):
+    def result(self, answer):
         """What became of a command that was accepted."""
-        return eventually(lambda: self._over(answer["id"]), seconds, f"the end of {answer}")
+        return eventually(lambda: self._over(answer["id"]), f"the end of {answer}")
 
     def _over(self, identity):
         found = self.query("result", id=identity)

@@ -75,14 +75,14 @@ def test_a_station_starts_its_channel_again_where_it_dies_and_takes_it_along(tmp
     )
     endpoints = Endpoints(tmp_path / "stations" / "demo")
     try:
-        first = eventually(lambda: found(endpoints), 30, "the channel")
+        first = eventually(lambda: found(endpoints), "the channel")
         assert asked(first["control"])["state"] == "disconnected"
         os.kill(first["pid"], signal.SIGKILL)
-        second = eventually(lambda: newer(endpoints, first), 30, "another channel")
+        second = eventually(lambda: newer(endpoints, first), "another channel")
         assert asked(second["control"])["station"] == "demo"
         assert station.poll() is None
         station.kill()  # and nothing of it is left
-        eventually(lambda: not alive(second["pid"]), 15, "the end of the channel")
+        eventually(lambda: not alive(second["pid"]), "the end of the channel")
     finally:
         station.kill()
         station.wait()
@@ -106,6 +106,6 @@ def asked(endpoint):
     """The station's snapshot over the channel, as soon as the coordinator answers."""
     script = Script(endpoint, {})
     try:
-        return eventually(lambda: script.send(query="station").get("data"), 20, "coordinator")
+        return eventually(lambda: script.send(query="station").get("data"), "coordinator")
     finally:
         script.close()

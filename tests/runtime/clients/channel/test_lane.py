@@ -7,8 +7,7 @@ import pytest
 from runtime.clients.channel import lane as module
 from runtime.clients.channel.lane import Job, Lane
 from runtime.clients.channel.message import Message
-
-PATIENCE = 10.0
+from tests.processes import PATIENCE_S
 
 
 class Clerk:
@@ -20,7 +19,7 @@ class Clerk:
     def answer(self, holder, message):
         if message.name == "slow":
             self.began.set()
-            assert self.let_go.wait(PATIENCE)
+            assert self.let_go.wait(PATIENCE_S)
         if message.name == "bad":
             raise ValueError("a mistake")
         return {"ok": True, "name": message.name, "holder": holder}
@@ -42,7 +41,7 @@ class World:
         return self.lane.put(Job([of, b""], "me", message, came, stops))
 
     def reply(self):
-        return self.replies.get(timeout=PATIENCE)
+        return self.replies.get(timeout=PATIENCE_S)
 
 
 @pytest.fixture
@@ -50,7 +49,7 @@ def world():
     made = World()
     yield made
     made.clerk.let_go.set()
-    made.lane.end(PATIENCE)
+    made.lane.end(PATIENCE_S)
     assert made.clerk.closed
 
 
@@ -76,7 +75,7 @@ def test_what_has_waited_too_long_is_not_carried_out_any_more(world):
 
 def test_what_waits_while_a_stop_comes_is_not_carried_out_after_it(world):
     world.put("slow")
-    assert world.clerk.began.wait(PATIENCE)
+    assert world.clerk.began.wait(PATIENCE_S)
     world.put("run")
     world.put("status", form="query")
     world.stops = 1
@@ -91,14 +90,14 @@ def test_what_waits_while_a_stop_comes_is_not_carried_out_after_it(world):
 
 def test_a_full_inbox_takes_no_more(world):
     world.put("slow")
-    assert world.clerk.began.wait(PATIENCE)
+    assert world.clerk.began.wait(PATIENCE_S)
     found = [world.put("a", of=b"%d" % number) for number in range(module.WAITING + 1)]
     assert found == [True] * module.WAITING + [False]
 
 
 def test_one_connection_cannot_take_the_room_of_others(world):
     world.put("slow")
-    assert world.clerk.began.wait(PATIENCE)
+    assert world.clerk.began.wait(PATIENCE_S)
     assert [world.put("a") for _ in range(module.EACH + 1)] == [True] * module.EACH + [False]
     assert world.put("b", of=b"another")
     world.clerk.let_go.set()
@@ -110,15 +109,15 @@ def test_one_connection_cannot_take_the_room_of_others(world):
 def test_a_lane_that_ends_answers_what_it_is_about_and_stops_alone_to_the_last(keep, carried_out):
     world = World(keep)
     world.put("slow")
-    assert world.clerk.began.wait(PATIENCE)
+    assert world.clerk.began.wait(PATIENCE_S)
     for _ in range(3):
         world.put("a")
-    ending = threading.Thread(target=world.lane.end, args=(PATIENCE,))
+    ending = threading.Thread(target=world.lane.end, args=(PATIENCE_S,))
     ending.start()
     while not world.lane._over.is_set():
         time.sleep(0.001)
     world.clerk.let_go.set()
-    ending.join(PATIENCE)
+    ending.join(PATIENCE_S)
     assert world.clerk.closed
     assert world.replies.qsize() == carried_out
 
@@ -132,11 +131,11 @@ def test_what_is_due_is_done_with_messages_and_without_and_may_fail():
 
     world = World(keep)
     try:
-        assert [kept.get(timeout=PATIENCE) for _ in range(3)] == [1, 1, 1]
+        assert [kept.get(timeout=PATIENCE_S) for _ in range(3)] == [1, 1, 1]
         world.put("a")
         assert world.reply()["ok"]
     finally:
-        world.lane.end(PATIENCE)
+        world.lane.end(PATIENCE_S)
 
 
 def test_a_lane_of_stops_carries_out_whatever_comes_however_late():
@@ -146,4 +145,4 @@ def test_a_lane_of_stops_carries_out_whatever_comes_however_late():
         world.put("stop", came=time.monotonic() - 100.0)
         assert world.reply()["ok"]
     finally:
-        world.lane.end(PATIENCE)
+        world.lane.end(PATIENCE_S)

@@ -12,7 +12,7 @@ from runtime.clients.channel.names import Names
 from runtime.clients.client import Refused, StationClient
 from runtime.ipc.session_state import SessionState
 from tests import presses
-from tests.processes import eventually
+from tests.processes import PATIENCE_MS, eventually
 from tests.runtime.clients.channel.bench import Bench
 from tests.runtime.lockstep_station import STANDS
 from tests.sources import ROOT
@@ -73,16 +73,14 @@ def test_a_session_of_an_existing_script_from_task_to_saved_rollout(start):
     assert script.query("status")["is_setup_done"] is True
     assert script.query("status")["selected_task"] == "fold the cloth"
     run = accepted(script.cmd("start"))
-    eventually(lambda: script.query("status")["chunk_index"] > 1, 10, "chunks")
+    eventually(lambda: script.query("status")["chunk_index"] > 1, "chunks")
     done(script.cmd("halt"))
     assert script.query("status")["session_status"] == "holding"
     assert script.result(run)["result"] == "failed"  # it did not go on to its end
     again = accepted(script.cmd("run"))
     assert done(script.cmd("stop"))["state"] == "ready"
     assert script.result(again)["result"] == "done"
-    saved = eventually(
-        lambda: script.cmd("rollout_save")["ok"] and script.cmd("rollout_save"), 10, "an episode"
-    )
+    saved = eventually(lambda: script.cmd("rollout_save")["ok"] and script.cmd("rollout_save"), "an episode")
     assert saved["data"]["episode"]["uuid"] == run["data"]["episode"]
 
 
@@ -125,9 +123,7 @@ def test_arguments_are_checked_before_the_answer_and_nothing_is_changed(start):
     assert "duration_s" in refused(script.command("run", duration_s=-1))
     assert "timeout" in refused(script.command("run", timeout=1e9))  # a word of the client's own
     aim = {"command": "aim", "arguments": {"kind": 1, "timeout": 2}}
-    eventually(
-        lambda: "kind" in script.send(**aim)["error"], 20, "what is wrong with it, once it can be solved"
-    )
+    eventually(lambda: "kind" in script.send(**aim)["error"], "what is wrong with it, once it can be solved")
     assert "colour" in refused(script.command("setup", colour="red"))
     assert "k_max" in refused(script.cmd('update_infer_params:{"k_max": "many"}'))
     assert "needs 14 finite numbers" in refused(script.cmd('init_move:{"qpos": [0]}'))
@@ -169,7 +165,7 @@ def test_chunk_by_chunk_and_by_hand(start):
     script = bench.script()
     done(script.cmd("select_mode:step"))
     accepted(script.cmd("start"))
-    step = eventually(lambda: (one := script.cmd("step_infer"))["ok"] and one, 10, "a step")
+    step = eventually(lambda: (one := script.cmd("step_infer"))["ok"] and one, "a step")
     assert script.result(step)["result"] == "done"
     assert script.query("status")["pending_chunk"]["rows"] > 0
     assert script.result(accepted(script.cmd("step_commit")))["result"] == "done"
@@ -177,7 +173,7 @@ def test_chunk_by_chunk_and_by_hand(start):
     done(script.cmd("select_mode:manual"))
     accepted(script.cmd("start"))
     done(script.cmd("manual_qpos:" + ",".join(map(str, FAR))))
-    move = eventually(lambda: (one := script.cmd("manual_send"))["ok"] and one, 10, "a move")
+    move = eventually(lambda: (one := script.cmd("manual_send"))["ok"] and one, "a move")
     assert script.result(move)["result"] == "done"
     assert script.query("frame")["qpos"][0] == pytest.approx(FAR[0], abs=1e-3)
     half = script.result(accepted(script.cmd("gripper:left:0.03")))
@@ -193,9 +189,9 @@ def test_a_recording_without_a_run_has_the_task_that_was_selected_for_it(start):
     script = bench.script()
     script.cmd("select_collect_task", task="wipe the table")
     begun = done(script.cmd("collect_start"))
-    eventually(lambda: script.query("status")["collect"], 10, "a recording")
+    eventually(lambda: script.query("status")["collect"], "a recording")
     done(script.cmd("collect_stop"))
-    path = eventually(lambda: script.query("station")["episode"].get("path"), 10, "an episode")
+    path = eventually(lambda: script.query("station")["episode"].get("path"), "an episode")
     assert bench.station.episode().manifest["task"] == "wipe the table"
     assert begun["data"]["episode"] in path
 
@@ -259,7 +255,7 @@ def test_a_dashboard_does_not_keep_a_dead_scripts_lease(start, scripts):
             bench.script().query(question)
         return dashboard.query("status")["state"] == "holding"
 
-    eventually(looked, 20, "holding")
+    eventually(looked, "holding")
 
 
 def test_a_dashboards_stop_button_does_not_make_it_a_script(start):
@@ -273,7 +269,7 @@ def test_a_dashboards_stop_button_does_not_make_it_a_script(start):
         bench.now += bench.silence_s / 4
         return dashboard.query("status")["state"] == "holding"
 
-    eventually(looked, 20, "holding")
+    eventually(looked, "holding")
 
 
 @pytest.mark.parametrize("question", ["status", "result"])
@@ -331,7 +327,7 @@ def test_a_reset_ends_a_halted_run_and_goes_home(start, verb):
     done(script.cmd("select_mode:manual"))
     accepted(script.cmd("start"))
     done(script.cmd("manual_qpos:" + ",".join(map(str, FAR))))
-    move = eventually(lambda: (one := script.cmd("manual_send"))["ok"] and one, 10, "a move")
+    move = eventually(lambda: (one := script.cmd("manual_send"))["ok"] and one, "a move")
     assert script.result(move)["result"] == "done"
     assert "home is not allowed while running" in refused(script.cmd(verb))
     done(script.cmd("halt"))
@@ -373,7 +369,7 @@ def test_the_estop_needs_no_lease_and_no_main(start):
     bench.frozen = False
     bench.reach(SessionState.FAULTED)
     assert "smoke" in bench.station.reason
-    assert waiting.socket.poll(10_000)
+    assert waiting.socket.poll(PATIENCE_MS)
     assert json.loads(waiting.socket.recv())["ok"] is False
     done(runner.command("release"))
     bench.reach(SessionState.IDLE)
@@ -407,7 +403,7 @@ def test_a_station_that_does_not_answer_is_told_and_asked_again(start):
     assert (stopped["ok"], stopped["result"]) == (False, "unknown")
     assert "estop" in stopped["error"]
     bench.frozen = False
-    eventually(lambda: script.cmd("setup")["ok"], 10, "an answer")
+    eventually(lambda: script.cmd("setup")["ok"], "an answer")
 
 
 # --- noise ---------------------------------------------------------------------------------------------------

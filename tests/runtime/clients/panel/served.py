@@ -15,13 +15,12 @@ from typing import Any
 from runtime.clients.panel.pin import PinFile
 from runtime.ipc.bus import Endpoints
 from tests.evaweb.stand_in import StandIn
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.sources import ROOT
 
 PIN = "271828"
 STATION = "bench-9"
 PLAIN = {"host": "127.0.0.1", "port": 0, "names": [], "certificate": None, "key": None}
-WAIT_S = 10.0
 
 
 class Served:
@@ -42,7 +41,7 @@ class Served:
         self.child = subprocess.Popen(
             [sys.executable, *words], cwd=ROOT, env=dict(os.environ), stdin=subprocess.PIPE
         )
-        self.url = eventually(self._listens, WAIT_S, "the panel")
+        self.url = eventually(self._listens, "the panel")
         self.port = int(self.url.rsplit(":", 1)[1])
 
     def _listens(self) -> str:
@@ -61,9 +60,9 @@ class Served:
     def connection(self, trusts: Path | None = None) -> http.client.HTTPConnection:
         """A connection, with TLS where a certificate is trusted."""
         if trusts is None:
-            return http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+            return http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         context = ssl.create_default_context(cafile=str(trusts))
-        return http.client.HTTPSConnection("localhost", self.port, timeout=20, context=context)
+        return http.client.HTTPSConnection("localhost", self.port, timeout=PATIENCE_S, context=context)
 
     def ask(
         self,
@@ -93,6 +92,6 @@ class Served:
         """End the process as its supervisor does, and the station."""
         killed = self.child.returncode is not None
         self.child.stdin.close()
-        code = self.child.wait(20)
+        code = self.child.wait(PATIENCE_S)
         self.station.end()
         assert killed or code == 0

@@ -15,7 +15,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.link.uplink import Telling
 from tests.e2e.lab import CHROMIUM, NO_CHROMIUM, browsing
 from tests.processes import eventually
-from tests.runtime.clients.panel.served import PIN, WAIT_S, Served
+from tests.runtime.clients.panel.served import PIN, Served
 
 pytestmark = [
     pytest.mark.slow,
@@ -76,7 +76,7 @@ def test_whoever_stands_at_the_robot_sees_it_and_stops_it(panel, browser, tmp_pa
     page.get_by_text("nobody commands the station").wait_for()
     for name, size in WIDTHS.items():
         page.set_viewport_size(size)
-        eventually(lambda: filmed(panel) or drawn(page), WAIT_S, "pictures of three cameras")
+        eventually(lambda: filmed(panel) or drawn(page), "pictures of three cameras")
         page.screenshot(path=tmp_path / f"{name}.png", full_page=True)
         wide = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
         assert wide == 0, name

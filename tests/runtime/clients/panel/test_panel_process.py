@@ -15,7 +15,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.link.uplink import Telling
 from tests.e2e.tls_proxy import certificate
 from tests.processes import eventually
-from tests.runtime.clients.panel.served import PIN, STATION, WAIT_S, Served
+from tests.runtime.clients.panel.served import PIN, STATION, Served
 
 pytestmark = pytest.mark.slow
 
@@ -117,7 +117,7 @@ def test_who_has_given_the_pin_sees_the_station_and_its_pictures(panel):
         told = json.loads(panel.ask("GET", "/state", headers=entered)[2])
         return told if told["cameras"] and "state" in told else None
 
-    told = eventually(seen, WAIT_S, "the station")
+    told = eventually(seen, "the station")
     assert (told["station"], told["silent_s"], told["lab"]) == (STATION, 0, None)
     status, headers, jpeg = panel.ask("GET", "/camera/cam_high", headers=entered)
     assert (status, headers["Content-Type"]) == (200, "image/jpeg")
@@ -183,7 +183,7 @@ def test_clients_that_read_no_pictures_keep_nobody_from_the_estop(panel):
         panel.station.do(lambda: panel.station._cameras.publish("camera/big", big))
         return "big" in json.loads(panel.ask("GET", "/state", headers=entered)[2])["cameras"]
 
-    eventually(listed, WAIT_S, "a large picture")
+    eventually(listed, "a large picture")
     lines = [f"GET /camera/big HTTP/1.1\r\nHost: localhost\r\nCookie: {entered['Cookie']}\r\n\r\n"] * 40
     mute = []
     try:
@@ -225,7 +225,7 @@ def test_guesses_of_the_pin_are_refused_more_and_more_and_the_estop_is_not(panel
         status, _, content = panel.ask("POST", "/pin", {"pin": "000000"})
         return status == 429 and b"too many wrong PINs" in content
 
-    eventually(guess, WAIT_S, "a guess that is not looked at")
+    eventually(guess, "a guess that is not looked at")
     assert panel.ask("POST", "/estop", {})[0] == 200
 
 

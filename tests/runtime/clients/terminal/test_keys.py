@@ -8,8 +8,7 @@ import pytest
 
 from runtime.clients.terminal import keys as module
 from runtime.clients.terminal.keys import Keyboard, NoKeys, keys
-
-PATIENCE = 10.0
+from tests.processes import PATIENCE_S
 
 
 @pytest.fixture
@@ -25,9 +24,9 @@ def test_a_key_is_there_without_enter_and_enter_is_one(terminal):
     person, program = terminal
     with Keyboard(program) as keyboard:
         os.write(person, b"c")
-        assert keyboard.key(PATIENCE) == "c"
+        assert keyboard.key(PATIENCE_S) == "c"
         os.write(person, b"\r")
-        assert keyboard.key(PATIENCE) == "\n"
+        assert keyboard.key(PATIENCE_S) == "\n"
         assert keyboard.key(0.0) == ""
 
 
@@ -43,7 +42,7 @@ def test_the_terminal_is_left_as_it_was(terminal):
 def test_a_terminal_that_hangs_up_presses_nothing(terminal):
     with Keyboard(terminal[1]) as keyboard:
         os.close(terminal.pop(0))
-        assert keyboard.key(PATIENCE) == ""
+        assert keyboard.key(PATIENCE_S) == ""
         assert keyboard.key(0.0) == ""
 
 

@@ -96,9 +96,9 @@ class Terminal:
 
         try:
             self("wait", "waiting")
-            eventually(lambda: "q: stop]" in shown(), 10, "the keys")
+            eventually(lambda: "q: stop]" in shown(), "the keys")
             yield lambda key: os.write(ours, key.encode()), shown
-            eventually(lambda: shown() is not None and run.poll() is not None, 15, "the end")
+            eventually(lambda: shown() is not None and run.poll() is not None, "the end")
             assert run.returncode == 0, shown()
         finally:
             if run.poll() is None:
@@ -139,7 +139,7 @@ def joints_of(lab):
 
 
 def test_status_says_what_there_is(ctl):
-    eventually(lambda: "drives    enabled" in ctl("status"), 10, "the drives are reported")
+    eventually(lambda: "drives    enabled" in ctl("status"), "the drives are reported")
     told = ctl("status")
     assert "task      fold the cloth" in told
     assert "first     the policy's first action is" in told
@@ -175,10 +175,10 @@ def test_a_chunk_is_shown_then_committed_or_cancelled(ctl):
 def test_a_person_at_the_terminal_steps_with_single_keys(ctl):
     with ctl.at_the_keyboard("step") as (press, shown):
         press("\n")
-        eventually(lambda: "(step, executing)" in shown(), 10, "the chunk")
+        eventually(lambda: "(step, executing)" in shown(), "the chunk")
         ctl("wait", "waiting")
         press("c")
-        eventually(lambda: "commit is for preview" in shown(), 10, "the refusal")
+        eventually(lambda: "commit is for preview" in shown(), "the refusal")
         press("q")
     assert "[Enter: next chunk, x: cancel, q: stop]" in shown()
 
@@ -209,7 +209,7 @@ def test_a_simulation_moves_no_robot_and_is_tuned_while_it_runs(ctl, lab):
     with ctl.attended("sim", "--sim-state", "simulated"):
         assert "the policy sees the simulated state" in ctl("status")
         assert "sync" in ctl("tune", "--strategy", "sync", "--set", "execution_horizon=4")
-        eventually(lambda: lab.client.status()["policy"]["answers"] > 3, 10, "chunks in the simulation")
+        eventually(lambda: lab.client.status()["policy"]["answers"] > 3, "chunks in the simulation")
         assert "strategy.k_max = 'many'" in ctl("tune", "--set", "k_max=many", code=1)
         assert ctl.status()["tuning"]["execution_horizon"] == 4
         assert np.abs(joints_of(lab)["simulated"] - measured).max() > 0.05
@@ -219,11 +219,11 @@ def test_a_simulation_moves_no_robot_and_is_tuned_while_it_runs(ctl, lab):
 def test_drives_that_are_off_are_said_and_keep_it_from_being_set_up(ctl, lab):
     node = lab.addresses["node"]["action_endpoint"]
     assert drives.main(["fault", "--fault", "axis 2 is hot", "--action-endpoint", node]) == 0
-    eventually(lambda: ctl.status()["drives"].get("faults") == ["axis 2 is hot"], 10, "the fault")
+    eventually(lambda: ctl.status()["drives"].get("faults") == ["axis 2 is hot"], "the fault")
     assert "drives    DISABLED; fault: axis 2 is hot" in ctl("status")
     assert "axis 2 is hot" in ctl("setup", code=1)
     assert drives.main(["enable", "--action-endpoint", node]) == 0
-    eventually(lambda: ctl.status()["drives"] == {"enabled": True, "faults": []}, 10, "enabled drives")
+    eventually(lambda: ctl.status()["drives"] == {"enabled": True, "faults": []}, "enabled drives")
     told = ctl("events", "--kind", "drives")
     assert "drives disabled; drive fault: axis 2 is hot" in told
     assert "drives enabled; drive fault gone: axis 2 is hot" in told

@@ -22,6 +22,7 @@ from runtime.policies.openpi import OpenpiPolicy
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
+from tests.processes import PATIENCE_S
 
 ROBOT = robots.load("agilex_piper")
 DIALECTS = ["prev_action", "openpi_rtc", "kai0", "async_rtc"]
@@ -183,10 +184,10 @@ def test_a_reset_with_a_reply_in_flight_leaves_nothing_to_continue() -> None:
             return generation, policy.infer(seen(10))
 
         flight = pool.submit(ask, held.generation)
-        assert begun.wait(10)
+        assert begun.wait(PATIENCE_S)
         held.clear()
         policy.reset()
-        generation, chunk = flight.result(10)
+        generation, chunk = flight.result(PATIENCE_S)
         held.answered(2, chunk, 10, generation=generation)
         held.merged(placed(2, 10, 9, 40))
         conditioning = held.conditioning(20, [9], 0.9, None)

@@ -8,6 +8,7 @@ from collections import deque
 import pytest
 
 from runtime.policies.tunnel.keeper import Keeper
+from tests.processes import PATIENCE_S
 
 
 class FakeSsh:
@@ -205,16 +206,16 @@ def threads() -> int:
 def test_closed_it_ends_its_ssh_and_its_thread_and_says_so_at_once(world: World) -> None:
     before = threads()
     world.keeper.begin()
-    world.keeper.wait(lambda _: bool(world.started), 5.0)
+    world.keeper.wait(lambda _: bool(world.started), PATIENCE_S)
     world.keeper.close()
     assert (world.status.closed, world.status.why) == (True, "it was closed from our side")
-    world.keeper.wait(lambda _: threads() == before, 5.0)
+    world.keeper.wait(lambda _: threads() == before, PATIENCE_S)
     assert all(ssh.ended for ssh in world.started)
 
 
 def test_a_fault_of_our_own_is_told_to_whoever_waits(world: World) -> None:
     world.fault = ValueError("a bug")  # type: ignore[assignment]
     world.keeper.begin()
-    status = world.keeper.wait(lambda now: now.closed, 5.0)
+    status = world.keeper.wait(lambda now: now.closed, PATIENCE_S)
     assert status.closed
     assert status.why == "it is not kept any more (ValueError: a bug)"

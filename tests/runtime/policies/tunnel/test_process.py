@@ -16,7 +16,7 @@ import pytest
 from runtime.policies.tunnel import process
 from runtime.policies.tunnel.listening import listens
 from runtime.policies.tunnel.process import Ssh, free_port
-from tests.processes import alive, eventually
+from tests.processes import PATIENCE_S, alive, eventually
 
 Begin = Callable[[str], Ssh]
 LISTEN = """
@@ -43,7 +43,7 @@ def begin() -> Iterator[Begin]:
 
 
 def ended(ssh: Ssh) -> int:
-    eventually(lambda: ssh.look() is not None, 30, "its end")
+    eventually(lambda: ssh.look() is not None, "its end")
     code = ssh.look()
     assert code is not None
     return code
@@ -51,7 +51,7 @@ def ended(ssh: Ssh) -> int:
 
 def test_it_listens_when_its_own_process_does(begin: Begin) -> None:
     ssh = begin(LISTEN)
-    eventually(ssh.listens, 30, "its near end")
+    eventually(ssh.listens, "its near end")
     assert ssh.look() is None
 
 
@@ -70,17 +70,17 @@ print("ended" if not sys.stdin.readline() else "told more", file=sys.stderr, flu
 def test_where_a_session_is_wanted_it_counts_only_once_the_far_end_has_said_the_word_again() -> None:
     port = free_port()
     ssh = Ssh([sys.executable, "-c", ECHO.replace("{port}", str(port))], port, echoes=True)
-    eventually(lambda: ssh.look() is None and "listening" in ssh.said, 30, "its near end")
+    eventually(lambda: ssh.look() is None and "listening" in ssh.said, "its near end")
     assert listens(ssh.pid, port)
     assert not ssh.listens()
-    eventually(lambda: ssh.look() is None and ssh.listens(), 30, "the far end's word")
+    eventually(lambda: ssh.look() is None and ssh.listens(), "the far end's word")
     assert sorted(ssh.said) == ["a greeting", "listening"]  # a nologin's sentence, too, is on the output
     ssh.end()
 
 
 def test_a_session_ends_with_its_input() -> None:
     ssh = Ssh([sys.executable, "-c", ECHO.replace("{port}", "0")], 1, echoes=True)
-    eventually(lambda: ssh.look() is None and "listening" in ssh.said, 30, "its near end")
+    eventually(lambda: ssh.look() is None and "listening" in ssh.said, "its near end")
     assert ssh._process.stdin is not None
     ssh._process.stdin.close()
     assert ended(ssh) == 0
@@ -92,7 +92,7 @@ def test_somebody_else_on_its_port_is_not_taken_for_it(begin: Begin) -> None:
     ssh = begin("import time; print('x', file=__import__('sys').stderr, flush=True); time.sleep(60)")
     with socket.create_server(("127.0.0.1", ssh.port)):
         assert listens(os.getpid(), ssh.port)
-        eventually(lambda: ssh.look() is None and bool(ssh.said), 30, "its first word")
+        eventually(lambda: ssh.look() is None and bool(ssh.said), "its first word")
         assert not ssh.listens()
 
 
@@ -142,11 +142,11 @@ def test_its_end_is_that_of_what_it_started(begin: Begin) -> None:
         "jump = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
         "print(jump.pid, file=sys.stderr, flush=True); time.sleep(60)"
     )
-    eventually(lambda: ssh.look() is None and bool(ssh.said), 30, "its first word")
+    eventually(lambda: ssh.look() is None and bool(ssh.said), "its first word")
     started = int(ssh.said[-1])
     assert alive(started)
     ssh.end()
-    eventually(lambda: not alive(started), 30, "its end")
+    eventually(lambda: not alive(started), "its end")
     assert not alive(ssh.pid)
 
 
@@ -156,7 +156,7 @@ def test_one_that_does_not_want_to_end_is_made_to(begin: Begin, monkeypatch: pyt
         "import signal, sys, time\n"
         "signal.signal(signal.SIGTERM, signal.SIG_IGN); print('deaf', file=sys.stderr, flush=True); time.sleep(60)"
     )
-    eventually(lambda: ssh.look() is None and bool(ssh.said), 30, "its first word")
+    eventually(lambda: ssh.look() is None and bool(ssh.said), "its first word")
     ssh.end()
     assert not alive(ssh.pid)
     ssh.end()  # safe to call twice
@@ -175,16 +175,16 @@ def test_it_ends_with_the_thread_that_started_it() -> None:
 
     def start() -> None:
         made.append(Ssh([sys.executable, "-c", LISTEN.replace("{port}", str(free_port()))], 1))
-        eventually(lambda: made[0].look() is None and bool(made[0].said), 30, "its first word")
-        go_on.wait(10)
+        eventually(lambda: made[0].look() is None and bool(made[0].said), "its first word")
+        go_on.wait(PATIENCE_S)
 
     thread = threading.Thread(target=start)
     thread.start()
-    eventually(lambda: bool(made and made[0].said), 30, "its first word")
+    eventually(lambda: bool(made and made[0].said), "its first word")
     assert alive(made[0].pid)
     go_on.set()
     thread.join()
-    eventually(lambda: made[0].look() == -signal.SIGTERM, 30, "its end")
+    eventually(lambda: made[0].look() == -signal.SIGTERM, "its end")
     made[0].end()
 
 
@@ -208,4 +208,4 @@ def test_it_does_not_outlive_a_process_that_is_killed() -> None:
         pid = int(station.stdout.readline())
         assert alive(pid)
         station.kill()
-        eventually(lambda: not alive(pid), 30, "its end")
+        eventually(lambda: not alive(pid), "its end")

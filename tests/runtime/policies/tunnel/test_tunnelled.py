@@ -33,7 +33,7 @@ from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.starvla_server import Star, StarvlaServer
 from runtime.station.checks import checked_spec
-from tests.processes import alive, eventually
+from tests.processes import PATIENCE_S, alive, eventually
 from tests.runtime.policies.peers import PIPER, seen
 from tests.runtime.policies.tls import encrypted, self_signed
 from tests.runtime.sim.tabletop_station import pick_and_place, served
@@ -89,7 +89,7 @@ def test_a_policy_is_asked_through_a_tunnel_that_ends_with_it(ssh_server: Begin)
         assert len(session) == 1
         assert Path(f"/proc/{pid}/comm").read_text() == "ssh\n"
         policy.close()
-        eventually(lambda: not alive(pid), 30, "the end of ssh")
+        eventually(lambda: not alive(pid), "the end of ssh")
         with pytest.raises(PolicyError, match="connect first"):
             policy.infer(seen(PIPER))
         assert policy.connect().name == "stand-in"  # another tunnel
@@ -103,7 +103,7 @@ def test_a_second_set_up_replaces_the_tunnel(ssh_server: Begin) -> None:
         policy.connect()
         first = ssh_of(policy)
         policy.connect()
-        eventually(lambda: not alive(first), 30, "the end of the first ssh")
+        eventually(lambda: not alive(first), "the end of the first ssh")
         assert policy.infer(seen(PIPER)).actions.shape[1] == PIPER.dim
 
 
@@ -149,7 +149,7 @@ def test_every_protocol_goes_through_a_tunnel(protocol: str, ssh_server: Begin) 
             with pytest.raises(TunnelError, match=r"the tunnel to .* is down since 0 s: "):
                 policy.infer(seen(PIPER))
             server.start()
-            eventually(lambda: answered(policy), 30, "an answer through another tunnel")
+            eventually(lambda: answered(policy), "an answer through another tunnel")
 
 
 def answered(policy: Policy) -> bool:
@@ -233,7 +233,7 @@ def refused(policy: Policy) -> str:
     with contextlib.closing(policy), pytest.raises(TunnelError) as raised:
         policy.connect()
     eventually(
-        lambda: not any(one.name == "tunnel" for one in threading.enumerate()), 5, "the end of the keeper"
+        lambda: not any(one.name == "tunnel" for one in threading.enumerate()), "the end of the keeper"
     )
     return str(raised.value)
 
@@ -332,13 +332,13 @@ def test_a_set_up_that_is_cancelled_does_not_wait_for_the_tunnel() -> None:
 
         waiting = threading.Thread(target=connect)
         waiting.start()
-        eventually(lambda: policy._keeper is not None and policy._keeper._ssh is not None, 30, "an ssh")
+        eventually(lambda: policy._keeper is not None and policy._keeper._ssh is not None, "an ssh")
         pid = ssh_of(policy)
         policy.close()
-        waiting.join(30)
+        waiting.join(PATIENCE_S)
         assert not waiting.is_alive()
         assert "closed from our side" in told[0]
-        eventually(lambda: not alive(pid), 30, "the end of ssh")
+        eventually(lambda: not alive(pid), "the end of ssh")
 
 
 def test_a_host_on_the_way_is_jumped_over(ssh_server: Begin, tmp_path: Path) -> None:
@@ -358,7 +358,7 @@ def test_a_host_on_the_way_is_jumped_over(ssh_server: Begin, tmp_path: Path) -> 
         assert len(gate.sessions()) == len(inner.sessions()) == 1
         jump = Path(f"/proc/{ssh_of(policy)}/task/{ssh_of(policy)}/children").read_text().split()
         policy.close()
-        eventually(lambda: not any(alive(int(pid)) for pid in jump), 30, "the end of the jump's ssh")
+        eventually(lambda: not any(alive(int(pid)) for pid in jump), "the end of the jump's ssh")
 
 
 # Whole stations, in lockstep.
@@ -398,7 +398,7 @@ def test_a_run_holds_naming_the_tunnel_that_broke_and_goes_on_when_it_is_up_agai
         policy = station.coordinator.inference.policy
         assert isinstance(policy, TunnelledPolicy)
         assert policy._keeper is not None
-        assert policy._keeper.wait(lambda now: now.up, 30).up
+        assert policy._keeper.wait(lambda now: now.up, PATIENCE_S).up
         answers = station.coordinator.inference.metrics.answers
         station.command("resume")
         station.until(lambda: station.coordinator.inference.metrics.answers > answers + 2, 20.0, "answers")

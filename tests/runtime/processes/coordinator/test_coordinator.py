@@ -9,6 +9,7 @@ from runtime.core.errors import SetupError
 from runtime.ipc.messages import UNHEARD, Command, EpisodeOpened, Event, encode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
+from tests.processes import PATIENCE_S
 from tests.runtime.lockstep_station import STANDS, Station, ramp, stubbed
 
 
@@ -47,7 +48,7 @@ def test_a_run_whose_chunks_all_come_too_late_is_ended_by_the_rule_of_starvation
     late = stubbed(tmp_path, lambda seen, number: ramp(seen.step, 2), delay=4, faults={"starvation": answer})
     station = Station(late).ready()
     station.command("run")
-    station.reach(state, 5.0)
+    station.reach(state, PATIENCE_S)
     assert "no usable chunk" in station.reason
     assert "all in the past" in station.events("chunk_dropped")[0]
     station.close()
@@ -63,7 +64,7 @@ def test_a_run_of_which_no_answer_can_be_used_is_ended_by_the_rule_of_errors(
     station = Station(stubbed(tmp_path, faults={"policy_error": answer, "starvation": "slow"})).ready()
     monkeypatch.setattr(station.coordinator.inference.requests, "note", lambda answered: [][0])
     station.command("run")
-    station.reach(state, 10.0)
+    station.reach(state, PATIENCE_S)
     assert "the policy's answer cannot be used: IndexError" in station.reason
     station.close()
 

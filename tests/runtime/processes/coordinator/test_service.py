@@ -19,6 +19,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
 from runtime.processes.coordinator.process import CommandService
 from tests import presses
+from tests.processes import PATIENCE_MS
 from tests.runtime.lockstep_station import Station, stubbed
 
 PATIENCE = 500  # turns
@@ -217,7 +218,7 @@ def test_whatever_is_wrong_with_a_press_at_the_wrong_socket_it_is_pressed(bench:
     for name, payload in presses.PACKED.items():
         shared.set_estop(EStop.CLEAR)
         client.send(payload)
-        assert bench.service._server.socket.poll(5000)
+        assert bench.service._server.socket.poll(PATIENCE_MS)
         bench.service.serve(0.0)
         assert (name, shared.estop) == (name, EStop.LATCHED)
         answer = decode(client.recv())

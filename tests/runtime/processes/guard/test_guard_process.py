@@ -14,6 +14,7 @@ from runtime.ipc.shared_state import EStop, SharedState, SharedStateLayout
 from runtime.processes.guard import process as guard_module
 from runtime.processes.guard.process import Desk, Guard
 from tests import presses
+from tests.processes import PATIENCE_MS
 
 LAYOUT = SharedStateLayout(dim=2, eef_dim=8, cameras=())
 PERIOD = 1 / 30
@@ -402,7 +403,7 @@ def test_a_press_in_a_later_frame_or_in_several_is_heard(door, shared, frames):
     client = door.client()
     client.send_multipart(frames)
     door.serve()
-    assert client.poll(2000)
+    assert client.poll(PATIENCE_MS)
     assert decode(client.recv_multipart()[-1]).status == "done"
     assert shared.estop is EStop.LATCHED
 

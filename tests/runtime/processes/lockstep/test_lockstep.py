@@ -21,6 +21,7 @@ from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.spaces.end_effectors import EndEffectors
 from runtime.station.checks import checked_spec
+from tests.processes import PATIENCE_S
 from tests.runtime.lockstep_station import DIM, MOVED, STANDS, Station, column, on_time, ramp, stubbed
 from tests.runtime.recording.samples import decoded, numbers
 
@@ -232,7 +233,7 @@ def test_a_policy_that_jumps_is_refused_and_held(tmp_path: Path) -> None:
 
 def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_path: Path) -> None:
     station = Station(stubbed(tmp_path, lambda o, n: ramp(o.step, 5), delay=7)).running(0)
-    station.reach(SessionState.HOLDING, 10.0)
+    station.reach(SessionState.HOLDING, PATIENCE_S)
     assert "no usable chunk" in station.reason
     assert len(station.events("chunk_dropped")) >= 2
     assert (station.robot.sent == STANDS.astype(np.float32)).all()
@@ -241,7 +242,7 @@ def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_p
 
 def test_of_a_policy_that_does_not_answer_it_is_said_since_when(tmp_path: Path) -> None:
     station = Station(stubbed(tmp_path, delay=300)).running(0)
-    station.reach(SessionState.HOLDING, 20.0)
+    station.reach(SessionState.HOLDING, PATIENCE_S)
     reason = r"no usable chunk for [\d.]+ s: the policy was asked [1-9][\d.]* s ago and has not answered yet"
     assert re.fullmatch(reason, station.reason), station.reason
     station.close()
@@ -384,7 +385,7 @@ def test_a_run_that_is_halted_before_it_began_begins_when_it_is_resumed(tmp_path
     assert station.state is SessionState.HOLDING
     assert station.policy.calls.count("reset") == 1
     station.command("resume")
-    station.reach(SessionState.READY, 5.0)
+    station.reach(SessionState.READY, PATIENCE_S)
     assert "1 s are over" in station.reason
     assert station.policy.calls.count("reset") == 2
     station.go(3)
@@ -586,7 +587,7 @@ def test_where_evidence_is_not_wanted_a_run_goes_on_without_its_recording(tmp_pa
 def test_a_run_whose_recording_was_lost_is_not_resumed(tmp_path: Path) -> None:
     station = Station(stubbed(tmp_path)).running(20)
     station.robot.picture = lambda number: np.zeros((24, 32, 3), np.uint8)  # another size from now on
-    station.reach(SessionState.HOLDING, 5.0)
+    station.reach(SessionState.HOLDING, PATIENCE_S)
     assert "must be uint8" in station.reason
     station.go(3)
     assert station.coordinator.runs.last_episode["status"] == "failed"

@@ -27,6 +27,7 @@ from runtime.processes.lockstep.server import ServedLockstep
 from runtime.processes.media.episode_closing import Close, in_background
 from runtime.processes.media.recorder import ClosedEpisode
 from runtime.recording.reader import Episode, open_episode
+from tests.processes import PATIENCE_S
 from tests.runtime.lockstep_station import STANDS, StubPolicy, StubRobot, Stubs, column, stubbed
 
 TURNS = 5000
@@ -126,7 +127,7 @@ class Client:
 
         def hanging(*given: Any) -> ActionChunk:
             asked.set()
-            gate.wait(60)
+            gate.wait(PATIENCE_S)
             return infer(*given)
 
         self.policy.infer = hanging  # type: ignore[method-assign]
@@ -249,7 +250,7 @@ def test_who_sets_up_while_a_recording_is_closed_finds_the_same_as_who_comes_lat
 
     def slowly(close: Close) -> Future[ClosedEpisode]:
         def waiting() -> ClosedEpisode:
-            gate.wait(60)
+            gate.wait(PATIENCE_S)
             return close()
 
         return in_background(waiting)

@@ -13,7 +13,7 @@ import zmq
 
 from runtime.core.types import Observation
 from runtime.processes.media.background import NICE, LowPriorityWorker
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 
 def numbered(sequence: int) -> Observation:
@@ -70,15 +70,15 @@ def test_what_comes_while_it_is_at_work_is_passed_over_but_for_the_newest(
     def work(observation: Observation) -> None:
         seen.append(observation.sequence)
         begun.set()
-        assert go_on.wait(30)
+        assert go_on.wait(PATIENCE_S)
 
     aside = LowPriorityWorker(wanting(work))
     aside(numbered(1))
-    assert begun.wait(30)
+    assert begun.wait(PATIENCE_S)
     for sequence in (2, 3, 4):
         aside(numbered(sequence))
     go_on.set()
-    eventually(lambda: seen == [1, 4], 30, "the newest is worked on")
+    eventually(lambda: seen == [1, 4], "the newest is worked on")
     aside.close()
     assert seen == [1, 4]
 
@@ -92,7 +92,7 @@ def test_its_thread_gives_way_and_its_process_does_not(wanting: Callable[..., Wa
 
     aside = LowPriorityWorker(wanting(work))
     aside(numbered(1))
-    eventually(lambda: bool(found), 30, "it is worked on")
+    eventually(lambda: bool(found), "it is worked on")
     aside.close()
     assert found == [min(19, own + NICE)]
     assert os.getpriority(os.PRIO_PROCESS, 0) == own
@@ -104,7 +104,7 @@ def test_a_failure_is_that_of_the_next_call(wanting: Callable[..., Wanted]) -> N
 
     aside = LowPriorityWorker(wanting(work))
     aside(numbered(1))
-    aside._thread.join(30)
+    aside._thread.join(PATIENCE_S)
     with pytest.raises(ValueError, match="no such picture"):
         aside(numbered(2))
     aside.close()
@@ -116,13 +116,13 @@ def test_what_nobody_wants_is_not_done_and_who_begins_to_want_it_gets_the_newest
     seen: list[int] = []
     work = wanting(lambda observation: seen.append(observation.sequence), False)
     aside = LowPriorityWorker(work)
-    eventually(lambda: not aside._wanted, 30, "it has found that nobody wants it")
+    eventually(lambda: not aside._wanted, "it has found that nobody wants it")
     aside(numbered(1))
     aside(numbered(2))
     work.say(b"yes")
-    eventually(lambda: seen == [2], 30, "the newest is worked on without another one")
+    eventually(lambda: seen == [2], "the newest is worked on without another one")
     work.say(b"no")
-    eventually(lambda: not aside._wanted, 30, "it has found that nobody wants it")
+    eventually(lambda: not aside._wanted, "it has found that nobody wants it")
     aside(numbered(3))
     aside.close()
     assert seen == [2]

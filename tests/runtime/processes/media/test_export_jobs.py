@@ -12,9 +12,8 @@ from runtime.processes.media import export_jobs as module
 from runtime.processes.media.export_jobs import Exports
 from runtime.recording.export import place
 from runtime.recording.files import read_document
+from tests.processes import PATIENCE_S
 from tests.runtime.recording.test_export import recorded
-
-PATIENCE_S = 60.0
 
 
 @pytest.fixture(scope="module")

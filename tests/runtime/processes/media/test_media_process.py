@@ -38,6 +38,7 @@ from runtime.recording.base import Outcome
 from runtime.recording.files import UnclosedError
 from runtime.recording.repair import Report
 from runtime.transports.base import Source
+from tests.processes import PATIENCE_S
 from tests.runtime.processes.media.test_recorder import FakeJournal
 
 RATE = 30.0
@@ -738,7 +739,7 @@ def test_a_thread_closes_while_the_caller_goes_on() -> None:
     end = desk.journal.end
 
     def waiting(outcome: Any) -> None:
-        assert let.wait(10)
+        assert let.wait(PATIENCE_S)
         end(outcome)
 
     desk.journal.end = waiting  # type: ignore[method-assign]

@@ -3,6 +3,7 @@ import logging
 import pytest
 
 from runtime.processes.supervisor.optional_child import LONGEST_S, OptionalChild
+from tests.processes import PATIENCE_S
 
 
 class Process:
@@ -38,7 +39,7 @@ def world():
 
 def test_who_lives_is_left_alone(world):
     for _ in range(5):
-        world.wait(100.0)
+        world.wait(PATIENCE_S)
     assert len(world.started) == 1
 
 
@@ -68,7 +69,7 @@ def test_who_has_lived_for_a_minute_is_soon_back(world):
     for _ in range(4):
         world.end()
         world.wait(LONGEST_S)
-    world.wait(61.0)
+    world.wait(PATIENCE_S)
     world.end()
     world.wait(1.0)
     assert len(world.started) == 6

@@ -65,7 +65,7 @@ class Peer:
             found.extend(one for one in self._readers[topic].take(100) if hasattr(one, "header"))
             return len(found) >= at_least
 
-        eventually(come, 10, f"{at_least} messages on {topic}")
+        eventually(come, f"{at_least} messages on {topic}")
         return found
 
     def matched(self, topic: str) -> None:
@@ -74,7 +74,7 @@ class Peer:
         count: Callable[[], int] = lambda: len(  # noqa: E731
             writer.get_matched_subscriptions() if writer is not None else reader.get_matched_publications()
         )
-        eventually(count, 10, f"a peer of {topic}")
+        eventually(count, f"a peer of {topic}")
 
     def close(self) -> None:
         for entity in reversed(self._entities):

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from tests.processes import PATIENCE_S
+
 _NODE = "test_peer"
 
 
@@ -51,7 +53,7 @@ class Peer:
     def _end(self) -> None:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.wait(20)
+        self._process.wait(PATIENCE_S)
         self._thread.join()
         self._process.stdout.close()
         if not self._process.stdin.closed:

@@ -77,7 +77,7 @@ class Inbox:
         self.threads.add(threading.get_ident())
 
     def until(self, count: int = 1) -> list[Any]:
-        eventually(lambda: len(self.payloads) >= count, 10, f"{count} messages")
+        eventually(lambda: len(self.payloads) >= count, f"{count} messages")
         return [cdr.decode("JointState", payload) for payload in self.payloads]
 
 
@@ -87,7 +87,7 @@ def test_a_best_effort_subscriber_hears_every_publisher(opened: Middleware, peer
     opened.subscribe(Topic("/arm/state", "JointState", SENSOR_QUALITY), inbox)
     writer = peer.writer("/arm/state", other.types.JointState, policy)
     peer.matched("/arm/state")
-    eventually(lambda: opened.matches()["/arm/state"].peers == 1, 10, "a match on our side")
+    eventually(lambda: opened.matches()["/arm/state"].peers == 1, "a match on our side")
     for mark in range(5):
         writer.write(joints(["a", "b"], [float(mark), 0.5], 12.25))
         inbox.until(mark + 1)
@@ -105,7 +105,7 @@ def test_a_reliable_publisher_is_heard_by_every_subscriber(
     publish = opened.advertise(Topic("/arm/command", "JointState", COMMAND_QUALITY))
     peer.reader("/arm/command", other.types.JointState, policy)
     peer.matched("/arm/command")
-    eventually(lambda: opened.matches()["/arm/command"].peers == 1, 10, "a match on our side")
+    eventually(lambda: opened.matches()["/arm/command"].peers == 1, "a match on our side")
     publish(cdr.encode(JointState(5_000_000_001, "", ("a", "b"), np.array([0.25, -1.5]))))
     heard = peer.heard("/arm/command")[0]
     assert (heard.header.stamp.sec, heard.header.stamp.nanosec) == (5, 1)
@@ -117,7 +117,7 @@ def test_a_pose_arrives_as_it_was_sent(opened: Middleware, peer: Peer) -> None:
     publish = opened.advertise(Topic("/arm/pose", "PoseStamped", COMMAND_QUALITY))
     peer.reader("/arm/pose", other.types.PoseStamped)
     peer.matched("/arm/pose")
-    eventually(lambda: opened.matches()["/arm/pose"].peers == 1, 10, "a match on our side")
+    eventually(lambda: opened.matches()["/arm/pose"].peers == 1, "a match on our side")
     publish(cdr.encode(PoseStamped(7, "base", np.array([1, 2, 3, 0, 0, 0.6, 0.8]))))
     pose = peer.heard("/arm/pose")[0]
     assert pose.header.frame_id == "base"
@@ -127,7 +127,7 @@ def test_a_pose_arrives_as_it_was_sent(opened: Middleware, peer: Peer) -> None:
 def test_a_publisher_whose_quality_does_not_suffice_is_named(opened: Middleware, peer: Peer) -> None:
     opened.subscribe(Topic("/arm/state", "JointState", RELIABLE_READER), Inbox())
     peer.writer("/arm/state", other.types.JointState, BEST_EFFORT)
-    eventually(lambda: opened.matches()["/arm/state"].refused, 10, "a refusal")
+    eventually(lambda: opened.matches()["/arm/state"].refused, "a refusal")
     match = opened.matches()["/arm/state"]
     assert (
         "a publisher of /arm/state is incompatible in its reliability: we subscribe to it with reliability = "
@@ -140,7 +140,7 @@ def test_a_subscriber_who_wants_more_than_is_offered_is_named(opened: Middleware
     best_effort = Quality(reliability="best_effort", depth=1)
     publish = opened.advertise(Topic("/arm/command", "JointState", best_effort))
     peer.reader("/arm/command", other.types.JointState, RELIABLE)
-    eventually(lambda: opened.matches()["/arm/command"].refused, 10, "a refusal")
+    eventually(lambda: opened.matches()["/arm/command"].refused, "a refusal")
     assert "a subscriber of /arm/command is incompatible in its reliability" in (
         opened.matches()["/arm/command"].refused
     )
@@ -151,7 +151,7 @@ def test_another_type_on_the_topic_is_named(opened: Middleware, peer: Peer) -> N
     opened.subscribe(Topic("/camera", "CompressedImage", SENSOR_QUALITY), Inbox())
     peer.writer("/camera", other.types.Image, BEST_EFFORT)
     sentence = "/camera is published as sensor_msgs/msg/Image; expected sensor_msgs/msg/CompressedImage"
-    eventually(lambda: opened.matches()["/camera"].refused == sentence, 10, sentence)
+    eventually(lambda: opened.matches()["/camera"].refused == sentence, sentence)
 
 
 def test_a_publisher_that_comes_back_is_heard_again(opened: Middleware, domain: int) -> None:
@@ -161,13 +161,13 @@ def test_a_publisher_that_comes_back_is_heard_again(opened: Middleware, domain: 
         with contextlib.closing(Peer(domain)) as peer:
             writer = peer.writer("/arm/state")
             peer.matched("/arm/state")
-            eventually(lambda: opened.matches()["/arm/state"].peers >= 1, 10, "a match on our side")
+            eventually(lambda: opened.matches()["/arm/state"].peers >= 1, "a match on our side")
 
             def came(writer: Any = writer, life: float = life) -> bool:
                 writer.write(joints(["a"], [life]))
                 return any(one.position[0] == life for one in inbox.until(0))
 
-            eventually(came, 10, f"life {life}")
+            eventually(came, f"life {life}")
 
 
 def test_nothing_is_delivered_once_it_is_closed(opened: Middleware, peer: Peer) -> None:
@@ -180,7 +180,7 @@ def test_nothing_is_delivered_once_it_is_closed(opened: Middleware, peer: Peer) 
     before = len(inbox.payloads)
     for _ in range(5):
         writer.write(joints(["a"], [1.0]))
-    eventually(lambda: not writer.get_matched_subscriptions(), 10, "the subscriber to be gone")
+    eventually(lambda: not writer.get_matched_subscriptions(), "the subscriber to be gone")
     assert len(inbox.payloads) == before
 
 
@@ -200,7 +200,7 @@ def test_what_fails_on_one_message_does_not_end_the_next(opened: Middleware, pee
         writer.write(joints(["a"], [1.0]))
         return len(heard) >= 3
 
-    eventually(said, 10, "further messages")
+    eventually(said, "further messages")
 
 
 def test_an_interface_that_is_not_there_is_named(domain: int) -> None:

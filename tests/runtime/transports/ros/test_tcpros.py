@@ -25,11 +25,10 @@ from runtime.transports.ros.messages import JointState, MessageName, PoseStamped
 from runtime.transports.ros.middleware import COMMAND_QUALITY, SENSOR_QUALITY, Topic
 from runtime.transports.ros.rospy_process import RospyProcess, Site, require
 from runtime.transports.ros.tcpros import TcpRosMiddleware
-from tests.processes import alive, eventually
+from tests.processes import PATIENCE_S, alive, eventually
 from tests.runtime.ros_master import PYTHON, RosMaster, master, needs_ros1
 from tests.runtime.transports.ros.ros1_peer import Peer
 
-PATIENCE = 30.0  # s, on a busy machine
 JOINTS, IMAGE, COMPRESSED = "sensor_msgs/JointState", "sensor_msgs/Image", "sensor_msgs/CompressedImage"
 
 
@@ -59,7 +58,7 @@ class Inbox:
         self.threads.add(threading.get_ident())
 
     def until(self, count: int = 1) -> list[Any]:
-        eventually(lambda: len(self.payloads) >= count, PATIENCE, f"{count} messages")
+        eventually(lambda: len(self.payloads) >= count, f"{count} messages")
         return [packed.decode(self.name, payload) for payload in self.payloads]
 
 
@@ -70,7 +69,7 @@ def heard(middleware: TcpRosMiddleware, topic: str, inbox: Inbox, kind: MessageN
 
 def matched(middleware: TcpRosMiddleware, topic: str) -> None:
     try:
-        eventually(lambda: middleware.matches()[topic].peers == 1, PATIENCE, f"a match on {topic}")
+        eventually(lambda: middleware.matches()[topic].peers == 1, f"a match on {topic}")
     except AssertionError as error:
         raise AssertionError(f"{error}: {middleware.matches()}") from error
 
@@ -119,7 +118,7 @@ def test_a_compressed_picture_comes_whole(opened: TcpRosMiddleware, peer: Peer) 
         peer.publish("/camera/compressed", COMPRESSED, format="jpeg", fill=3, size=40_000)
         return bool(inbox.payloads)
 
-    eventually(came, PATIENCE, "a picture")
+    eventually(came, "a picture")
     (image, *_) = inbox.until()
     assert (image.format, len(image.data), set(image.data.tolist())) == ("jpeg", 40_000, {3})
 
@@ -134,13 +133,13 @@ def test_commands_arrive_counted_and_as_they_were(opened: TcpRosMiddleware, peer
     matched(opened, "/arm/pose")
     for mark in range(3):
         publish(packed.encode(JointState(5_000_000_001, "", ("a", "b"), np.array([mark, -1.5]))))
-        eventually(lambda: len(peer.heard["/arm/command"]) > mark, PATIENCE, "the command")  # noqa: B023
+        eventually(lambda: len(peer.heard["/arm/command"]) > mark, "the command")  # noqa: B023
     first = peer.heard["/arm/command"][0]
     assert (first["stamp"], first["names"], first["position"]) == (5_000_000_001, ["a", "b"], [0.0, -1.5])
     assert first["velocity"] == []
     assert [one["seq"] for one in peer.heard["/arm/command"]] == [1, 2, 3]
     pose(packed.encode(PoseStamped(7, "base", np.array([1, 2, 3, 0, 0, 0.6, 0.8]))))
-    eventually(lambda: peer.heard["/arm/pose"], PATIENCE, "the pose")
+    eventually(lambda: peer.heard["/arm/pose"], "the pose")
     assert peer.heard["/arm/pose"][0]["frame"] == "base"
     assert peer.heard["/arm/pose"][0]["pose"] == [1, 2, 3, 0, 0, 0.6, 0.8]
 
@@ -150,13 +149,13 @@ def test_another_type_on_a_topic_is_named_both_ways(opened: TcpRosMiddleware, pe
     heard(opened, "/camera", Inbox(), "CompressedImage")
     peer.publish("/camera", IMAGE, fill=0, size=3)
     sentence = "/camera is published as sensor_msgs/Image by /test_peer; expected sensor_msgs/CompressedImage"
-    eventually(lambda: opened.matches()["/camera"].refused == sentence, PATIENCE, sentence)
+    eventually(lambda: opened.matches()["/camera"].refused == sentence, sentence)
     opened.advertise(Topic("/goal", "PoseStamped", COMMAND_QUALITY))
     peer.listen("/goal", JOINTS)
     sentence = (
         "/goal is subscribed to as sensor_msgs/JointState by /test_peer; expected geometry_msgs/PoseStamped"
     )
-    eventually(lambda: opened.matches()["/goal"].refused == sentence, PATIENCE, sentence)
+    eventually(lambda: opened.matches()["/goal"].refused == sentence, sentence)
     assert opened.matches()["/goal"].peers == 0
 
 
@@ -172,11 +171,11 @@ def test_a_publisher_that_was_killed_and_comes_back_is_heard_again(
             say(peer, "/lives/state", life)
             return any(one.position[0] == life for one in inbox.until(0))
 
-        eventually(came, PATIENCE, f"life {life}")
+        eventually(came, f"life {life}")
         peer.kill()
-        eventually(lambda: opened.matches()["/lives/state"].peers == 0, PATIENCE, "its end")
+        eventually(lambda: opened.matches()["/lives/state"].peers == 0, "its end")
     sentence = "/test_peer, which publishes /lives/state, is not to be reached at http://127.0.0.1:"
-    eventually(lambda: sentence in opened.matches()["/lives/state"].refused, PATIENCE, sentence)
+    eventually(lambda: sentence in opened.matches()["/lives/state"].refused, sentence)
 
 
 @needs_ros1
@@ -213,7 +212,7 @@ def test_what_fails_on_one_message_does_not_end_the_next(opened: TcpRosMiddlewar
         say(peer, "/stumble", 1.0)
         return len(heard) >= 3
 
-    eventually(said, PATIENCE, "further messages")
+    eventually(said, "further messages")
 
 
 @needs_ros1
@@ -229,7 +228,7 @@ def test_rospys_process_that_dies_is_started_again(
     first = opened.pid
     assert first is not None
     os.kill(first, signal.SIGKILL)
-    eventually(lambda: opened.pid not in (None, first), PATIENCE, "another process")
+    eventually(lambda: opened.pid not in (None, first), "another process")
     inbox.payloads.clear()
 
     def both() -> bool:
@@ -237,7 +236,7 @@ def test_rospys_process_that_dies_is_started_again(
         publish(packed.encode(JointState(1, "", ("again",), np.zeros(1))))
         return bool(inbox.payloads) and any("again" in one["names"] for one in peer.heard["/death/command"])
 
-    eventually(both, PATIENCE, "messages both ways")
+    eventually(both, "messages both ways")
     assert "the process of rospy has ended (-9); starting it again" in caplog.messages
 
 
@@ -265,11 +264,9 @@ def test_commands_that_waited_too_long_are_not_published(
         publish(packed.encode(JointState(1, "", ("new",), np.zeros(1))))
         return any("new" in one["names"] for one in peer.heard["/late/command"])
 
-    eventually(fresh, PATIENCE, "a command of now")
+    eventually(fresh, "a command of now")
     assert not [one for one in peer.heard["/late/command"] if "old" in one["names"]]
-    eventually(
-        lambda: any("too old to be published" in message for message in caplog.messages), PATIENCE, "a word"
-    )
+    eventually(lambda: any("too old to be published" in message for message in caplog.messages), "a word")
 
 
 @needs_ros1
@@ -288,9 +285,9 @@ def test_it_ends_with_the_process_that_it_works_for(ros_master: RosMaster) -> No
     pid = int(owner.stdout.readline())
     assert alive(pid)
     owner.kill()
-    owner.wait(20)
+    owner.wait(PATIENCE_S)
     owner.stdout.close()
-    eventually(lambda: not alive(pid), PATIENCE, "the end of its rospy")
+    eventually(lambda: not alive(pid), "the end of its rospy")
 
 
 @needs_ros1
@@ -306,20 +303,20 @@ def test_a_master_that_dies_and_comes_back_is_registered_with_again(
         say(peer, "/master/state", 0.0)
         matched(made, "/master/state")
         ros.kill()
-        eventually(lambda: any("goes on" in text for text in caplog.messages), PATIENCE, "the master's end")
+        eventually(lambda: any("goes on" in text for text in caplog.messages), "the master's end")
         inbox.payloads.clear()
         say(peer, "/master/state", 1.0)  # what is connected goes on
         assert inbox.until()[0].position[0] == 1.0
         first = made.pid
         ros.start()
-        eventually(lambda: made.pid not in (None, first), PATIENCE, "a new registration")
+        eventually(lambda: made.pid not in (None, first), "a new registration")
         later = held.enter_context(contextlib.closing(Peer(PYTHON, ros.environment)))
 
         def came() -> bool:
             say(later, "/master/state", 2.0)
             return any(one.position[0] == 2.0 for one in inbox.until(0))
 
-        eventually(came, PATIENCE, "a node of the new master")
+        eventually(came, "a node of the new master")
     said = f"the ROS master at {ros.uri} is another than before, and does not know us; starting rospy again"
     assert said in caplog.messages
 
@@ -345,7 +342,7 @@ def test_a_master_that_starts_later_is_waited_for_and_named_meanwhile(
     with contextlib.closing(TcpRosMiddleware(site(ros), "eva_test")) as made, contextlib.closing(ros):
         inbox = heard(made, "/later/state", Inbox())
         sentence = f"no ROS master is to be reached at {ros.uri}: "
-        eventually(lambda: sentence in made.matches()["/later/state"].refused, PATIENCE, sentence)
+        eventually(lambda: sentence in made.matches()["/later/state"].refused, sentence)
         ros.start()
         with contextlib.closing(Peer(PYTHON, ros.environment)) as peer:
 
@@ -353,7 +350,7 @@ def test_a_master_that_starts_later_is_waited_for_and_named_meanwhile(
                 say(peer, "/later/state", 1.0)
                 return bool(inbox.payloads)
 
-            eventually(came, PATIENCE, "a message")
+            eventually(came, "a message")
     said = [text for text in caplog.messages if "no ROS master" in text]
     assert len(said) == 1  # however often it was looked for
 

@@ -23,6 +23,7 @@ from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
 from runtime.processes.coordinator.inference.worker import LockstepRunner, Runner, ThreadRunner
 from runtime.spaces.conversion import ActionSpaces, CommandRows, Onset
 from runtime.strategies import overlap, rtc, sync
+from tests.processes import PATIENCE_S
 
 RATE = 30.0
 ASYNC = Strategy(overlap.query(overlap.Config()), overlap.Config())
@@ -50,7 +51,7 @@ class FakePolicy(Policy):
         self.seen.append(observation)
         self.conditionings.append(conditioning)
         self.reached.set()
-        self.open.wait(10)
+        self.open.wait(PATIENCE_S)
         self.answered.set()
         if isinstance(self.answer, Exception):
             raise self.answer
@@ -461,7 +462,7 @@ def test_a_slow_policy_in_its_thread_never_stops_the_caller() -> None:
     for _ in range(5):
         assert desk.inference.pump() is None
     desk.policy.open.set()
-    flight.result(10)
+    flight.result(PATIENCE_S)
     assert desk.inference.pump() is not None
     assert desk.policy.calls == ["reset", "infer"]
     desk.runner.close()
@@ -472,16 +473,16 @@ def test_an_answer_that_the_former_policy_gives_late_is_never_used() -> None:
     former, other = desk.policy, FakePolicy()
     former.open.clear()
     desk.inference.pump()
-    former.reached.wait(10)
+    former.reached.wait(PATIENCE_S)
     desk.inference.exchange(other, "place")
     connected = desk.runner.submit(other.connect)
     assert former.calls == ["reset", "infer", "close"]
     assert not desk.runner.ready(connected)  # never two: the last call of the former one is not over
     former.open.set()
-    connected.result(10)
+    connected.result(PATIENCE_S)
     desk.inference.begin(2, fresh=True)
     assert desk.inference.pump() is None
-    other.answered.wait(10)
+    other.answered.wait(PATIENCE_S)
     answer = None
     while answer is None:
         answer = desk.inference.pump()

@@ -7,6 +7,7 @@ import pytest
 
 from runtime.core.errors import PolicyError
 from runtime.processes.coordinator.inference.worker import DeclaredRunner, LockstepRunner, ThreadRunner
+from tests.processes import PATIENCE_S
 
 
 def test_lockstep_hands_every_result_over_the_same_number_of_ticks_later() -> None:
@@ -33,7 +34,7 @@ def test_a_thread_of_its_own_makes_one_call_after_the_other() -> None:
     gate, order = threading.Event(), []
 
     def slow() -> str:
-        gate.wait(10)
+        gate.wait(PATIENCE_S)
         order.append("slow")
         return threading.current_thread().name
 
@@ -42,8 +43,8 @@ def test_a_thread_of_its_own_makes_one_call_after_the_other() -> None:
     assert not runner.ready(first)
     assert not runner.ready(second)
     gate.set()
-    second.result(10)
-    assert first.result(10) != threading.current_thread().name
+    second.result(PATIENCE_S)
+    assert first.result(PATIENCE_S) != threading.current_thread().name
     assert order == ["slow", "quick"]
     assert runner.ready(first)
     runner.close()
@@ -53,20 +54,20 @@ def test_an_error_in_the_thread_is_told_as_a_policy_error() -> None:
     runner = ThreadRunner()
     future = runner.submit(lambda: 1 // 0)
     with pytest.raises(PolicyError, match="ZeroDivisionError"):
-        future.result(10)
+        future.result(PATIENCE_S)
     runner.close()
 
 
 def test_what_is_made_aside_waits_for_no_call_to_the_policy_and_makes_none_wait() -> None:
     runner = ThreadRunner()
     gate = threading.Event()
-    first = runner.submit(lambda: gate.wait(10))
-    assert runner.aside(lambda: 7).result(10) == 7
+    first = runner.submit(lambda: gate.wait(PATIENCE_S))
+    assert runner.aside(lambda: 7).result(PATIENCE_S) == 7
     gate.set()
-    assert first.result(10)
+    assert first.result(PATIENCE_S)
     never = threading.Event()
     runner.aside(never.wait)
-    assert runner.submit(lambda: 8).result(10) == 8
+    assert runner.submit(lambda: 8).result(PATIENCE_S) == 8
     assert not runner.busy
     never.set()
     runner.close()
@@ -75,7 +76,7 @@ def test_what_is_made_aside_waits_for_no_call_to_the_policy_and_makes_none_wait(
 def test_an_error_aside_is_its_own() -> None:
     for runner in (ThreadRunner(), LockstepRunner(0)):
         with pytest.raises(ZeroDivisionError):
-            runner.aside(lambda: 1 // 0).result(10)
+            runner.aside(lambda: 1 // 0).result(PATIENCE_S)
         runner.close()
 
 
@@ -87,11 +88,11 @@ def declaring(ticks: int) -> DeclaredRunner:
 def test_a_declared_delay_counts_from_the_question_whatever_the_call_took() -> None:
     runner = declaring(3)
     gate = threading.Event()
-    future = runner.submit(lambda: gate.wait(10))
+    future = runner.submit(lambda: gate.wait(PATIENCE_S))
     assert runner.busy
     assert runner.begin()  # being made: no time may pass now
     gate.set()
-    assert future.result(10) == "True"
+    assert future.result(PATIENCE_S) == "True"
     ready = []
     for _ in range(5):
         ready.append(runner.ready(future))
@@ -104,7 +105,7 @@ def test_what_is_declared_to_take_no_time_is_there_with_the_next_tick() -> None:
     runner = declaring(0)
     future = runner.submit(lambda: 1)
     runner.begin()
-    assert future.result(10) == "1"
+    assert future.result(PATIENCE_S) == "1"
     assert not runner.ready(future)
     runner.tick()
     assert runner.ready(future)
@@ -117,7 +118,7 @@ def test_no_call_is_made_before_time_stands_still() -> None:
     runner.tick()
     assert made == []
     runner.begin()
-    assert futures[-1].result(10) == "None"
+    assert futures[-1].result(PATIENCE_S) == "None"
     assert made == [0, 1, 2]
     runner.close()
 
@@ -130,9 +131,9 @@ def test_an_error_of_a_call_or_of_what_it_declares_is_handed_over_with_the_next_
     failing, odd = runner.submit(lambda: 1 // 0), runner.submit(lambda: 1)
     runner.begin()
     with pytest.raises(PolicyError, match="ZeroDivisionError"):
-        failing.result(10)
+        failing.result(PATIENCE_S)
     with pytest.raises(PolicyError, match="it says -1 ms"):
-        odd.result(10)
+        odd.result(PATIENCE_S)
     runner.tick()
     assert runner.ready(failing)
     assert runner.ready(odd)
