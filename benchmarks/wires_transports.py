@@ -114,9 +114,9 @@ def _staged(
 
 def _receiving(stage: Stage, wired: Wired, fast: bool) -> subprocess.Popen[str]:
     """The process that fills the page."""
-    given = Receiving(stage.robot, wired.transport, stage.shared, wired.cameras, fast)
+    given = Receiving(stage.robot, wired.transport, stage.page, wired.cameras, fast)
     command = [sys.executable, "-m", "benchmarks.wires_receiver", given.text()]
-    return stage.stack.enter_context(process(command, stage.shared))
+    return stage.stack.enter_context(process(command, stage.page))
 
 
 def _await(

@@ -1,8 +1,8 @@
 """Refuses waits with a number of their own: `python -m tests.lint.waits`, called by `make lint`.
 
-What a test waits for has PATIENCE_S (or PATIENCE_MS) of tests/processes.py, which a slow machine can lengthen. A shorter
-number is the length of a turn, or of a silence that is wanted; one that is longer decides whether a right product
-passes.
+What a test waits for has PATIENCE_S (or PATIENCE_MS) of tests/processes.py, which a slow machine can lengthen. A
+shorter number is the length of a turn, or of a silence that is wanted; one that is longer decides whether a right
+product passes.
 """
 
 from __future__ import annotations
