@@ -15,6 +15,7 @@ import pytest
 
 from runtime.core.environment import for_programs
 from tests.migrated import SHARED
+from tests.stalls import Stalls, Watch
 
 _LABS = (
     "tests/e2e/",
@@ -55,6 +56,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             raise pytest.UsageError(f"{item.nodeid} is both a story and a lab: neither command would make it")
         if item.nodeid.startswith(_LABS) and not story:
             item.add_marker("lab")
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Where whole labs are run, it is noticed when the machine stood still."""
+    if any(item.get_closest_marker("story") or item.get_closest_marker("lab") for item in session.items):
+        session.config.pluginmanager.register(Stalls(Watch()))
 
 
 def pytest_configure() -> None:
