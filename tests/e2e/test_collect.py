@@ -6,7 +6,7 @@ from contextlib import suppress
 import pytest
 
 from tests.e2e.bench_page import BenchPage
-from tests.e2e.conftest import SETS
+from tests.e2e.conftest import LOCKSTEP
 from tests.e2e.lab import STATION, TABLET, Demo
 from tests.processes import eventually
 
@@ -35,7 +35,7 @@ CollectSession.objects.create(
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    lab = Demo(tmp_path_factory.mktemp("collect"), "--collect", "--set=collection.max_age_s=2", *SETS).start()
+    lab = Demo(tmp_path_factory.mktemp("collect"), "--collect", *LOCKSTEP).start()
     yield lab
     assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
 

@@ -1,17 +1,20 @@
 """The Debug tab by hand, in every mode, with the real processes: what is pressed, what is said, what moves."""
 
 import math
-import os
-import signal
+import socket
 
 import pytest
 
 from tests.e2e.by_hand import ByHand
 from tests.e2e.lab import STATION, WIDE
-from tests.e2e.remote import SKILLED
 from tests.processes import eventually
 
 pytestmark = pytest.mark.slow
+MUTE = "mute-policy"
+_MUTE = f"""
+from evaweb.lab.seed import demo_checkpoint
+demo_checkpoint(name="{MUTE}", description="", policy={{{{"url": "ws://127.0.0.1:{{port}}"}}}})
+"""
 
 
 @pytest.fixture(scope="module")
@@ -36,19 +39,21 @@ def ready(bench):
 
 
 def test_the_set_up_shows_its_stages_and_can_be_cancelled_and_repeated(bench, patient):
-    policy = patient.pid(SKILLED)
-    os.kill(policy, signal.SIGSTOP)  # so that there is something to be cancelled
-    try:
+    with socket.create_server(("127.0.0.1", 0)) as mute:  # so that there is something to be cancelled
+        patient.python(_MUTE.format(port=mute.getsockname()[1]))
+        bench.page.reload()
+        bench.at_rest()
+        bench.take_again()
+        bench.page.select_option("#checkpoint", label=MUTE)
         bench.keys("u")
         active = bench.page.locator("[data-stages] [data-state=active]")
         active.first.wait_for()
         assert bench.page.locator("[data-stages] li").count() >= 4
         bench.keys("s")
         bench.reaches("IDLE")
-    finally:
-        os.kill(policy, signal.SIGCONT)
     assert "cancelled" in bench.snapshot()["reason"]
     bench.answered("setup")  # the station may have begun, and ended, before the page hears that it was asked
+    bench.page.select_option("#checkpoint", "")
     bench.keys("u")
     bench.reaches("READY")
     bench.quiet("[data-stages]")

@@ -6,7 +6,7 @@ import pytest
 
 from runtime.ipc.estop_latch import Latch
 from tests.e2e.bench_page import BenchPage
-from tests.e2e.conftest import SETS
+from tests.e2e.conftest import LOCKSTEP
 from tests.e2e.lab import STATION, WIDE, Demo
 from tests.e2e.test_faults import suspended
 from tests.e2e.tls_proxy import NAME, https
@@ -20,7 +20,7 @@ AREA = "#estop-area"
 def lab(tmp_path_factory):
     folder = tmp_path_factory.mktemp("https")
     behind = {"EVA_HTTPS": "1", "EVA_PROXIES": "127.0.0.1", "EVA_ALLOWED_HOSTS": f"{NAME},127.0.0.1"}
-    demo = Demo(folder, *SETS, **behind).start()
+    demo = Demo(folder, *LOCKSTEP, **behind).start()
     ports = json.loads((demo.data / "stops.json").read_text())
     with https(folder, ports["web_port"], ports["port"]) as demo.url:
         yield demo
