@@ -56,6 +56,7 @@ def nobody_reads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         pipe.write("goes nowhere, and ends nothing")
 
 
+@pytest.mark.lab
 @pytest.mark.parametrize("program", sorted(set(programs()) - NOT_OF_A_TERMINAL))
 def test_the_help_of_every_program_may_be_read_in_part(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
     module = importlib.import_module(program)

@@ -480,7 +480,7 @@ def test_that_something_has_to_be_compiled_is_said_before(
     assert "compiling the kinematics for this processor, once" in caplog.text
 
 
-@pytest.mark.slow
+@pytest.mark.lab
 def test_what_is_kept_on_disk_and_broken_is_compiled_again(tmp_path: Path) -> None:
     code = (
         "import logging, robots; logging.basicConfig(level='INFO'); from runtime.kinematics import compiled; "
