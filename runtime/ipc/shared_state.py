@@ -8,7 +8,8 @@ from __future__ import annotations
 import functools
 import mmap
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -21,6 +22,7 @@ from runtime.ipc.bells import Bell
 from runtime.ipc.shared_memory import Record, Ring, aligned
 
 _FOR_SECONDS = Pattern("shared.for_seconds", "for {seconds:.1f} s")
+_FOR_SECONDS_WHILE = Pattern("shared.for_seconds_while", "for {seconds:.1f} s, while {stage}")
 _SINCE_RESTART = fixed("shared.since_restart", "since it was restarted")
 _JOINTS_NOT_SEEN = fixed("shared.joints_not_seen", "control has not seen the joints for long enough yet")
 
@@ -46,6 +48,22 @@ WOKEN = {
 }
 DOUBT_BYTES = 200
 PROCESSES = ("control", "coordinator", "reception", "media", "guard")
+
+
+class RecorderStage(IntEnum):
+    """What the recorder is at, for whoever wonders why it is silent."""
+
+    WAITING = 0
+    OPENING = 1
+    WRITING = 2
+    CLOSING = 3
+
+
+_STAGES = {
+    RecorderStage.OPENING: fixed("shared.opening_an_episode", "opening an episode"),
+    RecorderStage.WRITING: fixed("shared.writing_an_episode", "writing an episode"),
+    RecorderStage.CLOSING: fixed("shared.closing_an_episode", "closing an episode"),
+}
 
 
 class EStop(IntEnum):
@@ -150,6 +168,7 @@ class SharedState:
         self._generations = {
             name: memory.word(shared, _LINE * index + 8) for index, name in enumerate(PROCESSES)
         }
+        self._stage = memory.word(shared, _LINE * PROCESSES.index("media") + 16)
         self._estop = offset
         self._release = memory.word(shared, offset + 8)
         self._unrecorded = memory.word(shared, offset + 16)
@@ -216,7 +235,22 @@ class SharedState:
     def silence(self, process: str, now: float) -> str:
         """For how long `process` has given no sign of life at `now`, as a sentence ends with it."""
         beat = self.last_beat(process)
-        return _FOR_SECONDS(seconds=now - beat) if beat else _SINCE_RESTART
+        if not beat:
+            return _SINCE_RESTART
+        stage = _STAGES.get(RecorderStage(self._stage[0])) if process == "media" else None
+        if stage is None:
+            return _FOR_SECONDS(seconds=now - beat)
+        return _FOR_SECONDS_WHILE(seconds=now - beat, stage=stage)
+
+    @contextmanager
+    def recorder_stage(self, stage: RecorderStage) -> Iterator[None]:
+        """What the recorder is at meanwhile; written by media alone."""
+        before = self._stage[0]
+        self._stage[0] = stage
+        try:
+            yield
+        finally:
+            self._stage[0] = before
 
     def generation(self, process: str) -> int:
         """Number of starts of `process` by the supervisor; a change means that it died and was restarted."""

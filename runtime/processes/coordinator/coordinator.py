@@ -113,7 +113,7 @@ class Coordinator:
             self.observe(*noticed)
         if missed := self.collecting.look(self.session.state):
             self.observe(*missed)
-        for event in self.timing.look(self.clock.now()):
+        for event in (*self.health.look_at_recorder(self.session.state), *self.timing.look(self.clock.now())):
             self.say(event)
         self.runs.pump()
         self._advance_setup()

@@ -11,7 +11,7 @@ from runtime.cameras.complaints import complaints
 from runtime.core.clock import Clock
 from runtime.core.sentences import Pattern, fixed, series
 from runtime.ipc.estop_latch import Latch
-from runtime.ipc.messages import ReceptionReport
+from runtime.ipc.messages import Event, ReceptionReport
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop, SharedState
 from runtime.processes.coordinator.lease import Lease
@@ -21,6 +21,11 @@ from runtime.station.spec import StationSpec
 
 _RESTARTED = Pattern("health.restarted", "the process {process} died and was restarted: set up again")
 _SILENT = Pattern("health.silent", "no sign of life from the process {process} {since}")
+_RECORDING_LATE = Pattern(
+    "health.recording_late",
+    "the recorder has given no sign of life {since}: is the disk slow? the robot is held after {seconds:g} s",
+)
+_RECORDING_GOES_ON = fixed("health.recording_goes_on", "the recorder goes on")
 _ESTOPPED = Pattern("health.estopped", "e-stop {pressed}: make safe, then release")
 _NO_PICTURE = Pattern("health.no_picture", "no picture has arrived from {cameras}")
 _PRESSED_BY = Pattern("health.pressed_by", "by {who}: {why}")
@@ -83,6 +88,7 @@ class HealthMonitor:
         self._generations = {name: shared.generation(name) for name in SIBLINGS}
         self._lease_held = False
         self._unattended = False  # a run goes on though its holder is lost
+        self._recording_late = False
         self.estop = ""  # who pressed and why, while it is latched
         self._pressed: float | None = None  # when the flag was seen without its latch
 
@@ -99,6 +105,18 @@ class HealthMonitor:
         """A sibling that gives no sign of life, "" where all do: what it is sent would be lost."""
         now, within = self._clock.now(), self._plan.deployment.heartbeat_timeout_s
         return next((name for name in SIBLINGS if not self._page.alive(name, now, within(name))), "")
+
+    def look_at_recorder(self, state: SessionState) -> Iterator[Event]:
+        """Events of a recorder that is silent in a run, before that is held, and of one that goes on."""
+        now, settings = self._clock.now(), self._plan.deployment
+        late = not self._page.alive("media", now, settings.control.heartbeat_timeout_s)
+        if late and not self._recording_late and state is SessionState.RUNNING:
+            since, limit = self._page.silence("media", now), settings.heartbeat_timeout_s("media")
+            yield Event("recording_late", _RECORDING_LATE(since=since, seconds=limit), now)
+            self._recording_late = True
+        elif self._recording_late and not late:
+            yield Event("recording_goes_on", _RECORDING_GOES_ON, now)
+            self._recording_late = False
 
     def missing_cameras(self) -> list[str]:
         """Cameras that have not sent a picture yet."""

@@ -36,7 +36,7 @@ from runtime.ipc.messages import (
 )
 from runtime.ipc.observation_messages import as_observation
 from runtime.ipc.shared_memory import TornReadError
-from runtime.ipc.shared_state import SharedState
+from runtime.ipc.shared_state import RecorderStage, SharedState
 from runtime.kinematics.forward import ChainForward
 from runtime.processes.child import join
 from runtime.processes.media.background import LowPriorityWorker
@@ -133,9 +133,10 @@ class Media:
         if died and self._waiting is not None and self._waiting.generation == self._generation:
             self._waiting = None
         self.collect()
-        self._drain("observations")
-        self._drain("minutes")
-        self._drain("ticks")
+        with self._page.recorder_stage(RecorderStage.WRITING if self.recording else RecorderStage.WAITING):
+            self._drain("observations")
+            self._drain("minutes")
+            self._drain("ticks")
         if died:
             self._leave_the_dead()
         for event in self._recorder.news():
@@ -222,7 +223,8 @@ class Media:
         self._page.set_unrecorded(False)  # before anybody hears that it has begun
         opened = EpisodeOpened(message.run, "", "")
         if message.manifest is not None:
-            opened = self._open(message.run, message.manifest)
+            with self._page.recorder_stage(RecorderStage.OPENING):
+                opened = self._open(message.run, message.manifest)
         if opened.error or not message.run:
             self._tell(opened)
         else:
@@ -257,7 +259,8 @@ class Media:
         """Close the open episode, if there is one; the coordinator is told when that is done."""
         if self._recorder.recording:
             self._closing_uuid = self._recorder.recording
-            self._closing = self._closer(self._recorder.end(status, reason, details or {}))  # type: ignore[arg-type]
+            with self._page.recorder_stage(RecorderStage.CLOSING):
+                self._closing = self._closer(self._recorder.end(status, reason, details or {}))  # type: ignore[arg-type]
             self.collect()
 
     def finish(self, seconds: float) -> None:

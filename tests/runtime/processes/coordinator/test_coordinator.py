@@ -8,7 +8,7 @@ import pytest
 from runtime.core.errors import SetupError
 from runtime.ipc.messages import UNHEARD, Command, EpisodeOpened, Event, encode
 from runtime.ipc.session_state import SessionState
-from runtime.ipc.shared_state import EStop
+from runtime.ipc.shared_state import EStop, RecorderStage
 from tests.processes import PATIENCE_S
 from tests.runtime.lockstep_station import STANDS, Station, ramp, stubbed
 
@@ -35,6 +35,21 @@ def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(
     station.command("resume")
     station.go(5)
     assert station.state is SessionState.RUNNING
+    station.close()
+
+
+def test_a_recorder_that_is_late_is_told_once_with_what_it_is_at_and_so_is_that_it_goes_on(
+    tmp_path: Path,
+) -> None:
+    station = Station(stubbed(tmp_path)).running(10)
+    with station.shared.recorder_stage(RecorderStage.CLOSING):
+        without(station, "media", 3.0)
+    station.go(2)
+    assert station.state is SessionState.RUNNING
+    (late,) = station.events("recording_late")
+    assert "for 1.0 s, while closing an episode" in late
+    assert "held after 5 s" in late
+    assert len(station.events("recording_goes_on")) == 1
     station.close()
 
 
