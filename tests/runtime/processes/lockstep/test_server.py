@@ -36,10 +36,13 @@ TURNS = 5000
 class Client:
     """A station and who commands it, turn by turn in one thread; `people` is the time that they have."""
 
-    def __init__(self, made: Stubs, over: Callable[[bool], str] = lambda running: "") -> None:
+    def __init__(
+        self, made: Stubs, over: Callable[[bool], str] = lambda running: "", paced: bool = False
+    ) -> None:
         made.built.clear()
         self.people = VirtualClock(100.0)
-        self.station = ServedLockstep(made.spec, VirtualClock(), over, self.people, made.peers)
+        self._waits = 1.0 / made.spec.rate if paced else 0.0
+        self.station = ServedLockstep(made.spec, VirtualClock(), over, self.people, made.peers, paced)
         self.station.connect()
         self.robot: StubRobot = made.built["robot"]
         self.policy: StubPolicy = made.built["policy"]
@@ -98,6 +101,7 @@ class Client:
         for _ in range(TURNS):
             if self.state in states:
                 return
+            self.people.advance(self._waits)
             self.station.turn()
         raise AssertionError(f"never {states}; {self.state}: {self.reason}")
 
@@ -110,6 +114,7 @@ class Client:
         self.accepted("run")
         begun = self.station.step
         while self.station.step < begun + ticks:
+            self.people.advance(self._waits)
             self.station.turn()
         return self
 
@@ -395,3 +400,13 @@ def test_when_it_ends_its_episode_is_closed_and_nothing_is_found_of_it(made: Stu
         Endpoints(made.spec.deployment.station_dir).read("coordinator")
     assert client.robot.sent[-1] == pytest.approx(STANDS, abs=0.2)
     Client(made).close()
+
+
+def test_a_paced_station_is_no_faster_than_life_whatever_it_does(tmp_path: Path) -> None:
+    client = Client(stubbed(tmp_path), paced=True)
+    period = 1.0 / client.station.spec.rate
+    for begin in (lambda: None, client.ready, client.running):
+        begin()
+        assert client.turn(50) <= 1
+        assert 45 <= client.turn(50, period) <= 50  # time stands still while the policy is asked
+    client.close()
