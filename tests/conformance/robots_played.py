@@ -26,6 +26,7 @@ from runtime.transports.ros import cdr, packed
 from runtime.transports.ros.messages import Image, JointState, Message
 from runtime.transports.ros.middleware import SENSOR_QUALITY, Middleware, Publish, Topic
 from runtime.transports.ros.topics import GroupTopics, Topics
+from tests.processes import PATIENCE_S
 from tests.runtime.ros_master import PYTHON, absent
 
 ROBOT = robots.load("ur5e")
@@ -147,7 +148,7 @@ class ZmqPlayed(Played):
 def _published(endpoint: str) -> tuple[zmq.Socket[bytes], str]:
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PUB)
     socket.setsockopt(zmq.SNDHWM, 8)  # what it hoards itself is not what is looked for
-    until = time.monotonic() + 10
+    until = time.monotonic() + PATIENCE_S
     while True:
         try:
             socket.bind(endpoint)

@@ -16,6 +16,7 @@ from tests.lint.waits import waits
         "subprocess.run([], timeout=60)",
         "SOON = 20\nthread.join(SOON)",
         "pytestmark = pytest.mark.timeout(300)",
+        "deadline = time.monotonic() + 10",
     ],
 )
 def test_a_wait_with_a_number_of_its_own_is_refused(line: str) -> None:

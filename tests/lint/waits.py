@@ -48,6 +48,10 @@ def waits(tree: ast.Module) -> Iterator[tuple[int, str]]:
         if isinstance(target, ast.Name)
     }
     for node in ast.walk(tree):
+        if isinstance(node, ast.BinOp) and ast.unparse(node.left) == "time.monotonic()":
+            number = node.right.value if isinstance(node.right, ast.Constant) else 0.0
+            if isinstance(node.op, ast.Add) and isinstance(number, (int, float)) and number > LONGEST_S:
+                yield node.lineno, f"a deadline of {number:g} s; allowed: PATIENCE_S"
         if not isinstance(node, ast.Call):
             continue
         name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")

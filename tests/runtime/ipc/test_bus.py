@@ -21,7 +21,7 @@ from runtime.ipc.bus import (
     Subscriber,
 )
 from runtime.ipc.messages import Ack, Command, Event, decode, encode
-from tests.processes import PATIENCE_MS, eventually
+from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
 
 PACE_S = 0.002  # between bursts: ZMQ looks only once a millisecond at what a reader has taken
 
@@ -380,7 +380,7 @@ def test_endpoints_that_the_disk_refuses_are_said_and_come_when_it_takes_them(tm
     with pytest.raises(TransportError):
         endpoints.read("media")
     refusing["full"] = False
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE_S
     while not list(tmp_path.glob("bench-1/endpoints/*.json")):
         assert time.monotonic() < deadline
     assert endpoints.read("media")["cameras"] == "tcp://127.0.0.1:2"

@@ -28,7 +28,7 @@ from runtime.policies.gr00t import Config, Gr00tPolicy
 from runtime.policies.groot import arrays
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 ROBOT = robots.load("agilex_piper")
 PARTS = {group.name: list(range(group.slice.start, group.slice.stop)) for group in ROBOT.groups}
@@ -313,7 +313,7 @@ def vacant(url: str) -> Iterator[None]:
     """Nobody listens there, and nobody else's server comes to: the port is taken and mute."""
     with socket.socket() as taken:
         taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + PATIENCE_S
         while True:
             try:
                 taken.bind(("127.0.0.1", int(url.rpartition(":")[2])))

@@ -23,6 +23,7 @@ from runtime.core.errors import PolicyLostError
 from runtime.core.plugins import variants
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.station.checks import checked_spec
+from tests.processes import PATIENCE_S
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 
 ROOT = Path(__file__).parents[3]
@@ -71,7 +72,7 @@ def test_the_servers_thirty_lines_are_a_policy() -> None:
     layout = {"policy": {"kind": "openpi", "url": f"ws://127.0.0.1:{port}"}}
     policy, robot = built(layout)
     with shown_server(port), contextlib.closing(policy):
-        until = time.monotonic() + 30.0
+        until = time.monotonic() + PATIENCE_S
         while True:
             try:
                 info = policy.connect()

@@ -20,7 +20,7 @@ def test_an_encoder_thread_writes_what_it_was_given(tmp_path: Path) -> None:
     assert all(encoder.put(numbered(k)) for k in range(20))
     assert not encoder.put(None)
     encoder.finish()
-    assert encoder.drain(time.monotonic() + 60)
+    assert encoder.drain(time.monotonic() + PATIENCE_S)
     encoder.file.close()
     assert encoder.failure is None
     assert encoder.frames == 21
@@ -42,7 +42,7 @@ def test_a_failing_encoder_names_its_camera_and_keeps_what_it_had(
     for k in range(30):
         encoder.put(numbered(k))
     encoder.finish()
-    assert encoder.drain(time.monotonic() + 60)
+    assert encoder.drain(time.monotonic() + PATIENCE_S)
     encoder.file.close()
     assert "camera front" in str(encoder.failure)
     assert "no more colours" in str(encoder.failure)
@@ -61,7 +61,7 @@ def test_the_way_of_each_picture_to_the_muxer_is_measured_and_repeats_do_not_cou
         encoder.put(numbered(k), PATIENCE_S, captured=begun - 10.0)
     encoder.put(None)
     encoder.finish()
-    assert encoder.drain(time.monotonic() + 30.0)
+    assert encoder.drain(time.monotonic() + PATIENCE_S)
     taken = encoder.muxed_ms
     encoder.file.close()
     assert taken is not None
@@ -73,7 +73,7 @@ def test_pictures_whose_capture_is_unknown_give_no_such_figure(tmp_path: Path) -
     encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, SETTINGS)
     encoder.put(numbered(1), PATIENCE_S)
     encoder.finish()
-    assert encoder.drain(time.monotonic() + 30.0)
+    assert encoder.drain(time.monotonic() + PATIENCE_S)
     assert encoder.muxed_ms is None
     encoder.file.close()
 
@@ -114,7 +114,7 @@ def test_one_that_is_too_far_behind_is_given_up_and_keeps_what_it_had(
     assert not encoder.put(numbered(0))
     held.free.set()
     encoder.finish()
-    assert encoder.drain(time.monotonic() + 60)
+    assert encoder.drain(time.monotonic() + PATIENCE_S)
     encoder.file.close()
     assert numbers(tmp_path / "a.mp4") == [0, 1, 2, 3]
 
@@ -124,7 +124,7 @@ def test_a_patient_caller_is_never_too_far_ahead(tmp_path: Path) -> None:
     encoder = CameraEncoder("front", tmp_path / "a.mp4", SIZE, 30.0, settings)
     assert all(encoder.put(numbered(k), PATIENCE_S) for k in range(100))
     encoder.finish()
-    assert encoder.drain(time.monotonic() + 60)
+    assert encoder.drain(time.monotonic() + PATIENCE_S)
     encoder.file.close()
     assert encoder.failure is None
     assert numbers(tmp_path / "a.mp4") == list(range(100))
@@ -139,6 +139,6 @@ def test_what_waits_together_is_coded_as_a_run(tmp_path: Path, monkeypatch: pyte
     encoder.put(numbered(8))
     held.free.set()
     encoder.finish()
-    assert encoder.drain(time.monotonic() + 60)
+    assert encoder.drain(time.monotonic() + PATIENCE_S)
     encoder.file.close()
     assert numbers(tmp_path / "a.mp4") == [7] * 101 + [8]

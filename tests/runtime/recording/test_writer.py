@@ -11,6 +11,7 @@ from runtime.recording.reader import read_events
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.tables import SCHEMAS, TableWriter, read_table
 from runtime.recording.writer import DiskWriter, Faults
+from tests.processes import PATIENCE_S
 
 from .samples import SETTINGS, manifest, tick
 
@@ -19,7 +20,7 @@ NEVER = RecordingSettings(min_free_bytes=0, flush_period_s=1.0)
 
 
 def soon() -> float:
-    return time.monotonic() + 60.0
+    return time.monotonic() + PATIENCE_S
 
 
 def steps(folder: Path) -> list[int]:

@@ -9,6 +9,7 @@ import zmq
 
 from runtime.core.errors import SetupError
 from runtime.sim.sockets import Sockets
+from tests.processes import PATIENCE_S
 
 FREE = "tcp://127.0.0.1:0"
 
@@ -31,7 +32,7 @@ def peer(kind: int, address: str) -> zmq.Socket[bytes]:
 def test_commands_come_in_order_and_all_that_have_come(sockets: Sockets) -> None:
     assert sockets.received() == []
     with closing(peer(zmq.PUB, sockets.addresses["action_endpoint"])) as commands:
-        deadline, heard = time.monotonic() + 10, []
+        deadline, heard = time.monotonic() + PATIENCE_S, []
         while not heard and time.monotonic() < deadline:
             commands.send(b"hello")
             time.sleep(0.005)  # a queue that is full of greetings would drop what comes after them
@@ -46,7 +47,7 @@ def test_commands_come_in_order_and_all_that_have_come(sockets: Sockets) -> None
 def test_an_observation_reaches_who_listens_and_without_anybody_is_dropped(sockets: Sockets) -> None:
     sockets.publish(b"nobody")
     with closing(peer(zmq.SUB, sockets.addresses["obs_endpoint"])) as listener:
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + PATIENCE_S
         while not listener.poll(10) and time.monotonic() < deadline:
             sockets.publish(b"frame")
         assert listener.recv() == b"frame"
