@@ -15,13 +15,14 @@ from django.test import TransactionTestCase
 from pytest_django import DjangoDbBlocker
 
 from evaweb.errors import NotFound
-from evaweb.stations import commands
+from evaweb.stations import commands, stops
 from evaweb.stations.models import Command, Station
 from evaweb.trials import selectors as trial_selectors
 from tests import migrated
 from tests.evaweb.as_migrated import CHECK, AsMigrated
 from tests.evaweb.stand_in import StandIn
 from tests.evaweb.trials import builders
+from tests.processes import PATIENCE_S
 
 
 @pytest.fixture(autouse=True)
@@ -38,6 +39,12 @@ def _noted_in_the_tests_own_thread(monkeypatch: pytest.MonkeyPatch) -> None:
             note(row)
 
     monkeypatch.setattr(commands.notes, "note", here)
+
+
+@pytest.fixture(autouse=True)
+def _estops_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As long as EVA_COMMAND_TIMEOUT_S says: a press that a slow machine answers late is no press without answer."""
+    monkeypatch.setattr(stops, "_ESTOP_S", PATIENCE_S)
 
 
 @pytest.fixture(autouse=True)

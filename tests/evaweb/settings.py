@@ -13,12 +13,11 @@ else:
 os.environ.setdefault("EVA_SECRET_KEY", "for tests alone")
 
 from evaweb.settings import *
+from tests.processes import PATIENCE_S
+
+EVA_COMMAND_TIMEOUT_S = PATIENCE_S  # a test of what comes too late, or never, gives its own
 
 PASSWORD_HASHERS = ["django.contrib.auth.hashers.MD5PasswordHasher"]
-
-WHITENOISE_AUTOREFRESH = (
-    True  # looks for a file when it is asked for: each test's client would list all of them
-)
 
 if DATABASES["default"]["ENGINE"].endswith("sqlite3"):
     # A file, as in a lab: threads that share a database in memory never wait for each other's locks.

@@ -47,7 +47,7 @@ class StandIn:
     """A station `name` whose folder is below `data`; `mute` says nothing at all; commands of the kinds in `swallows`
     never arrive."""
 
-    def __init__(self, data: Path, name: str, ttl: float = 5.0) -> None:
+    def __init__(self, data: Path, name: str, ttl: float = 10 * PATIENCE_S) -> None:
         self.name = name
         self.ttl = ttl
         self.mute = False

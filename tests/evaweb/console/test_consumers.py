@@ -233,7 +233,7 @@ def test_a_lease_is_renewed_and_a_restarted_web_goes_on_with_it(live, ann, runti
     run(scenario())
 
 
-def test_a_lease_that_is_lost_or_somebody_elses_is_not_renewed(live, ann, bob, runtime):
+def test_a_lease_that_is_lost_or_somebody_elses_is_not_renewed(live, ann, bob, runtime, settings):
     lease = leases.claim(user=ann, station=live, page="p1")
 
     async def scenario():
@@ -245,6 +245,7 @@ def test_a_lease_that_is_lost_or_somebody_elses_is_not_renewed(live, ann, bob, r
         await thief.close()
         page = await Page(live.name, ann).open()
         runtime.swallows.add("lease_renew")
+        settings.EVA_COMMAND_TIMEOUT_S = 0.5
         await page.say(type="renew", epoch=lease.epoch)
         answer = await page.told("renewed")
         assert (answer["ok"], answer["lost"]) == (False, False)
@@ -317,7 +318,9 @@ def test_an_estop_is_pressed_although_the_page_is_closed_at_once(live, vera, run
     assert [command.args["why"] for command in runtime.pressed] == ["closing"]
 
 
-def test_the_estop_waits_neither_for_the_database_nor_for_a_renewal(live, ann, runtime, monkeypatch):
+def test_the_estop_waits_neither_for_the_database_nor_for_a_renewal(
+    live, ann, runtime, monkeypatch, settings
+):
     order = []
     lease = leases.claim(user=ann, station=live, page="p1")
     noted = commands.estop_noted
@@ -331,6 +334,7 @@ def test_the_estop_waits_neither_for_the_database_nor_for_a_renewal(live, ann, r
     async def scenario():
         page = await Page(live.name, ann).open()
         runtime.swallows.add("lease_renew")
+        settings.EVA_COMMAND_TIMEOUT_S = 2.0
         await page.say(type="renew", epoch=lease.epoch)  # hangs until its deadline
         await page.say(type="estop", uuid=str(uuid4()), why="smoke")
         first = await page.told("ack")
@@ -345,7 +349,7 @@ def test_the_estop_waits_neither_for_the_database_nor_for_a_renewal(live, ann, r
 
 
 def test_the_estop_does_not_queue_behind_stops_that_hang(live, ann, runtime, settings):
-    settings.EVA_COMMAND_TIMEOUT_S = 0.5
+    settings.EVA_COMMAND_TIMEOUT_S = 3.0  # which a hundred stops hang, and the e-stop does not
     runtime.swallows = {"stop"}
 
     async def scenario():
@@ -625,9 +629,10 @@ def test_a_viewer_aims_at_nothing(live, vera, runtime):
     assert runtime.aims == []
 
 
-def test_an_aim_that_hangs_keeps_no_stop_and_no_command_waiting(live, ann, runtime):
+def test_an_aim_that_hangs_keeps_no_stop_and_no_command_waiting(live, ann, runtime, settings):
     lease = leases.claim(user=ann, station=live, page="p1")
     runtime.swallows.add("aim")
+    settings.EVA_COMMAND_TIMEOUT_S = 2.0
     runtime.ready()
     runtime.do(lambda: runtime.session._enter(SessionState.RUNNING, ""))
 
@@ -673,12 +678,13 @@ def test_the_chunk_and_every_sample_of_the_joints_are_shown(live, ann, runtime):
 
 
 def test_a_flood_of_presses_at_a_dead_station_is_two_and_another_station_is_stopped_meanwhile(
-    ann, vera, make_stand_in
+    ann, vera, make_stand_in, settings
 ):
     dead, alive = make_stand_in(), make_stand_in()
     for one in (dead, alive):
         Station.objects.create(name=one.name, robot="agilex_piper")
     dead.mute = True
+    settings.EVA_COMMAND_TIMEOUT_S = 3.0
     presses = []
     urgent = StationWire.urgent
 

@@ -15,13 +15,9 @@ from evaweb.stations.commands import NotSent, issue, settle
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.stops import HARDWARE_STOP
 from runtime.processes.coordinator.session.transitions import COMMANDS, STOPPING, GuardFacts
+from tests.processes import PATIENCE_S
 
 pytestmark = pytest.mark.django_db
-
-
-@pytest.fixture(autouse=True)
-def _short(settings):
-    settings.EVA_COMMAND_TIMEOUT_S = 0.5
 
 
 @pytest.fixture
@@ -134,7 +130,8 @@ def test_the_second_press_of_the_same_person_is_stale(held, runtime):
     assert "the state has changed since it was decided" in second.reason
 
 
-def test_no_answer_is_an_unknown_outcome(held, runtime):
+def test_no_answer_is_an_unknown_outcome(held, runtime, settings):
+    settings.EVA_COMMAND_TIMEOUT_S = 0.3
     runtime.swallows.add("run")
     row = issue(kind="run", **held, **seen(runtime))
     assert row.status == CommandStatus.UNKNOWN
@@ -248,9 +245,11 @@ def test_a_lost_answer_is_found_by_asking_again(held, runtime):
     assert runtime.session.state == "running"
 
 
-def test_a_command_that_never_arrived_comes_too_late_for_ever(held, runtime):
+def test_a_command_that_never_arrived_comes_too_late_for_ever(held, runtime, settings):
     runtime.swallows.add("run")
+    settings.EVA_COMMAND_TIMEOUT_S = 0.3
     row = issue(kind="run", **held, **seen(runtime))
+    settings.EVA_COMMAND_TIMEOUT_S = PATIENCE_S
     runtime.swallows.clear()
     settled = _settled_later(row)
     assert settled.status == CommandStatus.REFUSED
@@ -265,7 +264,8 @@ def test_a_young_command_is_not_asked_about(held, runtime):
     assert len(runtime.commands) == 1
 
 
-def test_a_stop_whose_outcome_is_unknown_is_never_given_again(held, runtime):
+def test_a_stop_whose_outcome_is_unknown_is_never_given_again(held, runtime, settings):
+    settings.EVA_COMMAND_TIMEOUT_S = 0.3
     runtime.mute = True
     row = issue(kind="stop", **held)
     runtime.mute = False

@@ -13,7 +13,8 @@ from evaweb.stations.stops import HARDWARE_STOP
 from runtime.ipc.messages import Ack
 
 
-def test_an_estop_without_answer_says_use_the_hardware_stop(runtime):
+def test_an_estop_without_answer_says_use_the_hardware_stop(runtime, settings):
+    settings.EVA_COMMAND_TIMEOUT_S = 0.3
     runtime.mute = True
     answer = stops.estop(station=runtime.name, username="ann", why="smoke", uuid=uuid4())
     assert answer.status == CommandStatus.UNKNOWN
