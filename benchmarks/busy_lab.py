@@ -50,13 +50,14 @@ def main() -> int:
         with a_lab("127.0.0.1", 0) as lab:
             _up(lab, given)
             lab.watch()
-    except Ended:
+    except Ended:  # as it should
         return 0
+    return 1
 
 
 def _up(lab: Any, given: argparse.Namespace) -> None:
     from evaweb.lab import programs, seed
-    from evaweb.lab.lab import Bench
+    from evaweb.lab.benches import Bench
     from evaweb.lab.processes import Program
     from evaweb.roles import Role
     from runtime.sim.standin import announce

@@ -284,8 +284,10 @@ def measure(seconds: float, seed: int | None = None) -> Report:
             with lab(["-m", "benchmarks.linked_lab", str(ready)], ready, extra) as running:
                 node = bench.node("--bench", "tabletop").addresses["node"]
                 _rows(bench.server().addresses["server"]["url"])
-                patient = ("recording.export=false", "lease.ttl_s=30.0", "safety.joint_age_s=10.0")
-                patient += ("safety.picture_age_s=10.0",)
+                patient = (
+                    *("recording.export=false", "lease.ttl_s=30.0"),
+                    *("safety.joint_age_s=10.0", "safety.picture_age_s=10.0"),
+                )
                 with started(node, robot, f'station="{PRESSED}"', *patient) as station:
                     enrol(robot, running.announced["enrol"][PRESSED])
                     operator = _Operator(running, random.Random(seed + 1))

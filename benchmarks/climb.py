@@ -70,7 +70,8 @@ def stations(
 
     `add` brings up one more.
     """
-    rungs, up = [], 1
+    rungs: list[Any] = []
+    up = 1
     for count in (1, 2, 4, 8, 16, MOST_STATIONS):
         if psutil.virtual_memory().available < (count - up) * _STATION_BYTES:
             return _told("stations", rungs, "the machine's memory")
@@ -106,7 +107,8 @@ def _rung(running: RunningLab, names: list[str], pages: int, count: int, seconds
     """`pages` on each of `names` for so long, and presses round and round; then what became of them."""
     watching = [watch(running.visitor, seconds, station=name, reading=pages) for name in names]
     open_pages = [OpenPage(running.visitor, running.announced["stops"], name) for name in names]
-    before, taken, begun = _used(), [], time.monotonic()
+    taken: list[float] = []
+    before, begun = _used(), time.monotonic()
     while time.monotonic() - begun < seconds:
         page = open_pages[len(taken) % len(open_pages)]
         taken.append(page.press(f"press {len(taken)}").ms)

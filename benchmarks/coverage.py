@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,8 +83,10 @@ def _conditions(first: float, second: float, spread: float, trials: int) -> Case
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         rates = first + spread * chance.uniform(-1, 1, n)
-        one = {i: (chance.random(trials) < rate).tolist() for i, rate in enumerate(rates)}
-        other = {i: (chance.random(trials) < second).tolist() for i in range(n)}
+        one: dict[Hashable, list[float]] = {
+            i: (chance.random(trials) < rate).tolist() for i, rate in enumerate(rates)
+        }
+        other: dict[Hashable, list[float]] = {i: (chance.random(trials) < second).tolist() for i in range(n)}
         found = over_conditions(one, other, seed=_seed(chance), draws=draws)
         return found.interval.holds(first - second)
 
@@ -144,7 +146,7 @@ def _preferred(chance: Chance, n: int, draws: int) -> bool:
     """Comparisons of two checkpoints, one worth e times the other; where nothing is ranked nothing is shown."""
     weights = np.array([math.e, math.exp(0.5), 1.0])  # Davidson's, with as many ties
     said = chance.choice(["first", "tie", "second"], n, p=weights / weights.sum()).tolist()
-    turned = {"first": "second", "tie": "tie", "second": "first"}
+    turned: dict[str, Any] = {"first": "second", "tie": "tie", "second": "first"}
     rows = [
         Comparison("a", "b", word) if i % 2 else Comparison("b", "a", turned[word])
         for i, word in enumerate(said)

@@ -7,6 +7,7 @@ Source of the anchors: STEP (Snyder et al. 2025), a near-optimal sequential test
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import product
@@ -201,7 +202,7 @@ def _least(n: int, alpha: float) -> tuple[int, int] | None:
     """The least extreme table that Barnard's test says something of: it says it of all that are more so."""
     tables = sorted(
         ((a, b) for a in range(n + 1) for b in range(a)),
-        key=lambda table: (lambda over, under: over / under)(*extremeness(table[0], n, table[1], n, None)),
+        key=lambda table: operator.truediv(*extremeness(table[0], n, table[1], n, None)),
     )
     low, high = 0, len(tables)
     while low < high:

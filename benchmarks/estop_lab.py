@@ -47,8 +47,9 @@ def main() -> int:
         with a_lab("127.0.0.1", 0) as lab:
             _up(lab, given.ready_file)
             lab.watch()
-    except Ended:
+    except Ended:  # as it should
         return 0
+    return 1
 
 
 def _limit_files() -> None:
@@ -57,7 +58,7 @@ def _limit_files() -> None:
 
 
 def _up(lab: Any, ready_file: Path) -> None:
-    from evaweb.lab.lab import Bench
+    from evaweb.lab.benches import Bench
     from evaweb.lab.processes import Program
     from runtime.sim.standin import announce
 

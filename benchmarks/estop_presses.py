@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 from uuid import uuid4
 
 from benchmarks.estop_lab import PRESSED
-from evaweb.lab.patience import NoReply
-from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
+from evaweb.lab.patience import NoReply, VisitFailed
+from evaweb.lab.visitor import LivePage, Visitor
 
 PATIENCE_S = 10.0
 _DONE = "done"

@@ -115,7 +115,8 @@ def _path(robot: Robot, start: Float64, end: Float64) -> Float64:
     rush = np.abs(way[dims]) * steepest / (_UNHURRIED * robot.velocity[dims])
     share = 1 / max(1.0, rush.max(), np.abs(way).max() / _TURN)
     eased = (1 - np.cos(np.linspace(0, math.pi, ROWS))) / 2
-    return start + eased[:, None] * share * way
+    path: Float64 = start + eased[:, None] * share * way
+    return path
 
 
 def _with_singular_value(robot: Robot, chance: np.random.Generator, wanted: float) -> Float64:

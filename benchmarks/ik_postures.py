@@ -84,4 +84,7 @@ def path(robot: Robot, number: int, legs: int = LEGS, leg: float = _LEG) -> Floa
 def worst(robot: Robot, kinematics: Kinematics, joints: Float64, rows: int | None = None) -> Float64:
     """m [arms]: how far off the poses of a joint path [T, D] are at most, in chunks of `rows` or in one."""
     targets = kinematics.forward(joints)
-    return followed(kinematics, robot, targets, joints[0], rows or len(joints)).position_error.max(axis=0)
+    missed: Float64 = followed(kinematics, robot, targets, joints[0], rows or len(joints)).position_error.max(
+        axis=0
+    )
+    return missed

@@ -159,7 +159,8 @@ def _idle(processes: Mapping[str, psutil.Process], seconds: float) -> dict[str, 
 
 def _presses(running: RunningLab, seconds: float) -> list[Press]:
     """Presses of an open page, both ways at once, one after the other."""
-    page, pressed = OpenPage(running.visitor, running.announced["stops"]), []
+    pressed: list[Press] = []
+    page = OpenPage(running.visitor, running.announced["stops"])
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         pressed.append(page.press(f"press {len(pressed)}"))
@@ -170,7 +171,8 @@ def _presses(running: RunningLab, seconds: float) -> list[Press]:
 
 def _presses_here(robot: Path, seconds: float) -> list[float]:
     """The same at the station's own socket [ms]."""
-    client, taken = StationClient(robot / "stations" / PRESSED, "benchmark"), []
+    taken: list[float] = []
+    client = StationClient(robot / "stations" / PRESSED, "benchmark")
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         begun = time.monotonic()

@@ -27,7 +27,8 @@ import zmq
 
 from benchmarks.labs import STATION, Processors, RunningLab, busy_lab, only_episode, set_up, watch
 from benchmarks.report import Figure, Report
-from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
+from evaweb.lab.patience import VisitFailed
+from evaweb.lab.visitor import LivePage, Visitor
 from runtime.core import msgpack_arrays
 from runtime.recording.reader import Episode
 
@@ -170,8 +171,9 @@ def _shortest_way(endpoint: str) -> float:
 def _from(episode: Episode, presses: Sequence[float], transit: float) -> dict[str, Any]:
     """Figures from the recording [ms]: arrays, and percentiles where it keeps only these."""
     assert episode.outcome is not None
-    muxed = episode.outcome["muxed_ms"].values()
-    ages = episode.outcome["policy"]["observation_age_ms"]
+    outcome: Mapping[str, Any] = episode.outcome
+    muxed = outcome["muxed_ms"].values()
+    ages = outcome["policy"]["observation_age_ms"]
     shift = transit * 1000.0
     return {
         "node_ms": _ms(_to_the_node(episode, presses)),

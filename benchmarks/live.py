@@ -74,7 +74,7 @@ def _void(visitor: Visitor, trial: int) -> None:
 
 
 def _viewers(visitor: Visitor, seconds: float, **counts: int) -> dict[str, Any]:
-    child = watch(visitor, seconds, **counts)
+    child = watch(visitor, seconds, STATION, **counts)
     found: dict[str, Any] = json.loads(child.communicate()[0])
     return found
 
@@ -91,4 +91,4 @@ def _stalled(visitor: Visitor, web: int, seconds: float) -> float:
         largest = max(largest, process.memory_info().rss)
         time.sleep(0.2)
     watching.join()
-    return (largest - before) / _STALLED / 1e6
+    return float(largest - before) / _STALLED / 1e6

@@ -128,6 +128,7 @@ def _judged(
     late = woke - planned + skipped / rate  # a tick after a gap was due when the gap began
     ours, floor = _spread(late), _spread(np.array(bare["late"]))
     assert episode.outcome is not None
+    outcome: Mapping[str, Any] = episode.outcome
     return {
         "ticks": len(steps),
         "scheduling": control["scheduling"],
@@ -141,8 +142,8 @@ def _judged(
             "rate_error_ppm"
         ],
         "rows": episode.frames,
-        "repeated": max(episode.outcome["repeated"].values()),
-        "muxed_ms": episode.outcome["muxed_ms"],
+        "repeated": max(outcome["repeated"].values()),
+        "muxed_ms": outcome["muxed_ms"],
         "load": os.getloadavg(),
     }
 

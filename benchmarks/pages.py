@@ -26,7 +26,7 @@ PLANS, TRIALS = 200, 100_000
 LOADS = 5
 _AXE = ROOT / "node_modules" / "axe-core" / "axe.min.js"
 _LATER_MS = 1000  # after a page has loaded, in which what it shows last is seen
-_VIEWPORT = {"width": 1440, "height": 900}
+_VIEWPORT: Any = {"width": 1440, "height": 900}
 _SEEKS = (0.3, 0.7, 0.1, 0.9, 0.5)  # of an episode
 # Runs before a page's own scripts. A press that leads away is told at the page's end, and known to the next one.
 _WATCH = """

@@ -17,6 +17,7 @@ from benchmarks.busy_lab import PATIENT
 from benchmarks.recording_station import SIZE, PatientLab
 from runtime.clients.client import Refused
 from runtime.recording.reader import Episode, open_episode
+from tests.processes import PATIENCE_S
 
 _LOOK_S = 20.0  # less than what the ages are of
 _LOOP = "while True: pass"
@@ -51,13 +52,13 @@ def record(folder: Path, seconds: float) -> dict[str, Any]:
 
 def _run(lab: PatientLab, seconds: float, busy: bool) -> dict[str, Any]:
     lab.client.command("run")
-    uuid = lab.client.wait(lambda status: status["recording"]["uuid"], lab.patience)["recording"]["uuid"]
+    uuid = lab.client.wait(lambda status: status["recording"]["uuid"], 2 * PATIENCE_S)["recording"]["uuid"]
     with _loops(os.cpu_count() or 1 if busy else 0):
         ages, held = _watch(lab, seconds)
         status = lab.client.status()
     lab.client.command("stop")
     lab.reach("ready", "idle")
-    lab.client.wait(lambda status: status["episode"].get("uuid") == uuid, lab.patience)
+    lab.client.wait(lambda status: status["episode"].get("uuid") == uuid, 2 * PATIENCE_S)
     episode = open_episode(lab.data / "episodes" / uuid)
     return {
         "seconds": seconds,

@@ -34,7 +34,7 @@ from runtime.recording.episode import EpisodeJournal
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.settings import RecordingSettings
 from tests.crash.lab import Lab
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 EPISODES = 6  # for the worker
 PROCESSES = ("media", "coordinator", "control", "reception")
@@ -75,7 +75,7 @@ def _one(lab: Lab, process: str, moment: float, kills: deque[float]) -> dict[str
     lab.reach("idle", "ready")
     lab.ready()
     lab.client.command("run")
-    uuid = lab.client.wait(lambda status: status["recording"]["uuid"], lab.patience)["recording"]["uuid"]
+    uuid = lab.client.wait(lambda status: status["recording"]["uuid"], PATIENCE_S)["recording"]["uuid"]
     before = lab.pids()
     time.sleep(moment)
     lab.kill(process)
@@ -83,8 +83,8 @@ def _one(lab: Lab, process: str, moment: float, kills: deque[float]) -> dict[str
     kills.append(killed)
     folder = lab.data / "episodes" / uuid
     episode = _closed(folder)
-    eventually(lambda: lab.pids()[process] != before[process], lab.patience, f"another {process}")
-    eventually(lab.answers, lab.patience, "the station answers again")
+    eventually(lambda: lab.pids()[process] != before[process], f"another {process}")
+    eventually(lab.answers, "the station answers again")
     lab.reach("idle")
     return {"process": process, "after_s": moment, **_loss(episode, killed)}
 

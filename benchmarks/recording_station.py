@@ -18,6 +18,7 @@ from benchmarks.busy_lab import PATIENT
 from benchmarks.labs import ROOT
 from runtime.recording.reader import Episode, open_episode
 from tests.crash.lab import Lab
+from tests.processes import PATIENCE_S
 
 SIZE = ("--width", "640", "--height", "480")
 _SETTLED_S = 3.0  # of a recording, until encoders, queues and pools have what they need
@@ -28,17 +29,14 @@ _MEMORY_PERIOD_S = 0.5
 class PatientLab(Lab):
     """Its processes may start on a machine that is full."""
 
-    patience = 120.0
-    ending = 60.0
-
-    def ready(self) -> PatientLab:
+    def ready(self, **asked: Any) -> PatientLab:
         """Set up, again where a process that was killed is not back yet; AssertionError says what is in the way."""
         begun = time.monotonic()
         while True:
             try:
-                super().ready()
+                super().ready(**asked)
             except AssertionError:
-                if time.monotonic() - begun > self.patience:
+                if time.monotonic() - begun > 2 * PATIENCE_S:
                     raise
                 time.sleep(1.0)
             else:
@@ -109,7 +107,9 @@ def record(folder: Path, seconds: float) -> dict[str, Any]:
         idle = (_used(media) + _used(reception) - before[1]) / (time.monotonic() - before[2]) * 100.0
         missed = _missed(lab)
         lab.client.command("run")
-        uuid = lab.client.wait(lambda status: status["recording"]["uuid"], lab.patience)["recording"]["uuid"]
+        uuid = lab.client.wait(lambda status: status["recording"]["uuid"], 2 * PATIENCE_S)["recording"][
+            "uuid"
+        ]
         episode = lab.data / "episodes" / uuid
         watch = Watch(media, reception, episode)
         time.sleep(seconds)

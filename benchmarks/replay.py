@@ -128,4 +128,4 @@ def _visits(url: str, password: str, episode: str, size: int) -> Iterator[dict[s
 
 
 def _median(rows: list[dict[str, Any]], name: str) -> float:
-    return statistics.median(row[name] for row in rows)
+    return float(statistics.median(row[name] for row in rows))

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -82,6 +83,7 @@ class StepLoop:
         self._commitment = RtcPrefix(rate, Mixture(self._dims))
         self._kind = ""
         self._joining = False
+        self._merge: Any = None
         self.tune(strategy, config)
 
     def tune(self, strategy: ModuleType, config: StrategyParameters) -> None:

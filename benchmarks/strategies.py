@@ -132,7 +132,9 @@ def _figures(rows: Sequence[dict[str, Any]]) -> Iterable[Figure]:
     """One strategy's: the worst over its feasible cells, and what it does in the cell of the reaction."""
     kind, feasible = rows[0]["strategy"], [row for row in rows if row["feasible"]]
     there = next(row for row in rows if all(row[key] == value for key, value in THE_CELL.items()))
-    bound = THE_CELL["delay"] + StrategyParameters().blend_window + there["interval"]
+    window = StrategyParameters().blend_window
+    assert window != "all"
+    bound = THE_CELL["delay"] + window + there["interval"]
     yield Figure(f"offset_steps.{kind}", max(abs(row["offset_steps"]) for row in feasible), "steps", "== 0")
     for share in (50, 90, 99):
         wanted = f"<= {bound}" if (kind, share) == ("async", 99) else ""

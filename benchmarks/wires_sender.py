@@ -92,7 +92,7 @@ def main(file: str, shared: str, module: str, *arguments: str) -> int:
         plain(noting, clock, rate, told)
         Path(file).write_text(json.dumps(noting.times), "utf-8")
 
-    simulated.run = run
+    simulated.run = run  # type: ignore[attr-defined]
     code: int = simulated.main([*arguments, "--lifeline"])
     return code
 

@@ -13,7 +13,8 @@ from uuid import uuid4
 
 from benchmarks.attacks.target import Target
 from benchmarks.estop_lab import OTHER, PRESSED
-from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
+from evaweb.lab.patience import VisitFailed
+from evaweb.lab.visitor import LivePage, Visitor
 from runtime.ipc.bus import Endpoints
 
 _STOPS, _PRESSES = 5000, 1500

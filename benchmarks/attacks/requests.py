@@ -14,7 +14,8 @@ from itertools import count
 
 from benchmarks.attacks.target import Target
 from benchmarks.estop_lab import GUESSED, PRESSED
-from evaweb.lab.visitor import VisitFailed, Visitor
+from evaweb.lab.patience import VisitFailed
+from evaweb.lab.visitor import Visitor
 
 _CONNECTIONS, _LOGINS, _BODIES = 1100, 10, 4
 _BODY, _CHUNK = 200_000_000, bytes(1_000_000)

@@ -215,7 +215,7 @@ class Scenario(Bench):
             switches = not np.isclose(told[dim], told[dim] if before is None else before)
             if not np.isclose(told[dim], ends).any() and (switches or not (stopped or before is not None)):
                 self._wrong(f"a gripper neither open nor closed: {told[dim]}")
-            if switches and np.isclose(before, ends).any():
+            if switches and before is not None and np.isclose(before, ends).any():
                 if self.step - self.switched[dim] < _RESTS:
                     self._wrong("a gripper switches too often")
                 self.switched[dim] = self.step

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from runtime.clients.client import StationClient
 from runtime.core.errors import RuntimeFault
@@ -43,7 +44,8 @@ class Lab:
         self.children = {}
         self.addresses = dict(addresses or {})
         self.own = {}  # addresses of what this lab started: another one of a name is started where the first was
-        self.supervisor = self.client = None
+        self.supervisor: Any = None
+        self.client: Any = None
         self.killed = 0  # of the processes of this start of the station
 
     def start(self, name, module, *arguments, stdout=subprocess.PIPE):

@@ -179,6 +179,7 @@ def asks(client, path, looked):
     return sorted(looked), sorted(looked | set(QUESTIONS))
 
 
+@pytest.mark.lab
 def test_in_questions(admin, looked):
     """Each parameter alone with the two texts that go farthest, and all of them together with the others."""
     faults, count = set(), 0

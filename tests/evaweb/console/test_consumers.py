@@ -753,7 +753,7 @@ def test_a_page_that_floods_is_told_once_and_closed_and_its_presses_are_obeyed(
         assert said["code"] == 4429
         assert [text["type"] for text in page.texts].count("error") == 1
         await page.close()
-        await asyncio.to_thread(eventually, lambda: runtime.pressed, 20, "the press is obeyed")
+        await asyncio.to_thread(eventually, lambda: runtime.pressed, "the press is obeyed")
         await _written()
 
     run(scenario())

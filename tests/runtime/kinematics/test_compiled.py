@@ -251,6 +251,7 @@ def test_forward_is_what_the_chains_of_every_robot_say(name: str) -> None:
     np.testing.assert_allclose(CompiledKinematics(robot).forward(q), expected, atol=1e-14)
 
 
+@pytest.mark.lab  # its kernels are compiled anew
 def test_carried_sliding_endless_and_mimicking_joints_are_followed(
     lifting: tuple[Robot, CompiledKinematics],
 ) -> None:
@@ -270,6 +271,7 @@ def test_carried_sliding_endless_and_mimicking_joints_are_followed(
     np.testing.assert_allclose(result.q[:, 9:], way[:, 9:], atol=1e-4)  # four joints have no choice
 
 
+@pytest.mark.lab  # its kernels are compiled anew
 def test_what_carries_an_arm_stands_as_in_the_seed(lifting: tuple[Robot, CompiledKinematics]) -> None:
     robot, kinematics = lifting
     home = robot.poses["home"]
@@ -280,6 +282,7 @@ def test_what_carries_an_arm_stands_as_in_the_seed(lifting: tuple[Robot, Compile
     assert result.reached.all()
 
 
+@pytest.mark.lab  # its kernels are compiled anew
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_errors_and_flags_are_those_of_the_joints_that_are_returned(

@@ -18,6 +18,7 @@ from tests.processes import eventually
 from tests.runtime.clients.panel.served import PIN, Served
 
 pytestmark = [
+    pytest.mark.lab,
     pytest.mark.slow,
     pytest.mark.skipif(not os.path.exists(CHROMIUM), reason=NO_CHROMIUM),
 ]

@@ -196,7 +196,7 @@ def test_a_process_that_was_restarted_and_says_nothing_yet_is_not_told_to_be_sil
 
 
 def test_resume_is_refused_under_an_id_of_its_own_while_a_process_is_starting(tmp_path: Path) -> None:
-    station = Station(stubbed(tmp_path)).running(60)
+    station = Station(stubbed(tmp_path)).running(180)  # longer than the recorder may be silent
     station.shared.beat("media", 0.0)  # as the supervisor does before it starts one anew
     beat = station.shared.beat
     station.shared.beat = lambda name, now: None if name == "media" else beat(name, now)

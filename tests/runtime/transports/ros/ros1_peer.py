@@ -13,8 +13,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.processes import PATIENCE_S
-
 _NODE = "test_peer"
 
 
@@ -51,6 +49,10 @@ class Peer:
             self._end()
 
     def _end(self) -> None:
+        from tests.processes import (
+            PATIENCE_S,  # ROS's Python, which runs this file too, knows nothing of ours
+        )
+
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.wait(PATIENCE_S)
