@@ -1,0 +1,1 @@
+"""Whether the suite would notice a mistake: seeded ones, and the script that tries them."""
