@@ -232,7 +232,7 @@ def test_an_answer_that_is_not_written_down_is_given_all_the_same_and_found_late
 
 
 def _settled_later(row):
-    Command.objects.filter(pk=row.pk).update(issued_at=row.issued_at - timedelta(seconds=60))
+    Command.objects.filter(pk=row.pk).update(issued_at=row.issued_at - timedelta(seconds=2 * PATIENCE_S))
     (lost,) = commands.unsettled(station=row.station)
     settle(row=lost)
     return Command.objects.get(pk=row.pk)
@@ -271,7 +271,7 @@ def test_a_stop_whose_outcome_is_unknown_is_never_given_again(held, runtime, set
     runtime.mute = False
     assert row.status == CommandStatus.UNKNOWN
     assert "the e-stop goes another way" in row.reason
-    Command.objects.filter(pk=row.pk).update(issued_at=row.issued_at - timedelta(seconds=60))
+    Command.objects.filter(pk=row.pk).update(issued_at=row.issued_at - timedelta(seconds=2 * PATIENCE_S))
     assert commands.unsettled(station=row.station) == []
 
 
