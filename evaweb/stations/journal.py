@@ -92,7 +92,8 @@ def _take_up(path: Path, take: Callable[[Sequence[bytes]], bool]) -> None:
             return
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with open(descriptor, "rb", closefd=False) as file:
-            lines = file.read().splitlines()
+            content = file.read()
+        lines = content.removesuffix(b"\n").split(b"\n") if content else []
         if take(lines):
             path.unlink(missing_ok=True)
         else:

@@ -65,7 +65,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path} cannot be read: {error}") from error
     lines = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if not line.strip():
             continue
         try:

@@ -34,7 +34,7 @@ def labels(data: Path, episode: str) -> list[Label]:
         return []
     except OSError as error:
         raise RecordingError(f"the labels of {episode} cannot be read: {error}") from error
-    return [label for line in content.splitlines() if (label := _read(line)) is not None]
+    return [label for line in content.split("\n") if (label := _read(line)) is not None]
 
 
 def newest(data: Path, episode: str) -> Label | None:
