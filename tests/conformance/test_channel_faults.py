@@ -15,7 +15,7 @@ import zmq
 
 from runtime.clients.channel.message import LARGEST
 from runtime.ipc.session_state import SessionState
-from tests.processes import PATIENCE_MS, eventually
+from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
 from tests.runtime.clients.channel.bench import Bench, Script
 
 MESSAGES: dict[str, tuple[list[bytes], str]] = {
@@ -133,7 +133,7 @@ def test_a_script_that_never_reads_its_answers_is_not_kept_for(bench: Bench, scr
         assert script.query("status")["state"] == "idle"
         before = process.memory_info().rss
         ask(10_000)
-        eventually(lambda: asked(script), "an answer for somebody else")
+        eventually(lambda: asked(script), "an answer for somebody else", 3 * PATIENCE_S)
         assert process.memory_info().rss - before < 60e6
 
 

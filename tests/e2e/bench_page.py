@@ -2,7 +2,7 @@
 
 from tests.e2e.lab import STATION
 from tests.e2e.pixels import pixels
-from tests.processes import PATIENCE_MS, eventually
+from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
 
 
 class BenchPage:
@@ -37,11 +37,15 @@ class BenchPage:
         return self.page.locator(".status-state .state").inner_text().strip().upper()
 
     def reaches(self, word):
-        eventually(lambda: word in self.state(), f"the status bar says {word}, not {self.state()}")
+        eventually(
+            lambda: word in self.state(), f"the status bar says {word}, not {self.state()}", 3 * PATIENCE_S
+        )
 
     def at_rest(self):
         """The page shows a station that can be set up."""
-        eventually(lambda: self.state() in ("IDLE", "READY"), "the status bar says IDLE or READY")
+        eventually(
+            lambda: self.state() in ("IDLE", "READY"), "the status bar says IDLE or READY", 3 * PATIENCE_S
+        )
 
     def take(self):
         self.page.click("[data-lease=claim]")

@@ -4,7 +4,7 @@ import pytest
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 MODE_KEYS = {"sim": "1", "step": "2", "preview": "3", "continuous": "4", "manual": "5"}
 
@@ -33,7 +33,9 @@ class ByHand(BenchPage):
         self.at_rest()
         began = self.snapshot()["sequence"]
         self.press("setup")
-        eventually(lambda: self.snapshot()["sequence"] > began + 1, "the set-up has begun and ended")
+        eventually(
+            lambda: self.snapshot()["sequence"] > began + 1, "the set-up has begun and ended", 3 * PATIENCE_S
+        )
         self.reaches("READY")
         self.at_the_pose()
 
@@ -69,7 +71,7 @@ class ByHand(BenchPage):
                 self.page.wait_for_timeout(200)
             return self.moved_from(before)
 
-        eventually(moved, "the committed chunk is executed")
+        eventually(moved, "the committed chunk is executed", 3 * PATIENCE_S)
 
     def stop(self):
         self.press("stop")

@@ -61,7 +61,7 @@ class Demo:
             return ready.exists()
 
         try:
-            eventually(up, "the demo is up")
+            eventually(up, "the demo is up", 3 * PATIENCE_S)
         except BaseException:
             self.child.kill()  # all that it started ends with it
             raise

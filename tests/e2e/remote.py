@@ -80,7 +80,7 @@ class Page(LivePage):
             assert state["state"] == "ready" or was_late(state["reason"]), state["reason"]
             return state["state"] == "ready"
 
-        eventually(ready, "ready")
+        eventually(ready, "ready", 3 * PATIENCE_S)
 
     def running(self, checkpoint=SKILLED):
         """The id of a trial that has just begun to run."""
@@ -191,7 +191,7 @@ def opened(visitor, page=""):
         except VisitFailed:  # nobody listens yet
             return None
 
-    return eventually(tried, "the web opens a live page")
+    return eventually(tried, "the web opens a live page", 3 * PATIENCE_S)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import pytest
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.conftest import LOCKSTEP
 from tests.e2e.lab import STATION, TABLET, Demo
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 TASK = "put the block on the plate"
@@ -142,10 +142,11 @@ def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(an
             and page.locator("#queue-words").inner_text().startswith("4 of 4 done")
         ),
         "both are checked and prepared",
+        3 * PATIENCE_S,
     )
     page.locator("#publish-version").select_option("v3.0")
     ann.key("p")
-    eventually(lambda: ann.counts()["published"] == 1, "the success is published")
+    eventually(lambda: ann.counts()["published"] == 1, "the success is published", 3 * PATIENCE_S)
     dataset = demo.data / "datasets" / "tabletop_demonstrations-simulated"
     lines = [json.loads(line) for line in (dataset / "meta" / "eva_episodes.jsonl").read_text().splitlines()]
     assert [(line["uuid"], line["success"], line["result"]) for line in lines] == [(first, True, "success")]
@@ -184,10 +185,10 @@ def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(ann
         ann.can_start()
         press(0)
         with suppress(AssertionError):
-            eventually(lambda: ann.collect["episode"], "an episode is open")
+            eventually(lambda: ann.collect["episode"], "an episode is open", 3 * PATIENCE_S)
         return ann.collect["episode"]
 
-    begun = eventually(begin, "an episode is open")
+    begun = eventually(begin, "an episode is open", 3 * PATIENCE_S)
     ann.reaches("RUNNING")
     press(3)
     ann.said("press again")
@@ -201,7 +202,7 @@ def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(ann
             begin()
         return ann.collect["episode"] not in (None, begun)
 
-    eventually(recorded_again, "the next episode is open")
+    eventually(recorded_again, "the next episode is open", 3 * PATIENCE_S)
     again = ann.collect["episode"]
     eventually(lambda: ann.api(f"stations/{STATION}")["snapshot"]["run"]["elapsed"] > 1.2, "it is led")
 

@@ -7,7 +7,7 @@ from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
 from tests.e2e.pixels import pixels, share
 from tests.e2e.remote import SKILLED, tidy, visitor
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 TAGS = 40  # rows of pixels at the top of the plot, where sentences may stand that count seconds
@@ -35,7 +35,7 @@ class Live(BenchPage):
         for _ in range(3):
             self.press("setup")
             self.reaches("SETTING UP")
-            eventually(lambda: "SETTING UP" not in self.state(), "the set-up ends")
+            eventually(lambda: "SETTING UP" not in self.state(), "the set-up ends", 3 * PATIENCE_S)
             if "READY" in self.state():
                 return
         raise AssertionError(f"it is not set up: {self.page.locator('[data-show=stage]').inner_text()}")
@@ -44,7 +44,7 @@ class Live(BenchPage):
         """Run in a mode."""
         self.page.locator(f"input[name=mode][value={mode}]").locator("..").click()
         self.press("run")
-        eventually(self.moves, f"it runs in mode {mode}")
+        eventually(self.moves, f"it runs in mode {mode}", 3 * PATIENCE_S)
 
     def moves(self):
         """Whether it runs; resumed where this machine was late."""
@@ -136,9 +136,15 @@ def test_chunks_are_seen_in_the_curves_which_stand_still_while_the_data_goes_on(
     bench.press("tune")
     bench.runs("continuous")
     plot = bench.page.locator("#curves .u-over")
-    eventually(lambda: bench.moves() and columns(pixels(plot), band) > 10, "bands stand where chunks overlap")
     eventually(
-        lambda: bench.moves() and columns(pixels(plot), hairline) >= 5, "hairlines stand between chunks"
+        lambda: bench.moves() and columns(pixels(plot), band) > 10,
+        "bands stand where chunks overlap",
+        3 * PATIENCE_S,
+    )
+    eventually(
+        lambda: bench.moves() and columns(pixels(plot), hairline) >= 5,
+        "hairlines stand between chunks",
+        3 * PATIENCE_S,
     )
     bench.page.click("#curves-pause")
     eventually(lambda: "paused" in bench.tag("paused"), "the page says that the curves are paused")

@@ -10,7 +10,7 @@ import pytest
 from tests.e2e.by_hand import ByHand
 from tests.e2e.lab import WIDE
 from tests.e2e.pixels import share, white
-from tests.processes import PATIENCE_MS, eventually
+from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
 from tests.runtime.datasets.foreign import Plan, shown, write
 
 pytestmark = pytest.mark.slow
@@ -112,6 +112,7 @@ def test_a_dataset_of_somebody_else_is_imported_replayed_and_reviewed(viewer, pa
     eventually(
         lambda: viewer.api(f"episodes/{uuid}/reviews")["quality"],
         "it is looked through by itself",
+        3 * PATIENCE_S,
     )
 
     viewer.open(f"/replay/{uuid}/")

@@ -7,7 +7,7 @@ import pytest
 
 from tests.e2e.by_hand import ByHand
 from tests.e2e.lab import STATION, WIDE
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 MUTE = "mute-policy"
@@ -255,8 +255,14 @@ def test_space_is_a_focused_controls_and_escape_closes_what_is_open_before_it_st
     ready.keys("e")
     page.locator(".bar-user summary").click()
     menu = page.locator(".bar-user summary")
-    eventually(lambda: closes("#keys", lambda: ready.keys("?")), "Escape closes the keys and stops nothing")
-    eventually(lambda: closes(".bar-user", menu.click), "Escape closes the menu and stops nothing")
+    eventually(
+        lambda: closes("#keys", lambda: ready.keys("?")),
+        "Escape closes the keys and stops nothing",
+        3 * PATIENCE_S,
+    )
+    eventually(
+        lambda: closes(".bar-user", menu.click), "Escape closes the menu and stops nothing", 3 * PATIENCE_S
+    )
 
     page.locator("#task").focus()
     page.keyboard.press("Escape")
@@ -315,7 +321,7 @@ def test_a_hidden_page_keeps_the_station_at_rest_and_lets_a_run_be_held(ready):
             ready.answered("resume")
         return found["state"] == "holding" and not found["lease"]["holder"]
 
-    eventually(held_for_nobody, "the run is held and nobody has the station")
+    eventually(held_for_nobody, "the run is held and nobody has the station", 3 * PATIENCE_S)
     ready.page.evaluate(_SEEN, False)
     ready.page.locator("#outcome", has_text="its lease has ended").wait_for()
     ready.take_again()

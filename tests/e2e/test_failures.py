@@ -7,7 +7,7 @@ import pytest
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import WIDE
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.quality import built
 
 pytestmark = pytest.mark.slow
@@ -66,8 +66,16 @@ def test_arrow_keys_choose_a_failed_trial_letters_say_its_cause_and_each_change_
     researcher.open("/result/")
     page.get_by_role("link", name="Failures").click()
     card = page.locator(f"[data-trial='{newer}']")
-    eventually(lambda: page.reload() and card.locator("video").count(), "the worker has prepared its video")
-    eventually(lambda: card.locator("video").evaluate("one => one.currentTime > 0.6"), "the clip plays")
+    eventually(
+        lambda: page.reload() and card.locator("video").count(),
+        "the worker has prepared its video",
+        3 * PATIENCE_S,
+    )
+    eventually(
+        lambda: card.locator("video").evaluate("one => one.currentTime > 0.6"),
+        "the clip plays",
+        3 * PATIENCE_S,
+    )
     card.locator("h3").click()
     keys.press("ArrowRight")
     assert page.locator("[data-trial][aria-current]").get_attribute("data-trial") == str(older)
@@ -93,7 +101,11 @@ def test_all_cameras_of_a_trial_follow_one_clock_and_a_milestone_leads_to_its_mo
     page, keys = researcher.page, researcher.page.keyboard
     researcher.open(f"/result/trials/{failed[0]}/")
     shown = page.locator("[data-player-time]")
-    eventually(lambda: page.reload() and page.locator("[data-player]").is_visible(), "it can be played")
+    eventually(
+        lambda: page.reload() and page.locator("[data-player]").is_visible(),
+        "it can be played",
+        3 * PATIENCE_S,
+    )
     row = 1 / built.FPS
 
     def within_one_row():
@@ -110,7 +122,7 @@ def test_all_cameras_of_a_trial_follow_one_clock_and_a_milestone_leads_to_its_mo
     eventually(lambda: all(abs(at - 30 * row) <= row for at in times(page)), "all are where the slider is")
     page.select_option("[data-player-speed]", "0.25")
     page.locator("[data-player-play]").click()
-    eventually(lambda: min(times(page)) > 34 * row, "all play")
+    eventually(lambda: min(times(page)) > 34 * row, "all play", 3 * PATIENCE_S)
     eventually(within_one_row, "they are within a row of each other")
     keys.press("Escape")
     page.locator("h1").click()

@@ -91,11 +91,11 @@ def test_a_worker_that_is_killed_right_after_a_score_publishes_the_episode_once(
     bench.score(trial)
     episode = bench.trial(trial)["episode"]
     jobs = "SELECT status FROM jobs_job WHERE key = ? AND status IN ('running', 'done')"
-    eventually(lambda: demo.rows(jobs, f"publish:{episode}"), "the dataset is being written")
+    eventually(lambda: demo.rows(jobs, f"publish:{episode}"), "the dataset is being written", 3 * PATIENCE_S)
     os.kill(demo.pid("worker"), signal.SIGKILL)
-    placed = eventually(lambda: placed_at(bench, episode), "the episode is in the dataset")
+    placed = eventually(lambda: placed_at(bench, episode), "the episode is in the dataset", 3 * PATIENCE_S)
     waiting = "SELECT key FROM jobs_job WHERE status IN ('queued', 'running')"
-    eventually(lambda: not demo.rows(waiting), "the worker has nothing left to do")
+    eventually(lambda: not demo.rows(waiting), "the worker has nothing left to do", 3 * PATIENCE_S)
     meta = demo.data / placed["dataset"] / "meta"
     lines = [json.loads(line) for line in (meta / "eva_episodes.jsonl").read_text().splitlines()]
     assert [line["episode_index"] for line in lines if line["uuid"] == episode] == [placed["dataset_index"]]
@@ -206,7 +206,7 @@ def test_a_policy_server_that_dies_mid_run_is_tried_again_until_it_is_back_or_pa
                 bench.command("resume", trial)
         return bench.state()["state"] == "running" and bench.state()["policy"]["answers"] > answers
 
-    eventually(goes_on, "the policy answers again")
+    eventually(goes_on, "the policy answers again", 3 * PATIENCE_S)
     bench.goes_on(trial)
     bench.stop(trial)
     whole(bench, trial)
@@ -246,7 +246,9 @@ def test_the_page_says_which_policy_does_not_answer_and_lets_one_choose_again(co
     page.check("input[name=position][value='1']")
     page.click("[data-prepare]")
     step = page.locator("[data-step=setup]")
-    eventually(lambda: "ws://127.0.0.1:1: start it" in step.inner_text(), "the step says what to do")
+    eventually(
+        lambda: "ws://127.0.0.1:1: start it" in step.inner_text(), "the step says what to do", 3 * PATIENCE_S
+    )
     assert commanding.state() == "IDLE"
     page.click("[data-abandon]")
     page.locator("#checkpoint-choice").wait_for()

@@ -31,7 +31,9 @@ class EmptyLab:
                 stdout=output,
                 stderr=output,
             )
-        eventually(lambda: "type this code" in self.said(), "the lab is up and shows its code")
+        eventually(
+            lambda: "type this code" in self.said(), "the lab is up and shows its code", 3 * PATIENCE_S
+        )
         self.url = re.search(r"EVA Web is at (http://\S+?)/?\s", self.said())[1]
         self.code = re.search(r"type this code: +(\S+)", self.said())[1]
         self.passwords = {}  # of accounts that are made on the pages
@@ -130,6 +132,7 @@ def scores_a_first_trial(person):
     eventually(
         lambda: pictures.evaluate_all("all => all.length && all.every(one => one.naturalWidth > 0)"),
         "each camera shows a picture",
+        3 * PATIENCE_S,
     )
     person.press_button("Confirm the cameras")
     person.step("Home the robot")
@@ -151,7 +154,7 @@ def scores_a_first_trial(person):
     person.press("run")
     person.reaches("RUNNING")
     clock = page.locator(".status-clock")
-    eventually(lambda: re.search(r"[1-9]\d$", clock.inner_text().strip()), "the run goes on")
+    eventually(lambda: re.search(r"[1-9]\d$", clock.inner_text().strip()), "the run goes on", 3 * PATIENCE_S)
     assert "Press Stop" in hint.inner_text()
     person.press("stop")
     person.reaches("READY")
@@ -174,9 +177,17 @@ def says_why_it_failed(person):
     person.follow("Result")
     person.follow("Failures")
     card = page.locator("[data-trial]")
-    eventually(lambda: page.reload() and card.locator("video").count(), "the worker has prepared its video")
+    eventually(
+        lambda: page.reload() and card.locator("video").count(),
+        "the worker has prepared its video",
+        3 * PATIENCE_S,
+    )
     assert card.locator("[data-why]").inner_text() == "not said"
-    eventually(lambda: card.locator("video").evaluate("one => one.played.length > 0"), "the clip plays")
+    eventually(
+        lambda: card.locator("video").evaluate("one => one.played.length > 0"),
+        "the clip plays",
+        3 * PATIENCE_S,
+    )
     card.locator("h3").click()
     for key, why in (("g", "grasp"), ("d", "grasp: dropped"), ("m", "grasp: missed")):
         keys.press(key)

@@ -4,7 +4,7 @@ import pytest
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import WIDE
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.quality import built
 
 pytestmark = pytest.mark.slow
@@ -53,7 +53,7 @@ def test_trials_are_rated_again_and_compared_from_their_videos_without_the_first
     page.get_by_role("link", name="Rate again").click()
     for left in (2, 1):
         page.get_by_text(f"{left} left for you").wait_for()
-        eventually(lambda: page.reload() and ready.is_visible(), "its videos can be watched")
+        eventually(lambda: page.reload() and ready.is_visible(), "its videos can be watched", 3 * PATIENCE_S)
         assert "success" not in page.locator("form.judge-form .check").first.inner_text()
         keys.press("ArrowRight")
         page.locator("[data-player-time]", has_text=f"{1 / built.FPS:.2f} of").wait_for()

@@ -24,7 +24,7 @@ JOIN episodes_episode AS episode ON episode.uuid = trial.episode_id WHERE trial.
 """
 
 
-def run(folder, *options, timeout=180):
+def run(folder, *options):
     """Run the command to its end; what it wrote as its result, and how it ended."""
     out = folder / "out.json"
     done = subprocess.run(
@@ -33,7 +33,7 @@ def run(folder, *options, timeout=180):
         env=environment(folder / "data"),
         capture_output=True,
         text=True,
-        timeout=timeout,
+        timeout=6 * PATIENCE_S,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return json.loads(out.read_text()), done
@@ -46,8 +46,8 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def first(folder):
-    """One trial in a home that has nothing."""
-    found, done = run(folder, "--once")
+    """One trial in a home that has nothing; a slow machine holds no robot of it, or a newcomer resumes."""
+    found, done = run(folder, "--once", *SETS[1:])
     assert json.loads(done.stdout) == found
     return found
 
@@ -55,7 +55,7 @@ def first(folder):
 @pytest.fixture(scope="module")
 def evaluated(folder, first):
     """Two trials of a blind plan on the same data, and what was said of them."""
-    return run(folder, "--evaluate", "2", *SETS[1:], timeout=PATIENCE_S)
+    return run(folder, "--evaluate", "2", *SETS[1:])
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def places(folder, evaluated):
         return None if None in [index for _, index, _ in found] else found
 
     with working(folder):
-        return eventually(published, "the episodes are in a dataset")
+        return eventually(published, "the episodes are in a dataset", 3 * PATIENCE_S)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import pytest
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 ARMS = ("pick-place-40k", "pick-place-8k")
@@ -49,7 +49,7 @@ def drafted(page):
     page.get_by_label("Trials of each checkpoint at each position").fill("20")
     assert found(page, 80) > few + 20
     page.get_by_label("Of the other checkpoint").fill("0.55")
-    eventually(lambda: found(page, 80) < few, "another assumption gives another power")
+    eventually(lambda: found(page, 80) < few, "another assumption gives another power", 3 * PATIENCE_S)
     page.get_by_label("Trials of each checkpoint at each position").fill("2")
     found(page, 8)
 

@@ -4,7 +4,7 @@ import pytest
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import DEAD, ROOT, STATION, WIDE
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 SERVED = "pick-place-40k"
@@ -33,6 +33,7 @@ def flown(bench, checkpoint):
     eventually(
         lambda: page.locator("#outcome").inner_text() not in ("Preflight: pressed …", "Preflight: under way"),
         "the preflight is over",
+        3 * PATIENCE_S,
     )
     return page.locator("[data-preflight-result]").inner_text()
 
@@ -72,5 +73,5 @@ def test_the_worker_asks_where_the_station_does_not_run(bench, patient):
     )
     assert asked.get("by") == "worker", asked
     address = f"preflights/{asked['id']}"
-    eventually(lambda: bench.api(address)["status"] != "running", "the worker has asked")
+    eventually(lambda: bench.api(address)["status"] != "running", "the worker has asked", 3 * PATIENCE_S)
     assert bench.api(address)["verdict"] == "port_closed"

@@ -8,7 +8,7 @@ from runtime.datasets.journal import read_journal
 from runtime.datasets.published import publish
 from tests.e2e.by_hand import ByHand
 from tests.e2e.lab import STATION, WIDE
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.quality import built
 
 pytestmark = pytest.mark.slow
@@ -44,7 +44,7 @@ def test_it_is_set_up_approached_and_run_to_its_last_row(operator, patient, reco
     places, actions = recorded
     page = operator.open(places[kind]).page
     on_robot = page.get_by_role("link", name="Run on the robot")
-    eventually(on_robot.is_visible, "the episode is prepared")
+    eventually(on_robot.is_visible, "the episode is prepared", 3 * PATIENCE_S)
     on_robot.click()
     page.locator(f"[data-station={STATION}] a").click()
     page.locator("#replay").wait_for()

@@ -8,7 +8,7 @@ import pytest
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import WIDE
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.quality import built
 
 pytestmark = pytest.mark.slow
@@ -46,6 +46,7 @@ def test_an_episode_is_reviewed_by_keyboard_and_the_next_one_comes(reviewer, pat
             for uuid in brought
         ),
         "both are prepared and checked",
+        3 * PATIENCE_S,
     )
     reviewer.open("/replay/?review=unreviewed&quality=flagged")
     assert page.locator(f"[data-episode='{newer}'] .episode-quality").inner_text() == "1 flag"
@@ -131,7 +132,9 @@ IN_SIGHT = """(places) => places.filter((place) => {
 
 def played(reviewer, uuid):
     """The page of an episode, once it can be played."""
-    eventually(lambda: reviewer.api(f"episodes/{uuid}")["previewed_at"], "the episode is prepared")
+    eventually(
+        lambda: reviewer.api(f"episodes/{uuid}")["previewed_at"], "the episode is prepared", 3 * PATIENCE_S
+    )
     page = reviewer.open(f"/replay/{uuid}/").page
     page.locator("#curves .u-over").wait_for()
     page.locator("#segment-vocabulary button").first.wait_for()
@@ -257,7 +260,7 @@ def test_twenty_episodes_are_reviewed_with_one_key_each(reviewer, patient, twent
     count = "SELECT COUNT(*) FROM episodes_episode WHERE previewed_at IS NOT NULL AND uuid IN ({})"
     asked = count.format(", ".join("?" * TWENTY))
     bare = [uuid.replace("-", "") for uuid in twenty]
-    eventually(lambda: patient.rows(asked, *bare) == [(TWENTY,)], "all are prepared")
+    eventually(lambda: patient.rows(asked, *bare) == [(TWENTY,)], "all are prepared", 3 * PATIENCE_S)
     reviewer.open("/replay/?review=unreviewed")
     page.locator(f"[data-episode='{twenty[0]}'] a").first.click()
     took = []

@@ -8,7 +8,7 @@ from tests.e2e.by_hand import ByHand
 from tests.e2e.conftest import SETS
 from tests.e2e.lab import STATION, WIDE, Demo
 from tests.e2e.pixels import moved, pixels
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 ROBOT, MESHED = "agibot_g2", "head_link3"
@@ -66,10 +66,10 @@ def test_body_and_head_are_moved_drawn_recorded_and_played_back(browser, demo):
 
     episode = bench.snapshot()["last_run"]["uuid"]
     address = f"/replay/{episode}/"
-    eventually(lambda: page.request.get(demo.url + address).ok, "the lab knows the episode")
+    eventually(lambda: page.request.get(demo.url + address).ok, "the lab knows the episode", 3 * PATIENCE_S)
     bench.open(address)
     played = page.locator(".replay-scene")
-    eventually(lambda: played.count() == 1, "the episode can be played")
+    eventually(lambda: played.count() == 1, "the episode can be played", 3 * PATIENCE_S)
     page.locator("#scene-note").wait_for(state="hidden")
     first = pixels(played)
     page.locator("#scrub").press("End")

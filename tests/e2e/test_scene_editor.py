@@ -7,7 +7,7 @@ import pytest
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
 from tests.e2e.remote import tidy, visitor
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 TITLE = "Block beside the plate"
@@ -83,6 +83,7 @@ def test_a_scene_is_laid_by_dragging_and_offered_at_the_bench(admin):
             and "required for success" in seen.nth(1).inner_text()
         ),
         "the preview shows both milestones as they are",
+        3 * PATIENCE_S,
     )
     assert page.locator("#preview kbd", has_text=re.compile("^[12]$")).count() == 2
     assert "beside the plate." in page.locator("#preview").inner_text()

@@ -12,7 +12,7 @@ from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
 from tests.e2e.remote import tidy, visitor
 from tests.e2e.test_faults import suspended
-from tests.processes import alive, eventually
+from tests.processes import PATIENCE_S, alive, eventually
 
 pytestmark = pytest.mark.slow
 AREA = "#estop-area"
@@ -122,7 +122,9 @@ def test_a_press_arrives_while_the_process_for_stops_is_gone_and_pages_know_its_
         pressed(demo, page)
         page.page.reload()
         assert page.page.get_attribute(AREA, "data-stops") == said
-    eventually(lambda: page.page.evaluate(ANSWERS), "the lab has started it again where it was")
+    eventually(
+        lambda: page.page.evaluate(ANSWERS), "the lab has started it again where it was", 3 * PATIENCE_S
+    )
     assert demo.pid("stops") != gone
     page.page.reload()
     page.page.locator(f"{AREA}[data-second-way]").wait_for()
@@ -147,8 +149,10 @@ def test_presses_of_one_second_are_written_down_though_the_process_for_stops_is_
         os.kill(demo.pid("stops"), signal.SIGKILL)
     answered = {UUID(one["uuid"]) for one in sent if one["status"] == "done"}
     assert len(answered) == len(sent)
-    eventually(lambda: written(demo, before) == len(sent), "all presses are in the record")
-    eventually(lambda: page.page.evaluate(ANSWERS), "the lab has started it again where it was")
+    eventually(lambda: written(demo, before) == len(sent), "all presses are in the record", 3 * PATIENCE_S)
+    eventually(
+        lambda: page.page.evaluate(ANSWERS), "the lab has started it again where it was", 3 * PATIENCE_S
+    )
 
 
 def test_a_page_whose_session_has_ended_still_presses(demo, page):

@@ -7,7 +7,7 @@ import pytest
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import WIDE, Demo
 from tests.evaweb.s3_server import Server, why_no_server
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.quality import built
 
 pytestmark = pytest.mark.slow
@@ -37,7 +37,11 @@ def test_videos_play_from_the_store_as_the_policy_of_pages_allows(browser, store
     uuid = built.record_of(root, "agilex_piper", started_wall=time.time(), station="bench-1").name
     stored.python("from evaweb.episodes.reconcile import reconcile; reconcile()")
     preview = stored.data / "previews" / uuid
-    eventually(lambda: (preview / "stored.json").exists() and not list(preview.glob("*.mp4")), "the store")
+    eventually(
+        lambda: (preview / "stored.json").exists() and not list(preview.glob("*.mp4")),
+        "the store",
+        3 * PATIENCE_S,
+    )
     page = BenchPage(browser, stored, "ann", WIDE)
     try:
         asked = []

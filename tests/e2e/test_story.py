@@ -9,7 +9,7 @@ import pytest
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
 from tests.e2e.pixels import moved, orange, pixels, share, white, wood
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
 CHECKPOINT = "pick-place-40k"
@@ -41,9 +41,9 @@ def trial(operator):
     seen["ready"] = {"overhead": operator.camera("cam_high"), "scene": operator.scene()}
     operator.press("run")
     operator.reaches("RUNNING")
-    eventually(lambda: operator.truth()["milestones"]["lifted"], "the block is lifted")
+    eventually(lambda: operator.truth()["milestones"]["lifted"], "the block is lifted", 3 * PATIENCE_S)
     seen["carried"] = {"overhead": operator.camera("cam_high"), "scene": operator.scene()}
-    eventually(lambda: operator.truth()["success"], "the block lies on the plate")
+    eventually(lambda: operator.truth()["success"], "the block lies on the plate", 3 * PATIENCE_S)
     page.keyboard.press("s")
     operator.reaches("READY")
     page.locator("#score").wait_for()
@@ -91,6 +91,7 @@ def test_result_shows_the_trial_with_its_video(trial, operator):
     eventually(
         lambda: operator.api(f"episodes/{trial['trial']['episode']}")["previewed_at"],
         "the videos are there",
+        3 * PATIENCE_S,
     )
     page.reload()
     assert "<b>gripper</b>" in page.locator("main").inner_text()
@@ -160,6 +161,7 @@ def test_the_dataset_has_the_episode(trial, operator):
     found = eventually(
         lambda: operator.api(f"episodes/{episode['uuid']}")["dataset_index"] is not None,
         "it is published",
+        3 * PATIENCE_S,
     )
     assert found
 

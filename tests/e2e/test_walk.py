@@ -163,7 +163,11 @@ def test_a_blind_evaluation_goes_on_while_a_station_is_cut_off_and_counts_each_t
     assert found == {codes[0]: "running", **dict.fromkeys(codes[1:], "scored")}
 
     walk.network.plug(CUT)
-    eventually(lambda: cut.state() in ("HOLDING", "READY"), "the station is back, without its operator")
+    eventually(
+        lambda: cut.state() in ("HOLDING", "READY"),
+        "the station is back, without its operator",
+        3 * PATIENCE_S,
+    )
     cut.take_again()
     scored(cut, ticks=(1,))
     codes.append(runs(cut))
@@ -180,14 +184,20 @@ def test_a_blind_evaluation_goes_on_while_a_station_is_cut_off_and_counts_each_t
     recorded = {trial["episode"] for trial in trials}
     assert len(recorded) == len(trials)
     eventually(
-        lambda: recorded == {folder.name for folder in episodes.glob("*-*")}, "the recordings have come"
+        lambda: recorded == {folder.name for folder in episodes.glob("*-*")},
+        "the recordings have come",
+        3 * PATIENCE_S,
     )
     found = revealed(walk)
     assert {name: arm["n"] for name, arm in found["arms"].items()} == dict.fromkeys(NAMES, len(ROBOTS))
     report = walk.folder / "report"
     walk.run("lab", f"python manage.py eval_report {PLAN} --out {report}")
     again = subprocess.run(
-        [sys.executable, "-m", "recompute"], cwd=report, capture_output=True, text=True, timeout=PATIENCE_S
+        [sys.executable, "-m", "recompute"],
+        cwd=report,
+        capture_output=True,
+        text=True,
+        timeout=3 * PATIENCE_S,
     )
     assert again.returncode == 0, again.stdout + again.stderr
 

@@ -155,7 +155,9 @@ class Walk:
         trusted, more = as_run(documented_inline("EVA_ALLOWED_HOSTS=10.0.0.7", "10.0.0.7", self.address))
         host = more[more.index("--host") :][:2]
         self.start("lab", [*words, *host], **gate, **trusted)
-        said = eventually(lambda: _FIRST.search(self.log("lab")), f"the lab's code; {self.log('lab')}")
+        said = eventually(
+            lambda: _FIRST.search(self.log("lab")), f"the lab's code; {self.log('lab')}", 3 * PATIENCE_S
+        )
         self.url = said["url"]
         return said["code"]
 
@@ -169,7 +171,7 @@ class Walk:
             input=said,
             capture_output=True,
             text=True,
-            timeout=PATIENCE_S,
+            timeout=3 * PATIENCE_S,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout
@@ -206,7 +208,9 @@ class Walk:
             str(ROOT / "tests" / "e2e" / "scan.py"),
             *words,
         ]
-        done = subprocess.run(found, cwd=ROOT, check=True, capture_output=True, text=True, timeout=PATIENCE_S)
+        done = subprocess.run(
+            found, cwd=ROOT, check=True, capture_output=True, text=True, timeout=3 * PATIENCE_S
+        )
         return json.loads(done.stdout)
 
     def log(self, name):

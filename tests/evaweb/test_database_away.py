@@ -42,7 +42,7 @@ def ask(database, tmp_path):
         environment["PYTHONPATH"] = os.pathsep.join(paths)
         command = [sys.executable, AWAY, json.dumps(questions)]
         done = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=True
+            command, env=environment, capture_output=True, text=True, timeout=4 * PATIENCE_S, check=True
         )
         return [json.loads(line) for line in done.stdout.splitlines()]
 

@@ -62,7 +62,7 @@ class RosMaster:
             stdout=subprocess.DEVNULL,
             start_new_session=True,
         )
-        eventually(self._pid, "a ROS master")
+        eventually(self._pid, "a ROS master", 3 * PATIENCE_S)
 
     def kill(self) -> None:
         """The master is gone without a word; what roscore started beside it ends with it."""

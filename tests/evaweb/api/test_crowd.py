@@ -65,7 +65,7 @@ def bench(folder):
 
 def press(port, session, address):
     """The status of a press by that session from that address."""
-    connection = http.client.HTTPConnection(QUIET, port, timeout=PATIENCE_S, source_address=(address, 0))
+    connection = http.client.HTTPConnection(QUIET, port, timeout=4 * PATIENCE_S, source_address=(address, 0))
     connection.request("POST", PATH, "{}", {"Cookie": f"eva_session_{LAB}={session}"})
     status = connection.getresponse().status
     connection.close()
@@ -94,7 +94,7 @@ def test_presses_of_people_come_through_and_those_of_the_crowd_are_refused(port,
     crowd = Thread(target=hammer, args=(port, over, answers))
     crowd.start()
     try:
-        eventually(lambda: sum(answers.values()) >= AT_ONCE, "the crowd is at it")
+        eventually(lambda: sum(answers.values()) >= AT_ONCE, "the crowd is at it", 3 * PATIENCE_S)
         pressed = [
             press(port, session, address)
             for _ in range(2)

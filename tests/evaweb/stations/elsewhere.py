@@ -85,7 +85,7 @@ class Elsewhere:
             env=self._environment,
             capture_output=True,
             text=True,
-            timeout=PATIENCE_S,
+            timeout=3 * PATIENCE_S,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout

@@ -14,7 +14,7 @@ from django.db import OperationalError
 from evaweb.stations import notes as module
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.notes import Notes
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 
 class Quiet(Notes):
@@ -155,7 +155,9 @@ def test_the_thread_survives_what_nobody_expects_and_keeps_the_note(kept, monkey
     notes, rows = Notes(kept.append), [halted(), halted(user="bob")]
     for row in rows:
         notes.note(row)
-    eventually(lambda: sorted(map(id, kept)) == sorted(map(id, rows)), "both are written down")
+    eventually(
+        lambda: sorted(map(id, kept)) == sorted(map(id, rows)), "both are written down", 3 * PATIENCE_S
+    )
     assert "RuntimeError: anything" in caplog.text
 
 

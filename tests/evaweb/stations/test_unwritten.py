@@ -22,7 +22,7 @@ from evaweb.stations.journal import take_up
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.unwritten import Unwritten
 from runtime.recording.files import DiskFullError
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 
 
 @pytest.fixture(autouse=True)
@@ -87,6 +87,7 @@ def test_a_halt_during_a_locked_database_is_carried_out_and_written_when_the_loc
     eventually(
         lambda: Command.objects.filter(kind="halt").exists() and not list(folder.iterdir()),
         "the halt is written down",
+        3 * PATIENCE_S,
     )
     found = Command.objects.get(kind="halt")
     assert (found.uuid, found.status, found.user, found.holder) == (row.uuid, row.status, ann, "web:ann:p1")
@@ -462,5 +463,5 @@ def test_the_thread_survives_whatever_happens_in_one_turn(monkeypatch, caplog):
     one = Unwritten(away)
     one.attempt = attempt
     one.look()
-    eventually(lambda: len(turns) == 3, "it goes on")
+    eventually(lambda: len(turns) == 3, "it goes on", 3 * PATIENCE_S)
     assert caplog.text.count("RuntimeError: anything") == 1, "one line for many"

@@ -88,7 +88,7 @@ def test_ssh_gets_what_it_needs_and_no_key_of_anybody(monkeypatch):
     ]
     ssh = Ssh(line, 1)
     try:
-        eventually(lambda: ssh.look() is not None, "its end")
+        eventually(lambda: ssh.look() is not None, "its end", 3 * PATIENCE_S)
         assert list(ssh.said) == ["False /run/agent"]
     finally:
         ssh.end()
