@@ -6,6 +6,7 @@ import gc
 import os
 import re
 import shutil
+import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,7 +66,12 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_configure() -> None:
-    """Whatever started the tests, they are ordinary: else a busy one starves the real-time loops it looks at."""
+    """Whatever started the tests, they are ordinary: else a busy one starves the real-time loops it looks at.
+
+    Signals that a shell has its background ignore (nohup, &) end what the tests start all the same.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     if _BEGAN != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.environ["XDG_RUNTIME_DIR"] = _SOCKETS
