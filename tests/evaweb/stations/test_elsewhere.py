@@ -21,7 +21,7 @@ from tests.namespaces import why_no_namespaces
 from tests.processes import PATIENCE_S, eventually
 from tests.runtime.link.episodes import content, recorded
 
-pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow]
+pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow, pytest.mark.lab]
 
 
 @pytest.fixture
@@ -168,7 +168,7 @@ def test_an_episode_arrives_whole_though_both_ends_are_killed_on_its_way(elsewhe
 
 def why_gone(name):
     try:
-        wire_to(name).status()
+        wire_to(name).status(timeout=1.0)  # what was asked as it was withdrawn is never answered
     except StationGone as gone:
         return str(gone)
     return ""
