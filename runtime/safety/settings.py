@@ -30,6 +30,8 @@ class SafetySettings(Settings):
     """Oldest picture of any camera that a policy action may be based on [s]."""
     following_error: float = Field(default=0.5, gt=0)
     """Farthest that a target may be from the measured joints [rad]."""
+    steady_error: float = Field(default=0.1, ge=0)
+    """Farthest that gravity and payload hold a joint from its command [rad]: an e-stop keeps the command there."""
     jump: float = Field(default=0.5, gt=0)
     """Farthest that an action may be from the last command [rad]."""
     velocity_scale: float = Field(default=1.0, gt=0, le=1)

@@ -190,10 +190,14 @@ class Bench:
             self.tick(self.step, self.clock.now())
             self.step += 1
             self.clock.advance(PERIOD * stretch)
-            if self.moved_by_hand is not None:
-                self.measured = self.moved_by_hand
-            elif self.sink.sent:
-                self.measured = self.sink.sent[-1].astype(float)
+            self.move(PERIOD * stretch)
+
+    def move(self, seconds: float) -> None:
+        """Let the robot go on for so long."""
+        if self.moved_by_hand is not None:
+            self.measured = self.moved_by_hand
+        elif self.sink.sent:
+            self.measured = self.sink.sent[-1].astype(float)
 
     # --- what control tells --------------------------------------------------------------------------------
 

@@ -112,12 +112,13 @@ class Move(Behaviour):
 
 
 class EStopped(Behaviour):
-    """Sends where the robot was measured, or the last command where that is not known.
+    """Sends where the robot comes to rest, or the last command where that is not known.
 
-    It goes along with the measurement for `_FOLLOWS_S`, while the arm comes to rest, no farther from where it was first
-    seen than that takes, and then keeps it: an arm that is sent its own measurement sinks under its weight.
-    `position` float64 [D], None before the robot was ever measured: nothing is sent then. `rest` [D]: the distance
-    within which it could come to rest.
+    Joints that stood within their steady error keep their command. The others go along with the measurement for
+    `_FOLLOWS_S`, while the arm comes to rest, as far beside it as they last stood from their command and no farther
+    from where they were first seen than coming to rest takes, and then keep that: an arm that is sent its own
+    measurement sinks under its weight. `position` float64 [D], None before the robot was ever measured: nothing is
+    sent then. `rest` [D]: the distance within which it could come to rest.
     """
 
     name = "estop"
@@ -127,6 +128,7 @@ class EStopped(Behaviour):
     def __init__(self, position: Float64 | None, rest: Float64) -> None:
         self.position = position
         self.rest = rest
+        self.kept: np.ndarray | None = None  # joints that keep their command, bool [D]; None until it is seen
         self._first: Float64 | None = None  # where it was seen first since it was pressed
         self._time = 0.0
 

@@ -22,6 +22,7 @@ from runtime.processes.control.command_subscribers import SubscriberCheck
 from runtime.processes.control.gripper_locks import GripperLocks
 from runtime.processes.control.node_handover import NodeHandover
 from runtime.processes.control.plausibility import Plausibility, Unquestioned
+from runtime.processes.control.steady_error import SteadyError
 from runtime.processes.control.telemetry import StatusRecord, Telemetry, TickState
 from runtime.safety.filter import SafetyFilter
 from runtime.transports.base import Sink
@@ -87,6 +88,7 @@ class Tick:
         self._plausibility = judges(settings.limits, settings.dims)
         self._displacement = Displacement(settings, self._plausibility)
         self._actuator = RobotActuator(shared, sink, settings, clock)
+        self._steady = SteadyError(settings, self._actuator.engaged)
         self._hearing = SubscriberCheck(shared, sink, self._report.say)
         # A restarted control goes on holding where its predecessor stood; a new one keeps silent.
         self._robot = self._lane(self._actuator)
@@ -104,6 +106,7 @@ class Tick:
         self._seen = self._plausibility.judge(self._eyes.look(), planned, self._moved)
         for payload in self._page.rings["orders"].drain():
             self._read(payload, step, planned)
+        self._steady.look(self._actuator, self._measured(planned), planned)
         self._check_estop(planned)
         self._check_family(planned)
         self._check_doubt(planned)
@@ -329,9 +332,9 @@ class Tick:
             return
         measured = None if stopped is None else self._measured(now)
         if stopped is not None and measured is not None:
-            self._stop_at(measured, stopped)
+            self._stop_at(measured, stopped, now)
 
-    def _stop_at(self, measured: Float64, stopped: EStopped) -> None:
+    def _stop_at(self, measured: Float64, stopped: EStopped, now: float) -> None:
         """Send where the robot is: at once as far as it takes to come to rest, farther as fast as it moves."""
         actuator, limits = self._actuator, self._settings.limits
         if not actuator.engaged and (self._plausibility.dead or not self._plausibility.settled):
@@ -339,8 +342,12 @@ class Tick:
         if not actuator.engaged:
             actuator.engage(measured)
             stopped.stay(actuator.commanded.copy())
+            stopped.kept = limits.places.copy()
         elif stopped.follows:
             measured = self._plausibility.middle(measured)
+            if stopped.kept is None:
+                stopped.kept = self._steady.keeps(actuator, measured, now)
+            measured = np.where(stopped.kept, actuator.commanded, measured + self._steady.last)
             if not stopped.seen:
                 self._displacement.follow(actuator, measured)
             measured = self._displacement.trusted(actuator, measured)

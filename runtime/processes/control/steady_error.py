@@ -1,0 +1,88 @@
+"""Steady servo error: how far joints stand from their command while both rest, because of gravity and payload."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import takewhile
+from typing import NamedTuple
+
+import numpy as np
+
+from runtime.core.types import Float64
+from runtime.motion.timeline import difference
+from runtime.processes.control.actuator import RobotActuator, TickSettings
+
+_EVERY_S = 0.05  # between samples
+_REST_S = 0.25  # for which command and reading rest in a joint that stands
+_STILL = 1e-3  # [rad] of a command that rests
+_QUIET = 0.01  # [rad] of a reading that rests, noise included
+_WINDOW_S = 1.0  # in which the error of a joint that stands has not grown
+_GROWN = 0.01  # [rad] more than noise
+_UNSEEN_S = 0.5  # without joints: whatever happened to the robot was not seen
+
+
+class _Sample(NamedTuple):
+    time: float
+    commanded: Float64
+    error: Float64
+
+
+class SteadyError:
+    """Tells an arm that stands below its command from one that is held up by something, or moves.
+
+    A command that follows the measurement of an arm that gravity pulls down makes it sink, tick by tick. An error that
+    has lasted is that of the servo, and says nothing about where the arm ought to be; one that has grown within the
+    last second may be something in the way.
+    """
+
+    def __init__(self, settings: TickSettings, inherited: bool) -> None:
+        """`inherited`: the command is that of a control that ran before this one."""
+        self._settings = settings
+        self._samples: deque[_Sample] = deque()
+        self._inherited = inherited
+        self.last: Float64 = np.zeros(len(settings.limits.names))  # of each joint, when it last stood [rad]
+
+    def look(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
+        """Take note of a tick; `measured` [D], None where the joints are not known."""
+        if not robot.engaged:
+            self._samples.clear()
+            self.last[:] = 0.0
+            self._inherited = False
+        elif measured is not None and not (self._samples and now - self._samples[-1].time < _EVERY_S):
+            self._note(robot, measured, now)
+            standing, error = self._standing(now)
+            self._inherited = self._inherited and now - self._samples[0].time < _REST_S
+            self.last = np.where(standing, error, self.last)
+
+    def keeps(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
+        """The joints that stand within a steady error of their command: a stop leaves that as it is, bool [D]."""
+        if self._inherited:
+            error = self._error(robot, measured)
+            standing = self._settings.limits.places & (np.abs(error) <= self._settings.safety.steady_error)
+        else:
+            self._note(robot, measured, now)
+            standing, error = self._standing(now)
+        self.last = np.where(standing, error, self.last)
+        return standing
+
+    def _note(self, robot: RobotActuator, measured: Float64, now: float) -> None:
+        if self._samples and now - self._samples[-1].time > _UNSEEN_S:
+            self._samples.clear()
+        self._samples.append(_Sample(now, robot.commanded.copy(), self._error(robot, measured)))
+        while now - self._samples[0].time > _WINDOW_S:
+            self._samples.popleft()
+
+    def _error(self, robot: RobotActuator, measured: Float64) -> Float64:
+        return difference(robot.commanded, measured, self._settings.dims.wrapping)
+
+    def _standing(self, now: float) -> tuple[np.ndarray, Float64]:
+        """The joints, bool [D], that stand within a steady error, and that error [D]."""
+        lately = list(takewhile(lambda sample: now - sample.time <= _REST_S, reversed(self._samples)))
+        commands = np.array([sample.commanded for sample in lately])
+        errors = np.array([sample.error for sample in lately])
+        error = np.median(errors, axis=0)
+        least = np.abs([sample.error for sample in self._samples]).min(axis=0)
+        rests = (np.ptp(commands, axis=0) <= _STILL) & (np.ptp(commands - errors, axis=0) <= _QUIET)
+        steady = (np.abs(error) <= self._settings.safety.steady_error) & (np.abs(error) - least <= _GROWN)
+        seen = now - self._samples[0].time >= _REST_S - _EVERY_S
+        return np.asarray(self._settings.limits.places & rests & steady & seen), error

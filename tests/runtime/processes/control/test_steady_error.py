@@ -1,0 +1,161 @@
+"""An arm that stands below its command, as gravity and a payload make it: nothing that stops it may make it sink."""
+
+import numpy as np
+import pytest
+
+from runtime.ipc.shared_state import EStop
+from tests.runtime.tick_bench import PERIOD, Bench, following, wave
+
+ERRORS = [0.01, 0.03, -0.05, 0.098]
+SUBSTEP_S = 1e-3
+STIFFNESS, DAMPING = 900.0, 60.0  # [1/s2], [1/s]: critically damped, a lag of 67 ms
+
+
+class Compliant(Bench):
+    """Servos with a proportional and a derivative part under a steady load; they stand `error` below their command.
+
+    Its node holds it where it stands until it is told otherwise. Nothing passes `wall` [D].
+    """
+
+    def __init__(self, error=0.05, noise=0.0, **given):
+        self.error = np.broadcast_to(np.asarray(error, float), 2).copy()
+        self.wall = np.full(2, np.inf)
+        self.true, self.speed = np.zeros(2), np.zeros(2)
+        self.node = self.error.copy()
+        self.course = []
+        self._random, self._noise = np.random.default_rng(1), noise
+        super().__init__({"kind": "naive"}, **given)
+
+    def observe(self, **changes):
+        read = self.true + self._noise * self._random.standard_normal(2)
+        super().observe(**{"qpos": read.astype(np.float32), **changes})
+
+    def move(self, seconds):
+        told = self.sent[-1] if len(self.sent) else self.node
+        for _ in range(round(seconds / SUBSTEP_S)):
+            push = STIFFNESS * (told - self.error - self.true) - DAMPING * self.speed
+            self.speed = self.speed + push * SUBSTEP_S
+            self.true = self.true + self.speed * SUBSTEP_S
+            self.speed[self.true > self.wall] = 0.0
+            self.true = np.minimum(self.true, self.wall)
+        self._measured = self.true.copy()
+        self.course.append(self.true.copy())
+
+    def seconds(self, seconds):
+        self.run(round(seconds / PERIOD))
+        return self
+
+    def stop(self):
+        self.shared.set_estop(EStop.LATCHED)
+        return self
+
+    def release(self):
+        self.shared.set_estop(EStop.CLEAR)
+        return self
+
+
+def standing(error=0.05, **given):
+    """At 0 for three seconds, told by a motion."""
+    bench = Compliant(error, **given)
+    bench.say("motion", goal=np.zeros(2))
+    return bench.seconds(3.0)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001])
+@pytest.mark.parametrize("error", ERRORS)
+def test_an_e_stop_leaves_an_arm_that_stands_where_it_stands(error, noise):
+    bench = standing(error, noise=noise)
+    stood = bench.sent[-1]
+    for _ in range(6):
+        bench.stop().seconds(1.5)
+        bench.release().seconds(0.4)
+    assert bench.sent[-1] == pytest.approx(stood, abs=1e-9)
+
+
+@pytest.mark.parametrize("error", ERRORS)
+def test_a_control_that_is_restarted_under_the_e_stop_goes_on_with_the_command_of_the_one_before(error):
+    bench = standing(error).stop().seconds(1.0)
+    for _ in range(5):
+        bench.tick = bench.new_tick()
+        bench.seconds(1.0)
+    assert bench.sent[-1] == pytest.approx(np.zeros(2), abs=1e-9)
+
+
+def test_a_restarted_control_takes_the_reading_where_that_is_farther_from_the_command():
+    bench = standing(0.0).stop().seconds(1.0)
+    bench.tick = bench.new_tick()
+    bench.true = bench.true + np.array([0.0, 0.2])
+    bench.error = np.array([0.0, -0.2])  # it lies on something now
+    bench.seconds(2.0)
+    assert bench.sent[-1, 0] == pytest.approx(0.0, abs=1e-6)
+    assert bench.sent[-1, 1] > 0.15
+
+
+@pytest.mark.parametrize("error", ERRORS)
+def test_a_stop_in_motion_ends_as_it_would_without_a_load(error):
+    """Of which the command is the reading and the error that the joint had when it last stood, not its lag."""
+    ends = []
+    for load in (0.0, error):
+        bench = standing(load)
+        following(bench, wave(90, 1.0))
+        bench.seconds(1.0)
+        bench.stop().seconds(2.0)
+        ends.append(bench.sent[-60:])
+    assert ends[1] == pytest.approx(ends[0], abs=2e-3)
+
+
+def test_an_arm_that_presses_on_something_is_let_go_to_where_it_reads():
+    bench = standing(0.02)
+    bench.wall = bench.true + 0.03
+    following(bench, wave(6, 0.6))
+    bench.seconds(0.6)
+    pressed = bench.sent[-1] - bench.true
+    bench.stop().seconds(1.0)
+    assert pressed.min() > 0.05
+    assert bench.sent[-1] - bench.true == pytest.approx(np.full(2, 0.02), abs=3e-3)
+
+
+@pytest.mark.parametrize("error", ERRORS)
+@pytest.mark.parametrize("stopped", [True, False])
+def test_joints_that_are_missing_for_half_a_second_move_nothing(error, stopped):
+    bench = standing(error)
+    if stopped:
+        bench.stop().seconds(1.0)
+    for missing in (0.6, 2.0):
+        bench.feed = False
+        bench.seconds(missing)
+        bench.feed = True
+        bench.seconds(1.0)
+    assert bench.sent[-1] == pytest.approx(np.zeros(2), abs=1e-9)
+
+
+@pytest.mark.parametrize("error", ERRORS)
+def test_an_arm_that_is_first_seen_under_the_e_stop_is_let_down_by_its_error_once(error):
+    bench = Compliant(error, seen=False)
+    bench.stop().seconds(2.0)
+    assert len(bench.sent)
+    assert np.abs(np.array(bench.course)).max() <= abs(error) + 1e-3
+
+
+@pytest.mark.parametrize("error", ERRORS)
+def test_a_take_over_lets_an_arm_down_by_its_error_once(error):
+    bench = Compliant(error)
+    bench.say("motion", goal=np.full(2, 0.01))
+    bench.seconds(2.0)
+    assert np.abs(np.array(bench.course)).max() <= abs(error) + 0.011
+
+
+@pytest.mark.parametrize("error", ERRORS)
+def test_hold_home_release_and_the_first_chunk_begin_at_the_command(error):
+    bench = standing(error)
+    bench.say("hold", run=1)
+    bench.seconds(0.5)
+    bench.stop().seconds(0.5)
+    bench.release().seconds(0.5)
+    bench.say("motion", goal=np.zeros(2))
+    bench.seconds(0.5)
+    following(bench, wave(60, 0.0))
+    bench.seconds(1.0)
+    assert bench.sent[-1] == pytest.approx(np.zeros(2), abs=1e-9)
+    told = bench.sent[-90:]
+    assert np.abs(told).max() <= 1e-9
