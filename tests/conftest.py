@@ -15,7 +15,7 @@ import hypothesis
 import pytest
 
 from runtime.core.environment import for_programs
-from tests.migrated import SHARED
+from tests.once import SHARED
 from tests.stalls import Stalls, Watch
 
 _LABS = (
@@ -25,9 +25,12 @@ _LABS = (
 _ALONE = re.compile(r"pytest\.mark\.(?:lab|story)\b")
 os.environ |= for_programs(os.environ)
 _BEGAN = os.sched_getscheduler(0)
-hypothesis.settings.register_profile("gate", deadline=None, derandomize=True, print_blob=True)
+# In the gate the same examples everywhere, what fails is what was changed; and few: others come with `make labs`.
+hypothesis.settings.register_profile(
+    "gate", deadline=None, derandomize=True, print_blob=True, max_examples=30
+)
 hypothesis.settings.register_profile("random", deadline=None, derandomize=False, print_blob=True)
-hypothesis.settings.load_profile("gate")  # the same examples everywhere: what fails is what was changed
+hypothesis.settings.load_profile("gate")
 _SOCKETS = tempfile.mkdtemp(prefix="eva-")  # of every station that a test starts
 _OWN = SHARED not in os.environ  # else that of the process that started this one
 if _OWN:

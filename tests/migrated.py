@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import sqlite3
@@ -12,8 +11,9 @@ from contextlib import closing
 from functools import cache
 from pathlib import Path
 
+from tests.once import made_once
+
 ROOT = Path(__file__).parents[1]
-SHARED = "EVA_TESTS_SHARED"  # the folder of all processes of these tests; tests/conftest.py makes it
 
 
 def copy(folder: Path) -> None:
@@ -30,17 +30,10 @@ def copy_to(database: Path) -> None:
 
 @cache
 def _made() -> Path:
-    """The file, of all processes of these tests: the first one that wants it makes it, others wait."""
-    folder = Path(os.environ[SHARED])
-    whole = folder / "whole.sqlite3"
-    with (folder / "lock").open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not whole.exists():
-            _make(folder, whole)
-    return whole
+    return made_once("migrated", _make) / "whole.sqlite3"
 
 
-def _make(folder: Path, whole: Path) -> None:
+def _make(folder: Path) -> None:
     ours = {name: value for name, value in os.environ.items() if not name.startswith(("EVA_", "DJANGO_"))}
     subprocess.run(
         [sys.executable, "manage.py", "migrate", "--verbosity", "0"],
@@ -48,7 +41,8 @@ def _make(folder: Path, whole: Path) -> None:
         env=ours | {"EVA_DATA_DIR": str(folder)},
         check=True,
     )
-    part = folder / "part.sqlite3"
-    with closing(sqlite3.connect(folder / "eva.sqlite3")) as made, closing(sqlite3.connect(part)) as copied:
+    with (
+        closing(sqlite3.connect(folder / "eva.sqlite3")) as made,
+        closing(sqlite3.connect(folder / "whole.sqlite3")) as copied,
+    ):
         made.backup(copied)  # whatever its journal still has
-    part.rename(whole)

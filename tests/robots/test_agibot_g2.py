@@ -8,7 +8,7 @@ import pytest
 from robots import Body, load
 from robots.clearance import MARGIN, Clearance
 from robots.rotations import matrix_of_quaternion, rotation_vector, transform_of
-from tests.robots.standing import extents, lowest
+from tests.robots.standing import lowest
 
 ROBOT = load("agibot_g2")
 MIRROR = np.array([-1, 1, -1, 1, -1, 1, -1])  # of the arm's joints
@@ -158,34 +158,3 @@ def test_ready_holds_the_fingers_down_and_open_beside_the_workspace() -> None:
         np.testing.assert_allclose(tip[:3, 3], [side * 0.36, 0.22, 0.22], atol=0.002)
         own = arm.joint_dims
         assert np.minimum(q - ROBOT.lower, ROBOT.upper - q)[own].min() > 0.1
-
-
-EXTENTS = {  # of the meshes of the published description [m]
-    "base_link": ([-0.3739, -0.3180, 0.0], [0.3841, 0.3280, 0.3258]),
-    "body_link1": ([-0.0765, -0.1008, -0.0765], [0.0766, 0.0884, 0.4365]),
-    "body_link2": ([-0.0695, -0.1210, -0.0689], [0.0868, 0.1210, 0.4491]),
-    "body_link3": ([-0.0876, -0.0895, -0.0725], [0.0876, 0.0935, 0.0725]),
-    "body_link4": ([-0.2035, -0.1162, -0.0804], [0.1296, 0.1162, 0.1561]),
-    "body_link5": ([-0.1999, -0.1650, -0.0153], [0.1477, 0.1651, 0.5664]),
-    "head_link1": ([-0.0261, -0.0288, -0.1449], [0.0366, 0.0288, 0.0948]),
-    "head_link2": ([-0.0639, -0.0428, -0.0290], [0.0002, 0.0315, 0.0270]),
-    "head_link3": ([-0.0854, -0.0814, -0.0848], [0.1163, 0.0815, 0.1550]),
-    "arm_l_link1": ([-0.0519, -0.0623, 0.1010], [0.0519, 0.0549, 0.2265]),
-    "arm_l_link2": ([-0.0559, -0.0562, -0.0709], [0.0559, 0.1830, 0.0709]),
-    "arm_l_link3": ([-0.0480, -0.0524, 0.1720], [0.0615, 0.0588, 0.3829]),
-    "arm_l_link4": ([-0.0561, -0.0494, -0.0642], [0.0492, 0.1370, 0.0642]),
-    "arm_l_link5": ([-0.0444, -0.0531, 0.1380], [0.0444, 0.0531, 0.2918]),
-    "arm_l_link6": ([-0.0409, -0.0394, -0.0394], [0.0518, 0.0394, 0.0394]),
-    "arm_l_link7": ([-0.0357, -0.0357, -0.0549], [0.0900, 0.0357, 0.0549]),
-    "arm_r_link1": ([-0.0519, -0.0549, 0.1010], [0.0519, 0.0623, 0.2265]),
-    "arm_r_link3": ([-0.0480, -0.0588, 0.1720], [0.0615, 0.0524, 0.3829]),
-    "gripper_l_base_link": ([-0.0287, -0.0397, 0.0], [0.0286, 0.0397, 0.0834]),
-    "gripper_l_camera_link": ([-0.1199, -0.0320, -0.0015], [0.0320, 0.0484, 0.0779]),
-    "gripper_l_inner_link1": ([-0.0128, -0.0245, -0.0187], [0.0369, 0.0128, 0.0181]),
-    "gripper_l_inner_link4": ([-0.0051, -0.0223, -0.0130], [0.0479, 0.0054, 0.0130]),
-}
-
-
-@pytest.mark.parametrize("link", EXTENTS)
-def test_the_drawn_shapes_of_a_link_fill_the_extents_of_the_real_one_to_10_mm(link: str) -> None:
-    np.testing.assert_allclose(extents(ROBOT, link), EXTENTS[link], rtol=0, atol=0.01)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from robots import load
-from tests.robots.standing import extents
 
 HOME = ([0.0] * 6, [0.056142472, -5.6e-08, 0.213193093], [0.737256126, 2.326e-06, 0.675613354, -4.995e-06])
 LEFT = (
@@ -55,22 +54,3 @@ def test_forward_kinematics_of_recorded_joints_agrees_with_recorded_poses() -> N
         assert np.linalg.norm(pose[:, :3] - wanted[:, :3], axis=1).max() < 1.2e-4
         assert np.degrees(turned).max() < 0.03
         np.testing.assert_array_equal(wanted[:, 7], qpos[:, arm.gripper_dim])
-
-
-EXTENTS = {  # of the meshes of the published description [m]
-    "base_link": ([-0.0585, -0.0400, 0.0000], [0.0400, 0.0400, 0.0860]),
-    "link1": ([-0.0359, -0.0367, -0.0430], [0.0360, 0.0408, 0.0300]),
-    "link2": ([-0.0315, -0.0648, -0.0485], [0.3165, 0.0317, 0.0485]),
-    "link3": ([-0.0561, -0.2148, -0.0400], [0.0299, 0.0300, 0.0407]),
-    "link4": ([-0.0329, -0.0285, -0.0360], [0.0298, 0.0326, 0.0284]),
-    "link5": ([-0.0300, -0.0900, -0.0324], [0.0300, 0.0235, 0.0285]),
-    "link6": ([-0.0175, -0.0175, -0.0040], [0.0174, 0.0175, 0.0000]),
-    "gripper_base": ([-0.0400, -0.0725, 0.0000], [0.0305, 0.0725, 0.0630]),
-    "link7": ([-0.0280, -0.0765, 0.0000], [0.0280, 0.0000, 0.0265]),
-    "link8": ([-0.0280, -0.0765, 0.0000], [0.0280, 0.0000, 0.0265]),
-}
-
-
-@pytest.mark.parametrize("link", EXTENTS)
-def test_the_drawn_shapes_of_a_link_fill_the_extents_of_the_real_one_to_3_mm(link: str) -> None:
-    np.testing.assert_allclose(extents(load("agilex_piper"), link), EXTENTS[link], rtol=0, atol=0.003)

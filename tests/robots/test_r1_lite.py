@@ -8,7 +8,7 @@ import pytest
 from robots import Body, load, shapes
 from robots.clearance import MARGIN, Clearance
 from robots.rotations import matrix_of_quaternion, rotation_vector, transform_of
-from tests.robots.standing import extents, lowest
+from tests.robots.standing import lowest
 
 ROBOT = load("r1_lite")
 WHOLE = load("r1_lite", groups=["left_arm", "right_arm", "torso", "base"])
@@ -172,28 +172,3 @@ def test_ready_holds_the_fingers_down_and_open_beside_the_workspace() -> None:
         assert q[arm.gripper_dim] == arm.gripper.open
         own = arm.joint_dims
         assert np.minimum(q - ROBOT.lower, ROBOT.upper - q)[own].min() > 0.1
-
-
-EXTENTS = {  # of the meshes of the published description [m]
-    "base_link": ([-0.2302, -0.2995, 0.0396], [0.3620, 0.2965, 0.2505]),
-    "steer_motor_link1": ([-0.0475, -0.0400, -0.1591], [0.0475, 0.0400, 0.0]),
-    "wheel_motor_link1": ([-0.0700, -0.0240, -0.0698], [0.0700, 0.0240, 0.0698]),
-    "torso_link1": ([-0.0625, -0.0904, -0.0625], [0.0625, 0.0866, 0.4125]),
-    "torso_link2": ([-0.0625, -0.0915, -0.0625], [0.0626, 0.0915, 0.4125]),
-    "left_arm_base_link": ([-0.0496, -0.0496, -0.0002], [0.0496, 0.0496, 0.0860]),
-    "left_arm_link1": ([-0.0395, -0.0313, 0.0012], [0.0395, 0.0333, 0.0887]),
-    "left_arm_link2": ([-0.3300, -0.0728, -0.0430], [0.0395, 0.0113, 0.0395]),
-    "left_arm_link3": ([-0.0342, -0.0692, -0.0300], [0.2044, 0.0072, 0.1052]),
-    "left_arm_link4": ([-0.0175, -0.0600, -0.0175], [0.1085, 0.0060, 0.0915]),
-    "left_arm_link5": ([-0.0285, -0.0285, -0.0690], [0.0265, 0.0285, -0.0060]),
-    "left_arm_link6": ([0.0010, -0.0251, -0.0225], [0.0120, 0.0251, 0.0225]),
-    "left_gripper_link": ([-0.0767, -0.0542, -0.0300], [0.0, 0.0542, 0.0300]),
-    "left_D405_link": ([-0.0120, -0.0210, -0.0299], [0.0301, 0.0664, 0.0413]),
-    "left_gripper_finger_link1": ([-0.0505, -0.0652, -0.0142], [0.0415, 0.0048, 0.0229]),
-    "left_gripper_finger_link2": ([-0.0505, -0.0048, -0.0229], [0.0415, 0.0652, 0.0142]),
-}
-
-
-@pytest.mark.parametrize("link", EXTENTS)
-def test_the_drawn_shapes_of_a_link_fill_the_extents_of_the_real_one_to_10_mm(link: str) -> None:
-    np.testing.assert_allclose(extents(ROBOT, link), EXTENTS[link], rtol=0, atol=0.01)

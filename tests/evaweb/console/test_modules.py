@@ -28,6 +28,7 @@ def run(module: str, body: str, given: Any = None) -> Any:
         f"const m = await import({json.dumps((MODULES / module).as_uri())});"
         "const given = JSON.parse((await import('node:fs')).readFileSync(0, 'utf8'));"
         f"console.log(JSON.stringify(await (async () => {{ {body} }})()));"
+        "process.exit();"  # no timer that is left is waited for
     )
     assert NODE is not None
     found = subprocess.run(

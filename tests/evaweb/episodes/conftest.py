@@ -17,19 +17,25 @@ from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
 from evaweb.stations.models import Station
 from runtime.recording.export import export
+from tests.once import made_once
 from tests.runtime.lockstep_station import Station as Bench
 from tests.runtime.lockstep_station import stubbed
 
+STATUSES = ("finished", "interrupted")
 FRAMES = 24
 HELD = 6
 
 
 @pytest.fixture(scope="session")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def recorded() -> dict[str, Path]:
     """Folders of one finished and one interrupted episode, by status; in both the robot was held for a while."""
-    made = {}
-    for status in ("finished", "interrupted"):
-        bench = Bench(stubbed(tmp_path_factory.mktemp(status)))
+    made = made_once("recorded", _record)
+    return {status: next((made / status / "episodes").iterdir()) for status in STATUSES}
+
+
+def _record(folder: Path) -> None:
+    for status in STATUSES:
+        bench = Bench(stubbed(folder / status))
         bench.running(12)
         bench.command("halt")
         bench.go(HELD)
@@ -43,8 +49,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             episode = bench.stop()
         assert episode.outcome is not None
         assert episode.outcome["status"] == status
-        made[status] = episode.path
-    return made
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from runtime.link import door, key_files, wire
 from runtime.link.admission import Admission, AllowList
 from runtime.link.line import dialled
 from runtime.link.wire import COMMANDS, RELEASE, STOPS, Ask, Beat, Bye, Hello, Welcome, read, write
-from tests.processes import PATIENCE_MS, eventually
+from tests.processes import eventually
 from tests.runtime.link.linked import STATION, allowed
 
 OTHER = "bench-8"
@@ -116,9 +116,12 @@ def test_a_message_of_nothing_but_parts_keeps_no_press_and_its_key_is_refused_fo
     whole.send(b"")
     assert "frames" in said(whole, Bye).why
     assert lab.press().status == "done"
+    refused, asked = [], lab.allowed.refused
+    monkeypatch.setattr(lab.allowed, "refused", lambda *given: refused.append(asked(*given)) or refused[-1])
     again = dial()
     again.send_multipart(write(Hello(RELEASE, "0", OTHER, STOPS, b"hostile")))
-    assert not again.poll(PATIENCE_MS)
+    eventually(lambda: True in refused, "the question about its key")
+    assert not again.poll(200)
     lab.allowed._refused.clear()
     again = dial()
     again.send_multipart(write(Hello(RELEASE, "0", OTHER, STOPS, b"hostile")))
