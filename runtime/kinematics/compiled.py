@@ -13,6 +13,7 @@ from pydantic import Field
 from robots import Chain, Group, Robot
 from runtime.core.errors import SetupError
 from runtime.core.types import Float64
+from runtime.kinematics import kernel_cache
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsError, KinematicsSettings
 from runtime.kinematics.replanning import CRAMPED, ROOMIER, missed, postures, replanned
 from runtime.kinematics.tables import POSED, Record, Records, Way, chains_of
@@ -42,12 +43,17 @@ def build(config: Config, robot: Robot) -> CompiledKinematics:
     return made
 
 
+def is_compiled(robot: Robot) -> bool:
+    """True if nothing is left to compile for the robot."""
+    return kernel_cache.is_compiled(robot)
+
+
 class CompiledKinematics(Kinematics):
     """Forward and inverse kinematics in float64; each arm is solved by itself, frame after frame."""
 
     def __init__(self, robot: Robot, config: Config | None = None) -> None:
         try:
-            from runtime.kinematics.kernels import chains, chunks, compiling, frames
+            from runtime.kinematics.kernels import chains, chunks, frames
         except ImportError as error:
             raise SetupError(str(error)) from error
         config = config or Config()
@@ -59,7 +65,7 @@ class CompiledKinematics(Kinematics):
             postures(robot.poses["home"][dims], robot.lower[dims], robot.upper[dims], _TRIED)
             for dims in (group.joint_dims for group, _ in own)
         ]
-        self._is_kept, self._forget = compiling.is_kept, compiling.forget
+        self._robot = robot
         self._poses_of, self._solve_chunk = chains.poses_of, chunks.solve_chunk
         self._reach_type = chains.reach_type(self._whole["drive"].shape[1])
         self._scratch_type = chunks.scratch_type(*_lengths(self._arms))
@@ -79,12 +85,12 @@ class CompiledKinematics(Kinematics):
 
         What is kept on disk and cannot be read, after a full disk or a loss of power, is compiled again.
         """
-        if not self._is_kept():
+        if not kernel_cache.is_compiled(self._robot):
             _log.info("compiling the kinematics for this processor, once; this takes some seconds")
         try:
             self._solve_once()
         except Exception as error:
-            if not self._forget():
+            if not kernel_cache.forget():
                 raise
             _log.warning(
                 "compiled kinematics cannot be used as they are kept (%s: %s); compiling them again",
@@ -92,6 +98,7 @@ class CompiledKinematics(Kinematics):
                 error,
             )
             self._solve_once()
+        kernel_cache.note_compiled(self._robot)
 
     def _solve_once(self) -> None:
         seed = np.zeros(self._dim)

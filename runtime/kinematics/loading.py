@@ -19,15 +19,28 @@ class Loading(Kinematics):
     A station whose policy speaks joints starts without a compiler, and never loads one.
     """
 
-    def __init__(self, forward: Forward, make: Make, aside: Callable[[Make], Future[Kinematics]]) -> None:
+    def __init__(
+        self,
+        forward: Forward,
+        make: Make,
+        aside: Callable[[Make], Future[Kinematics]],
+        compiled: Callable[[], bool] = lambda: True,
+    ) -> None:
+        """`compiled`: whether `make` would have nothing to compile."""
         self._forward = forward  # until it is there
-        self._make, self._aside = make, aside
+        self._make, self._aside, self._compiled = make, aside, compiled
         self._made: Future[Kinematics] | None = None
         self._once = Lock()
 
     def prepare(self) -> bool:
         """Begin to load, where nobody has; whether `solve` would not have to wait for that."""
         return self._begun().done()
+
+    def compile(self) -> Future[Kinematics] | None:
+        """Begin to compile what a run could need; None where there is nothing to compile, and nothing is loaded."""
+        if self._made is None and self._compiled():
+            return None
+        return self._begun()
 
     def forward(self, q: Float64) -> Float64:
         """Poses [..., arms, 7] for joint vectors [..., D]; KinematicsError for another width. Waits for nothing."""

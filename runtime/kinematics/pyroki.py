@@ -43,6 +43,11 @@ def build(config: Config, robot: Robot) -> PyrokiKinematics:
     return made
 
 
+def is_compiled(robot: Robot) -> bool:
+    """False: what JAX compiles is kept in memory alone."""
+    return False
+
+
 class PyrokiKinematics(Kinematics):
     """Inverse kinematics in float32 by Levenberg-Marquardt, frame after frame in one compiled scan per arm.
 

@@ -12,7 +12,12 @@ from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
 from runtime.kinematics.forward import ChainForward
 from runtime.kinematics.loading import Loading
-from runtime.processes.coordinator.builders import MakePolicy, make_kinematics, make_policy
+from runtime.processes.coordinator.builders import (
+    MakePolicy,
+    kinematics_compiled,
+    make_kinematics,
+    make_policy,
+)
 from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.processes.coordinator.coordinator import Coordinator
 from runtime.processes.coordinator.demonstrations import Demonstrations
@@ -61,11 +66,16 @@ def assemble(
 
     boot, people = str(uuid.uuid4()), people or clock
     lease, orders = Lease(spec.deployment.lease.ttl_s), ControlQueue(shared)
-    kinematics = Loading(ChainForward(spec.robot), partial(make_kinematics, spec), runner.aside)
+    kinematics = Loading(
+        ChainForward(spec.robot),
+        partial(make_kinematics, spec),
+        runner.aside,
+        partial(kinematics_compiled, spec),
+    )
     spaces = ActionSpaces(spec.robot, kinematics, spec.rate)
     inference = _inference(spec, shared, clock, runner, orders, kinematics, make_policy)
     endpoints = Endpoints(spec.deployment.station_dir)
-    setup = SetUp(spec, inference, orders, shared, clock, reception)
+    setup = SetUp(spec, inference, orders, shared, clock, reception, kinematics.compile)
     health = HealthMonitor(spec, shared, lease, clock, people, reception, partial(endpoints.served, "panel"))
     runs = Runs(
         spec,

@@ -74,3 +74,9 @@ def make_kinematics(spec: StationSpec) -> Kinematics:
     settings = spec.deployment.kinematics
     made: Kinematics = variants("runtime.kinematics")[settings.kind].build(settings, spec.robot)
     return made
+
+
+def kinematics_compiled(spec: StationSpec) -> bool:
+    """True if `make_kinematics` would have nothing to compile."""
+    backend = variants("runtime.kinematics")[spec.deployment.kinematics.kind]
+    return bool(backend.is_compiled(spec.robot))

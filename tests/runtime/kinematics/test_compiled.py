@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from robots import Robot, load, names
 from robots.rotations import transform_of
+from runtime.kinematics import kernel_cache
 from runtime.kinematics.base import IkFlag, IkResult, KinematicsError
 from runtime.kinematics.compiled import CompiledKinematics, Config, build
-from runtime.kinematics.kernels import compiling
 from runtime.kinematics.kernels.chains import poses_of
 from runtime.kinematics.kernels.chunks import solve_chunk
 from tests.runtime.kinematics.crane import crane
@@ -477,7 +477,7 @@ def test_kernels_are_kept_in_the_folder_that_is_named(tmp_path: Path) -> None:
 def test_that_something_has_to_be_compiled_is_said_before(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(compiling, "is_kept", lambda: False)
+    monkeypatch.setattr(kernel_cache, "is_compiled", lambda robot: False)
     with caplog.at_level("INFO"):
         build(Config(), ROBOT)
     assert "compiling the kinematics for this processor, once" in caplog.text
@@ -491,8 +491,9 @@ def test_what_is_kept_on_disk_and_broken_is_compiled_again(tmp_path: Path) -> No
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     build(Config(), load("ur5e"))  # so that it is kept
-    assert compiling.CACHE is not None
-    shutil.copytree(compiling.CACHE, tmp_path / compiling.CACHE.name)
+    kept_at = kernel_cache.folder()
+    assert kept_at is not None
+    shutil.copytree(kept_at, tmp_path / kept_at.name)
 
     def started() -> str:
         done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Stages of `setup`, none of them blocking: connect, observe, home, reset, warm up, validate."""
+"""Stages of `setup`, none of them blocking: connect, compile once, observe, home, reset, warm up, validate."""
 
 from __future__ import annotations
 
@@ -73,6 +73,7 @@ class Stage(StrEnum):
 
     IDLE = "idle"
     CONNECT = "connecting to the policy"
+    COMPILE = "compiling the robot's kinematics, once on this machine"
     OBSERVE = "waiting for a complete observation"
     HOME = "going to the pose"
     SETTLE = "waiting for the arm to arrive"
@@ -112,6 +113,7 @@ class SetUp:
         shared: SharedState,
         clock: Clock,
         reception: Callable[[], ReceptionReport],
+        compile_: Callable[[], Future[Any] | None],
     ) -> None:
         self._plan = spec
         self._inference = inference
@@ -119,6 +121,7 @@ class SetUp:
         self._page = shared
         self._clock = clock
         self._reception = reception  # what it last reported
+        self._compile = compile_  # begins that, None where there is nothing to compile
         self._met = False  # control was asked to take the robot over where it is read
         self._going = SetupMotion(spec, orders, shared, clock)
         self.bench = BenchReset(spec, orders, clock, reception)
@@ -130,6 +133,7 @@ class SetUp:
         self.took: dict[str, float] = {}  # how long the policy took for its stages [s], without rests
         self.failed: Stage | None = None
         self._least = LeastTimes()
+        self._compiling: Future[Any] | None = None
         self._motion_only = ""  # what a motion alone amounts to, "" in a whole set-up
         self._reset: dict[str, Any] | None = None  # of the bench, that has been asked for
 
@@ -161,7 +165,9 @@ class SetUp:
     def _course(self) -> tuple[Stage, ...]:
         """Stages of the newest set-up in their order: of a motion alone those that were entered."""
         whole = Stage.CONNECT in self.stages or not self.stages
-        return _ALL if whole else tuple(self.stages)
+        if not whole or Stage.COMPILE not in self.stages:
+            return _ALL if whole else tuple(self.stages)
+        return (_ALL[0], Stage.COMPILE, *_ALL[1:])
 
     def _stage_status(self, stage: Stage, now: float) -> dict[str, Any]:
         """Whether it is done, goes on, or failed, and how long it took."""
@@ -240,6 +246,12 @@ class SetUp:
                 with telling(_POLICY_UNUSABLE):
                     self.info = self._connection.result()
                     check_info(self.info, self._plan, self._inference.continues)
+                self._compiling = self._compile()
+                waits = self._compiling is not None and not self._compiling.done()
+                self._enter(Stage.COMPILE if waits else Stage.OBSERVE)
+        elif self.stage is Stage.COMPILE:
+            # What fails there is told to whoever needs it: most policies speak joints, and none of it.
+            if self._compiling is None or self._compiling.done():
                 self._enter(Stage.OBSERVE)
         elif self.stage is Stage.OBSERVE:
             return self._observe()

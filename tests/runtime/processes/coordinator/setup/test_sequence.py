@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from runtime.core.errors import PolicyError, SetupError
 from runtime.core.types import Observation
 from runtime.ipc.session_state import SessionState
 from runtime.policies.base import PolicyInfo
+from runtime.processes.coordinator import assembly
+from runtime.processes.coordinator.inference.worker import LockstepRunner
 from runtime.processes.coordinator.setup.sequence import Stage
 from runtime.spaces.conversion import CommandRows
 from tests.runtime.lockstep_station import MOVED, STANDS, Station, on_time, ramp, stubbed
@@ -51,6 +54,29 @@ def test_it_goes_from_stage_to_stage_and_says_so(tmp_path: Path) -> None:
     assert station.coordinator.setup.validated == station.reason
     assert station.coordinator.setup.info is not None
     assert station.coordinator.setup.info.name == "stub"
+    station.close()
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_kinematics_that_are_not_compiled_yet_are_waited_for_and_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    compiled: Future[Any] = Future()
+    monkeypatch.setattr(assembly, "kinematics_compiled", lambda spec: False)
+    monkeypatch.setattr(LockstepRunner, "aside", lambda self, call: compiled)
+    station = Station(stubbed(tmp_path))
+    station.until(lambda: station.state is SessionState.IDLE, 5.0, "observations")
+    station.command("setup")
+    station.go(300)
+    assert station.coordinator.setup.stage is Stage.COMPILE
+    assert station.events("setup")[-1] == "compiling the robot's kinematics, once on this machine"
+    states = {stage["name"]: stage["state"] for stage in station.coordinator.snapshot()["stages"]}
+    assert list(states.values())[:3] == ["done", "active", "waiting"]
+    if fails:  # most policies speak joints, and need none of it
+        compiled.set_exception(SetupError("no compiler"))
+    else:
+        compiled.set_result(None)
+    station.reach(SessionState.READY)
     station.close()
 
 

@@ -1,0 +1,90 @@
+"""Where compiled kernels are kept, and for which robots they are there; loads no compiler to say so."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import os
+import tempfile
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from robots import Robot
+
+_KERNELS = Path(__file__).resolve().parent / "kernels"
+
+
+@functools.cache
+def folder() -> Path | None:
+    """The first folder that can be written: below $NUMBA_CACHE_DIR, beside the sources, in the user's cache."""
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    roots = [Path(chosen)] if chosen else [_KERNELS / "__pycache__", home / "eva-web"]
+    for root in roots:
+        found = root / f"kernels-{_digest()}"
+        try:
+            found.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=found).close()
+        except OSError:
+            continue
+        return found
+    logging.getLogger(__name__).warning(
+        "compiled kinematics are kept in memory alone, and every start takes seconds longer: %s cannot be written; "
+        "name a folder in NUMBA_CACHE_DIR",
+        " and ".join(map(str, roots)),
+    )
+    return None
+
+
+def is_compiled(robot: Robot) -> bool:
+    """True if the robot's kernels are on disk: a solve loads them within a second, instead of compiling them."""
+    kept = folder()
+    return kept is not None and (kept / _name(robot)).exists()
+
+
+def note_compiled(robot: Robot) -> None:
+    """Remember that the robot's kernels are on disk."""
+    if (kept := folder()) is not None:
+        (kept / _name(robot)).touch()
+
+
+def forget() -> bool:
+    """Remove what is kept on disk, so that it is compiled again; False where nothing is."""
+    kept = folder()
+    files = [] if kept is None else [file for file in kept.rglob("*") if file.is_file()]
+    for file in files:
+        file.unlink(missing_ok=True)
+    return bool(files)
+
+
+def _digest() -> str:
+    """Of all kernels: numba looks at a loop's own file alone, and would go on using what an old callee was."""
+    found = hashlib.sha256()
+    for file in sorted(_KERNELS.glob("*.py")):
+        found.update(file.read_bytes())
+    return found.hexdigest()[:16]
+
+
+def _name(robot: Robot) -> str:
+    """Of the mark for such a robot with this compiler on this processor."""
+    found = hashlib.sha256(robot.urdf.read_bytes())
+    for part in (robot.joint_names, _numba(), _processor()):
+        found.update(repr(part).encode())
+    return f"{robot.name}-{found.hexdigest()[:16]}.compiled"
+
+
+def _numba() -> str:
+    try:
+        return version("numba")
+    except PackageNotFoundError:
+        return ""
+
+
+@functools.cache
+def _processor() -> list[str]:
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
+    except OSError:
+        return []
+    return sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
