@@ -14,6 +14,7 @@ from evaweb.errors import EvaError, NotFound
 from evaweb.names import is_name
 from runtime.core.sentences import Pattern
 from runtime.datasets import layout
+from runtime.datasets.entries import episode_lines
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.recording.files import RecordingError
 
@@ -55,7 +56,7 @@ _OWN = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """Contents of info.json; where that cannot be read, `problem` says why, and the rest is empty."""
+    """Contents of info.json; where that cannot be read or is contradicted, `problem` says why, the rest is empty."""
 
     name: str  # its folder, relative to the data folder
     version: str = ""
@@ -142,6 +143,8 @@ def overview(name: str) -> Overview:
     folder = dataset_found(name)
     try:
         info = layout.read_info(folder)
+        if problem := _contradiction(folder, _stamp(folder)):
+            return Overview(name=name, problem=problem)
         return Overview(
             name=name,
             version=str(info["codebase_version"]),
@@ -185,6 +188,16 @@ def _stamp(folder: Path) -> tuple[int, int]:
 @lru_cache(16)
 def _opened(folder: Path, stamp: tuple[int, int]) -> Dataset:
     return open_dataset(folder)
+
+
+@lru_cache(256)
+def _contradiction(folder: Path, stamp: tuple[int, int]) -> str:
+    """Why its list of episodes cannot be what info.json counts, "" where it is."""
+    try:
+        episode_lines(folder, layout.read_info(folder))
+    except RecordingError as error:
+        return str(error)
+    return ""
 
 
 @lru_cache(256)

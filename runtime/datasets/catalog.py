@@ -12,7 +12,7 @@ from runtime.core.errors import RecordingError
 from runtime.datasets import layout, parquet_lists
 from runtime.datasets.entries import (
     EpisodeEntry,
-    committed,
+    of_episodes,
     entry,
     episode_lines,
     statistic_lines,
@@ -49,13 +49,17 @@ class Catalog:
                 "convert it first"
             )
         episodes = tuple(episode_lines(root, info))
-        eva = committed(root / layout.EVA_EPISODES, layout.read_lines(root / layout.EVA_EPISODES), info)
+        try:
+            eva = of_episodes(layout.read_lines(root / layout.EVA_EPISODES), episodes)
+            statistics = of_episodes(statistic_lines(root, info), episodes)
+        except (KeyError, TypeError, ValueError) as error:
+            raise RecordingError(f"{root / layout.EVA_EPISODES}: a line says no episode_index: {error!r}") from error
         catalog = cls(
             root,
             info,
             episodes,
             _committed_tasks(root, info, episodes),
-            tuple(statistic_lines(root, info)),
+            tuple(statistics),
             tuple(eva),
         )
         catalog._require_whole()

@@ -11,7 +11,7 @@ import numpy as np
 
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout, parquet_lists
-from runtime.datasets.entries import EpisodeEntry, Span, committed, entry, statistic_lines, task_lines
+from runtime.datasets.entries import EpisodeEntry, Span, entry, of_episodes, publishing, statistic_lines, task_lines
 from runtime.datasets.features import INDEX_COLUMNS, arrow_type, stored
 from runtime.datasets.pictures import Pictures, Stretch
 from runtime.datasets.rows import numbers, read_rows
@@ -66,7 +66,7 @@ def _said(root: Path) -> list[str]:
             *_declarations(info),
             *_episodes(info, entries, statistics, {line["task_index"] for line in tasks}),
             *_strays(root, info, entries),
-            *_sides(root, info),
+            *_sides(root, lines),
         ]
     except RecordingError as error:
         return [str(error)]
@@ -269,12 +269,13 @@ def _video(span: Span, key: str, info: layout.Info, length: int) -> Iterator[str
 
 def _strays(root: Path, info: layout.Info, entries: list[EpisodeEntry]) -> Iterator[str]:
     """Data files beyond those that are counted: LeRobot reads every parquet file below data/."""
-    counted = {listed.data for listed in entries if listed.index < int(info["total_episodes"])}
+    cut_off, total = publishing(root), int(info["total_episodes"])
+    counted = {listed.data for listed in entries if listed.index != cut_off or listed.index < total}
     for path in sorted((root / "data").rglob("*.parquet")):
         if path not in counted:
             yield f"{path} belongs to no episode: publishing was interrupted; `repair` removes it"
 
 
-def _sides(root: Path, info: layout.Info) -> Iterator[str]:
-    path = root / layout.EVA_EPISODES
-    yield from strays(root, {str(line["uuid"]) for line in committed(path, layout.read_lines(path), info)})
+def _sides(root: Path, episodes: list[Line]) -> Iterator[str]:
+    ours = of_episodes(layout.read_lines(root / layout.EVA_EPISODES), episodes)
+    yield from strays(root, {str(line["uuid"]) for line in ours})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,20 +33,57 @@ class EpisodeEntry:
 
 
 def episode_lines(root: Path, info: Info) -> list[Line]:
-    """The list of episodes as stored, in order of their indices; only those that info.json counts."""
+    """The list of episodes as stored, in order of their indices, which may have gaps.
+
+    The one that is just being published, or was when that was cut off, is not among them. RecordingError where the
+    list has others than info.json counts: nothing is left out without a word.
+    """
     v30 = info["codebase_version"] == layout.V30
-    name = parquet_lists.EPISODES_FOLDER if v30 else layout.EPISODES
-    lines = parquet_lists.read_episodes(root) if v30 else layout.read_lines(root / name)
-    return committed(root / name, lines, info)
-
-
-def committed(path: Path, lines: list[Line], info: Info) -> list[Line]:
-    """Those of `lines` that info.json counts, by episode; raises RecordingError for one that is of no episode."""
+    path = root / (parquet_lists.EPISODES_FOLDER if v30 else layout.EPISODES)
+    lines = parquet_lists.read_episodes(root) if v30 else layout.read_lines(path)
     try:
-        counted = [line for line in lines if int(line["episode_index"]) < int(info["total_episodes"])]
+        total, by_index = int(info["total_episodes"]), {int(line["episode_index"]): line for line in lines}
     except (KeyError, TypeError, ValueError) as error:
         raise RecordingError(f"{path}: a line says no episode_index: {error!r}") from error
-    return sorted(counted, key=lambda line: int(line["episode_index"]))
+    if len(by_index) < len(lines):
+        raise RecordingError(f"{path} lists an episode twice: {_brief([*map(_index, lines)])}")
+    if (pending := publishing(root)) is not None and pending >= total:
+        by_index.pop(pending, None)
+    if len(by_index) != total:
+        if int(layout.read_info(root)["total_episodes"]) == total:
+            raise RecordingError(
+                f"{path} lists {len(by_index)} episodes ({_brief(sorted(by_index))}), {layout.INFO} counts {total}: "
+                "correct the one that is wrong"
+            )
+        by_index = {index: line for index, line in by_index.items() if index < total}  # published meanwhile
+    return [by_index[index] for index in sorted(by_index)]
+
+
+def of_episodes(lines: Iterable[Line], episodes: Iterable[Line]) -> list[Line]:
+    """Those of `lines`, each about an episode, that are about one of `episodes`, in order of their indices."""
+    listed = {_index(line) for line in episodes}
+    return sorted((line for line in lines if _index(line) in listed), key=_index)
+
+
+def _index(line: Line) -> int:
+    return int(line["episode_index"])
+
+
+def publishing(root: Path) -> int | None:
+    """The episode whose publication goes on, or was cut off; None where there is none."""
+    path = root / layout.PUBLISHING_PLAN
+    try:
+        index = layout.read_json(path).get("episode_index")
+    except RecordingError:
+        if path.exists():
+            raise
+        return None
+    return index if isinstance(index, int) else None
+
+
+def _brief(indices: list[int]) -> str:
+    said = ", ".join(map(str, indices[:8]))
+    return said if len(indices) <= 8 else f"{said}, ... {indices[-1]}"
 
 
 def task_lines(root: Path, info: Info) -> list[Line]:
@@ -61,10 +98,15 @@ def task_lines(root: Path, info: Info) -> list[Line]:
 
 
 def statistic_lines(root: Path, info: Info) -> list[Line]:
-    """Statistics by episode as {"episode_index", "stats"}; [] for v2.0, which has none."""
+    """Statistics by episode as {"episode_index", "stats"}, as stored; [] for v2.0, which has none."""
     if info["codebase_version"] == layout.V30:
-        return committed(root / parquet_lists.EPISODES_FOLDER, parquet_lists.read_statistics(root), info)
-    return committed(root / layout.EPISODES_STATS, layout.read_lines(root / layout.EPISODES_STATS), info)
+        return parquet_lists.read_statistics(root)
+    path = root / layout.EPISODES_STATS
+    lines = layout.read_lines(path)
+    for line in lines:
+        if not isinstance(line.get("episode_index"), int):
+            raise RecordingError(f"{path}: a line says no episode_index: {_short(line)}")
+    return lines
 
 
 def entry(root: Path, info: Info, line: Line) -> EpisodeEntry:

@@ -52,8 +52,11 @@ def uuids_of(dataset: Path) -> dict[int, str]:
     return {int(line["episode_index"]): str(line["uuid"]) for line in _told(dataset)}
 
 
-def identity(dataset: Dataset, index: int) -> str:
-    """A uuid that is of these rows: the same for the same numbers at the same index, whatever columns are called."""
+def identity(dataset: Dataset, index: int, place: int | None = None) -> str:
+    """A uuid that is of these rows: the same for the same numbers at the same index, whatever columns are called.
+
+    `place`: the index that the episode has in a copy without gaps.
+    """
     digests = []
     table = dataset.table(index)
     for name in table.column_names:
@@ -65,7 +68,7 @@ def identity(dataset: Dataset, index: int) -> str:
         if pa.types.is_floating(column.type):
             values = np.ascontiguousarray(column.to_numpy(zero_copy_only=False), np.float64)
             digests.append(hashlib.sha256(values.tobytes()).hexdigest())
-    told = json.dumps([index, dataset.fps, table.num_rows, sorted(digests)])
+    told = json.dumps([index if place is None else place, dataset.fps, table.num_rows, sorted(digests)])
     return str(uuid5(NAMESPACE_URL, f"eva-imported:{hashlib.sha256(told.encode()).hexdigest()}"))
 
 
@@ -114,7 +117,8 @@ def _line(dataset: Dataset, index: int) -> dict[str, Any]:
 def _require_same(dataset: Path, target: Path) -> None:
     source, known = open_dataset(dataset), uuids_of(dataset)
     wanted = {
-        entry.index: known.get(entry.index) or identity(source, entry.index) for entry in source.episodes
+        place: known.get(entry.index) or identity(source, entry.index, place)
+        for place, entry in enumerate(source.episodes)
     }
     if uuids_of(target) != wanted:
         raise RecordingError(

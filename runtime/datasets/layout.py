@@ -29,6 +29,8 @@ TASKS_V30 = "meta/tasks.parquet"
 STATS = "meta/stats.json"
 MODALITY = "meta/modality.json"
 EVA_EPISODES = "meta/eva_episodes.jsonl"
+PUBLISHING = ".publishing"  # hidden: readers that take every file below data/ do not look here
+PUBLISHING_PLAN = f"{PUBLISHING}/plan.json"
 
 COUNTED = ("total_episodes", "total_frames", "total_tasks", "total_videos", "total_chunks", "splits")
 INFO_KEYS = frozenset(  # of any version

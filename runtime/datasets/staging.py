@@ -20,9 +20,8 @@ from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog
 from runtime.recording.files import disk_fault, read_document, sync_folder, write_whole
 
-FOLDER = ".publishing"  # hidden: readers that take every file below data/ do not look here
+FOLDER = layout.PUBLISHING
 LOCK = ".lock"
-PLAN = "plan.json"
 _HERE, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and the flag of renameat2(2)
 
 
@@ -60,7 +59,7 @@ def recover(root: Path) -> None:
     staging = root / FOLDER
     if not staging.exists():
         return
-    plan = staging / PLAN
+    plan = root / layout.PUBLISHING_PLAN
     if plan.exists():
         content = read_document(plan)
         index, files = content.get("episode_index"), content.get("files")
@@ -206,7 +205,7 @@ class Staging:
             "episode_index": self._index,
             "files": [str(path.relative_to(self._root)) for path in self._data],
         }
-        write_whole(self._folder / PLAN, json.dumps(plan).encode())
+        write_whole(self._root / layout.PUBLISHING_PLAN, json.dumps(plan).encode())
         return self
 
     def __exit__(

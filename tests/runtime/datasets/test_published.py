@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from runtime.core.errors import RecordingError
-from runtime.datasets import staging
+from runtime.datasets import layout, staging
 from runtime.datasets.consistency import check
 from runtime.datasets.mapping import ColumnMapping
 from runtime.datasets.published import publish
@@ -465,7 +465,7 @@ def _before_each_rename(act: Callable[[], None]) -> Iterator[None]:
     real = os.replace
 
     def replace(source: Any, target: Any) -> None:
-        if Path(target).name != staging.PLAN:
+        if Path(target).name != Path(layout.PUBLISHING_PLAN).name:
             act()
         real(source, target)
 
