@@ -7,6 +7,7 @@ from typing import Annotated, Any, Generic, TypeVar
 
 from django.db.models import QuerySet
 from ninja import Field, Schema
+from pydantic import ConfigDict
 
 Row = TypeVar("Row")
 LARGEST_PAGE = 1000
@@ -23,6 +24,12 @@ class Failure(Schema):
     error: str
     id: str | None = None
     arguments: dict[str, Any] | None = None
+
+
+class Body(Schema):
+    """What is posted. An unknown field is refused, because one that is misspelt does nothing."""
+
+    model_config = ConfigDict(extra="forbid")
 
 
 class Page(Schema, Generic[Row]):
@@ -65,4 +72,5 @@ def _sentence(fault: Mapping[str, Any]) -> str:
     place = ".".join(str(part) for part in fault["loc"] if part not in _WRAPPERS) or "body"
     given = fault["input"]
     shown = f" = {given!r:.80}" if isinstance(given, str | int | float) else ""
-    return f"{place}{shown}: {fault['msg']}"
+    msg = "unknown field" if fault["type"] == "extra_forbidden" else fault["msg"]
+    return f"{place}{shown}: {msg}"

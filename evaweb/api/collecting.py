@@ -9,7 +9,7 @@ from uuid import UUID
 from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema, Status
 
-from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.api.answers import FAILURES, Body, Page, Paging
 from evaweb.api.jobs import JobOut
 from evaweb.blinding import Sight, sight_for
 from evaweb.collect import selectors, services
@@ -125,7 +125,7 @@ class SessionDetail(SessionOut):
         }
 
 
-class SessionIn(Schema):
+class SessionIn(Body):
     """Task to be demonstrated; `dataset` "" takes the one that the deployment names."""
 
     task: str
@@ -133,13 +133,13 @@ class SessionIn(Schema):
     target: _Target = None
 
 
-class TargetIn(Schema):
+class TargetIn(Body):
     """Number of episodes wanted."""
 
     target: _Target
 
 
-class PublishIn(Schema):
+class PublishIn(Body):
     """Which results are published, and the version of a dataset that is new, "" for the usual one."""
 
     results: Annotated[

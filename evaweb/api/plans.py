@@ -9,7 +9,7 @@ from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema, Status
 from pydantic import StrictBool
 
-from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.api.answers import FAILURES, Body, Page, Paging
 from evaweb.api.trials import TrialDetail
 from evaweb.blinding import sight_for
 from evaweb.plans import bench_checks as bench
@@ -112,7 +112,7 @@ class Reason(Schema):
     reason: str = ""
 
 
-class RegionIn(Schema):
+class RegionIn(Body):
     """A named rectangle: its left upper corner and its size, as shares of the picture's width and height."""
 
     name: str
@@ -122,7 +122,7 @@ class RegionIn(Schema):
     height: float
 
 
-class RegionsIn(Schema):
+class RegionsIn(Body):
     """All regions of a reference picture."""
 
     regions: list[RegionIn]
@@ -178,13 +178,13 @@ class CamerasOut(Schema):
         return {"confirmed": check is not None, "at": check.at if check else None, "cameras": rows}
 
 
-class CamerasIn(Schema):
+class CamerasIn(Body):
     """`first`: what a camera without a reference shows becomes its reference."""
 
     first: StrictBool = False
 
 
-class ReferenceIn(Schema):
+class ReferenceIn(Body):
     """Of which position of which scene; without a scene of the cameras at all."""
 
     scene: str | int | None = None
@@ -214,7 +214,7 @@ class ReferenceOut(Schema):
         }
 
 
-class AchievedIn(Schema):
+class AchievedIn(Body):
     """Why a lower match than the plan's least is accepted."""
 
     override: str = ""

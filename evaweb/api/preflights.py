@@ -9,7 +9,7 @@ from uuid import UUID
 from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema, Status
 
-from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.api.answers import FAILURES, Body, Page, Paging
 from evaweb.blinding import sight_for
 from evaweb.preflights import selectors, services
 from evaweb.preflights.blinding_rules import shown
@@ -56,7 +56,7 @@ class PreflightOut(Schema):
         }
 
 
-class PreflightIn(Schema):
+class PreflightIn(Body):
     """Which checkpoint, by name or id, with the deployment of which station; without one the first that can."""
 
     checkpoint: str | int

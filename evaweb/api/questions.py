@@ -83,11 +83,26 @@ class Bounded(Parser):
         if not (request.path.endswith("/commands") and pressing.in_json(request.body, "kind")):
             require(request.auth, post_at(request.path).role)
         try:
-            return _read(request)
+            given = _read(request)
+            return _without_unknown(given) if request.path.endswith("/commands") else given
         except (EvaError, bounded.Unreadable):
             if pressed:
                 return {}
             raise
+
+
+def _without_unknown(given: Any) -> Any:
+    """The body; of a command that stops the robot without what nobody knows: it is not refused for that."""
+    from evaweb.api.stations import CommandIn  # which is read by this
+
+    if not _stops(given):
+        return given
+    return {name: value for name, value in given.items() if name in CommandIn.model_fields}
+
+
+def _stops(given: Any) -> bool:
+    kind = given.get("kind") if isinstance(given, dict) else None
+    return isinstance(kind, str) and kind in STOPPING
 
 
 def _read(request: HttpRequest) -> Any:
@@ -95,7 +110,7 @@ def _read(request: HttpRequest) -> Any:
     if len(request.body) > post.largest:
         raise TooLong(_BODY_TOO_LONG(count=len(request.body), largest=post.largest))
     given = bounded.from_json(request.body, "the body", most=post.values)
-    if b"\\u" in request.body and not (isinstance(given, dict) and given.get("kind") in STOPPING):
+    if b"\\u" in request.body and not _stops(given):
         for place, text in _texts(given):
             if not is_text(text):
                 raise EvaError(_NO_TEXT(place=place or "body", text=text))

@@ -9,7 +9,7 @@ from uuid import UUID
 from django.http import HttpRequest
 from ninja import Field, Router, Schema, Status
 
-from evaweb.api.answers import FAILURES
+from evaweb.api.answers import FAILURES, Body
 from evaweb.api.jobs import JobOut
 from evaweb.blinding import sight_for
 from evaweb.episodes.selectors import episode_get, tag_counts
@@ -111,14 +111,14 @@ class SaidOut(Schema):
     quality: QualityOut | None
 
 
-class ReviewIn(Schema):
+class ReviewIn(Body):
     """A verdict, or a note that leaves the verdict as it is."""
 
     verdict: Annotated[str, Field(description="pass, fail or note")]
     note: str = ""
 
 
-class SegmentIn(Schema):
+class SegmentIn(Body):
     """A part of the episode; with `segment`, one of one's own is changed."""
 
     first: _Frame
@@ -128,7 +128,7 @@ class SegmentIn(Schema):
     segment: UUID | None = None
 
 
-class TagsIn(Schema):
+class TagsIn(Body):
     """Tags to put on it and to take off; each is kept in small letters."""
 
     add: Annotated[list[str], Field(default_factory=list, max_length=30)]

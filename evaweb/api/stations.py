@@ -12,7 +12,7 @@ from django.utils import timezone
 from ninja import Field, Router, Schema, Status
 from pydantic import AfterValidator, ValidationError, field_validator
 
-from evaweb.api.answers import FAILURES, Failure
+from evaweb.api.answers import FAILURES, Body, Failure
 from evaweb.api.trials import TrialDetail
 from evaweb.blinding import Sight, sight_for
 from evaweb.collect.selectors import session_get
@@ -123,7 +123,7 @@ class StationDetail(StationOut):
     trial: TrialDetail | None
 
 
-class LeaseIn(Schema):
+class LeaseIn(Body):
     """Action on a lease; `request` is the id of another user's, `reason` why an administrator takes it.
 
     `move` brings one's own lease from another page to this one."""
@@ -141,7 +141,7 @@ def _no_trial(args: dict[str, Any]) -> dict[str, Any]:
     return args
 
 
-class ReplayIn(Schema):
+class ReplayIn(Body):
     """A recorded episode, by its uuid or as DATASET:INDEX; `robot` is whose numbers those of a dataset are."""
 
     episode: Annotated[str, Field(min_length=1, max_length=220)]
@@ -149,7 +149,7 @@ class ReplayIn(Schema):
     robot: Annotated[str, Field(max_length=63)] = ""
 
 
-class CommandIn(Schema):
+class CommandIn(Body):
     """A discrete verb; boot and sequence are those of the snapshot that it was decided by.
 
     With `trial`, set-up and run get their arguments from the trial, with `session` from what is collected;
@@ -204,7 +204,7 @@ class EStopIn(Schema):
         return stops.spoken(given) if isinstance(given, str) and given else "pressed"
 
 
-class TrialIn(Schema):
+class TrialIn(Body):
     """Next trial; scene and checkpoint by name or id, the position by its number."""
 
     scene: str | int

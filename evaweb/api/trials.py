@@ -11,7 +11,7 @@ from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema
 from pydantic import StrictBool, create_model
 
-from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.api.answers import FAILURES, Body, Page, Paging
 from evaweb.api.tables import Format, table_answer
 from evaweb.blinding import Sight, sight_for
 from evaweb.trials import corrections, selectors, services, voids
@@ -137,7 +137,7 @@ class TrialDetail(_Detail):
         return {**shown(trial, sight, (*_LIST, *_DETAIL)), "scores": scores, "void_requests": asked}
 
 
-class ScoreIn(Schema):
+class ScoreIn(Body):
     """A score: every milestone of the scene by id; `success` only where none of them is required.
 
     A trial that has a score takes another one as a correction, with a `reason`. After a lost answer a client sends the
@@ -165,7 +165,7 @@ class ScoreIn(Schema):
     uuid: Annotated[UUID | None, Field(description="Of your own; another one for each score")] = None
 
 
-class FailureIn(Schema):
+class FailureIn(Body):
     """Why a scored trial failed; null leaves that level as it is, "" takes it away."""
 
     failure: str | None = None

@@ -109,3 +109,20 @@ def test_of_many_faults_the_first_are_told(rest):
 def test_what_is_posted_where_nothing_is_read_does_nothing(rest, body):
     status, answer = posted(rest, "/api/v1/plans/nothing/reveal", body)
     assert (status, answer["error"]) == (404, "plan nothing does not exist; there are: none yet")
+
+
+def test_an_unknown_field_is_refused_and_a_stop_never_is_for_one(rest, bench, wire):
+    path = "/api/v1/stations/bench-1/commands"
+    status, answer = posted(rest, path, command(kind="home", sequnce=4))
+    assert (status, "sequnce = 4: unknown field" in answer["error"]) == (422, True)
+    assert not wire.heard
+    assert posted(rest, path, command(kind="stop", sequnce=4))[0] == 200
+    assert posted(rest, "/api/v1/stations/bench-1/estop", b'{"kind": "x", "wy": 4}')[0] == 200
+
+
+def test_every_body_but_that_of_a_press_refuses_unknown_fields():
+    described = json.loads(PLACE.read_text("utf-8"))["components"]["schemas"]
+    posted_to = {name: shape for name, shape in described.items() if name.endswith("In")}
+    open_ = {name for name, shape in posted_to.items() if shape.get("additionalProperties") is not False}
+    assert len(posted_to) > 15
+    assert open_ == {"EStopIn"}
