@@ -12,9 +12,9 @@ from runtime.core.errors import RecordingError
 from runtime.datasets import layout, parquet_lists
 from runtime.datasets.entries import (
     EpisodeEntry,
-    of_episodes,
     entry,
     episode_lines,
+    of_episodes,
     statistic_lines,
     task_lines,
 )
@@ -53,7 +53,9 @@ class Catalog:
             eva = of_episodes(layout.read_lines(root / layout.EVA_EPISODES), episodes)
             statistics = of_episodes(statistic_lines(root, info), episodes)
         except (KeyError, TypeError, ValueError) as error:
-            raise RecordingError(f"{root / layout.EVA_EPISODES}: a line says no episode_index: {error!r}") from error
+            raise RecordingError(
+                f"{root / layout.EVA_EPISODES}: a line says no episode_index: {error!r}"
+            ) from error
         catalog = cls(
             root,
             info,

@@ -11,7 +11,15 @@ import numpy as np
 
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout, parquet_lists
-from runtime.datasets.entries import EpisodeEntry, Span, entry, of_episodes, publishing, statistic_lines, task_lines
+from runtime.datasets.entries import (
+    EpisodeEntry,
+    Span,
+    entry,
+    of_episodes,
+    publishing,
+    statistic_lines,
+    task_lines,
+)
 from runtime.datasets.features import INDEX_COLUMNS, arrow_type, stored
 from runtime.datasets.pictures import Pictures, Stretch
 from runtime.datasets.rows import numbers, read_rows

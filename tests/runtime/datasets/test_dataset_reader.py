@@ -120,7 +120,9 @@ def test_episodes_that_the_info_does_not_count_are_not_there(tmp_path: Path) -> 
     write_dataset(tmp_path, lengths=(3, 4))
     info = json.loads((tmp_path / "meta/info.json").read_text()) | {"total_episodes": 1}
     (tmp_path / "meta/info.json").write_text(json.dumps(info))
-    with pytest.raises(RecordingError, match=r"lists 2 episodes \(0, 1\), meta/info.json counts 1: correct the one"):
+    with pytest.raises(
+        RecordingError, match=r"lists 2 episodes \(0, 1\), meta/info.json counts 1: correct the one"
+    ):
         open_dataset(tmp_path)
     (tmp_path / ".publishing").mkdir()  # ours, cut off
     (tmp_path / ".publishing/plan.json").write_text('{"episode_index": 1, "files": []}')
