@@ -48,7 +48,7 @@ class _Api(NinjaAPI):
         """Every error with its place and what stood there."""
         return ValidationError(
             [
-                {"loc": error["loc"], "msg": error["msg"], "input": error["input"]}
+                {key: error[key] for key in ("loc", "type", "msg", "input")}
                 for context in error_contexts
                 for error in context.pydantic_validation_error.errors(include_url=False)
             ]

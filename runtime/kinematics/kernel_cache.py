@@ -15,7 +15,7 @@ from robots import Robot
 _KERNELS = Path(__file__).resolve().parent / "kernels"
 
 
-@functools.cache
+@functools.cache  # cache: one process compiles into one folder
 def folder() -> Path | None:
     """The first folder that can be written: below $NUMBA_CACHE_DIR, beside the sources, in the user's cache."""
     chosen = os.environ.get("NUMBA_CACHE_DIR")
@@ -81,7 +81,7 @@ def _numba() -> str:
         return ""
 
 
-@functools.cache
+@functools.cache  # cache: it stays the same
 def _processor() -> list[str]:
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()

@@ -12,6 +12,7 @@ from runtime.config import loader
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.types import Observation
 from runtime.ipc.session_state import SessionState
+from runtime.kinematics.forward import ChainForward
 from runtime.policies.base import PolicyInfo
 from runtime.processes.coordinator import assembly
 from runtime.processes.coordinator.inference.worker import LockstepRunner
@@ -75,7 +76,7 @@ def test_kinematics_that_are_not_compiled_yet_are_waited_for_and_that_is_said(
     if fails:  # most policies speak joints, and need none of it
         compiled.set_exception(SetupError("no compiler"))
     else:
-        compiled.set_result(None)
+        compiled.set_result(ChainForward(station.spec.robot))
     station.reach(SessionState.READY)
     station.close()
 
