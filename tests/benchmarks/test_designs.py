@@ -14,6 +14,7 @@ from evaweb.statistics.difference import barnard
 from evaweb.statistics.planning import exact_power
 
 
+@pytest.mark.exhaustive
 def test_every_figure_has_its_name_and_the_designs_keep_what_they_claim(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

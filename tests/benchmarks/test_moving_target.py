@@ -16,6 +16,7 @@ def chased(strategy: str, delay: int, seed: int = 1) -> Chased:
     return chase({"kind": strategy, **STRATEGIES[strategy]}, delay, seed)
 
 
+@pytest.mark.exhaustive
 def test_async_stays_with_the_block_at_eight_ticks_of_delay_and_sync_does_not() -> None:
     moving, waiting = chased("async", 8), chased("sync", 8)
     assert moving.success
@@ -25,6 +26,7 @@ def test_async_stays_with_the_block_at_eight_ticks_of_delay_and_sync_does_not() 
     assert moving.acceleration < waiting.acceleration
 
 
+@pytest.mark.exhaustive
 def test_without_delay_both_do_and_an_episode_is_the_same_to_the_last_bit() -> None:
     moving, waiting = chased("async", 0), chased("sync", 0)
     assert moving.success

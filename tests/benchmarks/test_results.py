@@ -45,7 +45,7 @@ def test_a_share_is_one_of_the_values():
     assert _share([3.0, 1.0, 2.0], 0.95) == 3.0
 
 
-@pytest.mark.lab
+@pytest.mark.exhaustive
 def test_a_small_lab_is_measured_on_sqlite(tmp_path):
     found = results._measured(tmp_path / "data", {}, plans=2, trials=80)
     assert set(found["pages"]) == set(results.PAGES)

@@ -22,6 +22,7 @@ from runtime.sim import arrays
 from runtime.sim.gate import Accepted, Gate
 from runtime.transports.node_messages import MESSAGE_LIMIT, NodeFrame, NodeMessages
 from tests.conformance.test_recorded_bytes import MNP, NPY, OPENPI, PICKLED_ACTIONS, vector
+from tests.examples import some
 
 ROBOT = robots.load("ur5e")
 NODE = NodeMessages(ROBOT, "bgr", frozenset(), MESSAGE_LIMIT)
@@ -143,7 +144,7 @@ def test_real_messages_are_read(name: str) -> None:
 
 
 @on_every_reader
-@settings(max_examples=100)
+@settings(max_examples=some(100))
 @given(payload=st.binary(max_size=200))
 def test_random_bytes_are_a_value_or_the_readers_own_error(name: str, payload: bytes) -> None:
     found = outcome(READERS[name].read, payload)
@@ -151,7 +152,7 @@ def test_random_bytes_are_a_value_or_the_readers_own_error(name: str, payload: b
 
 
 @on_every_reader
-@settings(max_examples=150)
+@settings(max_examples=some(150))
 @given(data=st.data())
 def test_cut_and_bent_messages_are_a_value_or_the_readers_own_error(name: str, data: st.DataObject) -> None:
     reader = READERS[name]
@@ -165,7 +166,7 @@ def test_cut_and_bent_messages_are_a_value_or_the_readers_own_error(name: str, d
 
 
 @pytest.mark.parametrize("name", ["node", "gate"])
-@settings(max_examples=150)
+@settings(max_examples=some(150))
 @given(data=st.data())
 def test_fields_of_any_kind_are_a_value_or_the_readers_own_error(name: str, data: st.DataObject) -> None:
     """Whole messages whose fields are something else."""

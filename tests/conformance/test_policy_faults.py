@@ -127,7 +127,10 @@ EVERYWHERE = {
     *("bad_array_dialect", "object_array", "exception", "two_batches", "too_large"),
 }
 
-pytestmark = pytest.mark.usefixtures("no_thread_is_left")
+pytestmark = [
+    pytest.mark.usefixtures("no_thread_is_left"),
+    pytest.mark.exhaustive,
+]  # policies/ has each protocol
 on_every_protocol = pytest.mark.parametrize("name", PROTOCOLS)
 
 

@@ -83,6 +83,7 @@ def test_a_fault_is_counted_by_name_and_the_next_frame_comes(robot: Played, faul
 WAITED_FOR = [case for case in CASES if case.values[0] != "ros1" or case.values[1] in ("noise", "truncated")]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("robot", "fault"), WAITED_FOR, indirect=["robot"])
 def test_a_robot_that_was_never_right_is_waited_for_with_the_reason(robot: Played, fault: str) -> None:
     words = robot.faults[fault].words
@@ -153,6 +154,7 @@ def test_a_frozen_camera_is_named_while_all_else_goes_on(
     assert "shows the same picture" in robot.source.why("frozen_cam_wrist")
 
 
+@pytest.mark.exhaustive
 @on_every_transport
 def test_frames_that_come_while_nobody_reads_are_not_kept(robot: Played) -> None:
     """1,000 of 115 kB: who kept them would have grown by as much."""
@@ -170,6 +172,7 @@ def test_frames_that_come_while_nobody_reads_are_not_kept(robot: Played) -> None
     assert observation.arrived - observation.captured["joints"] < 5
 
 
+@pytest.mark.exhaustive
 @on_every_transport
 def test_a_flood_of_noise_ends_nothing(robot: Played) -> None:
     seen(robot, 1)

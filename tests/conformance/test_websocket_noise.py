@@ -15,6 +15,7 @@ from runtime.core.clock import MonotonicClock
 from runtime.core.errors import PolicyError
 from runtime.core.plugins import variants
 from tests.conformance.policies_served import WEBSOCKETS
+from tests.examples import some
 from tests.runtime.policies.peers import FRANKA, serving
 
 
@@ -43,7 +44,7 @@ def _pieces() -> st.SearchStrategy[bytes]:
 
 
 @pytest.mark.parametrize("kind", ["openpi", "roboarena", "starvla"])
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(payload=_pieces())
 def test_bytes_without_sense_are_a_policy_error_and_never_a_crash(kind: str, payload: bytes) -> None:
     policy: Any = _unconnected(kind)
@@ -73,7 +74,7 @@ def _read(policy: Any, kind: str, payload: bytes) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["openpi", "roboarena", "starvla"])
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(
     metadata=st.dictionaries(
         st.sampled_from(

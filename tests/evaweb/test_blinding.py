@@ -40,7 +40,9 @@ def lab(live, runtime, ann, recorded, settings):  # noqa: F811
 STAGES = ("before", "handed", "running", "failed", "scored", "closed")
 
 
-@pytest.mark.parametrize("looked_at", [("scored", "closed"), pytest.param(STAGES, marks=pytest.mark.lab)])
+@pytest.mark.parametrize(
+    "looked_at", [("scored", "closed"), pytest.param(STAGES, marks=pytest.mark.exhaustive)]
+)
 def test_nothing_that_an_operator_can_reach_tells_before_the_reveal(lab, looked_at):
     client = Client()
     client.force_login(lab.operator)
@@ -71,7 +73,7 @@ def test_nothing_that_an_operator_can_reach_tells_before_the_reveal(lab, looked_
 
 
 @pytest.mark.parametrize(
-    "who", ["alma", *(pytest.param(who, marks=pytest.mark.lab) for who in ("operator", "owner"))]
+    "who", ["alma", *(pytest.param(who, marks=pytest.mark.exhaustive) for who in ("operator", "owner"))]
 )
 def test_a_plan_that_was_lost_with_the_database_goes_on_hiding(lab, alma, who):
     """What comes back from the disk are its trials alone; an administrator may look behind none of them either."""

@@ -71,6 +71,7 @@ def test_the_cache_brings_what_is_wanted_once_and_compares_it(store, video, tmp_
         assert not list((tmp_path / "cache").glob(".draft*"))
 
 
+@pytest.mark.exhaustive
 def test_a_bucket_whose_object_was_changed_is_not_believed(server, video, tmp_path):
     store = S3Store(server.bucket(prefix="changed"))
     store.put(video, "video/mp4")

@@ -56,7 +56,7 @@ def nobody_reads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         pipe.write("goes nowhere, and ends nothing")
 
 
-@pytest.mark.lab
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("program", sorted(set(programs()) - NOT_OF_A_TERMINAL))
 def test_the_help_of_every_program_may_be_read_in_part(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
     module = importlib.import_module(program)
@@ -88,6 +88,7 @@ LISTS: list[tuple[str, Callable[[Path], list[str]]]] = [
 ]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("program", "words"), LISTS, ids=lambda given: given if isinstance(given, str) else ""
 )
@@ -99,6 +100,7 @@ def test_what_commands_print_may_be_read_in_part(
         assert main(words(episode)) == UNREAD
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "words",
     [["-m", "robots", "list"], ["-m", "runtime.config.reference"], ["manage.py", "help"]],
@@ -114,6 +116,7 @@ def test_a_process_whose_output_nobody_reads_says_nothing_at_its_end(words: list
     assert (ended.returncode, ended.stderr) == (UNREAD, "")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "words",
     [["-m", "robots", "list"], ["-m", "robots", "--help"], ["manage.py", "help"], ["manage.py", "check"]],
@@ -147,6 +150,7 @@ def test_the_break_of_any_other_pipe_is_an_error() -> None:
         main()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
 @pytest.mark.parametrize(
     ("words", "code"),

@@ -18,6 +18,7 @@ from robots.capsules import Capsule, capsules
 from robots.clearance import MARGIN, Clearance, problems
 from robots.description import TABLE
 from robots.rotations import Float64
+from tests.examples import some
 from tests.robots.conftest import Edit
 
 NAMES = robots.names()
@@ -66,7 +67,7 @@ def sampled(name: str, one: str, other: str, q: Float64) -> float:
     )
 
 
-@settings(max_examples=40)
+@settings(max_examples=some(40))
 @given(seed=st.integers(0, 10**6))
 @pytest.mark.parametrize("name", ["agilex_piper", "ur5e"])
 def test_distances_are_those_of_many_points_along_the_capsules(name: str, seed: int) -> None:

@@ -89,7 +89,7 @@ def test_ready_is_outside_of_the_workspace_fingers_down_and_away_from_limits(nam
         assert ready.opened
 
 
-@pytest.mark.lab
+@pytest.mark.exhaustive
 @every_standing
 def test_every_place_on_the_table_is_reached_from_above(name: str) -> None:
     assert unreached(robot(name), (0.02, 0.15), tilt=STANDING[name].tilt) == []

@@ -80,6 +80,7 @@ def test_it_serves_and_ends_with_its_lifeline(tmp_path):
         assert process.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_it_gives_way_once_it_serves(tmp_path):
     own = os.getpriority(os.PRIO_PROCESS, 0)
@@ -89,6 +90,7 @@ def test_it_gives_way_once_it_serves(tmp_path):
         assert found == {min(own + 3, 19)}
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_it_ends_when_it_is_told(tmp_path):
     with served(tmp_path) as (process, address):
@@ -97,6 +99,7 @@ def test_it_ends_when_it_is_told(tmp_path):
         assert process.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_connections_that_ask_for_nothing_keep_nobody_out_and_are_closed(tmp_path):
     """Twice as many as the process had files for before its limit was raised."""

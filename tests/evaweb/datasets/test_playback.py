@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.evaweb.console import test_modules
+from tests.examples import some
 
 run = test_modules.run
 pytestmark = pytest.mark.skipif(test_modules.NODE is None, reason="Node is not installed")
@@ -115,7 +116,7 @@ def test_one_of_several_episodes_rests_before_it_begins_and_after_its_end() -> N
     loop=st.booleans(),
     speed=st.sampled_from([0.1, 0.25, 0.5, 1, 2, 4]),
 )
-@settings(max_examples=15)
+@settings(max_examples=some(15))
 def test_an_address_brings_back_what_it_was_written_for(
     row: int, first: int, length: int, fps: float, narrowed: bool, loop: bool, speed: float
 ) -> None:

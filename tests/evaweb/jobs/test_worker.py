@@ -136,6 +136,7 @@ def test_a_job_asked_for_before_the_worker_and_with_no_broker_is_done_and_the_li
     assert worker.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.exhaustive
 def test_told_to_end_it_finishes_its_job_or_puts_it_back_and_after_a_kill_another_one_takes_it(
     lab: Lab,
 ) -> None:

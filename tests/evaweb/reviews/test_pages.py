@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from evaweb.jobs.services import work
 from evaweb.reviews import services
 from evaweb.reviews.models import Standing
+from tests.examples import some
 
 NODE = shutil.which("node")
 LANES = Path(__file__).parents[3] / "static" / "replay" / "review_lanes.js"
@@ -109,7 +110,7 @@ SPANS = st.lists(
 
 
 @needs_node
-@settings(max_examples=15)
+@settings(max_examples=some(15))
 @given(SPANS)
 def test_segments_that_overlap_lie_below_each_other(spans):
     segments = [{"first": first, "last": last} for first, last in sorted(spans)]
@@ -121,7 +122,7 @@ def test_segments_that_overlap_lie_below_each_other(spans):
 
 
 @needs_node
-@settings(max_examples=15)
+@settings(max_examples=some(15))
 @given(SPANS)
 def test_where_segments_overlap_is_said_with_how_many(spans):
     segments = [{"first": first, "last": last} for first, last in spans]

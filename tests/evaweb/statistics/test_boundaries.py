@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.boundaries import SHAPES, Boundary, Look, boundary, extremeness, in_pairs
 from evaweb.statistics.planning import exact_power
+from tests.examples import some
 
 GROWTH = st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)).filter(any), min_size=1, max_size=8)
 MARGINS = st.sampled_from([None, 0.05, 0.1, 0.25])
@@ -57,7 +58,7 @@ def test_the_course_is_that_of_all_sequences_there_are(looks, margin):
     assert any(look.least for look in found.looks)
 
 
-@settings(max_examples=40)
+@settings(max_examples=some(40))
 @given(GROWTH, st.sampled_from([0.01, 0.05, 0.2]), st.sampled_from(sorted(SHAPES)), MARGINS)
 def test_no_rates_of_the_null_stop_it_more_often_than_alpha(growth, alpha, shape, margin):
     found = boundary(looks_of(growth), alpha=alpha, shape=shape, margin=margin)
@@ -69,7 +70,7 @@ def test_no_rates_of_the_null_stop_it_more_often_than_alpha(growth, alpha, shape
 
 
 @given(GROWTH, MARGINS.filter(bool))
-@settings(max_examples=15)
+@settings(max_examples=some(15))
 def test_what_is_worse_by_more_than_the_margin_stops_less_often_still(growth, margin):
     found = boundary(looks_of(growth), alpha=0.1, margin=margin)
     bound = found.error()[1]
@@ -78,7 +79,7 @@ def test_what_is_worse_by_more_than_the_margin_stops_less_often_still(growth, ma
 
 
 @given(GROWTH, MARGINS)
-@settings(max_examples=40)
+@settings(max_examples=some(40))
 def test_a_table_that_is_more_extreme_stops_too(growth, margin):
     found = boundary(looks_of(growth), alpha=0.2, shape="early", margin=margin)
     for number, look in enumerate(found.looks):

@@ -14,6 +14,7 @@ from evaweb.statistics.difference import barnard, newcombe, probability_better
 from evaweb.statistics.paired import mcnemar, over_conditions
 from evaweb.statistics.proportions import posterior
 from evaweb.statistics.strata import Table, exact_within, interaction, mantel_haenszel
+from tests.examples import some
 
 COUNTS = st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
 
@@ -84,7 +85,7 @@ def test_barnard_refuses_counts_that_cannot_be():
         barnard(6, 5, 0, 5)
 
 
-@settings(max_examples=30)
+@settings(max_examples=some(30))
 @given(COUNTS, COUNTS)
 def test_the_probability_to_be_better_is_that_of_the_posteriors(one, other):
     from scipy.integrate import quad

@@ -100,6 +100,7 @@ def test_a_recording_is_as_it_was_recorded(lab):
     assert episode.frames == len(episode.rows) > 0
 
 
+@pytest.mark.exhaustive
 def test_a_report_is_made_and_recomputed_and_the_disk_changes_nothing(lab, tmp_path):
     before = found(lab)
     [revealed] = [name for name, _, state, _ in before["plans"] if state == "revealed"]

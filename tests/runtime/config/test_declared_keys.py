@@ -132,7 +132,7 @@ def excused(key: str) -> tuple[str, str] | None:
     )
 
 
-@pytest.mark.lab
+@pytest.mark.exhaustive
 def test_every_declared_key_is_read_by_what_it_is_for() -> None:
     silent = unread(reads_of(modules(), ROOT), Deployment, RobotTable, Robot, Group, Gripper)
     lies = []

@@ -126,6 +126,7 @@ def test_there_and_back_nothing_has_changed(tmp_path: Path) -> None:
     assert (tmp_path / "set" / video).read_bytes() == (tmp_path / "back" / video).read_bytes()
 
 
+@pytest.mark.exhaustive
 def test_the_sample_episode_goes_to_v30_and_back_with_equal_values(tmp_path: Path) -> None:
     given = os.environ.get("EVA_SAMPLE_EPISODE")
     if not given:

@@ -23,6 +23,7 @@ from runtime.kinematics.base import IkFlag, IkResult, KinematicsError
 from runtime.kinematics.compiled import CompiledKinematics, Config, build
 from runtime.kinematics.kernels.chains import poses_of
 from runtime.kinematics.kernels.chunks import solve_chunk
+from tests.examples import some
 from tests.runtime.kinematics.crane import crane
 from tests.sources import ROOT
 
@@ -65,7 +66,7 @@ def test_forward_gives_each_arm_its_pose_for_rows_as_for_single_vectors() -> Non
         np.testing.assert_allclose(poses[1, 1, index], arm.chain.pose(q[1, 1, arm.joint_dims]), atol=1e-15)
 
 
-@settings(max_examples=100)
+@settings(max_examples=some(100))
 @given(shares, moves)
 def test_reachable_targets_near_the_seed_are_reached(share: np.ndarray, move: np.ndarray) -> None:
     seed = within(share)
@@ -75,7 +76,7 @@ def test_reachable_targets_near_the_seed_are_reached(share: np.ndarray, move: np
     assert inside_limits(result.q)
 
 
-@settings(max_examples=50)
+@settings(max_examples=some(50))
 @given(shares, st.lists(st.floats(-2, 2), min_size=14, max_size=14))
 def test_whatever_is_asked_joints_stay_in_limits_and_errors_are_those_of_the_joints(
     share: np.ndarray, numbers: list[float]
@@ -251,7 +252,7 @@ def test_forward_is_what_the_chains_of_every_robot_say(name: str) -> None:
     np.testing.assert_allclose(CompiledKinematics(robot).forward(q), expected, atol=1e-14)
 
 
-@pytest.mark.lab  # its kernels are compiled anew
+@pytest.mark.exhaustive  # its kernels are compiled anew
 def test_carried_sliding_endless_and_mimicking_joints_are_followed(
     lifting: tuple[Robot, CompiledKinematics],
 ) -> None:
@@ -271,7 +272,7 @@ def test_carried_sliding_endless_and_mimicking_joints_are_followed(
     np.testing.assert_allclose(result.q[:, 9:], way[:, 9:], atol=1e-4)  # four joints have no choice
 
 
-@pytest.mark.lab  # its kernels are compiled anew
+@pytest.mark.exhaustive  # its kernels are compiled anew
 def test_what_carries_an_arm_stands_as_in_the_seed(lifting: tuple[Robot, CompiledKinematics]) -> None:
     robot, kinematics = lifting
     home = robot.poses["home"]
@@ -282,8 +283,8 @@ def test_what_carries_an_arm_stands_as_in_the_seed(lifting: tuple[Robot, Compile
     assert result.reached.all()
 
 
-@pytest.mark.lab  # its kernels are compiled anew
-@settings(max_examples=40)
+@pytest.mark.exhaustive  # its kernels are compiled anew
+@settings(max_examples=some(40))
 @given(st.integers(0, 2**32 - 1))
 def test_errors_and_flags_are_those_of_the_joints_that_are_returned(
     lifting: tuple[Robot, CompiledKinematics], seed: int
@@ -483,7 +484,7 @@ def test_that_something_has_to_be_compiled_is_said_before(
     assert "compiling the kinematics for this processor, once" in caplog.text
 
 
-@pytest.mark.lab
+@pytest.mark.exhaustive
 def test_what_is_kept_on_disk_and_broken_is_compiled_again(tmp_path: Path) -> None:
     code = (
         "import logging, robots; logging.basicConfig(level='INFO'); from runtime.kinematics import compiled; "

@@ -14,6 +14,7 @@ from benchmarks.ik_postures import LOOPS, PATHS, SETTLED, drift, path, worst
 from robots import Robot, load, names
 from runtime.kinematics.base import IkFlag, IkResult
 from runtime.kinematics.compiled import CompiledKinematics, Config
+from tests.examples import some
 
 SEVEN = ("dual_franka", "agibot_g2")
 
@@ -108,6 +109,7 @@ def test_a_long_path_that_joints_have_is_missed_by_no_arm(name: str) -> None:
     assert off.max() <= 1e-3
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", names())
 def test_a_smooth_path_is_met_within_ten_micrometres(name: str) -> None:
     robot, kinematics = robot_of(name)
@@ -129,7 +131,7 @@ def held_to(robot: Robot, result: IkResult, anchor: np.ndarray, row: int, dt: fl
     assert (result.q[:, still] == result.q[0, still]).all()
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(st.sampled_from(names()), st.integers(0, 10_000), st.integers(0, 12), st.floats(0.0, 0.5))
 def test_whatever_is_planned_anew_keeps_to_limits_and_velocities(
     name: str, number: int, row: int, off: float

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.recording.backlog import RUN, Pace, Picture, PictureQueue, codings
+from tests.examples import some
 
 from .samples import numbered
 
@@ -62,7 +63,7 @@ def test_an_encoder_that_keeps_up_loses_no_picture(cost: float) -> None:
     assert all(run.taken)
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(cost=st.floats(0.0, 1.5), places=st.integers(1, 64))
 def test_it_is_never_further_behind_than_the_bound_and_a_few_frames(cost: float, places: int) -> None:
     run = Simulated(lambda time: cost, places)
@@ -74,7 +75,7 @@ def test_it_is_never_further_behind_than_the_bound_and_a_few_frames(cost: float,
     assert max(run.lags) <= max(bound, (17 + 6) * cost) + 1e-9  # before the pace is known it is guessed
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(
     costs=st.lists(st.floats(0.0, 0.4), min_size=1, max_size=20),
     seconds=st.lists(st.floats(0.05, 3.0), min_size=1, max_size=20),

@@ -29,6 +29,7 @@ from runtime.recording.scrub import require_sound, verify
 from runtime.recording.sealing import OUTCOME, SECOND, read_outcome
 from runtime.recording.tables import SCHEMAS
 from runtime.recording.verdict import UNSEALED, DamagedError
+from tests.examples import some
 
 from .samples import CAMERAS, SETTINGS, chunk, manifest, resealed, row, tick, unended, unsealed
 
@@ -442,7 +443,7 @@ BEGINNINGS = (
 @example(
     beginning=BEGINNINGS[-1], kinds=("lose copy", "spoil mark", "scrub", "back"), how=(FILES[1], a_bit_off, 0)
 )
-@settings(max_examples=80, suppress_health_check=SLOW)
+@settings(max_examples=some(80), suppress_health_check=SLOW)
 def test_no_sequence_ends_with_changed_bytes_that_pass_for_what_was_recorded(
     whole: Path, tmp_path: Path, beginning: Sequence[str], kinds: Sequence[str], how: tuple[str, Harm, int]
 ) -> None:
@@ -458,7 +459,7 @@ def test_no_sequence_ends_with_changed_bytes_that_pass_for_what_was_recorded(
 
 @given(name=st.sampled_from([*FILES[1:4]]), at=st.floats(0, 1), bit=st.integers(0, 7))
 @example(name=FILES[2], at=0.0078125, bit=7)  # a name in its metadata is no UTF-8 then
-@settings(max_examples=20, suppress_health_check=SLOW)
+@settings(max_examples=some(20), suppress_health_check=SLOW)
 def test_nor_where_both_outcomes_are_lost_as_long_as_its_tables_have_their_ends(
     whole: Path, tmp_path: Path, name: str, at: float, bit: int
 ) -> None:

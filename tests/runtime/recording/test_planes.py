@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.recording.planes import planes
+from tests.examples import some
 
 LUMA = np.array([65.481, 128.553, 24.966]) / 255  # ITU-R BT.601, limited range
 BLUE, RED = np.array([-37.797, -74.203, 112.0]) / 255, np.array([112.0, -93.786, -18.214]) / 255
@@ -31,7 +32,7 @@ def made(picture: np.ndarray, size: tuple[int, int]) -> list[np.ndarray]:
     width=st.integers(4, 40),
     kind=st.integers(0, 2),
 )
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 def test_every_plane_is_that_of_the_standard_to_within_its_rounding(
     seed: int, height: int, width: int, kind: int
 ) -> None:

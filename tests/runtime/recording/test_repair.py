@@ -14,6 +14,7 @@ from runtime.recording.layout import Layout
 from runtime.recording.reader import open_episode
 from runtime.recording.repair import UNCUT, repair, repair_all
 from runtime.recording.tables import SCHEMAS, read_table
+from tests.examples import some
 
 from .samples import CAMERAS, SETTINGS, chunk, manifest, numbers, row, tick, unended
 from .test_tables import old_raw
@@ -138,7 +139,7 @@ def test_a_repair_that_was_itself_killed_is_completed(folder: Path, monkeypatch:
 
 
 @given(data=st.data())
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=some(40), suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_whatever_is_torn_rows_and_frames_belong_together_afterwards(
     unfinished: Path, tmp_path: Path, data: st.DataObject
 ) -> None:

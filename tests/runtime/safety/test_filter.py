@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 import robots
 from runtime.safety.collision import Collisions
 from runtime.safety.filter import Limits, RobotState, SafetyFilter, SafetySettings
+from tests.examples import some
 from tests.runtime.collision_samples import collisions, robot, turned
 
 NAMES = ("arm.joint0", "arm.joint1", "arm.gripper")
@@ -141,7 +142,7 @@ def test_an_arm_that_starts_outside_its_limits_may_stay_or_come_back_but_not_go_
     assert verdict.refused or verdict.action[1] >= -0.02 - 1e-9
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(
     st.lists(st.floats(-5, 5), min_size=30, max_size=120),
     st.lists(st.floats(0.2, 1.5), min_size=120, max_size=120),
@@ -184,7 +185,7 @@ def followed(targets, dt, **options):
     return np.array(sent), notes
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(st.floats(-0.5, 0.5), st.sampled_from([30.0, 50.0, 100.0, 200.0]))
 def test_a_target_that_jumped_is_reached_without_going_beyond_it(jump, rate):
     sent, _ = followed([jump] * int(rate), 1 / rate)
@@ -192,7 +193,7 @@ def test_a_target_that_jumped_is_reached_without_going_beyond_it(jump, rate):
     assert sent[-1] == pytest.approx(jump, abs=1e-5)
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(st.floats(-0.4, 0.4), st.floats(-2.0, 2.0), st.sampled_from([50.0, 100.0, 200.0]))
 @example(0.015625, -2.0, 200.0)
 def test_a_moving_target_that_jumped_is_caught_up_with_and_then_kept(jump, speed, rate):

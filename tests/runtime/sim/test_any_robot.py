@@ -28,18 +28,19 @@ def test_one_arm_puts_the_block_on_the_plate(tmp_path):
     assert_placed("tabletop_ur5e", 0, tmp_path)
 
 
-@pytest.mark.lab
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", IN_JOINTS)
 def test_every_robot_puts_the_block_on_the_plate(name, tmp_path):
     assert_placed(name, 1, tmp_path)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["tabletop_agilex_piper_eef", "tabletop_ur5e_eef"])
 def test_so_does_a_policy_in_poses_whose_rows_kinematics_make_joints_of(name, tmp_path):
     assert_placed(name, 2, tmp_path)
 
 
-@pytest.mark.lab
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("name", "assignments"), WRITTEN, ids=[name for name, _ in WRITTEN])
 def test_it_does_not_matter_how_poses_are_written(name, assignments, tmp_path):
     assert_placed(name, 3, tmp_path, ['policy.action_space="eef"', *assignments])

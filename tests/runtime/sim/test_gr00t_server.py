@@ -70,6 +70,7 @@ def toml(table: dict[str, Any]) -> str:
     return "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in table.items()) + "}"
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("version", ["n1.7-early", "starvla"])
 def test_a_trial_through_gr00t_puts_the_block_on_the_plate(tmp_path: Path, version: Any) -> None:
     robot = planned("tabletop_ur5e", tmp_path, None).robot

@@ -142,6 +142,7 @@ def test_the_process_serves_the_client(start: Any) -> None:
         assert policy.infer(shown).actions.shape == (20, 7)
 
 
+@pytest.mark.exhaustive
 def test_a_trial_through_lerobot_puts_the_block_on_the_plate(tmp_path: Path) -> None:
     robot = planned("tabletop_ur5e", tmp_path, None).robot
     cameras = ", ".join(f"{camera.key} = {json.dumps(camera.key)}" for camera in robot.cameras)

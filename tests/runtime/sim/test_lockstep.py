@@ -140,6 +140,7 @@ def courses(
     return found
 
 
+@pytest.mark.exhaustive
 def test_the_same_plan_gives_the_same_course_however_busy_the_machine(tmp_path: Path) -> None:
     trials = [(1, 4, 3.0), (0, 5, 3.0)]
     *first, skilled = courses(tmp_path / "first", [*trials, (0, 4, 20.0)])

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from runtime.sim.bench import BenchError
 from runtime.sim.tabletop import Reset, Tabletop
+from tests.examples import some
 from tests.runtime.sim.operator_hands import LEFT, OPEN, POSITIONS, RATE, READY, RIGHT, ROBOT, SHUT, Operator
 
 EDGE = 0.04
@@ -214,7 +215,7 @@ def test_a_reset_that_cannot_be_leaves_everything_as_it_is():
     assert hands.truth == before
 
 
-@settings(max_examples=25)
+@settings(max_examples=some(25))
 @given(st.integers(0, 10_000), st.integers(1, 3))
 def test_whatever_is_commanded_blocks_stay_above_the_table_and_are_numbers(seed, blocks):
     chance = np.random.default_rng(seed)

@@ -70,6 +70,7 @@ TRIALS |= {
 }
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("wire", TRIALS)
 def test_a_policy_on_this_wire_puts_the_block_on_the_plate(wire: str, tmp_path: Path) -> None:
     assignments, serve = TRIALS[wire]

@@ -16,6 +16,7 @@ from runtime.motion.timeline import DimensionKinds
 from runtime.policies.base import PolicyInfo
 from runtime.safety.limits import Limits
 from runtime.spaces.binary_grippers import DWELL_S, Dwell, Switch, switches
+from tests.examples import some
 from tests.runtime.lockstep_station import Station, Stubs, stubbed
 from tests.runtime.tick_bench import PERIOD, WITH_GRIPPER, Bench
 
@@ -121,7 +122,7 @@ chunk_of = st.tuples(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(st.sampled_from(KINDS), st.lists(chunk_of, min_size=1, max_size=12))
 def test_what_is_sent_switches_in_one_tick_and_rests_whatever_is_asked_for(
     kind: str, course: list[tuple[int, list[float], str]]
@@ -185,7 +186,7 @@ order = st.tuples(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(anything, st.lists(order, min_size=1, max_size=15))
 def test_whatever_control_is_ordered_it_sends_open_or_closed(
     stood: float, course: list[tuple[str, float, int]]
@@ -255,7 +256,16 @@ def r1_lite(tmp_path: Path, kind: str, told: list[float], **more: Any) -> tuple[
 
 
 @pytest.mark.parametrize(
-    ("kind", "rate"), [("sync", None), *((kind, rate) for kind in KINDS[1:] for rate in (None, 12.0, 50.0))]
+    ("kind", "rate"),
+    [
+        ("sync", None),
+        *((kind, None) for kind in KINDS[1:]),
+        *(
+            pytest.param(kind, rate, marks=pytest.mark.exhaustive)
+            for kind in KINDS[1:]
+            for rate in (12.0, 50.0)
+        ),
+    ],
 )
 def test_an_r1_lite_is_told_open_or_closed_under_every_strategy(
     tmp_path: Path, kind: str, rate: float | None

@@ -17,6 +17,7 @@ from runtime.kinematics.base import IkFlag
 from runtime.kinematics.compiled import CompiledKinematics
 from runtime.spaces.conversion import ActionSpaces, CommandRows, Onset
 from runtime.spaces.pose_rows import PoseRows
+from tests.examples import some
 from tests.runtime.odd_robot import odd_robot
 
 ROBOT = load("agilex_piper")
@@ -217,7 +218,7 @@ def test_relative_joints_are_added_to_the_observed_ones_and_grippers_are_not(
     np.testing.assert_array_equal(made.rows[:, ROBOT.gripper_dims], rows[:, ROBOT.gripper_dims])
 
 
-@settings(max_examples=20)
+@settings(max_examples=some(20))
 @given(modes, st.sampled_from(["base", "tool"]), st.integers(1, 6), st.floats(-0.02, 0.02))
 def test_relative_poses_come_back_to_the_absolute_ones_they_were_made_of(
     mode: str, frame: str, count: int, step: float
@@ -255,7 +256,7 @@ def test_an_observation_without_a_pose_is_no_ground_for_a_relative_chunk() -> No
 # Rates
 
 
-@settings(max_examples=20)
+@settings(max_examples=some(20))
 @given(st.integers(1, 6), st.sampled_from([7.5, 10.0, 30.0, 50.0]))
 def test_poses_of_another_rate_stay_on_the_straight_way_between_rows(count: int, rate: float) -> None:
     ends = SPACES.eef_of(path(count)).astype(np.float64)
@@ -293,7 +294,7 @@ LOWER[ENDLESS_DIM], UPPER[ENDLESS_DIM] = -np.inf, np.inf
 ENDLESS = replace(ROBOT, lower=LOWER, upper=UPPER)
 
 
-@settings(max_examples=20)
+@settings(max_examples=some(20))
 @given(st.lists(st.sampled_from([0.0, 0.1]), min_size=1, max_size=5), st.sampled_from(["joint", "eef"]))
 def test_binary_grippers_stay_binary_at_every_rate(values: list[float], space: str) -> None:
     spaces = ActionSpaces(SWITCHED, CompiledKinematics(SWITCHED), 30.0)

@@ -12,6 +12,7 @@ from robots import Body, Robot, load
 from robots.rotations import transform_of
 from runtime.core.errors import ConfigurationError
 from runtime.spaces.frames import Frame
+from tests.examples import some
 from tests.runtime.odd_robot import odd_robot
 
 TORSO = load("r1_lite", ["left_arm", "right_arm", "torso"])
@@ -40,7 +41,7 @@ def placed(robot: Robot, q: np.ndarray, name: str, arm: int) -> np.ndarray:
     return body.poses(q)[body.link_of(robot.arms[arm].name, name)]
 
 
-@settings(max_examples=40)
+@settings(max_examples=some(40))
 @given(st.sampled_from(FRAMES), st.integers(0, 1000), st.booleans())
 def test_a_pose_is_the_same_place_in_the_scene_whatever_frame_it_is_given_in(
     case: tuple[Robot, str], seed: int, row_by_row: bool
@@ -57,7 +58,7 @@ def test_a_pose_is_the_same_place_in_the_scene_whatever_frame_it_is_given_in(
     np.testing.assert_array_equal(told[..., 7], vectors[..., 7])
 
 
-@settings(max_examples=40)
+@settings(max_examples=some(40))
 @given(st.sampled_from(FRAMES), st.integers(0, 1000))
 def test_the_way_there_and_back_is_exact(case: tuple[Robot, str], seed: int) -> None:
     robot, name = case

@@ -18,6 +18,7 @@ from runtime.spaces.orientations import (
     SixNumbers,
     continuous_signs,
 )
+from tests.examples import some
 
 ORDERS = ["".join(o) for o in product("xyz", repeat=3) if o[0] != o[1] and o[1] != o[2]]
 ORDERS += [order.upper() for order in ORDERS]
@@ -63,7 +64,7 @@ def apart(first: np.ndarray, second: np.ndarray) -> float:
     return float((one.inv() * other).magnitude().max())
 
 
-@settings(max_examples=400)
+@settings(max_examples=some(400))
 @given(codecs, rotations)
 def test_what_is_written_down_comes_back_exactly(codec: Orientation, given_: list[Rotation]) -> None:
     quaternions = wxyz(given_)
@@ -75,7 +76,7 @@ def test_what_is_written_down_comes_back_exactly(codec: Orientation, given_: lis
     assert apart(quaternions, back) < EXACT
 
 
-@settings(max_examples=300)
+@settings(max_examples=some(300))
 @given(st.sampled_from(ORDERS), st.booleans(), st.lists(angles, min_size=3, max_size=3))
 def test_euler_angles_mean_what_scipy_says(order: str, degrees: bool, three: list[float]) -> None:
     given_ = np.degrees(three) if degrees else np.array(three)
@@ -85,7 +86,7 @@ def test_euler_angles_mean_what_scipy_says(order: str, degrees: bool, three: lis
 
 
 @pytest.mark.filterwarnings("ignore:Gimbal lock")
-@settings(max_examples=300)
+@settings(max_examples=some(300))
 @given(st.sampled_from(ORDERS), st.one_of(turns, vectors))
 def test_single_euler_angles_are_in_the_range_of_scipys(order: str, turn: Rotation) -> None:
     expected = turn.as_euler(order)
@@ -99,7 +100,7 @@ def test_single_euler_angles_are_in_the_range_of_scipys(order: str, turn: Rotati
         np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * expected), atol=1e-7)
 
 
-@settings(max_examples=200)
+@settings(max_examples=some(200))
 @given(st.one_of(turns, vectors), st.booleans())
 def test_rotation_vectors_are_scipys(turn: Rotation, degrees: bool) -> None:
     vector = turn.as_rotvec(degrees=degrees)
@@ -120,7 +121,7 @@ def test_tiny_angles_keep_all_their_digits(angle: float, axis: int) -> None:
     np.testing.assert_allclose(RotationVector().encode(back), vector, rtol=1e-12, atol=0)
 
 
-@settings(max_examples=200)
+@settings(max_examples=some(200))
 @given(st.one_of(turns, vectors))
 def test_six_numbers_are_columns_or_rows_of_the_matrix(turn: Rotation) -> None:
     matrix = turn.as_matrix()
@@ -176,7 +177,7 @@ def path(count: int, seed: int, span: float = 4.0) -> np.ndarray:
     return (way.as_quat(scalar_first=True) * chance.choice([-1.0, 1.0], (count, 1)))[:, None]
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(st.booleans(), st.integers(0, 1000))
 def test_quaternions_keep_their_sign_from_row_to_row(scalar_first: bool, seed: int) -> None:
     way = path(200, seed)
@@ -186,7 +187,7 @@ def test_quaternions_keep_their_sign_from_row_to_row(scalar_first: bool, seed: i
     np.testing.assert_array_equal(later, rows[50:])
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(st.booleans(), st.integers(0, 1000))
 def test_rotation_vectors_do_not_jump_where_half_a_turn_is_passed(degrees: bool, seed: int) -> None:
     way = path(1500, seed)
@@ -210,7 +211,7 @@ def test_a_vector_turns_on_beyond_half_a_turn() -> None:
     np.testing.assert_allclose(rows[:, 0, 1], angles_, atol=1e-12)
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(st.sampled_from(ORDERS), st.booleans(), st.integers(0, 1000))
 def test_euler_angles_do_not_jump_by_turns_where_they_are_continuous(
     order: str, degrees: bool, seed: int

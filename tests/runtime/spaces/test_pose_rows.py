@@ -15,6 +15,7 @@ from runtime.config.loader import load as load_deployment
 from runtime.core.errors import ConfigurationError, PolicyError
 from runtime.core.pose_format import CANONICAL, PoseFormat, refuse_format
 from runtime.spaces.pose_rows import PoseRows
+from tests.examples import some
 from tests.runtime.odd_robot import odd_robot
 from tests.runtime.spaces.test_frames import joints, some_vectors
 from tests.runtime.spaces.test_orientations import ORDERS
@@ -39,7 +40,7 @@ def odd(tmp_path_factory: pytest.TempPathFactory) -> Robot:
     return odd_robot(tmp_path_factory.mktemp("robots"))
 
 
-@settings(max_examples=120)
+@settings(max_examples=some(120))
 @given(formats, frames, groups, st.integers(0, 1000))
 def test_what_is_written_comes_back_exactly_in_every_format_and_frame(
     made: PoseFormat, frame: str, following: list[str], seed: int
@@ -101,7 +102,7 @@ def test_an_arm_without_a_gripper_writes_0_and_reads_nothing(odd: Robot) -> None
     np.testing.assert_array_equal(rows.decode(written)[0][:, 0, 7], 0.0)
 
 
-@settings(max_examples=30)
+@settings(max_examples=some(30))
 @given(formats, st.integers(0, 1000))
 def test_rows_that_are_written_one_by_one_are_those_that_are_written_together(
     made: PoseFormat, seed: int

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from runtime.core.types import ActionMode, RelativeFrame
 from runtime.spaces.pose_rows import continuous
 from runtime.spaces.relative_poses import absolute
+from tests.examples import some
 
 
 def quarter_turned(rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -51,7 +52,7 @@ unit = arrays(np.float64, (30, 2, 4), elements=st.floats(-1, 1)).map(
 )
 
 
-@settings(max_examples=25)
+@settings(max_examples=some(25))
 @given(unit, st.sampled_from(["relative", "delta"]), st.sampled_from(["base", "tool"]))
 def test_absolute_poses_are_unit_and_continuous(
     quaternions: np.ndarray, mode: ActionMode, frame: RelativeFrame
@@ -64,7 +65,7 @@ def test_absolute_poses_are_unit_and_continuous(
     assert (made[0, :, 0] >= 0).all()
 
 
-@settings(max_examples=25)
+@settings(max_examples=some(25))
 @given(unit, st.integers(1, 30), st.sampled_from(["base", "tool"]))
 def test_steps_amount_to_what_they_are_one_after_the_other(
     quaternions: np.ndarray, count: int, frame: RelativeFrame

@@ -9,6 +9,7 @@ from benchmarks.step_loop import StepLoop
 from runtime.core.plugins import variants
 from runtime.motion.timeline import HELD, DimensionKinds
 from runtime.strategies.base import JOIN_WINDOW
+from tests.examples import some
 
 STRATEGIES = variants("runtime.strategies")
 KINDS = sorted(STRATEGIES)
@@ -63,7 +64,7 @@ def loop(kind, policy, delay, start=0.0, dim=1, dims=None, **given):
 
 @pytest.mark.parametrize("kind", MOVING)
 @given(delays, st.none() | st.sampled_from([1.0, 3.0, 10.0]), st.integers(45, 60))
-@settings(max_examples=40)
+@settings(max_examples=some(40))
 def test_the_action_published_for_a_step_is_exactly_the_one_meant_for_it(kind, delay, rate, horizon):
     log = loop(kind, consistent(horizon), delay, inference_rate=rate).run(150)
     followed = log.executed[delay[0] + JOIN_WINDOW :]  # once it has caught up from where it stood
@@ -71,7 +72,7 @@ def test_the_action_published_for_a_step_is_exactly_the_one_meant_for_it(kind, d
 
 
 @given(delays, st.none() | st.integers(1, 60), st.integers(1, 40))
-@settings(max_examples=40)
+@settings(max_examples=some(40))
 def test_sync_executes_every_action_in_order_and_nothing_else(delay, cropped, horizon):
     driven = loop("sync", consistent(horizon), delay, execution_horizon=cropped)
     log = driven.run(150)
@@ -90,7 +91,7 @@ def test_sync_executes_every_action_in_order_and_nothing_else(delay, cropped, ho
 
 @pytest.mark.parametrize("kind", MOVING)
 @given(delays, st.none() | st.sampled_from([1.0, 3.0, 10.0]))
-@settings(max_examples=25)
+@settings(max_examples=some(25))
 def test_nothing_starves_while_the_horizon_covers_delay_and_query_interval(kind, delay, rate):
     interval = max(max(delay) + 1, 0 if rate is None else int(np.ceil(RATE / rate)))
     horizon = max(delay) + interval + 1
@@ -107,7 +108,7 @@ def test_nothing_starves_while_the_horizon_covers_delay_and_query_interval(kind,
     st.lists(st.tuples(st.integers(0, 40), st.sampled_from(KINDS), parameters), max_size=3),
     st.integers(0, 9),
 )
-@settings(max_examples=40)
+@settings(max_examples=some(40))
 def test_whatever_is_asked_of_it_live_the_plan_stays_sound(kind, delay, given, horizon, switches, seed):
     driven = loop(kind, moody(horizon, seed), delay, dim=2, dims=DIMS, **given)
     kinds = {kind}

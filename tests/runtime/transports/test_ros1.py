@@ -120,6 +120,7 @@ def test_observations_come_and_commands_arrive(ros_master: RosMaster, node: Node
     assert json.loads(_end(process).splitlines()[-1])["refused"] == 0
 
 
+@pytest.mark.exhaustive
 @needs_ros1
 def test_a_robot_without_topics_of_its_own_has_compressed_pictures_and_those_of_the_deployment(
     ros_master: RosMaster, node: Node
@@ -136,6 +137,7 @@ def test_a_robot_without_topics_of_its_own_has_compressed_pictures_and_those_of_
     assert np.allclose(first.qpos, robot.poses["home"], atol=1e-4)
 
 
+@pytest.mark.exhaustive
 @needs_ros1
 def test_grippers_with_topics_of_their_own_are_split_off_and_put_together(
     ros_master: RosMaster, node: Node
@@ -170,6 +172,7 @@ def test_grippers_with_topics_of_their_own_are_split_off_and_put_together(
     assert json.loads(_end(process).splitlines()[-1])["refused"] == 0
 
 
+@pytest.mark.exhaustive
 @needs_ros1
 def test_a_group_and_a_camera_that_a_deployment_leaves_out_have_no_topics(
     ros_master: RosMaster, node: Node
@@ -182,6 +185,7 @@ def test_a_group_and_a_camera_that_a_deployment_leaves_out_have_no_topics(
     assert set(first.pictures) == {"cam_left_wrist", "cam_right_wrist"}
 
 
+@pytest.mark.exhaustive
 @needs_ros1
 def test_a_simulation_beside_the_robot_is_told_the_same(ros_master: RosMaster, node: Node) -> None:
     node("--as-simulation")
@@ -203,6 +207,7 @@ def test_a_robot_that_starts_again_is_seen_again(ros_master: RosMaster, node: No
         assert source.receive(1.0) is not None
 
 
+@pytest.mark.exhaustive
 @needs_ros1
 def test_a_topic_that_falls_silent_is_named_and_nothing_is_delivered(
     ros_master: RosMaster, node: Node
@@ -233,6 +238,7 @@ def test_joints_of_other_names_are_refused_by_name(ros_master: RosMaster, node: 
         assert np.allclose(seen(source).qpos, ROBOT.poses["home"], atol=1e-4)
 
 
+@pytest.mark.exhaustive
 @needs_ros1
 def test_pictures_of_another_type_and_of_unknown_colours_are_named(ros_master: RosMaster, node: Node) -> None:
     first = node("--other-pictures")

@@ -160,6 +160,7 @@ def test_a_folder_that_holds_backups_says_which(made):
         backup.Backup.at(made.path.parent)
 
 
+@pytest.mark.exhaustive
 def test_the_oldest_go_and_what_a_kill_left(data, made):
     (made.path.parent / "2026-01-01T000000.000000Z.partial").mkdir()
     code, said = manage(data, "backup", made.path.parent, "--keep", "1")

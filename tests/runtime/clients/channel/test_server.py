@@ -12,6 +12,7 @@ from runtime.clients.channel.names import Names
 from runtime.clients.client import Refused, StationClient
 from runtime.ipc.session_state import SessionState
 from tests import presses
+from tests.examples import some
 from tests.processes import PATIENCE_MS, eventually
 from tests.runtime.clients.channel.bench import Bench
 from tests.runtime.lockstep_station import STANDS
@@ -409,7 +410,7 @@ def test_a_station_that_does_not_answer_is_told_and_asked_again(start):
 # --- noise ---------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=some(60), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(frames=st.lists(st.binary(max_size=40), min_size=1, max_size=3))
 def test_noise_is_answered_and_changes_nothing(noisy, frames):
     answer = noisy.raw(*frames)
@@ -422,7 +423,7 @@ VERB = st.sampled_from(
 )
 
 
-@settings(max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=some(80), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     verb=VERB, argument=st.text(max_size=20) | st.from_regex(r"[lr]:(open|close)?:?[0-9e.]*", fullmatch=True)
 )

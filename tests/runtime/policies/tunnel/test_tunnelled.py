@@ -371,6 +371,7 @@ def assignments(tunnel: dict[str, Any]) -> list[str]:
     ]
 
 
+@pytest.mark.exhaustive
 def test_a_trial_through_a_tunnel_puts_the_block_on_the_plate(ssh_server: Begin, tmp_path: Path) -> None:
     trial = pick_and_place("tabletop_ur5e", 0, tmp_path / "data", assignments(ssh_server().settings()))
     assert trial.success, (trial.reason, trial.milestones, trial.events)

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.ipc.shared_state import EStop
+from tests.examples import some
 from tests.runtime.tick_bench import PERIOD, WITH_GRIPPER, Bench
 
 TOP = WITH_GRIPPER.velocity
@@ -119,7 +120,7 @@ class Witness:
         self.before, self.speed = sent, speed
 
 
-@settings(max_examples=80)
+@settings(max_examples=some(80))
 @given(happenings, st.sampled_from(["slow", "hold", "stop"]))
 def test_what_is_sent_is_within_limits_and_weights_sum_to_one(happening, starvation):
     bench = Bench(limits=WITH_GRIPPER, starvation=starvation)
@@ -140,7 +141,7 @@ only_simulation = st.one_of(
 )
 
 
-@settings(max_examples=40)
+@settings(max_examples=some(40))
 @given(st.lists(st.tuples(only_simulation, few), min_size=1, max_size=20), st.booleans())
 def test_nothing_of_a_simulation_is_ever_sent(happening, engaged):
     """A silent robot hears of an e-stop at most; one that is held is held where it was, but for a lock's gripper."""
@@ -161,7 +162,7 @@ def test_nothing_of_a_simulation_is_ever_sent(happening, engaged):
         assert len(arms) == 0
 
 
-@settings(max_examples=40)
+@settings(max_examples=some(40))
 @given(happenings, st.sampled_from([0.0, 0.04, 0.1]))
 def test_a_locked_gripper_comes_to_its_place_and_stays_there(happening, at):
     bench = Bench(limits=WITH_GRIPPER)

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from runtime.ipc.messages import Event
 from runtime.processes.media.camera_rows import QUIET_S, DropoutLog
+from tests.examples import some
 
 RATE = 10.0  # rows per second
 
@@ -77,7 +78,7 @@ def test_each_camera_has_a_quiet_time_of_its_own() -> None:
     assert [event.data["camera"] for event in silences.look(1.0, 1, {"wrist": 2.0, "high": 1.0})] == ["high"]
 
 
-@settings(max_examples=200)
+@settings(max_examples=some(200))
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 40)), min_size=1, max_size=60))
 def test_whatever_the_camera_does_little_is_said_and_every_silence_is_counted_once(
     stretches: list[tuple[bool, int]],

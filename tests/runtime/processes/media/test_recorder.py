@@ -18,6 +18,7 @@ from runtime.ipc.messages import ChunkMerged, PolicyAnswer, TickDone
 from runtime.processes.media.recorder import DatasetGrid, Recorder
 from runtime.recording.base import ExecutedTick, Journal, Loss, Outcome, RawChunk, Record, Row
 from runtime.recording.settings import RecordingSettings
+from tests.examples import some
 
 CAMERA = "cam"
 PICTURE = np.zeros((4, 6, 3), np.uint8)
@@ -125,7 +126,7 @@ def desk() -> Desk:
     return desk
 
 
-@settings(max_examples=60)
+@settings(max_examples=some(60))
 @given(
     rates=st.sampled_from([(30, 30), (100, 30), (200, 30), (30, 10), (30, 60), (50, 15)]),
     first=st.integers(0, 10_000),

@@ -13,6 +13,7 @@ from runtime.ipc.messages import Ack
 from runtime.ipc.session_state import SessionState
 from runtime.recording.reader import open_episode
 from runtime.station.run import Run
+from tests.examples import some
 from tests.runtime.lockstep_station import Station, stubbed
 
 SETTLED = 4  # ticks after which an order has gone to media and its answer to the coordinator
@@ -144,7 +145,7 @@ class Recorded(RuleBasedStateMachine):
 
 TestRecorded = Recorded.TestCase
 TestRecorded.settings = settings(
-    max_examples=20,
+    max_examples=some(20),
     stateful_step_count=20,
     suppress_health_check=[HealthCheck.too_slow],
 )

@@ -19,6 +19,7 @@ from runtime.transports.ros.messages import (
     MessageName,
     PoseStamped,
 )
+from tests.examples import some
 from tests.runtime.transports.ros.drawn import NAMES, Rosbags, messages, name_of, same
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
@@ -42,7 +43,7 @@ def test_every_truncation_and_every_remainder_is_refused(message: Message) -> No
         packed.decode(name_of(message), payload + b"\0")
 
 
-@settings(max_examples=300)
+@settings(max_examples=some(300))
 @given(st.sampled_from(NAMES), st.binary(max_size=120))
 def test_random_bytes_are_a_message_or_a_codec_error(name: MessageName, payload: bytes) -> None:
     with contextlib.suppress(CodecError):

@@ -290,6 +290,7 @@ def test_it_ends_with_the_process_that_it_works_for(ros_master: RosMaster) -> No
     eventually(lambda: not alive(pid), "the end of its rospy")
 
 
+@pytest.mark.exhaustive
 @needs_ros1
 @pytest.mark.slow
 def test_a_master_that_dies_and_comes_back_is_registered_with_again(

@@ -20,6 +20,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
 from runtime.processes.control.process import make_tick
 from runtime.processes.coordinator.session.transitions import COMMANDS
+from tests.examples import some
 from tests.runtime.lockstep_station import DIM, STANDS, Station, stubbed
 
 PERIOD = 1 / 30
@@ -354,7 +355,7 @@ class Machine(RuleBasedStateMachine):
 
 TestStation = Machine.TestCase
 TestStation.settings = settings(
-    max_examples=30,
+    max_examples=some(30),
     stateful_step_count=30,
     suppress_health_check=list(HealthCheck),
 )
