@@ -133,6 +133,11 @@ class Ring:
         """True if there is a message that has not been taken yet."""
         return int(self._head[0]) != int(self._tail[0])
 
+    @property
+    def fill(self) -> float:
+        """Part of the capacity that is taken, 0 to 1."""
+        return (int(self._head[0]) - int(self._tail[0])) / self._capacity
+
     def push(self, payload: bytes) -> bool:
         """Append one message; False (and counted in `refused`) where there is no room."""
         head, tail = int(self._head[0]), int(self._tail[0])

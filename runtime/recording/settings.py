@@ -48,7 +48,8 @@ class RecordingSettings(Settings):
     min_free_bytes: int = Field(default=1 << 30, ge=0)
     """Free space below which nothing is recorded [bytes]."""
     heartbeat_timeout_s: float = Field(default=5.0, ge=1.0, le=60.0)
-    """Silence of the recorder after which a run holds [s]: it moves nothing, and a disk may be slow for a while."""
+    """Silence of the recorder that is told, and in which no run begins [s]. A run goes on: it is held where half of the
+    room for what waits to be recorded is taken."""
     drain_timeout_s: float = Field(default=10.0, gt=0.0)
     """Longest time that the end of an episode waits for the encoders, and then for the disk [s]."""
 

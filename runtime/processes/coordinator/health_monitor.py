@@ -23,7 +23,12 @@ _RESTARTED = Pattern("health.restarted", "the process {process} died and was res
 _SILENT = Pattern("health.silent", "no sign of life from the process {process} {since}")
 _RECORDING_LATE = Pattern(
     "health.recording_late",
-    "the recorder has given no sign of life {since}: is the disk slow? the robot is held after {seconds:g} s",
+    "the recorder has given no sign of life {since}: is the disk slow? the run goes on and is recorded once it is back; "
+    "the robot is held when half of the room for that is taken, {percent:.0f} % is now",
+)
+_RECORDING_WAITS = Pattern(
+    "health.recording_waits",
+    "no sign of life from the process media {since}, and more than half of the room for what waits to be recorded is taken",
 )
 _RECORDING_GOES_ON = fixed("health.recording_goes_on", "the recorder goes on")
 _ESTOPPED = Pattern("health.estopped", "e-stop {pressed}: make safe, then release")
@@ -49,6 +54,8 @@ _TIME_OVER = Pattern("health.time_over", "the run's {seconds:g} s are over")
 _SOURCE_ENDED = fixed("health.source_ended", "the recording that is the source has ended")
 
 SIBLINGS = ("control", "reception", "media", "guard")
+_TO_RECORD = ("minutes", "ticks", "observations")  # rings that media reads
+_MOST_WAITING = 0.5  # of a ring: what comes after it is full is lost
 _LINK_LOST_S = 2.0
 _CONNECTED_S = 1.0
 _EARLY_S = 1e-6  # moments are sums of floats
@@ -103,16 +110,23 @@ class HealthMonitor:
 
     def absent(self) -> str:
         """A sibling that gives no sign of life, "" where all do: what it is sent would be lost."""
-        now, within = self._clock.now(), self._plan.deployment.heartbeat_timeout_s
-        return next((name for name in SIBLINGS if not self._page.alive(name, now, within(name))), "")
+        return next((name for name in SIBLINGS if not self._alive(name)), "")
+
+    def _alive(self, name: str) -> bool:
+        within = self._plan.deployment.heartbeat_timeout_s(name)
+        return self._page.alive(name, self._clock.now(), within)
+
+    @property
+    def _waiting_to_record(self) -> float:
+        """Part of the room for what waits to be recorded that is taken, of the fullest ring."""
+        return max(self._page.rings[ring].fill for ring in _TO_RECORD)
 
     def look_at_recorder(self, state: SessionState) -> Iterator[Event]:
-        """Events of a recorder that is silent in a run, before that is held, and of one that goes on."""
-        now, settings = self._clock.now(), self._plan.deployment
-        late = not self._page.alive("media", now, settings.control.heartbeat_timeout_s)
+        """Events of a recorder that is silent in a run, and of one that goes on."""
+        now, late = self._clock.now(), not self._alive("media")
         if late and not self._recording_late and state is SessionState.RUNNING:
-            since, limit = self._page.silence("media", now), settings.heartbeat_timeout_s("media")
-            yield Event("recording_late", _RECORDING_LATE(since=since, seconds=limit), now)
+            since, percent = self._page.silence("media", now), 100.0 * self._waiting_to_record
+            yield Event("recording_late", _RECORDING_LATE(since=since, percent=percent), now)
             self._recording_late = True
         elif self._recording_late and not late:
             yield Event("recording_goes_on", _RECORDING_GOES_ON, now)
@@ -132,10 +146,17 @@ class HealthMonitor:
                 self._generations[name] = generation
                 reason = _RESTARTED(process=name)
                 yield Noticed(SessionEvent.FAMILY_DIED, reason, name)
-        absent = self.absent() if state is SessionState.RUNNING else ""  # a set-up looks for itself
-        if absent:
-            silent = self._page.silence(absent, self._clock.now())
-            yield Noticed(SessionEvent.HELD, _SILENT(process=absent, since=silent))
+        if state is not SessionState.RUNNING:  # a set-up looks for itself
+            return
+        now = self._clock.now()
+        moving = [name for name in SIBLINGS if name != "media" and not self._alive(name)]
+        if moving:
+            yield Noticed(
+                SessionEvent.HELD, _SILENT(process=moving[0], since=self._page.silence(moving[0], now))
+            )
+        elif not self._alive("media") and self._waiting_to_record > _MOST_WAITING:
+            # It moves nothing, and what it has not read yet is kept for it.
+            yield Noticed(SessionEvent.HELD, _RECORDING_WAITS(since=self._page.silence("media", now)))
 
     def _estop(self, state: SessionState) -> Iterator[Noticed]:
         latched = self._page.estop is EStop.LATCHED
