@@ -23,12 +23,13 @@ _RESTARTED = Pattern("health.restarted", "the process {process} died and was res
 _SILENT = Pattern("health.silent", "no sign of life from the process {process} {since}")
 _RECORDING_LATE = Pattern(
     "health.recording_late",
-    "the recorder has given no sign of life {since}: is the disk slow? the run goes on and is recorded once it is back; "
-    "the robot is held when half of the room for that is taken, {percent:.0f} % is now",
+    "the recorder has given no sign of life {since}: is the disk slow? The run goes on and is recorded once it is "
+    "back; the robot is held when half of the room for that is taken, {percent:.0f} % is now",
 )
 _RECORDING_WAITS = Pattern(
     "health.recording_waits",
-    "no sign of life from the process media {since}, and more than half of the room for what waits to be recorded is taken",
+    "no sign of life from the process media {since}, and more than half of the room for what waits to be recorded is "
+    "taken",
 )
 _RECORDING_GOES_ON = fixed("health.recording_goes_on", "the recorder goes on")
 _ESTOPPED = Pattern("health.estopped", "e-stop {pressed}: make safe, then release")
