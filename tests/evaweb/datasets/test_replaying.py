@@ -86,6 +86,14 @@ def test_pictures_in_a_column_are_sent_one_by_one(browser: Client, foreign: Fore
     assert browser.get(f"{pictures['address']}?row=-1").status_code == 400
 
 
+def test_a_camera_with_a_slash_in_its_name_is_shown_as_any_other(browser: Client, foreign: Foreign) -> None:
+    foreign("cups", version="v2.1", videos=("wrist/left",), images=("hand/right",))
+    video, pictures = config(browser.get(reverse("dataset-replay", args=["cups", 1])))["videos"]
+    assert (video["camera"], pictures["camera"]) == ("wrist/left", "hand/right")
+    assert browser.get(video["address"]).status_code == 200
+    assert browser.get(f"{pictures['address']}?row=0").status_code == 200
+
+
 def test_what_is_not_there_is_named(browser: Client, foreign: Foreign) -> None:
     foreign("cups")
     for name, index, why in (
