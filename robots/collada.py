@@ -21,7 +21,7 @@ def points(path: Path) -> Float64:
     """
     try:
         root = ET.parse(path).getroot()
-    except ET.ParseError as error:
+    except (ET.ParseError, LookupError) as error:  # of an encoding that nobody knows
         raise ValueError(str(error)) from error
     geometries = {f"#{one.get('id')}": _positions(one) for one in root.iterfind(f".//{_NAMESPACE}geometry")}
     library = {f"#{one.get('id')}": one for one in root.iterfind(f".//{_NAMESPACE}node")}

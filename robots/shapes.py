@@ -103,7 +103,7 @@ def _shape(path: Path, link: str, visual: ET.Element, materials: Mapping[str, Co
         tags = ", ".join(f"<{element.tag}>" for element in given) or "nothing"
         raise RobotError(f"{path}: {owner}: a visual shows {tags}; allowed: one of {', '.join(KINDS)}")
     element = given[0]
-    size = _size(path, owner, element)
+    size = size_of(path, owner, element)
     file = None
     if element.tag == "mesh":
         file = meshes.named(path.parent, f"{path}: {owner}", text_of(path, element, "filename"))
@@ -111,7 +111,7 @@ def _shape(path: Path, link: str, visual: ET.Element, materials: Mapping[str, Co
     return Shape(link, element.tag, size, origin_of(path, owner, visual), colour, file)
 
 
-def _size(path: Path, owner: str, element: ET.Element) -> tuple[float, ...]:
+def size_of(path: Path, owner: str, element: ET.Element) -> tuple[float, ...]:
     """Lengths in m, of a mesh the factors along its axes (1 where nothing is said; below zero they mirror)."""
     if element.tag == "mesh":
         text = element.get("scale", "1 1 1")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +16,8 @@ from robots.errors import RobotError
 from robots.rotations import Float64, matrix_of_rpy
 
 KINDS = ("fixed", "revolute", "continuous", "prismatic")
+HELD = ("floating", "planar")  # kinds that no group moves: they are read as fixed, where the URDF draws them
+_ENCODING = re.compile(rb"""\s*<\?xml[^>]*?\sencoding\s*=\s*["']([^"']*)["'][^>]*\?>""")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +50,16 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class Urdf:
-    """A tree of links: `joints` by name in the file's order, `root` the one link without a parent."""
+    """A tree of links: `joints` by name in the file's order, `root` the one link without a parent.
+
+    `held` are the names of those that are floating or planar, and read as fixed.
+    """
 
     path: Path
     root: str
     links: frozenset[str]
     joints: Mapping[str, Joint]
+    held: tuple[str, ...]
 
     def joint(self, name: str) -> Joint:
         """The joint of that name; RobotError lists the names where there is none."""
@@ -105,21 +113,46 @@ def read(path: Path) -> Urdf:
     _refuse_twice(path, "link", links)
     _refuse_twice(path, "joint", [joint.name for joint in joints])
     root = _root(path, links, joints)
-    return Urdf(path, root, frozenset(links), {joint.name: joint for joint in joints})
+    held = tuple(
+        joint.name
+        for joint, element in zip(joints, robot.findall("joint"), strict=True)
+        if element.get("type") in HELD
+    )
+    return Urdf(path, root, frozenset(links), {joint.name: joint for joint in joints}, held)
 
 
 def document(path: Path) -> ET.Element:
     """The file's outermost element, <robot>."""
-    try:
-        robot = ET.parse(path).getroot()
-    except (OSError, ET.ParseError) as error:
-        raise RobotError(f"{path}: cannot be read as URDF: {error}") from error
+    robot = parsed(path)
     if _is_xacro(robot):
         made = f"xacro {path.name} > {path.name.split('.')[0]}.urdf"
         raise RobotError(f"{path}: this is a xacro, of which a URDF is yet to be made: {made}")
     if robot.tag != "robot":
         raise RobotError(f"{path}: the outermost element is <{robot.tag}>; a URDF has <robot>")
     return robot
+
+
+def parsed(path: Path, comments: bool = False) -> ET.Element:
+    """The outermost element of an XML file in any encoding that Python knows; RobotError. `comments` are kept."""
+    parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=comments))
+    try:
+        content = path.read_bytes()
+        declared = _ENCODING.match(content)
+        if declared is None:
+            parser.feed(content)
+        else:  # expat itself knows a few, and none with more than one byte but Unicode's
+            encoding = declared[1].decode("ascii", "replace")
+            try:
+                codecs.lookup(encoding)
+            except LookupError:
+                raise RobotError(
+                    f"{path}: encoding {encoding!r} is not known; allowed: that of the file, such as UTF-8"
+                ) from None
+            parser.feed(content[declared.end() :].decode(encoding))
+        root: ET.Element = parser.close()
+    except (OSError, ET.ParseError, LookupError, UnicodeError) as error:
+        raise RobotError(f"{path}: cannot be read as URDF: {error}") from error
+    return root
 
 
 def _is_xacro(robot: ET.Element) -> bool:
@@ -134,19 +167,22 @@ def _is_xacro(robot: ET.Element) -> bool:
 def _joint(path: Path, element: ET.Element) -> Joint:
     name = text_of(path, element, "name")
     kind = element.get("type")
+    if kind in HELD:
+        kind = "fixed"
     if kind not in KINDS:
-        raise RobotError(f"{path}: joint {name!r} has type {kind!r}; allowed: {', '.join(KINDS)}")
-    lower, upper, velocity = (_limit(path, element, name, key) for key in ("lower", "upper", "velocity"))
+        raise RobotError(f"{path}: joint {name!r} has type {kind!r}; allowed: {', '.join((*KINDS, *HELD))}")
+    endless, moves = kind == "continuous", kind != "fixed"  # what does not count may be anything
+    lower, upper = (None if endless else _limit(path, element, name, key) for key in ("lower", "upper"))
     return Joint(
         name=name,
         kind=kind,
         parent=_end(path, element, name, "parent"),
         child=_end(path, element, name, "child"),
         origin=origin_of(path, f"joint {name!r}", element),
-        axis=_axis(path, element, name),
-        lower=-math.inf if kind == "continuous" else lower,
-        upper=math.inf if kind == "continuous" else upper,
-        velocity=velocity,
+        axis=_axis(path, element, name) if moves else np.array([1.0, 0.0, 0.0]),
+        lower=-math.inf if endless else lower,
+        upper=math.inf if endless else upper,
+        velocity=_limit(path, element, name, "velocity"),
         mimic=_mimic(path, element, name),
     )
 

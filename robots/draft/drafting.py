@@ -47,10 +47,14 @@ def draft(name: str, source: Path, into: Path, copies: int = 1) -> Drafted:
         made = Path(scratch) / name
         made.mkdir()
         shown = made / f"{name}.urdf"
-        pictures = copy_urdf(tree, shown)
-        guessed = sheet(tree, shown, pictures.drawn, title, copies)
-        (made / "README.md").write_text(readme(name, guessed, pictures), "utf-8")
-        _write(made, guessed)
+        try:
+            pictures = copy_urdf(tree, shown)
+            guessed = sheet(tree, shown, pictures.drawn, title, copies)
+            (made / "README.md").write_text(readme(name, guessed, pictures), "utf-8")
+            _write(made, guessed)
+        except RobotError as error:  # which names files that are gone when it is read
+            said = str(error).replace(str(shown), str(source)).replace(str(made), str(folder))
+            raise RobotError(said) from None
         made.rename(folder)
     return Drafted(folder, pictures, inspect(folder))
 

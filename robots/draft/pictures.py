@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import shutil
 import xml.etree.ElementTree as ET
@@ -15,7 +16,7 @@ import numpy as np
 from robots import meshes, shapes
 from robots.errors import RobotError
 from robots.rotations import Float64
-from robots.urdf import Joint, Urdf
+from robots.urdf import Joint, Urdf, parsed
 
 _MESHES = "meshes"
 _STICK, _THICKEST, _THINNEST = 0.15, 0.04, 0.012  # of its length, m, m: the radius of a stand-in
@@ -28,7 +29,7 @@ _COLOUR = "0.55 0.58 0.63 1"
 class Pictures:
     """Results for the shapes: `copied` are files, `missing` are meshes that were not found or cannot be read.
 
-    `drawn` are links that stand-ins show, `plain` are links whose material was not declared.
+    `drawn` are links that stand-ins show, `plain` are links whose material was not declared, or has no colour.
     """
 
     copied: tuple[str, ...]
@@ -43,13 +44,14 @@ def copy_urdf(tree: Urdf, target: Path) -> Pictures:
     It is copied as it is where it shows what can be shown. Otherwise visuals of missing meshes are replaced by
     cylinders from joint to joint, as in all links where none shows anything.
     """
-    document = ET.parse(tree.path, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
-    robot = document.getroot()
+    robot = parsed(tree.path, comments=True)
     work = _Work(tree, target, robot)
+    work.colours()
     work.meshes()
     work.stand_ins()
     work.materials()
     if work.changed:
+        document = ET.ElementTree(robot)
         ET.indent(document)
         document.write(target, encoding="utf-8", xml_declaration=True)
     else:
@@ -69,10 +71,11 @@ class _Work:
         self.missing: list[str] = []
         self.drawn: list[str] = []
         self.plain: list[str] = []
+        self._recoloured = False
 
     @property
     def changed(self) -> bool:
-        return bool(self.copied or self.drawn or self.plain or self._bare)
+        return bool(self.copied or self.drawn or self.plain or self._bare or self._recoloured)
 
     def meshes(self) -> None:
         """Copies meshes that can be read and points to the copies; takes out visuals that cannot be shown."""
@@ -80,18 +83,44 @@ class _Work:
             for visual in link.findall("visual"):
                 geometry = visual.find("geometry")
                 mesh = None if geometry is None else geometry.find("mesh")
-                if mesh is not None and self._copied(mesh):
+                if mesh is not None and self._sized(mesh) and self._copied(mesh):
                     continue
-                if (
-                    mesh is None
-                    and geometry is not None
-                    and len(geometry) == 1
-                    and geometry[0].tag in shapes.KINDS
-                ):
+                given = [] if geometry is None or mesh is not None else list(geometry)
+                if len(given) == 1 and given[0].tag in shapes.KINDS and self._sized(given[0]):
                     continue
                 link.remove(visual)
                 if link not in self._bare:
                     self._bare.append(link)
+
+    def _sized(self, shape: ET.Element) -> bool:
+        """True if it has lengths above zero, or factors that are not."""
+        try:
+            shapes.size_of(self._tree.path, "a visual", shape)
+        except RobotError:
+            return False
+        return True
+
+    def colours(self) -> None:
+        """Takes out colours that are none: not three or four numbers from 0 to 1."""
+        for link in self._robot.findall("link"):
+            for material in link.iter("material"):
+                if self._without_odd_colour(material) and link.get("name", "") not in self.plain:
+                    self.plain.append(link.get("name", ""))
+        for material in self._robot.findall("material"):
+            self._recoloured |= self._without_odd_colour(material)
+
+    def _without_odd_colour(self, material: ET.Element) -> bool:
+        colour = material.find("color")
+        if colour is None:
+            return False
+        try:
+            parts = [float(part) for part in colour.get("rgba", "").split()]
+        except ValueError:
+            parts = []
+        if len(parts) == 4 and all(0.0 <= part <= 1.0 for part in parts):
+            return False
+        material.remove(colour)
+        return True
 
     def stand_ins(self) -> None:
         """Cylinders in links that lost a visual and have none left; in all links where nothing is shown at all."""
@@ -127,10 +156,7 @@ class _Work:
         if file is None:
             self.missing += [named] if named not in self.missing else []
             return False
-        name = file.name
-        if self._taken.setdefault(name, file) != file:  # another of the same name
-            name = f"{file.parent.name}_{file.name}"
-            self._taken.setdefault(name, file)
+        name = next(name for name in _names(file) if self._taken.setdefault(name, file) == file)
         folder = self._target.parent / _MESHES
         folder.mkdir(exist_ok=True)
         shutil.copyfile(file, folder / name)
@@ -171,6 +197,14 @@ def _visual(centre: Float64, rpy: str, shape: ET.Element) -> ET.Element:
     material = ET.SubElement(visual, "material", name="stand_in")
     ET.SubElement(material, "color", rgba=_COLOUR)
     return visual
+
+
+def _names(file: Path) -> Iterator[str]:
+    """Names for a copy of it, the first that no other file has."""
+    yield file.name
+    yield f"{file.parent.name}_{file.name}"
+    for number in itertools.count(2):
+        yield f"{file.parent.name}_{number}_{file.name}"
 
 
 def _places(source: Path, named: str) -> Iterator[Path]:

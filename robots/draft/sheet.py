@@ -56,7 +56,7 @@ class GroupSheet:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A whole draft; `idle` are joints that no group moves."""
+    """A whole draft; `idle` are joints that no group moves, `held` those that are floating or planar."""
 
     title: str
     urdf: str
@@ -64,6 +64,7 @@ class Sheet:
     cameras: Mapping[str, str]
     stand: Place | None
     idle: tuple[str, ...]
+    held: tuple[str, ...]
 
 
 def sheet(tree: Urdf, shown: Path, drawn: Collection[str], title: str, copies: int) -> Sheet:
@@ -91,6 +92,7 @@ def sheet(tree: Urdf, shown: Path, drawn: Collection[str], title: str, copies: i
         cameras=_cameras([group.name for group in groups if group.kind == "arm"]),
         stand=None if copies > 1 else _stand(tree, limbs),
         idle=tuple(name for name in tree.joints if name in names - moved),
+        held=tree.held,
     )
 
 

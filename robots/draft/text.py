@@ -115,9 +115,12 @@ def _unit(wxyz: Sequence[float]) -> list[float]:
 
 
 def _idle(sheet: Sheet) -> Iterator[str]:
-    if sheet.idle:
+    if sheet.idle or sheet.held:
         yield ""
+    if sheet.idle:
         yield f"# {GUESS}: nobody commands {', '.join(sheet.idle)}."
+    if sheet.held:
+        yield f"# {GUESS}: floating or planar, and held where the URDF draws them: {', '.join(sheet.held)}."
 
 
 def _place(place: Place) -> list[str]:
@@ -180,6 +183,11 @@ def _tasks(name: str, sheet: Sheet, pictures: Pictures) -> Iterator[str]:
     yield "Poses home and ready: go there slowly, with a hand on the hardware stop."
     yield "Cameras: the keys under which the node sends pictures."
     yield "Where the arms stand: mounts and stand, before anybody relies on the collision check."
+    if sheet.held:
+        yield (
+            f"{', '.join(sheet.held)}: floating or planar joints, which this description has none of; it is that of "
+            "the robot without them, standing where the URDF draws it."
+        )
     if pictures.missing:
         yield f"Meshes that were not found or cannot be read: {', '.join(pictures.missing)}."
     if pictures.drawn:

@@ -49,7 +49,7 @@ def test_everything_declared_is_read_at_full_precision(tmp_path: Path) -> None:
     [
         ("", "links without a parent are []"),
         (LINKS, "links without a parent are ['a', 'b']"),
-        (LINKS + JOINT.format(kind="planar", rest=""), "type 'planar'; allowed: fixed, revolute"),
+        (LINKS + JOINT.format(kind="spherical", rest=""), "type 'spherical'; allowed: fixed, revolute"),
         (LINKS + JOINT.format(kind="revolute", rest='<axis xyz="0 0 0"/>'), "axis xyz is '0 0 0'"),
         (LINKS + JOINT.format(kind="revolute", rest='<axis xyz="0 0"/>'), "allowed: 3 finite number"),
         (LINKS + JOINT.format(kind="revolute", rest='<origin xyz="0 x 0"/>'), "origin xyz is '0 x 0'"),
@@ -139,3 +139,44 @@ def test_mimics_in_a_circle_are_refused(tmp_path: Path) -> None:
     tree = urdf.read(write(tmp_path, body + joint.format("y", "b", "c", MIMIC.format("x", 1, 0))))
     with pytest.raises(RobotError, match="joints x, y mimic each other in a circle"):
         tree.master(tree.joint("x"))
+
+
+@pytest.mark.parametrize("axis", ["0 0 0", "", "0 0"])
+def test_the_axis_of_a_fixed_joint_does_not_matter(tmp_path: Path, axis: str) -> None:
+    read = urdf.read(write(tmp_path, LINKS + JOINT.format(kind="fixed", rest=f'<axis xyz="{axis}"/>')))
+    assert read.joint("j").kind == "fixed"
+
+
+def test_limits_of_an_endless_joint_do_not_matter(tmp_path: Path) -> None:
+    rest = '<limit lower="-inf" upper="inf" velocity="2"/>'
+    joint = urdf.read(write(tmp_path, LINKS + JOINT.format(kind="continuous", rest=rest))).joint("j")
+    assert (joint.lower, joint.upper, joint.velocity) == (-math.inf, math.inf, 2.0)
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_joints_that_nothing_drives_are_held_where_they_are_drawn(tmp_path: Path, kind: str) -> None:
+    read = urdf.read(write(tmp_path, LINKS + JOINT.format(kind=kind, rest="")))
+    assert (read.joint("j").kind, read.held) == ("fixed", ("j",))
+
+
+@pytest.mark.parametrize("encoding", ["gb2312", "GBK", "shift_jis", "utf-8", "iso-8859-1", "UTF-16"])
+def test_any_encoding_that_python_knows_is_read(tmp_path: Path, encoding: str) -> None:
+    comment = "\u00e9" if encoding == "iso-8859-1" else "\u4e2d"
+    body = f'<?xml version="1.0" encoding="{encoding}"?><!-- {comment} --><robot name="r"><link name="a"/></robot>'
+    (tmp_path / "r.urdf").write_bytes(body.encode(encoding))
+    assert urdf.read(tmp_path / "r.urdf").root == "a"
+
+
+@pytest.mark.parametrize(
+    ("encoding", "content", "said"),
+    [
+        ("klingon", b"", "encoding 'klingon' is not known"),
+        ("ascii", "\u00e9".encode(), "cannot be read as URDF"),
+        ("base64", b"", "cannot be read as URDF"),
+    ],
+)
+def test_an_encoding_that_is_none_is_named(tmp_path: Path, encoding: str, content: bytes, said: str) -> None:
+    head = f'<?xml version="1.0" encoding="{encoding}"?><robot name="r">'.encode()
+    (tmp_path / "r.urdf").write_bytes(head + content + b'<link name="a"/></robot>')
+    with pytest.raises(RobotError, match=said):
+        urdf.read(tmp_path / "r.urdf")

@@ -139,6 +139,25 @@ def test_a_gripper_alone_is_a_hand(tmp_path: Path) -> None:
     assert (group.kind, group.joints, group.chain) == ("hand", ("finger_joint1",), None)
 
 
+def test_a_floating_base_is_left_out_and_said_to_be(tmp_path: Path) -> None:
+    free = link("world") + joint("free", "world", "base_link", kind="floating", more="")
+    made, robot = drafted(tmp_path, free + single())
+    assert robot.dim == 7
+    assert "planar, and held where the URDF draws them: free" in (made.folder / "robot.toml").read_text()
+    assert "free: floating or planar joints" in (made.folder / "README.md").read_text()
+
+
+def test_a_refused_draft_names_files_that_are_there(tmp_path: Path) -> None:
+    body = single().replace('type="revolute"', 'type="revolute" ', 1) + link(
+        "lamp", "<visual><geometry/></visual>"
+    )
+    source = write(tmp_path / "from", body + joint("bolt", "nowhere", "lamp", kind="fixed"))
+    with pytest.raises(RobotError) as refused:
+        draft("mine", source, tmp_path / "into")
+    assert str(source) in str(refused.value)
+    assert ".mine-" not in str(refused.value)
+
+
 def test_a_refused_draft_leaves_nothing_behind(tmp_path: Path) -> None:
     into = tmp_path / "into"
     body = base() + link("lamp") + joint("bolt", "base_link", "lamp", kind="fixed")

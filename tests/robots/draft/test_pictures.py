@@ -48,13 +48,15 @@ def test_meshes_come_along_wherever_the_urdf_says_they_are(tmp_path: Path, named
     assert set(urdf.read(target).joints) == set(urdf.read(source).joints)
 
 
-def test_meshes_of_one_name_in_two_folders_stay_two(tmp_path: Path) -> None:
-    stl(tmp_path / "a" / "link.stl", 100.0)
-    stl(tmp_path / "b" / "link.stl", 200.0)
-    body = link("base_link", MESH.format("a/link.stl")) + link("tool", MESH.format("b/link.stl"))
-    _, target = copied(write(tmp_path, body + joint("j", "base_link", "tool")), tmp_path / "to")
+def test_meshes_of_one_name_in_several_folders_stay_apart(tmp_path: Path) -> None:
+    folders = ("a", "b", "x/b", "y/b")
+    for number, folder in enumerate(folders, start=1):
+        stl(tmp_path / folder / "link.stl", 100.0 * number)
+    body = "".join(link(f"l{k}", MESH.format(f"{folder}/link.stl")) for k, folder in enumerate(folders))
+    body += "".join(joint(f"j{k}", "l0", f"l{k}") for k in range(1, len(folders)))
+    _, target = copied(write(tmp_path, body), tmp_path / "to")
     ends = [float(shape.bounds()[1][0]) for shape in shapes.read(target)]
-    assert ends == pytest.approx([0.1, 0.2])
+    assert ends == pytest.approx([0.1, 0.2, 0.3, 0.4])
 
 
 @pytest.mark.parametrize("named", ["package://elsewhere/link.stl", "link.glb", "torn.stl"])
@@ -107,3 +109,23 @@ def test_a_material_that_nobody_declares_is_plain(tmp_path: Path) -> None:
     pictures, target = copied(write(tmp_path, body), tmp_path / "to")
     assert pictures.plain == ("base_link",)
     assert shapes.read(target)[0].colour == shapes.PLAIN
+
+
+@pytest.mark.parametrize(
+    "shape", ['<box size="0 0.1 0.1"/>', '<sphere radius="0"/>', '<cylinder radius="-1" length="1"/>']
+)
+def test_a_shape_without_size_is_left_out(tmp_path: Path, shape: str) -> None:
+    body = link("base_link", f"<visual><geometry>{shape}</geometry></visual>") + arm("base_link")
+    _, target = copied(write(tmp_path, body), tmp_path / "to")
+    assert {shown.link for shown in shapes.read(target)} >= {"link1", "link6"}
+
+
+@pytest.mark.parametrize("rgba", ["255 0 0 1", "1 1 1", "red", "", "nan 0 0 1"])
+def test_a_colour_that_is_none_is_plain(tmp_path: Path, rgba: str) -> None:
+    look = '<visual><geometry><sphere radius="0.1"/></geometry><material name="m">{}</material></visual>'
+    body = link("base_link", look.format(f'<color rgba="{rgba}"/>')) + arm("base_link")
+    pictures, target = copied(
+        write(tmp_path, body + f'<material name="n"><color rgba="{rgba}"/></material>'), tmp_path / "to"
+    )
+    assert shapes.read(target)[0].colour == shapes.PLAIN
+    assert pictures.plain == ("base_link",)
