@@ -147,12 +147,11 @@ def test_a_floating_base_is_left_out_and_said_to_be(tmp_path: Path) -> None:
     assert "free: floating or planar joints" in (made.folder / "README.md").read_text()
 
 
-def test_a_refused_draft_names_files_that_are_there(tmp_path: Path) -> None:
-    body = single().replace('type="revolute"', 'type="revolute" ', 1) + link(
-        "lamp", "<visual><geometry/></visual>"
-    )
-    source = write(tmp_path / "from", body + joint("bolt", "nowhere", "lamp", kind="fixed"))
-    with pytest.raises(RobotError) as refused:
+def test_a_refused_draft_names_the_file_that_was_given(tmp_path: Path) -> None:
+    odd = '<visual><origin xyz="0 x 0"/><geometry><sphere radius="0.1"/></geometry></visual>'
+    body = single() + link("lamp", odd) + joint("bolt", "base_link", "lamp", kind="fixed")
+    source = write(tmp_path / "from", body)
+    with pytest.raises(RobotError, match="origin xyz is '0 x 0'") as refused:
         draft("mine", source, tmp_path / "into")
     assert str(source) in str(refused.value)
     assert ".mine-" not in str(refused.value)
