@@ -18,6 +18,8 @@ _STILL = 1e-3  # [rad] of a command that rests
 _QUIET = 0.01  # [rad] of a reading that rests, noise included
 _WINDOW_S = 1.0  # in which the error of a joint that stands has not grown
 _GROWN = 0.01  # [rad] more than noise
+_TOLD = 0.01  # [rad] of a command that has moved within that time
+_FOLLOWED = 0.3  # of that way, by a joint that something holds up; one that is free goes twice as far at least
 _UNSEEN_S = 0.5  # without joints: whatever happened to the robot was not seen
 
 
@@ -31,8 +33,8 @@ class SteadyError:
     """Tells an arm that stands below its command from one that is held up by something, or moves.
 
     A command that follows the measurement of an arm that gravity pulls down makes it sink, tick by tick. An error that
-    has lasted is that of the servo, and says nothing about where the arm ought to be; one that has grown within the
-    last second may be something in the way.
+    has lasted is that of the servo, and says nothing about where the arm ought to be. One that has grown within the
+    last second, or came of a command that went on while its joint did not, may be something in the way.
     """
 
     def __init__(self, settings: TickSettings, inherited: bool) -> None:
@@ -41,12 +43,13 @@ class SteadyError:
         self._samples: deque[_Sample] = deque()
         self._inherited = inherited
         self.last: Float64 = np.zeros(len(settings.limits.names))  # of each joint, when it last stood [rad]
+        self._presses = np.zeros(len(self.last), bool)  # joints that did not follow their command, bool [D]
 
     def look(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
         """Take note of a tick; `measured` [D], None where the joints are not known."""
         if not robot.engaged:
             self._samples.clear()
-            self.last[:] = 0.0
+            self.last[:], self._presses[:] = 0.0, False
             self._inherited = False
         elif measured is not None and not (self._samples and now - self._samples[-1].time < _EVERY_S):
             self._note(robot, measured, now)
@@ -71,6 +74,12 @@ class SteadyError:
         self._samples.append(_Sample(now, robot.commanded.copy(), self._error(robot, measured)))
         while now - self._samples[0].time > _WINDOW_S:
             self._samples.popleft()
+        first, newest = self._samples[0], self._samples[-1]
+        told = newest.commanded - first.commanded
+        followed = told - (newest.error - first.error)
+        moved = np.abs(told) > _TOLD
+        self._presses |= moved & (followed * np.sign(told) < _FOLLOWED * np.abs(told))
+        self._presses &= ~(moved & (followed * np.sign(told) > 2.0 * _FOLLOWED * np.abs(told)))
 
     def _error(self, robot: RobotActuator, measured: Float64) -> Float64:
         return difference(robot.commanded, measured, self._settings.dims.wrapping)
@@ -85,4 +94,4 @@ class SteadyError:
         rests = (np.ptp(commands, axis=0) <= _STILL) & (np.ptp(commands - errors, axis=0) <= _QUIET)
         steady = (np.abs(error) <= self._settings.safety.steady_error) & (np.abs(error) - least <= _GROWN)
         seen = now - self._samples[0].time >= _REST_S - _EVERY_S
-        return np.asarray(self._settings.limits.places & rests & steady & seen), error
+        return np.asarray(self._settings.limits.places & rests & steady & seen & ~self._presses), error

@@ -104,11 +104,18 @@ def test_a_stop_in_motion_ends_as_it_would_without_a_load(error):
     assert ends[1] == pytest.approx(ends[0], abs=2e-3)
 
 
-def test_an_arm_that_presses_on_something_is_let_go_to_where_it_reads():
+@pytest.mark.parametrize("speed", [0.02, 0.6])
+@pytest.mark.parametrize("presses", [0.3, 3.0])
+def test_an_arm_that_presses_on_something_is_let_go_to_where_it_reads(speed, presses):
     bench = standing(0.02)
     bench.wall = bench.true + 0.03
-    following(bench, wave(6, 0.6))
-    bench.seconds(0.6)
+    bench.say("follow", run=1)
+    way = 0.1
+    for first in range(0, round(way / speed / PERIOD), 15):
+        bench.chunk(first + 1, wave(60, speed, speed * PERIOD * first).clip(max=way))
+        bench.run(15)
+    bench.say("hold", run=1)
+    bench.seconds(presses)
     pressed = bench.sent[-1] - bench.true
     bench.stop().seconds(1.0)
     assert pressed.min() > 0.05
