@@ -14,6 +14,7 @@ from PIL import Image, UnidentifiedImageError
 from evaweb.datasets.playing import Played
 from evaweb.errors import NotFound
 from runtime.core.sentences import Pattern
+from runtime.datasets.pictures import require_size
 from runtime.recording.files import RecordingError
 
 _PICTURES_VIDEO = Pattern("datasets.stills.pictures_video", "the pictures of {camera} are in a video")
@@ -30,6 +31,7 @@ def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
     content = _stored(episode, key, row)
     try:
         with Image.open(io.BytesIO(content)) as picture:
+            require_size(f"picture {row} of {key!r}", *picture.size)
             kind = _SHOWN.get(picture.format or "")
             if kind:
                 return content, kind

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import io
+import lzma
 import re
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -104,6 +106,19 @@ def packed(text: str, name: str, references: Iterable[Mapping[str, Any]]) -> byt
     return content.getvalue()
 
 
+_DAMAGED = (  # what the ways of packing say of bytes that are not theirs
+    *(
+        zipfile.BadZipFile,
+        zipfile.LargeZipFile,
+        NotImplementedError,
+        RuntimeError,
+        EOFError,
+        OSError,
+        ValueError,
+    ),
+    *(zlib.error, lzma.LZMAError),
+)
+
 # --- in ----------------------------------------------------------------------------------------------------
 
 
@@ -114,7 +129,7 @@ def unpacked(content: bytes) -> tuple[str, dict[str, bytes]]:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             return _of(archive)
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, RuntimeError) as error:
+    except _DAMAGED as error:
         raise EvaError(_THIS_ARCHIVE_CANNOT_READ(error=error)) from None
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import av
 
 
+MOST_PIXELS = 2**24  # of a picture that is decoded
 KEPT_BYTES = (
     16 << 20
 )  # decoded frames that are kept of a video: going backwards decodes a group of pictures once
@@ -222,6 +223,14 @@ class Pictures(PictureSequence):
         self._container.close()
 
 
+def require_size(name: str, width: int, height: int) -> None:
+    """Raise RecordingError where a picture's header says that it is larger than any camera's: a small file can be."""
+    if width * height > MOST_PIXELS:
+        raise RecordingError(
+            f"{name} is {width} x {height}; allowed: {MOST_PIXELS} pixels in all, such as 4096 x 4096"
+        )
+
+
 class StoredPictures(PictureSequence):
     """The pictures of an image column: coded as PNG or JPEG in the rows, or in files that the rows name."""
 
@@ -240,6 +249,7 @@ class StoredPictures(PictureSequence):
             raise IndexError(f"{self._name} has pictures 0 to {len(self) - 1}, asked for {index}")
         try:
             with Image.open(io.BytesIO(self._coded(index))) as image:
+                require_size(f"{self._name}, picture {index}", *image.size)
                 picture = np.array(image.convert("RGB"), dtype=np.uint8)
         except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
             raise RecordingError(f"{self._name}, picture {index} cannot be decoded: {error}") from error

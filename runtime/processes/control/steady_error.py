@@ -19,7 +19,9 @@ _QUIET = 0.01  # [rad] of a reading that rests, noise included
 _WINDOW_S = 1.0  # in which the error of a joint that stands has not grown
 _GROWN = 0.01  # [rad] more than noise
 _TOLD = 0.01  # [rad] of a command that has moved within that time
-_FOLLOWED = 0.3  # of that way, by a joint that something holds up; one that is free goes twice as far at least
+_FOLLOWED = (
+    0.3  # of that way, by a joint that something holds up; one that is free goes twice as far at least
+)
 _UNSEEN_S = 0.5  # without joints: whatever happened to the robot was not seen
 
 

@@ -1,5 +1,6 @@
 """Reference pictures travel between labs in an archive."""
 
+import contextlib
 import hashlib
 import io
 import tomllib
@@ -142,6 +143,19 @@ def test_what_is_no_such_archive_is_refused_and_named(taken, monkeypatch):
     monkeypatch.setattr(references, "LARGEST", 1000)
     with pytest.raises(EvaError, match="1000 bytes in all"):
         unpacked(exported_with_pictures(scenes=[taken.scene]))
+
+
+@pytest.mark.parametrize("packed", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_an_archive_that_is_damaged_anywhere_is_refused(packed):
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", packed) as made:
+        made.writestr("lab.toml", "# words\n" + "\n".join(f"# {number}" for number in range(500)))
+    whole = content.getvalue()
+    assert unpacked(whole)[1] == {}
+    for at in range(30, len(whole), 7):
+        damaged = whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :]
+        with contextlib.suppress(EvaError):
+            unpacked(damaged)
 
 
 def test_the_admin_pages_and_the_command_write_and_take_archives(

@@ -1,14 +1,17 @@
 from __future__ import annotations
 
+import io
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from runtime.core.errors import RecordingError
-from runtime.datasets.pictures import Pictures
+from runtime.datasets.pictures import Pictures, StoredPictures
 from tests.examples import some
 from tests.runtime.datasets.small import seen, write_video
 
@@ -134,3 +137,13 @@ def test_going_backwards_decodes_a_group_a_few_times_and_not_once_a_frame(
     assert seeks == [39, 27, 15, 3]
     with Pictures(path) as pictures:
         assert shades == [float(pictures[k].mean()) for k in range(frames)][::-1]
+
+
+def test_a_picture_whose_header_says_that_it_is_huge_is_not_decoded(tmp_path: Path) -> None:
+    small = io.BytesIO()
+    Image.new("RGB", (16, 16)).save(small, "JPEG")
+    content = small.getvalue()
+    size = content.index(b"\xff\xc0") + 5
+    huge = content[:size] + struct.pack(">HH", 5000, 6000) + content[size + 4 :]
+    with pytest.raises(RecordingError, match="picture 0 is 6000 x 5000; allowed: 16777216 pixels"):
+        StoredPictures("cam", [{"bytes": huge}], tmp_path)[0]
