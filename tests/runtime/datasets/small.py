@@ -77,12 +77,8 @@ def write_dataset(
     chunks_size: int = 1000,
     gop: int = 250,
     names: dict[str, str] | None = None,
-    numbers: tuple[int, ...] = (),
 ) -> dict[int, dict[str, np.ndarray]]:
-    """A v2.1 dataset of another program; returns the columns by episode. `names` renames columns.
-
-    `numbers` are the episodes' indices, by default 0, 1, ...
-    """
+    """A v2.1 dataset of another program; returns the columns by episode. `names` renames columns."""
     columns = {
         name: (names or {}).get(name, name)
         for name in ("observation.state", "observation.eef", "action", "action_eef")
@@ -100,8 +96,7 @@ def write_dataset(
         "task_index": {"dtype": "int64", "shape": [1], "names": None},
     }
     written: dict[int, dict[str, np.ndarray]] = {}
-    numbers = numbers or tuple(range(len(lengths)))
-    for index, length in zip(numbers, lengths, strict=True):
+    for index, length in enumerate(lengths):
         rows = {
             columns[name]: vectors(length, width, 10 * index + n)
             for n, (name, width) in enumerate(widths.items())
@@ -116,17 +111,12 @@ def write_dataset(
         for camera in cameras:
             video = f"films/part-{index // chunks_size:03d}/observation.images.{camera}/take_{index:06d}.mp4"
             write_video(root / video, length, fps, gop)
-    _write_meta(root, numbers, lengths, fps, chunks_size, features)
+    _write_meta(root, lengths, fps, chunks_size, features)
     return written
 
 
 def _write_meta(
-    root: Path,
-    numbers: tuple[int, ...],
-    lengths: tuple[int, ...],
-    fps: float,
-    chunks_size: int,
-    features: dict[str, Any],
+    root: Path, lengths: tuple[int, ...], fps: float, chunks_size: int, features: dict[str, Any]
 ) -> None:
     info = {
         "codebase_version": "v2.1",
@@ -144,7 +134,7 @@ def _write_meta(
     (meta / "info.json").write_text(json.dumps(info))
     episodes = [
         {"episode_index": index, "tasks": [f"task {index % 2}"], "length": length}
-        for index, length in zip(numbers, lengths, strict=True)
+        for index, length in enumerate(lengths)
     ]
     (meta / "episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in episodes))
     tasks = [{"task_index": number, "task": f"task {number}"} for number in (0, 1)]
