@@ -150,13 +150,14 @@ class HealthMonitor:
         if state is not SessionState.RUNNING:  # a set-up looks for itself
             return
         now = self._clock.now()
-        moving = [name for name in SIBLINGS if name != "media" and not self._alive(name)]
-        if moving:
+        # Media moves nothing, and what it has not read yet is kept for it, unless it has ended.
+        ended = not self._page.last_beat("media")
+        silent = [name for name in SIBLINGS if not self._alive(name) and (name != "media" or ended)]
+        if silent:
             yield Noticed(
-                SessionEvent.HELD, _SILENT(process=moving[0], since=self._page.silence(moving[0], now))
+                SessionEvent.HELD, _SILENT(process=silent[0], since=self._page.silence(silent[0], now))
             )
         elif not self._alive("media") and self._waiting_to_record > _MOST_WAITING:
-            # It moves nothing, and what it has not read yet is kept for it.
             yield Noticed(SessionEvent.HELD, _RECORDING_WAITS(since=self._page.silence("media", now)))
 
     def _estop(self, state: SessionState) -> Iterator[Noticed]:

@@ -355,7 +355,9 @@ def _renumber(root: Path, numbers: tuple[int, ...]) -> None:
         place = table.column_names.index("episode_index")
         given = [numbers[index] for index in table["episode_index"].to_pylist()]
         pq.write_table(table.set_column(place, table.schema.field(place), [given]), path)
-    for path in sorted(root.rglob("episode_*.*"), reverse=True):  # of v2.x: the last first, they are in the way
+    for path in sorted(
+        root.rglob("episode_*.*"), reverse=True
+    ):  # of v2.x: the last first, they are in the way
         number = numbers[int(path.stem.removeprefix("episode_"))]
         path.rename(path.with_stem(f"episode_{number:06d}"))
     for path in root.glob("meta/episodes*.jsonl"):
