@@ -19,9 +19,7 @@ _QUIET = 0.01  # [rad] of a reading that rests, noise included
 _WINDOW_S = 1.0  # in which the error of a joint that stands has not grown
 _GROWN = 0.01  # [rad] more than noise
 _TOLD = 0.01  # [rad] of a command that has moved within that time
-_FOLLOWED = (
-    0.3  # of that way, by a joint that something holds up; one that is free goes twice as far at least
-)
+_FOLLOWED = 0.3  # of that way, by a joint that something holds up; a free one goes twice as far at least
 _UNSEEN_S = 0.5  # without joints: whatever happened to the robot was not seen
 
 
@@ -58,6 +56,11 @@ class SteadyError:
             standing, error = self._standing(now)
             self._inherited = self._inherited and now - self._samples[0].time < _REST_S
             self.last = np.where(standing, error, self.last)
+
+    def leave_out(self) -> None:
+        """The command is led to the reading now: that says nothing of how joints follow it."""
+        self._samples.clear()
+        self._presses[:] = False
 
     def keeps(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
         """The joints that stand within a steady error of their command: a stop leaves that as it is, bool [D]."""

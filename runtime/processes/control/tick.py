@@ -106,7 +106,7 @@ class Tick:
         self._seen = self._plausibility.judge(self._eyes.look(), planned, self._moved)
         for payload in self._page.rings["orders"].drain():
             self._read(payload, step, planned)
-        self._steady.look(self._actuator, self._measured(planned), planned)
+        self._look_at_error(planned)
         self._check_estop(planned)
         self._check_family(planned)
         self._check_doubt(planned)
@@ -312,6 +312,13 @@ class Tick:
             self._actuator.engage(measured)
         self._actuator.open_or_close()
         return True
+
+    def _look_at_error(self, now: float) -> None:
+        stopped = self._robot.behaviour if isinstance(self._robot.behaviour, EStopped) else None
+        if (stopped is not None and stopped.follows) or self._displacement.goal is not None:
+            self._steady.leave_out()
+        else:
+            self._steady.look(self._actuator, self._measured(now), now)
 
     def _check_estop(self, now: float) -> None:
         latched = self._page.estop is EStop.LATCHED

@@ -101,6 +101,10 @@ def test_a_stop_in_motion_ends_as_it_would_without_a_load(error):
         bench.seconds(1.0)
         bench.stop().seconds(2.0)
         ends.append(bench.sent[-60:])
+        for _ in range(5):  # which stands now
+            bench.release().seconds(0.5)
+            bench.stop().seconds(1.5)
+        assert bench.sent[-1] == pytest.approx(ends[-1][-1], abs=1e-9)
     assert ends[1] == pytest.approx(ends[0], abs=2e-3)
 
 
