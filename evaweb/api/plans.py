@@ -87,13 +87,13 @@ class HandoutOut(Schema):
     trial: TrialDetail
 
 
-class At(Schema):
+class At(Body):
     """Which station."""
 
     station: str
 
 
-class Back(Schema):
+class Back(Body):
     """Which station's trials are given to others, and why."""
 
     station: str
@@ -106,7 +106,7 @@ class Freed(Schema):
     freed: int
 
 
-class Reason(Schema):
+class Reason(Body):
     """Reason, for later readers."""
 
     reason: str = ""

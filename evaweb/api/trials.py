@@ -176,7 +176,7 @@ class FailureIn(Body):
     reason: Annotated[str, Field(description='Without one: "failure was ..., now ..."')] = ""
 
 
-class Reason(Schema):
+class Reason(Body):
     """Reason, for later readers."""
 
     reason: str = ""
