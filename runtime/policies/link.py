@@ -27,6 +27,7 @@ from runtime.core.errors import (
     WrongProtocolError,
 )
 from runtime.core.sentences import Pattern, fixed
+from runtime.core.tls import allow_two_threads
 from runtime.policies.connection import Dial, Place, reached
 from runtime.policies.watchdog import Watchdog
 
@@ -252,10 +253,12 @@ class WebsocketLink:
             wire = self._stack.enter_context(
                 reached(self._url, *self._place(), deadline, seconds, self._require_not_aborted)
             )
+            secure = self._url.lower().startswith("wss:")
             return self._stack.enter_context(
                 connect(
                     self._url,
                     sock=wire,
+                    ssl=allow_two_threads(ssl.create_default_context()) if secure else None,
                     additional_headers=self._headers,
                     compression=None,
                     max_size=ANSWER_LIMIT,

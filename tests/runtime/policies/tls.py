@@ -15,6 +15,7 @@ from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
 from runtime.core import msgpack_arrays
+from runtime.core.tls import allow_two_threads
 
 Certificate = tuple[Path, Path]  # and its key
 
@@ -48,7 +49,7 @@ def self_signed(folder: Path) -> Certificate:
 @contextlib.contextmanager
 def encrypted(certificate: Certificate) -> Iterator[str]:
     """A websocket server with TLS that answers with rows; its address."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context = allow_two_threads(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER))
     context.load_cert_chain(*certificate)
 
     def converse(connection: ServerConnection) -> None:
