@@ -48,6 +48,7 @@ $(VENV)/.setup-dev: $(VENV)/.setup
 	@echo 'installing what tests and linters need'; $(TICKING) $(call fetch,what tests need,$(PIP) --editable '.[dev]')
 	@echo 'installing what tests of pages need'; $(TICKING) $(call fetch,what tests of pages need,$(call npm,ci))
 	@echo "compiling every robot's inverse kinematics"; $(TICKING) $(PY) -m runtime.kinematics
+	@echo 'compiling the tests'; $(TICKING) $(PY) -m pytest --collect-only -q >/dev/null
 	@touch $@
 
 demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json FILE" for one trial

@@ -25,7 +25,7 @@ PATIENT = (
     "safety.jump=3.0",
     "safety.refusals_to_hold=1000",
     "control.starvation_hold_s=30.0",
-    "control.heartbeat_timeout_s=10.0",
+    "control.heartbeat_timeout_s=10.0", "control.coordinator_timeout_s=10.0",
     'faults.policy_error="slow"',
     "faults.patience_s=30.0",
     "lease.ttl_s=30.0",

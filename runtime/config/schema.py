@@ -69,12 +69,15 @@ class ControlSettings(Settings):
     rate: float | None = Field(default=None, gt=0, le=1000)
     """Ticks per second [Hz]; the robot's own rate where it is not given."""
     realtime: Literal["auto", "off"] = "auto"
-    """"auto" asks for SCHED_FIFO and locked memory and says what it got; "off" does not ask. Reception likewise, one
-    priority below."""
+    """"auto" asks for SCHED_FIFO and locked memory and says what it got; "off" does not ask. Reception and guard
+    likewise, one priority below."""
     realtime_priority: int = Field(default=20, ge=1, le=99)
     """Priority within SCHED_FIFO."""
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)
-    """Silence of the coordinator or guard after which control holds [s]."""
+    """Silence of control, guard or reception after which the robot is held [s]."""
+    coordinator_timeout_s: float = Field(default=3.0, gt=0)
+    """Silence of the coordinator after which control holds, and the recorder ends its episode [s]: it decides what comes
+    next and stops nothing, so that a busy machine may keep it longer."""
     orphan_hold_s: float = Field(default=5.0, ge=0, le=8)
     """How long control goes on holding after its supervisor has died [s]."""
     starvation_hold_s: float = Field(default=1.0, gt=0)
@@ -330,8 +333,10 @@ class Deployment(Settings):
         return self
 
     def heartbeat_timeout_s(self, process: str) -> float:
-        """Silence [s] after which `process` counts as gone: the recorder is no part of safety and has longer."""
-        return (self.recording if process == "media" else self.control).heartbeat_timeout_s
+        """Silence [s] after which `process` counts as gone: those that stop the robot have the shortest."""
+        if process == "media":
+            return self.recording.heartbeat_timeout_s
+        return self.control.coordinator_timeout_s if process == "coordinator" else self.control.heartbeat_timeout_s
 
     @property
     def data(self) -> Path:

@@ -102,3 +102,15 @@ def test_a_terminal_sets_up_runs_and_stops_a_station(lab):
     assert lab.client.status()["state"] == "ready"
     (episode,) = {folder.name for folder in lab.episodes()} - before
     assert lab.outcome(episode)["status"] == "finished"
+
+
+def test_whoever_stops_the_robot_is_next_after_control(lab):
+    classes = {
+        name: (os.sched_getscheduler(pid), os.sched_getparam(pid).sched_priority)
+        for name, pid in lab.pids().items()
+    }
+    assert classes["guard"] == classes["reception"]
+    got, priority = classes["control"]
+    below = priority - 1 if got == os.SCHED_FIFO else 0
+    assert classes["guard"] == (got, below)
+    assert classes["coordinator"] == (os.SCHED_OTHER, 0)

@@ -10,6 +10,7 @@ from tests.e2e.lab import CHROMIUM, NO_CHROMIUM, Demo, browsing
 PATIENT = {
     "bus.preview_rate": 5,
     "control.heartbeat_timeout_s": 10,
+    "control.coordinator_timeout_s": 10,
     "control.orphan_hold_s": 0.5,  # each lab waits for it at its end
     "control.starvation_hold_s": 10,
     "recording.heartbeat_timeout_s": 20,

@@ -131,7 +131,7 @@ class Bench:
             limits=self.limits,
             dims=self.dims,
             safety=self.safety,
-            heartbeat_timeout=1.0,
+            heartbeat_timeout=lambda process: 1.0,
             starvation=self.starvation,
             starvation_hold=1.0,
             switches=self.switches,

@@ -42,7 +42,7 @@ class TickSettings:
     limits: Limits
     dims: DimensionKinds
     safety: SafetySettings
-    heartbeat_timeout: float
+    heartbeat_timeout: Callable[[str], float]  # silence after which the process of that name counts as gone
     starvation: Answer
     starvation_hold: float  # until "slow" holds
     moves_robot: bool = True  # commands reach something that can break

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from runtime.core.sentences import Pattern
@@ -24,10 +26,10 @@ _THERE = 1e-6  # [rad]
 _ALONG = 0.2  # [rad] of a way on which the reading of a joint that stands comes nearer by more than half
 
 
-def silent_sibling(shared: SharedState, now: float, allowed: float) -> str:
-    """The process whose heartbeat is older than `allowed` seconds, in a sentence; "" where none is."""
+def silent_sibling(shared: SharedState, now: float, allowed: Callable[[str], float]) -> str:
+    """The process whose heartbeat is older than it is `allowed` to be [s], in a sentence; "" where none is."""
     for process in ("coordinator", "guard"):
-        if not shared.alive(process, now, allowed):
+        if not shared.alive(process, now, allowed(process)):
             return _SIBLING_SILENT(process=process, since=shared.silence(process, now))
     return ""
 

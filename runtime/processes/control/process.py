@@ -74,7 +74,7 @@ def make_tick(spec: StationSpec, shared: SharedState, sink: Sink, now: Callable[
             limits=limits,
             dims=spec.dims,
             safety=deployment.safety,
-            heartbeat_timeout=deployment.control.heartbeat_timeout_s,
+            heartbeat_timeout=deployment.heartbeat_timeout_s,
             starvation=deployment.faults.starvation,
             starvation_hold=deployment.control.starvation_hold_s,
             moves_robot=spec.capabilities.moves_robot,

@@ -13,7 +13,7 @@ from typing import Any
 import zmq
 
 from runtime.core import file_limits as descriptors
-from runtime.core import logs
+from runtime.core import logs, realtime
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.sentences import Pattern
 from runtime.ipc.bells import bells
@@ -222,6 +222,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--period", required=True, type=float, help="of control's ticks [s]")
     parser.add_argument("--layout", required=True, help="of the shared state, as JSON")
     parser.add_argument("--rest", required=True, type=float, help="between two signs of life [s]")
+    parser.add_argument("--priority", type=int, help="of control in the real-time class, to be next after it")
     parser.add_argument("--shared", required=True, type=int)
     parser.add_argument("--bells", required=True, type=bells)
     parser.add_argument("--boot", required=True)
@@ -233,6 +234,9 @@ def main() -> None:
     descriptors.allow_all()
     given = _arguments()
     logs.start("guard")
+    # before there are other threads, which are to have the same
+    scheduling = realtime.enter_below(given.priority) if given.priority else "ordinary"
+    log.info("guarding, scheduling %s", scheduling)
     sizes = json.loads(given.layout)
     layout = SharedStateLayout(**{**sizes, "cameras": tuple(sizes["cameras"])})
     shared = SharedState.attach(layout, given.shared)

@@ -362,9 +362,8 @@ def main() -> None:
             now = clock.now()
             shared.beat("media", now)
             media.digest()
-            if media.recording and not shared.alive(
-                "coordinator", now, spec.deployment.control.heartbeat_timeout_s
-            ):
+            within = spec.deployment.heartbeat_timeout_s("coordinator")
+            if media.recording and not shared.alive("coordinator", now, within):
                 media.end(
                     "interrupted",
                     f"the coordinator has given no sign of life {shared.silence('coordinator', now)}",

@@ -136,11 +136,13 @@ class Supervisor:
 
     def _for_guard(self) -> tuple[str, ...]:
         """Values alone: the guard reads no deployment, which could name what fails to load."""
-        spec = self._plan
+        spec, control = self._plan, self._plan.deployment.control
+        punctual = control.realtime == "auto" and spec.capabilities.moves_robot
         return (
+            *(("--priority", str(control.realtime_priority)) if punctual else ()),
             *("--station", spec.deployment.station, "--folder", str(self._station_dir)),
             *("--period", repr(1.0 / spec.rate), "--layout", json.dumps(asdict(spec.layout))),
-            *("--rest", repr(rest_s(spec.deployment.control.heartbeat_timeout_s))),
+            *("--rest", repr(rest_s(control.heartbeat_timeout_s))),
         )
 
     def _spawn_companion(self, module: str) -> subprocess.Popen[bytes]:

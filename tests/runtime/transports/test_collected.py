@@ -93,7 +93,7 @@ def demonstration(
         "setup": {"home": False},
         "recording": {"min_free_bytes": 0},
         "safety": {"joint_age_s": PATIENCE_S, "picture_age_s": PATIENCE_S},
-        "control": {"heartbeat_timeout_s": 10.0},
+        "control": {"heartbeat_timeout_s": 10.0, "coordinator_timeout_s": 10.0},
     }
     station = lockstep.Lockstep(checked_spec(loader.resolve(tree, {}, "test")))
     session = station.coordinator.session

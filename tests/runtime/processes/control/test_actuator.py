@@ -18,7 +18,7 @@ def settings(limits=None, **options):
         "limits": limits or Bench().limits,
         "dims": DimensionKinds(),
         "safety": SafetySettings(),
-        "heartbeat_timeout": 1.0,
+        "heartbeat_timeout": lambda process: 1.0,
         "starvation": "slow",
         "starvation_hold": 1.0,
     }

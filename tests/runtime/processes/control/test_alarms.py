@@ -12,14 +12,17 @@ def test_a_sibling_that_is_silent_is_named_with_how_long():
     shared = Bench().shared
     shared.beat("coordinator", 100.0)
     shared.beat("guard", 100.0)
-    assert silent_sibling(shared, 100.9, 1.0) == ""
-    shared.beat("coordinator", 101.0)
-    assert silent_sibling(shared, 101.5, 1.0) == "no sign of life from guard for 1.5 s"
+    allowed = {"guard": 1.0, "coordinator": 3.0}.__getitem__
+    assert silent_sibling(shared, 100.9, allowed) == ""
+    assert silent_sibling(shared, 101.5, allowed) == "no sign of life from guard for 1.5 s"
+    shared.beat("guard", 104.0)
+    assert silent_sibling(shared, 103.0, allowed) == ""
+    assert silent_sibling(shared, 104.0, allowed) == "no sign of life from coordinator for 4.0 s"
 
 
 def test_a_sibling_that_never_gave_a_sign_is_named_so():
     assert (
-        silent_sibling(Bench().shared, 100.0, 1.0)
+        silent_sibling(Bench().shared, 100.0, lambda process: 1.0)
         == "no sign of life from coordinator since it was restarted"
     )
 
