@@ -147,9 +147,13 @@ class SafetyFilter:
 
     def blind(self, state: RobotState) -> str:
         """Why nobody knows where the robot is, "" where that is known."""
+        return state.doubt or self.unseen(state)
+
+    def unseen(self, state: RobotState) -> str:
+        """How old the joints are where they are too old, and nothing speaks against the last ones; else ""."""
         allowed = self._settings.joint_age_s
         if state.doubt or state.joint_age <= allowed:
-            return state.doubt
+            return ""
         return _JOINTS_OLD(seconds=state.joint_age, allowed=allowed)
 
     def _stale(self, state: RobotState) -> str:

@@ -26,6 +26,9 @@ class SafetySettings(Settings):
     """Judge and report, but send actions as they are; refused for a transport that can move a robot."""
     joint_age_s: float = Field(default=0.2, gt=0)
     """Oldest joint measurement that a policy action may be based on [s]."""
+    joint_gap_s: float = Field(default=1.0, ge=0)
+    """Oldest joint measurement at which a run that stands for that alone still goes on by itself once they are back,
+    where they were [s]."""
     picture_age_s: float = Field(default=0.5, gt=0)
     """Oldest picture of any camera that a policy action may be based on [s]."""
     following_error: float = Field(default=0.5, gt=0)

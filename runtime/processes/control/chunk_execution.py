@@ -98,6 +98,11 @@ class ExecuteChunks(Behaviour):
             return None
         return Target(planned.action, self._source, "policy", planned.makers)
 
+    def begin_anew(self) -> None:
+        """Forget what is planned: the next chunk is a first one, and the robot waits for it."""
+        self.timeline.clear()
+        self._expecting, self._useless, self._starved_since = True, False, None
+
     # --- chunks --------------------------------------------------------------------------------------------
 
     def tune(self, chosen: Strategy, step: int) -> None:

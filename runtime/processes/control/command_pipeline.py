@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from runtime.processes.control.behaviours import Behaviour, Hold, Move, Silent, 
 from runtime.processes.control.chunk_execution import ExecuteChunks
 from runtime.processes.control.gripper_locks import GripperLocks
 from runtime.processes.control.telemetry import Telemetry
-from runtime.safety.filter import SafetyFilter
+from runtime.safety.filter import RobotState, SafetyFilter
 from runtime.spaces.binary_grippers import Dwell, open_or_closed
 
 _ACTIONS_AGAIN = Pattern("control.actions_again", "actions again after {seconds:.2f} s")
@@ -26,6 +27,20 @@ _OF_THE_LAST = Pattern(
     "control.refused_of_the_last",
     "{count} actions refused of the last {of}, the last one: {why}",
 )
+_JOINTS_MISSING = Pattern(
+    "control.joints_missing",
+    "{why}: the run stands, and goes on by itself where they are back before they are {seconds:g} s old",
+)
+_JOINTS_BACK = Pattern("control.joints_back", "joints again after {seconds:.2f} s: the run goes on")
+_BACK_ELSEWHERE = Pattern(
+    "control.back_elsewhere",
+    "joints again after {seconds:.2f} s, but {joint} reads {distance:.2f} rad from its command, allowed {allowed:g} "
+    "(safety.steady_error): look what moved it, then resume",
+)
+_NOT_BELIEVED = Pattern(
+    "control.not_believed", "joints again after {seconds:.2f} s, but not believed: {why}"
+)
+_DISAGREE = fixed("control.disagree", "samples do not agree yet")
 _STARVED = Pattern("control.starved", "no usable chunk for {seconds:.1f} s")
 _STARVED_AT_ONCE = fixed("control.starved_at_once", "no usable chunk for this step")
 _ARRIVED_THERE = fixed("control.arrived", "arrived")
@@ -33,13 +48,23 @@ _NO_ACTION = fixed("control.no_action", "no action for this step: slowing down a
 
 _ARRIVED = 1e-4  # [rad] of a motion's end: it may have been limited on its last steps
 _QUIET_S = 1.0  # without a refusal: the next one is told again
+_BELIEVED_S = 0.5  # for joints that are back to be believed again
+
+
+@dataclass(slots=True)
+class _Gap:
+    """Gap in the joints for which a run stands."""
+
+    age: float  # of the newest joints, while they were too old [s]
+    seen: float  # our clock, when they last were
 
 
 class CommandPipeline:
     """Behaviour -> target -> locked grippers, those that switch -> safety -> actuator, once per tick.
 
     What safety refuses is replaced by the next point of a stop, so that something is sent on every tick; too many
-    refusals, or too long with nothing planned, make it hold for that reason.
+    refusals, or too long with nothing planned, make it hold for that reason. A run whose joints are too old, and that
+    is all, stands for a moment longer: it goes on by itself where they are back soon, and where they were.
     """
 
     def __init__(
@@ -49,7 +74,9 @@ class CommandPipeline:
         locks: GripperLocks,
         settings: TickSettings,
         report: Telemetry,
+        believed: Callable[[], bool],
     ) -> None:
+        self._believed = believed  # whether the newest joints are
         self.actuator = actuator
         self._safety = safety
         self._locks = locks
@@ -62,6 +89,8 @@ class CommandPipeline:
         self._verdicts: deque[bool] = deque(maxlen=2 * settings.safety.refusals_to_hold)
         self._refused_at = float("-inf")
         self.refused = 0  # in a row
+        self._unseen = 0  # of these the last ones, in a run, whose only fault was the age of the joints
+        self._gap: _Gap | None = None
         self.behaviour: Behaviour = Silent()
         if actuator.engaged:
             self.hold_here()
@@ -136,7 +165,7 @@ class CommandPipeline:
 
     def _begin(self) -> None:
         self._standing, self._aim = None, None
-        self.refused = 0
+        self.refused, self._unseen, self._gap = 0, 0, None
         self._verdicts.clear()
 
     def _go(self, goal: Float64, speed: float) -> None:
@@ -165,6 +194,9 @@ class CommandPipeline:
         return sent
 
     def _drive(self, step: int, planned: float, seen: LatestObservation) -> Sent:
+        run = self.run
+        if run is not None and self._gap is not None:
+            return self._wait_for_joints(run, self._gap, step, planned, seen)
         target = self.behaviour.target(step, self.actuator.elapsed(planned))
         if target is None:
             return self._nothing_planned(step, planned, seen)
@@ -183,7 +215,7 @@ class CommandPipeline:
         verdict = self._safety.judge(action, state, target.path or "policy")
         if verdict.action is None:
             return self._refuse(step, planned, target, (*notes, *verdict.notes), seen)
-        self.refused, self._standing, self._aim = 0, None, action
+        self.refused, self._unseen, self._standing, self._aim = 0, 0, None, action
         self._verdicts.append(False)
         if self.run is not None and (gap := self.run.fed(planned)) is not None:
             self._report.say("recovered", _ACTIONS_AGAIN(seconds=gap))
@@ -228,25 +260,73 @@ class CommandPipeline:
         return action, (*locked, *kept)
 
     def _refuse(
-        self, step: int, planned: float, target: Target, notes: tuple[str, ...], seen: LatestObservation
+        self, step: int, planned: float, target: Target | None, notes: tuple[str, ...], seen: LatestObservation
     ) -> Sent:
+        run, unseen = self.run, self._safety.unseen(self.actuator.state(seen, planned, None))
         self.refused += 1
+        self._unseen = self._unseen + 1 if unseen and run is not None else 0
         self._verdicts.append(True)
         self._brace()
         if planned - self._refused_at > _QUIET_S:
             self._report.say("refused", notes[-1])
         self._refused_at = planned
         refused = sum(self._verdicts)
-        if refused >= self._settings.safety.refusals_to_hold:
+        if refused < self._settings.safety.refusals_to_hold:
+            pass
+        elif run is not None and self._unseen >= refused and self._settings.safety.joint_gap_s:
+            self._gap = _Gap(planned - seen.joints_captured, planned)
+            run.begin_anew()
+            seconds = self._settings.safety.joint_gap_s
+            self._report.say("joints_missing", _JOINTS_MISSING(why=unseen, seconds=seconds))
+        else:
             told = {"count": refused, "why": notes[-1]}
             in_row, of = refused == self.refused, len(self._verdicts)
             self.hold_because("refusals", _IN_A_ROW(**told) if in_row else _OF_THE_LAST(**told, of=of))
         return self._stand(step, planned, seen)._replace(target=target, notes=notes, refused=True)
 
+    def _wait_for_joints(
+        self, run: ExecuteChunks, gap: _Gap, step: int, planned: float, seen: LatestObservation
+    ) -> Sent:
+        """Stand until the joints are seen and believed again; then go on with the next chunk, or hold."""
+        state, why = self.actuator.state(seen, planned, None), ""
+        if unseen := self._safety.unseen(state):
+            gap.age, gap.seen = state.joint_age, planned
+            if gap.age > self._settings.safety.joint_gap_s:
+                why = _IN_A_ROW(count=self.refused, why=unseen)
+        elif state.doubt or not self._believed():
+            if planned - gap.seen > _BELIEVED_S:
+                why = _NOT_BELIEVED(seconds=gap.age, why=state.doubt or _DISAGREE)
+        else:
+            why = self._elsewhere(state, gap)
+            if not why:
+                self._go_on(run, gap)
+        if why:
+            self.hold_because("refusals", why)
+        return self._stand(step, planned, seen)._replace(refused=True)
+
+    def _elsewhere(self, state: RobotState, gap: _Gap) -> str:
+        """Which joint is not where it was told to stand, "" where all are."""
+        limits, allowed = self._settings.limits, self._settings.safety.steady_error
+        apart = np.where(limits.places & ~limits.grippers, np.abs(state.measured - state.previous), 0.0)
+        worst = int(np.nanargmax(apart))
+        if apart[worst] <= allowed:
+            return ""
+        told = {"joint": limits.names[worst], "distance": apart[worst], "allowed": allowed}
+        return _BACK_ELSEWHERE(seconds=gap.age, **told)
+
+    def _go_on(self, run: ExecuteChunks, gap: _Gap) -> None:
+        run.begin_anew()  # what came meanwhile was meant for joints of before
+        self.refused, self._unseen, self._gap = 0, 0, None
+        self._verdicts.clear()
+        self._report.say("joints_back", _JOINTS_BACK(seconds=gap.age))
+
     def _nothing_planned(self, step: int, planned: float, seen: LatestObservation) -> Sent:
         run = self.run
         if run is None:
             return Sent(planned)
+        unseen = self._safety.unseen(self.actuator.state(seen, planned, None))
+        if unseen and not run.waits:  # nobody can answer without joints
+            return self._refuse(step, planned, None, (unseen,), seen)
         self._brace()
         starved = run.starve(planned)
         if starved == 0.0:

@@ -145,7 +145,10 @@ class Tick:
         return self._robot if self._simulated is None else self._simulated
 
     def _lane(self, actuator: Actuator) -> CommandPipeline:
-        return CommandPipeline(actuator, self._safety, self._locks, self._settings, self._report)
+        def believed() -> bool:
+            return self._plausibility.settled
+
+        return CommandPipeline(actuator, self._safety, self._locks, self._settings, self._report, believed)
 
     def _drive(self, step: int, planned: float) -> Sent:
         """Move every lane on by a tick; what became of it on the one that is led, for the record."""

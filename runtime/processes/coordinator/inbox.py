@@ -87,6 +87,8 @@ class Inbox:
         to.setup.heard(event)
         if event.kind == "motion_done":
             to.runs.arrived()
+        if event.kind == "joints_back":
+            to.inference.forget_plan()
         if event.kind == "starved":
             to.inference.metrics.count_starved()
         if event.kind == "starvation":

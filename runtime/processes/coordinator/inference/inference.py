@@ -230,6 +230,12 @@ class Inference:
         self._unmerged.clear()
         self._commitment.clear()
 
+    def forget_plan(self) -> None:
+        """Control has dropped its plan: the robot is committed to nothing, and no answer that is still out counts."""
+        self._flight, self._stale_since = None, None
+        self._unmerged.clear()
+        self._commitment.clear()
+
     # --- what control says -----------------------------------------------------------------------------------
 
     def merged(self, merged: ChunkMerged) -> None:

@@ -190,7 +190,7 @@ def test_nan_from_the_policy_is_never_sent(bench):
 def test_old_observations_lead_to_holding_with_the_reason(bench):
     following(bench, wave(90))
     bench.feed = False
-    bench.run(20)
+    bench.run(40)
     assert bench.behaviour == "hold"
     assert "joints are" in bench.said("refusals")[0].text
 
