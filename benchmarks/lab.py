@@ -103,6 +103,7 @@ def _linked(running: RunningLab, folder: Path, name: str) -> Iterator[StartedSta
             yield station
     finally:
         for child in bench.children.values():
+            assert child.stdin is not None
             child.stdin.close()
             child.wait(_PATIENCE_S)
 

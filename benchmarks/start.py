@@ -138,6 +138,7 @@ def measure(seconds: float) -> Report:
             rows = [_once(node, Path(name) / str(start)) for start in range(1 + _STARTS)][1:]
         finally:
             for child in lab.children.values():
+                assert child.stdin is not None
                 child.stdin.close()
                 child.wait(_PATIENCE_S)
     middle = {key: median(row[key] for row in rows) for key in rows[0]}

@@ -91,9 +91,8 @@ class Stalls:
             if gap is None:
                 self.failed.add(item.nodeid)
             else:
-                self.invalid[item.nodeid] = report.stalled = (
-                    f"the machine stood still for {gap[1] - gap[0]:.1f} s"
-                )
+                why = f"the machine stood still for {gap[1] - gap[0]:.1f} s"
+                self.invalid[item.nodeid] = vars(report)["stalled"] = why
         return report
 
     def pytest_report_teststatus(self, report: Any) -> tuple[str, str, str] | None:

@@ -7,7 +7,9 @@ Without DATASET it answers each line of its input, which names one.
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -22,7 +24,12 @@ INDICES = {
     "task_index": "int64",
 }
 TOLERANCE = 1e-4
-FIGURES = {"min": np.nanmin, "max": np.nanmax, "mean": np.nanmean, "std": np.nanstd}
+FIGURES: dict[str, Callable[..., Any]] = {
+    "min": np.nanmin,
+    "max": np.nanmax,
+    "mean": np.nanmean,
+    "std": np.nanstd,
+}
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 

@@ -41,9 +41,10 @@ class Lab:
         """`addresses` are of a node and a policy server that outlive it; what it starts itself takes their places."""
         self.folder = folder
         self.data = folder / "data"
-        self.children = {}
+        self.children: dict[str, subprocess.Popen[str]] = {}
         self.addresses = dict(addresses or {})
-        self.own = {}  # addresses of what this lab started: another one of a name is started where the first was
+        # Addresses of what this lab started: another one of a name is started where the first was.
+        self.own: dict[str, Any] = {}
         self.supervisor: Any = None
         self.client: Any = None
         self.killed = 0  # of the processes of this start of the station
@@ -58,6 +59,7 @@ class Lab:
             cwd=ROOT,
         )
         self.children[name] = child
+        assert child.stdout is not None
         self.own[name] = json.loads(child.stdout.readline())
         return self.own[name]
 
@@ -203,6 +205,7 @@ class Lab:
     def close(self):
         self.end()
         for child in self.children.values():
+            assert child.stdin is not None
             child.stdin.close()
             child.wait(PATIENCE_S)
         self.children.clear()

@@ -35,7 +35,7 @@ def violations(page, sizes=SIZES, colours=False):
     """{what axe-core says: widths [px]} of a page with all that it can unfold; with `colours` of these alone."""
     page.evaluate(_AXE.read_text("utf-8"))
     page.evaluate(_OPEN)
-    found = {}
+    found: dict[str, list[int]] = {}
     for width, height in sizes:
         page.set_viewport_size({"width": width, "height": height})
         for said in page.evaluate(_RUN, colours):

@@ -15,10 +15,17 @@ class BenchPage:
         )
         self.page = self.context.new_page()
         self.page.set_default_timeout(PATIENCE_MS)  # of a busy machine, as in tests.processes
-        self.errors = []
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("console", lambda said: said.type == "error" and self.errors.append(said.text))
+        self.errors: list[str] = []
+        self._listen()
         self.log_in(username)
+
+    def _listen(self):
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", self._said)
+
+    def _said(self, said):
+        if said.type == "error":
+            self.errors.append(said.text)
 
     def log_in(self, username):
         """Fill in the form, at first and where the session has ended."""

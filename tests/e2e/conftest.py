@@ -38,7 +38,7 @@ FIRST, LAST = (
     ("test_plan", "test_plan_wizard", "test_lifetime"),
 )  # it sees a fresh lab; they leave it blind, or end it
 LABS = ("patient", "shared")
-running = {}  # by the name of the fixture
+running: dict[str, Demo] = {}  # by the name of the fixture
 
 
 def pytest_collection_modifyitems(items):

@@ -39,7 +39,6 @@ class Demo:
         self.data = folder / "data"
         self.environment = environment(self.data) | settings
         self._options = options
-        self.child = None
 
     def start(self):
         """Start it and wait until it is up; returns itself."""

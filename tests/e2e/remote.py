@@ -5,7 +5,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from evaweb.lab.visitor import LivePage, VisitFailed, Visitor
+from evaweb.lab.patience import VisitFailed
+from evaweb.lab.visitor import LivePage, Visitor
 from tests.e2e.lab import STATION
 from tests.processes import PATIENCE_S, eventually
 

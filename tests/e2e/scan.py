@@ -39,7 +39,9 @@ def tcp(host):
     here, there = socket.inet_aton(own.getsockname()[0]), socket.inet_aton(host)
     raw = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_TCP)
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
-    source, listening, refused = 44444, set(), set()
+    source = 44444
+    listening: set[int] = set()
+    refused: set[int] = set()
 
     def take(seconds):
         until = time.monotonic() + seconds
@@ -99,7 +101,7 @@ def link(host, port):
             got += b""
     messages = []
     for keys in (False, True):
-        asking = zmq.Context.instance().socket(zmq.DEALER)
+        asking: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
         asking.linger = 0
         if keys:
             asking.curve_publickey, asking.curve_secretkey = zmq.curve_keypair()

@@ -26,6 +26,7 @@ def second_web(demo):
             stderr=log,
             text=True,
         )
+    assert child.stdout is not None
     try:
         said = child.stdout.readline()
         assert said, (demo.folder / "second.log").read_text()[-2000:]

@@ -101,8 +101,7 @@ class Desk(BenchPage):
         made = copy.copy(self)
         made.page = self.context.new_page()
         made.page.set_default_timeout(PATIENCE_MS)
-        made.page.on("pageerror", lambda error: made.errors.append(str(error)))
-        made.page.on("console", lambda said: said.type == "error" and made.errors.append(said.text))
+        made._listen()
         made._watch()
         return made
 
@@ -136,7 +135,7 @@ class Walk:
         self.network = Network(("lab", *ROBOTS, "desk"), closed=ROBOTS)
         self.address = self.network.address["lab"]
         self.passwords = {"alma": "leaf-of-the-alder-7", "ann": "root-of-the-birch-8"}
-        self.children = {}
+        self.children: dict[str, subprocess.Popen[bytes]] = {}
         chromium = folder / "chromium"
         chromium.write_text(f'#!/bin/sh\nexec {" ".join(self.network.inside["desk"])} {CHROMIUM} "$@"\n')
         chromium.chmod(0o755)
@@ -158,6 +157,7 @@ class Walk:
         said = eventually(
             lambda: _FIRST.search(self.log("lab")), f"the lab's code; {self.log('lab')}", 3 * PATIENCE_S
         )
+        assert said is not None
         self.url = said["url"]
         return said["code"]
 
@@ -224,6 +224,7 @@ class Walk:
                 child.terminate()
             ended = {name: child.wait(PATIENCE_S) for name, child in self.children.items()}
             for child in self.children.values():
+                assert child.stdin is not None
                 child.stdin.close()
         finally:
             self.network.close()

@@ -72,7 +72,9 @@ class Lab:
         draft.checkpoints.set(rows)
         draft.positions.set(self.scene.positions.all())
         self.plan = plan_freeze(user=self.owner, plan=draft)
-        self.trial = self.command = self.episode = None
+        self.trial: Trial | None = None
+        self.command: Command | None = None
+        self.episode: Episode | None = None
         self.dataset = ""
         for row in rows:
             Preflight.objects.create(
@@ -87,7 +89,7 @@ class Lab:
 
     def handed(self):
         """The next trial; the station is being set up for it."""
-        self.trial = hand_out(user=self.operator, station=self.station, plan=self.plan).trial
+        self.trial = trial = hand_out(user=self.operator, station=self.station, plan=self.plan).trial
         self.runtime.do(
             lambda: setattr(self.runtime, "snapshot", self._snapshot(type(self.runtime).snapshot))
         )
@@ -99,19 +101,20 @@ class Lab:
             status="refused",
             reason=ERROR,
             args={
-                "policy": self.trial.checkpoint.policy,
-                "checkpoint": {"id": self.trial.checkpoint_id, "name": NAMES[0]},
+                "policy": trial.checkpoint.policy,
+                "checkpoint": {"id": trial.checkpoint_id, "name": NAMES[0]},
             },
             data={"latency_ms": FIGURE, "name": NAMES[0]},
             issued_at=timezone.now(),
         )
         took = {"connect_s": FIGURE, "warm_up_s": FIGURE}
-        Trial.objects.filter(pk=self.trial.pk).update(setup=self.command.pk, setup_took=took)
+        Trial.objects.filter(pk=trial.pk).update(setup=self.command.pk, setup_took=took)
         self.runtime.say("setup", "connecting to the policy")
         self.runtime.say("setup_note", f"{NAMES[0]} answers {ROWS} rows in {FIGURE} ms")
 
     def _snapshot(self, plain):
         def told():
+            assert self.trial is not None
             own = plain(self.runtime)
             said = own | {
                 "checkpoint": {"id": self.trial.checkpoint_id, "name": self.trial.checkpoint.name},
@@ -138,6 +141,7 @@ class Lab:
 
     def running(self):
         """Its run goes on, with chunks of the policy."""
+        assert self.trial is not None
         Trial.objects.filter(pk=self.trial.pk).update(status="running", started_at=timezone.now())
         self.publish()
 
@@ -158,12 +162,13 @@ class Lab:
 
     def failed(self):
         """The policy's server is lost."""
+        assert self.trial is not None
         self.runtime.say("policy_failed", ERROR)
         self.runtime.enter(SessionEvent.CONNECTED, ERROR)
         Trial.objects.filter(pk=self.trial.pk).update(status="interrupted", reason=f"policy lost: {ERROR}")
-        self._record()
+        self._record(self.trial)
 
-    def _record(self):
+    def _record(self, trial):
         folder = self._data / "episodes" / self._folder.name
         shutil.copytree(self._folder, folder)
         for name in ("manifest.json", "outcome.json"):
@@ -210,7 +215,7 @@ class Lab:
             started_at=timezone.now(),
         )
         (self._data / "previews" / folder.name).mkdir(parents=True)
-        Trial.objects.filter(pk=self.trial.pk).update(
+        Trial.objects.filter(pk=trial.pk).update(
             episode=self.episode, duration_s=0.8, ended_at=timezone.now()
         )
         for key, facts in (
@@ -221,6 +226,8 @@ class Lab:
 
     def scored(self):
         """Somebody has scored it."""
+        assert self.trial is not None
+        assert self.episode is not None
         self.trial.refresh_from_db()
         ticks = dict.fromkeys(self.scene.milestones.values_list("pk", flat=True), True)
         trials.trial_score(user=self.operator, trial=self.trial, milestones=ticks, note="fine")

@@ -8,6 +8,7 @@ import json
 import re
 import uuid as uuids
 import zipfile
+from typing import Any
 
 import pyarrow.parquet as pq
 from django.urls import get_resolver, reverse
@@ -16,7 +17,7 @@ from evaweb.jobs.models import Job
 from evaweb.plans.models import Reference
 from evaweb.preflights.models import Preflight
 from tests.evaweb.blind_lab import AIM, KEYS, NAMES, SECRETS
-from tests.evaweb.console.test_consumers import Page
+from tests.evaweb.console.page import Page
 
 MARKS = ("execution_horizon", "something_new", '"targets"')  # only the live socket has them
 ROUNDS = 4  # of what the live socket is given to tell
@@ -71,7 +72,7 @@ def named(resolver, space=""):
 
 
 def filled(name, parameters, values):
-    choices = [{}]
+    choices: list[dict[str, Any]] = [{}]
     for parameter in parameters:
         assert parameter in values, f"{name} has the parameter {parameter}: say here what to fill in"
         own = values[parameter]

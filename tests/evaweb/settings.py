@@ -19,6 +19,6 @@ EVA_COMMAND_TIMEOUT_S = PATIENCE_S  # a test of what comes too late, or never, g
 
 PASSWORD_HASHERS = ["django.contrib.auth.hashers.MD5PasswordHasher"]
 
-if DATABASES["default"]["ENGINE"].endswith("sqlite3"):
+if str(DATABASES["default"]["ENGINE"]).endswith("sqlite3"):
     # A file, as in a lab: threads that share a database in memory never wait for each other's locks.
     DATABASES["default"]["TEST"] = {"NAME": DATA_DIR / f"test-{os.getpid()}.sqlite3"}

@@ -17,7 +17,7 @@ import zmq
 from runtime.core.sentences import Pattern, within
 from runtime.ipc.bus import CommandServer, Endpoints, EventLog, Key, Publisher
 from runtime.ipc.identity import forged, identified, lacking
-from runtime.ipc.messages import Ack, Command, Event
+from runtime.ipc.messages import Ack, AckStatus, Command, Event
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
@@ -54,11 +54,11 @@ class StandIn:
         self.swallows: set[str] = set()
         self.commands: list[Command] = []
         self.pressed: list[Command] = []
-        self.guard_says = "done"
+        self.guard_says: AckStatus = "done"
         self.collect: dict[str, Any] | None = None
         self.aims: list[Command] = []
         self.aim_says = Ack("", "done", data={"joints": [0.2] * DIM, "reached": True})
-        self.effects = Effortless()
+        self.effects: Any = Effortless()
         self._folder = data / "stations" / name
         self.key = Key(self._folder)
         self._ended = threading.Event()
@@ -67,7 +67,7 @@ class StandIn:
 
     def boot_up(self) -> None:
         """Begin as a runtime that was just started: new boot id, new addresses."""
-        context = zmq.Context.instance()
+        context: zmq.Context[Any] = zmq.Context.instance()
         self.boot = str(uuid4())
         self.events = EventLog()
         self.lease = Lease(self.ttl)

@@ -31,7 +31,8 @@ from evaweb.trials.record import (
     TrialRecord,
     VoidLine,
 )
-from tests.evaweb.test_data_of_before import HERE, report
+from tests.evaweb.data_of_before.reading import HERE
+from tests.evaweb.test_data_of_before import report
 from tests.evaweb.trials import builders
 
 __all__ = ["report"]

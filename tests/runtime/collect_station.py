@@ -107,7 +107,8 @@ class CollectStation(Station):
 
     @property
     def leader(self) -> HeldLeader:
-        return self.stubs.built["leader"]
+        made: HeldLeader = self.stubs.built["leader"]
+        return made
 
     def tick(self) -> None:
         if "leader" in self.stubs.built and self.leader.joints is not None:

@@ -152,7 +152,8 @@ class Stubs:
         return Peers(self.robot, self.robot, partial(make_policy, build=self.policy))
 
     def robot(self, spec: StationSpec, clock: Clock) -> StubRobot:
-        return self.built.setdefault("robot", StubRobot(self, clock))
+        made: StubRobot = self.built.setdefault("robot", StubRobot(self, clock))
+        return made
 
     def policy(self, config: Any, *given: Any) -> Policy:
         if self.unfit is not None:

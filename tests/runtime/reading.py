@@ -50,7 +50,8 @@ def _members(of: Node) -> Iterator[MemberExpr]:
         seen.add(id(given))
         if isinstance(given, MemberExpr):
             yield given
-        for attribute in _attributes(type(given)):
+        kind: type = type(given)  # mypy takes a type[Node] for unhashable
+        for attribute in _attributes(kind):
             left.extend(_nodes(getattr(given, attribute, None)))
 
 

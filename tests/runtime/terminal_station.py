@@ -1,12 +1,17 @@
 """A station of the terminal's tests: it answers as written down."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
+from pathlib import Path
+from typing import Any
 
 from runtime.ipc.messages import Ack
 from tests.standing import standing
 
-STATUS = {
+STATUS: dict[str, Any] = {
     "boot": "boot-1",
     "station": "bench-1",
     "robot": "toy",
@@ -49,7 +54,7 @@ STATUS = {
         "strategies": {"async": ["blend_window", "k_max"], "sync": ["execution_horizon"]},
     },
 }
-AIM = {
+AIM: dict[str, Any] = {
     "joints": [0.1, -0.2, 0.05],
     "poses": [0.0] * 8,
     "reached": True,
@@ -61,7 +66,7 @@ AIM = {
 }
 
 
-def status(state="ready", **changes):
+def status(state: str = "ready", **changes: Any) -> dict[str, Any]:
     return deepcopy(STATUS) | standing(state) | changes
 
 
@@ -70,61 +75,70 @@ class Script:
 
     holder = "terminal:me"
 
-    def __init__(self, statuses=(), refusal=None, streams=(), events=(), aims=()):
+    def __init__(
+        self,
+        statuses: Iterable[dict[str, Any] | BaseException] = (),
+        refusal: BaseException | None = None,
+        streams: Iterable[dict[str, Any] | BaseException] = (),
+        events: Iterable[dict[str, Any]] = (),
+        aims: Iterable[Mapping[str, Any]] = (),
+    ) -> None:
         self.statuses, self.refusal, self.streams = list(statuses) or [status()], refusal, list(streams)
         self.events, self.aims = list(events), list(aims)
-        self.given, self.asked, self.subscribed, self.closed = [], [], 0, False
+        self.given: list[str | tuple[str, Any]] = []
+        self.asked: list[dict[str, Any]] = []
+        self.subscribed, self.closed = 0, False
 
-    def __call__(self, folder):
+    def __call__(self, folder: Path) -> Script:
         self.folder = folder
         return self
 
-    def status(self):
+    def status(self) -> dict[str, Any]:
         found = self.statuses.pop(0) if len(self.statuses) > 1 else self.statuses[0]
         if isinstance(found, BaseException):
             raise found
         return found
 
-    def command(self, kind, **arguments):
+    def command(self, kind: str, **arguments: Any) -> None:
         self.given.append((kind, arguments) if arguments else kind)
         if self.refusal:
             raise self.refusal
 
-    def query(self, kind, **arguments):
+    def query(self, kind: str, **arguments: Any) -> Ack:
         self.asked.append(arguments)
         wanted = self.aims.pop(0) if arguments and self.aims else AIM
         return Ack("u", "done", data=wanted)
 
-    def renew(self):
+    def renew(self) -> None:
         self.given.append("renew")
 
-    def wait(self, reached, timeout):
+    def wait(self, reached: Callable[[dict[str, Any]], bool], timeout: float) -> dict[str, Any]:
         while not reached(found := self.status()):
             pass
         return found
 
-    def estop(self, why):
+    def estop(self, why: str) -> Ack:
         self.given.append(("estop", why))
         return Ack(
             "u", "failed" if self.refusal else "done", "USE THE HARDWARE STOP" if self.refusal else "ok"
         )
 
-    def subscribe(self, *streams):
+    def subscribe(self, *streams: str) -> Script:
         self.subscribed += 1
         return self
 
-    def receive(self, timeout):
+    def receive(self, timeout: float) -> dict[str, Any]:
         found = self.streams.pop(0)
         if isinstance(found, BaseException):
             raise found
         return found
 
-    def events_since(self, number):
+    def events_since(self, number: int) -> list[dict[str, Any]]:
         return [event for event in self.events if event["number"] > number]
 
-    def close(self):
+    def close(self) -> None:
         self.closed = True
 
 
-def event(number, kind="state", text="", time=90.0):
+def event(number: int, kind: str = "state", text: str = "", time: float = 90.0) -> dict[str, Any]:
     return {"number": number, "kind": kind, "text": text or f"event {number}", "time": time}

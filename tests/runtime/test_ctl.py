@@ -138,7 +138,7 @@ def test_the_estop_says_whether_it_was_obeyed(run, capsys):
     script = Script()
     assert run(script, "estop", "arm too low") == 0
     assert script.given == [("estop", "arm too low")]
-    assert run(Script(refusal=True), "estop", "--json") == 1
+    assert run(Script(refusal=Refused("no guard")), "estop", "--json") == 1
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["reason"] == "USE THE HARDWARE STOP"
 
 

@@ -147,7 +147,7 @@ class Bench:
     def observe(self, **changes: Any) -> None:
         self.sequence += 1
         now = self.clock.now()
-        fields = {
+        fields: dict[str, Any] = {
             "sequence": self.sequence,
             "arrived": now,
             "captured": {"joints": now, "cam": now},

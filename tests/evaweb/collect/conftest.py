@@ -17,6 +17,7 @@ from evaweb.collect import station_events as following
 from evaweb.collect.models import CollectSession, Demonstration
 from evaweb.episodes import services as episodes
 from evaweb.stations.models import Station
+from runtime.core.types import Result
 from runtime.recording.export import export
 from runtime.recording.labels import Label, append
 from tests.evaweb.episodes.conftest import data, recorded, station
@@ -64,7 +65,7 @@ def demonstrate(data: Path, recorded: dict[str, Path], session: CollectSession) 
     """Lay an episode of the session into the data folder as the station does, and let the station tell of it."""
 
     def do(
-        result: str | None = None, *, status: str = "finished", of: CollectSession | None = None
+        result: Result | None = None, *, status: str = "finished", of: CollectSession | None = None
     ) -> Demonstration:
         chosen, uuid = of or session, str(uuid4())
         target = data / "episodes" / uuid
@@ -76,16 +77,16 @@ def demonstrate(data: Path, recorded: dict[str, Path], session: CollectSession) 
         path.write_text(json.dumps(manifest | told | {"uuid": uuid, "session": named}))
         resealed(target)
         export(target, data)
-        event = {"kind": "episode_closed", "data": {"uuid": uuid, "status": status}}
-        episodes.episode_closed(station=chosen.station, data=event["data"])
-        made = following.demonstration_told(event=event)
+        closed = {"uuid": uuid, "status": status}
+        episodes.episode_closed(station=chosen.station, data=closed)
+        made = following.demonstration_told(event={"kind": "episode_closed", "data": closed})
         assert made is not None
         return made if result is None else labelled(data, made, result)
 
     return do
 
 
-def labelled(data: Path, made: Demonstration, result: str | None, **said: Any) -> Demonstration:
+def labelled(data: Path, made: Demonstration, result: Result | None, **said: Any) -> Demonstration:
     """As the station writes it down and tells of it."""
     append(data, str(made.pk), Label(1_700_000_000.0, "ann", result, **said))
     told = following.demonstration_told(event={"kind": "labelled", "data": {"episode": str(made.pk)}})

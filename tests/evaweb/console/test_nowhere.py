@@ -7,7 +7,7 @@ from channels.testing import WebsocketCommunicator
 
 from evaweb.asgi import application
 from evaweb.console.consumers import NO_STATION
-from tests.evaweb.console.test_consumers import Page, run
+from tests.evaweb.console.page import Page, run
 from tests.processes import PATIENCE_S
 
 pytestmark = pytest.mark.django_db(transaction=True)

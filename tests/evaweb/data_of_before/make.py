@@ -15,6 +15,7 @@ from uuid import UUID
 import pytest
 
 from evaweb.collect import services as collecting
+from evaweb.collect.models import CollectSession
 from evaweb.collect.record import SESSIONS
 from evaweb.episodes import services as episodes
 from evaweb.episodes.folders import journal_folder, preview_folder
@@ -24,15 +25,17 @@ from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
 from evaweb.results.ratings import judging
 from evaweb.reviews import services as reviews
-from evaweb.trials import services
+from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint
+from evaweb.trials.selectors import trial_open
+from runtime.core.types import Result
 from runtime.recording.labels import Label, append
 from runtime.recording.layout import Layout
 from runtime.recording.sealing import digests_of, sealed, told, write_outcome
 from tests.evaweb.collect.conftest import collecting as collects
-from tests.evaweb.test_data_of_before import HERE, answers, restored, rows
+from tests.evaweb.data_of_before.reading import HERE, answers, restored, rows
 from tests.evaweb.trials import builders
-from tests.evaweb.trials.test_restoring import lab  # noqa: F401  a fixture
+from tests.evaweb.trials.whole_lab import lab  # noqa: F401  a fixture
 
 pytestmark = pytest.mark.django_db
 KEPT = {
@@ -101,10 +104,12 @@ def _lived(lab):  # noqa: F811
     lab.score(corrected, True, True, True, reason="seen on the video")
     voided = lab.run()
     lab.score(voided, True, False, False)
-    services.trial_void(user=ann, trial=voided, reason="a hand was in the picture")
+    voids.trial_void(user=ann, trial=voided, reason="a hand was in the picture")
     lab.bench.unrecorded(success=False)
     lab.run(position=2, seed=7)  # waits for its score
-    services.trial_void(user=ann, trial=services.trial_open(station), reason="the lamp was off")
+    waiting = trial_open(station)
+    assert waiting is not None
+    voids.trial_void(user=ann, trial=waiting, reason="the lamp was off")
     lab.run(smoke=True)
     _reviewed(first.episode, ann)
     text = _planned(lab)
@@ -159,6 +164,7 @@ def _planned(lab):  # noqa: F811
         )
     for reached in (True, False):
         handout = judging.to_rate(rater).found
+        assert handout is not None
         ticks = lab.bench.ticks(True, reached, reached)
         judging.rate(
             user=rater,
@@ -168,6 +174,7 @@ def _planned(lab):  # noqa: F811
             failure="" if reached else "wölbt sich",
         )
     pair = judging.to_prefer(rater).found
+    assert pair is not None
     codes = {"first": pair.first.code, "second": pair.second.code}
     judging.prefer(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)
     return text
@@ -189,7 +196,12 @@ def _collected(lab, recorded):  # noqa: F811
         without = collecting.session_begin(user=ann, station=station, task="pour", dataset="tea")
         collecting.session_close(user=ann, session=without)
     SESSIONS.path(without.pk).unlink()
-    for number, (of, result) in enumerate(((session, "success"), (session, None), (without, "partial"))):
+    results: list[tuple[CollectSession, Result | None]] = [
+        (session, "success"),
+        (session, None),
+        (without, "partial"),
+    ]
+    for number, (of, result) in enumerate(results):
         uuid = str(UUID(int=number + 1))
         folder = recorded.parent / uuid
         shutil.copytree(recorded, folder)

@@ -72,6 +72,7 @@ class Elsewhere:
         ports = ("--port", str(self.port), "--second-port", str(self.second_port))
         words = ("manage.py", "gate", "--host", self.net.host, *ports)
         child = self._start("gate", self.net.lab, words, lab)
+        assert child.stdout is not None
         line = child.stdout.readline()
         assert line, f"the gate did not start: {self.log('gate')[-2000:]}"
         told = json.loads(line)
@@ -101,6 +102,7 @@ class Elsewhere:
         child.kill()
         child.wait(PATIENCE_S)
         for pipe in (child.stdin, child.stdout):
+            assert pipe is not None
             pipe.close()
 
     def log(self, name: str) -> str:
@@ -125,9 +127,11 @@ class Elsewhere:
     def close(self) -> None:
         """End all of it; a process that does not end by itself fails the test."""
         for child in self._children.values():
+            assert child.stdin is not None
             child.stdin.close()
         for child in self._children.values():
             child.wait(PATIENCE_S)
+            assert child.stdout is not None
             child.stdout.close()
         self.station.end()
         self.net.close()

@@ -14,7 +14,7 @@ from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, FailureTerm, Milestone, Position, Scene, Trial
-from runtime.ipc.messages import Ack, Command
+from runtime.ipc.messages import Ack, AckStatus, Command
 from tests.standing import standing
 
 BOOT = "boot-1"
@@ -84,7 +84,7 @@ class Bench:
         }
         return services.trial_prepare(**{**choice, **given})
 
-    def ticks(self, *reached: bool) -> dict[int, bool]:
+    def ticks(self, *reached: bool) -> dict[object, bool]:
         """Milestone id -> reached, in their order."""
         return dict(zip(self.scene.milestones.values_list("pk", flat=True), reached, strict=True))
 
@@ -128,7 +128,7 @@ def bench(station: str = "bench-1", operator: str = "ann") -> Bench:
 class Wire:
     """Stands where the wire to a runtime stands; answers "accepted" unless told otherwise."""
 
-    status_word: str = "accepted"
+    status_word: AckStatus = "accepted"
     reason: str = ""
     fault: Exception | None = None
     episode: uuid.UUID = field(default_factory=uuid.uuid4)

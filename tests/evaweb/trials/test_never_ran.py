@@ -24,7 +24,7 @@ from evaweb.trials.station_commands import trial_command
 from runtime.recording import episode as episode_module
 from runtime.recording.files import require_room
 from tests.evaweb.trials import builders
-from tests.evaweb.trials.test_restoring import Direct, lab
+from tests.evaweb.trials.whole_lab import Direct, lab
 
 __all__ = ["lab"]
 

@@ -226,4 +226,4 @@ def record(
             change = change | {"pictures": {camera: picture(index) for camera in told["cameras"]}}
         journal.append(row(index, seed, **change))
     journal.end(Outcome(status, "the operator said so", 1.7e9 + frames / 30, details or {}))
-    return root / told["uuid"]
+    return root / str(told["uuid"])

@@ -73,7 +73,8 @@ def wanted(index: float) -> np.ndarray:
 @functools.cache
 def _background(seed: int) -> np.ndarray:
     y, x = np.mgrid[:HEIGHT, :WIDTH]
-    return (60 + 30 * np.sin(x / 40.0 + seed) + 30 * np.cos(y / 30.0)).astype(np.uint8)
+    grey: np.ndarray = 60 + 30 * np.sin(x / 40.0 + seed) + 30 * np.cos(y / 30.0)
+    return grey.astype(np.uint8)
 
 
 def picture(index: int, seed: int = 0) -> np.ndarray:
@@ -122,7 +123,7 @@ def record(
         }
         journal.append(Row(**row))
     journal.end(Outcome(status, "the operator said so", 1.7e9 + frames / FPS))
-    return root / told["uuid"]
+    return root / str(told["uuid"])
 
 
 def at(frames: range, **changes: Any) -> Spoil:

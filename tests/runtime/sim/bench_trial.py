@@ -124,6 +124,6 @@ class Trial:
             if self.table.truth()["success"] and not to_the_end:
                 break
         truth = self.table.truth()
-        return Outcome(
-            bool(truth["success"]), step / RATE, dict(truth["milestones"]), tuple(notes), np.array(sent)
-        )
+        reached = truth["milestones"]
+        assert isinstance(reached, dict)
+        return Outcome(bool(truth["success"]), step / RATE, dict(reached), tuple(notes), np.array(sent))

@@ -119,7 +119,7 @@ def served(
     made, clock = planned(name, data, None, assignments), VirtualClock()
     bench = SlowEye(made.robot, Tabletop(made.robot, seed))
     options = parser().parse_args(["--robot", made.robot.name, "--bench", "tabletop"])
-    policy = made.deployment.policy
+    policy: Any = made.deployment.policy  # of a kind that has these keys
     in_poses = policy.action_space == "eef"
     skill, apart = Skill(_NOISE, seed=seed), poses_apart if in_poses else None
     script = PickPlace(made.robot, HORIZON, made.rate, skill, clock=clock, apart=apart)
@@ -152,9 +152,11 @@ def pick_and_place(
 
         station.until(over, 2 * _SECONDS, "the trial")
         truth = table.truth()
+        reached = truth["milestones"]
+        assert isinstance(reached, dict)
         return Trial(
             bool(truth["success"]),
-            dict(truth["milestones"]),
+            dict(reached),
             session.state,
             session.reason,
             station.coordinator.events.since(0),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import threading
 import time
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import zmq
 
@@ -14,6 +15,7 @@ from runtime.clients.channel.server import ChannelServer
 from runtime.clients.client import StationClient
 from runtime.ipc.bus import CommandServer, Endpoints
 from runtime.ipc.messages import Ack
+from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.process import CommandService
 from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
 from tests.runtime.lockstep_station import Station, stubbed
@@ -26,15 +28,18 @@ class Bench:
 
     silence_s = 60.0
 
-    def __init__(self, folder, scripts="together", **settings):
-        self.context, self.now = zmq.Context(), 0.0
+    def __init__(
+        self, folder: Path, scripts: Literal["apart", "together"] = "together", **settings: Any
+    ) -> None:
+        self.context: zmq.Context[Any] = zmq.Context()
+        self.now = 0.0
         self.lock, self._ended, self.frozen = threading.Lock(), threading.Event(), False
         self.station = Station(stubbed(folder, lease={"ttl_s": 60.0}, **settings))
         self.folder = self.station.spec.deployment.station_dir
         self._service = CommandService(self.station.coordinator, self.context)
         self._guard = CommandServer(self.context, self.folder, "estop")
         Endpoints(self.folder).write("guard", {"estop": self._guard.endpoint})
-        self._open: list[Any] = []
+        self._open: list[Script] = []
         self.door = ChannelServer(
             *(self.context, 0, Names("lab", scripts), self.silence_s),
             lambda name: StationClient(self.folder, name),
@@ -45,7 +50,7 @@ class Bench:
         for thread in self.threads:
             thread.start()
 
-    def _tick(self):
+    def _tick(self) -> None:
         while not self._ended.is_set():
             if not self.frozen:
                 with self.lock:
@@ -53,7 +58,7 @@ class Bench:
                     self._service.serve(0.0)
             time.sleep(_TICK_S)
 
-    def _press(self):
+    def _press(self) -> None:
         while not self._ended.is_set():
             self._guard.socket.poll(10)
             if (received := self._guard.receive()) is not None:
@@ -64,30 +69,30 @@ class Bench:
                     address, Ack(command.uuid, "done", "every tick now sends the measured position")
                 )
 
-    def _listen(self):
+    def _listen(self) -> None:
         while not self._ended.is_set():
             self.door.serve(0.01)
         self.door.close()
 
-    def script(self, **common):
+    def script(self, **common: Any) -> Script:
         """A script with a connection of its own; `common` goes into each of its messages."""
         made = Script(self.channel, common)
         self._open.append(made)
         return made
 
-    def reach(self, state):
+    def reach(self, state: SessionState) -> None:
         eventually(lambda: self.station.state == state, f"{state}, not {self.station.state}")
 
-    def kept(self):
+    def kept(self) -> None:
         """The lease has been renewed since."""
         began = self._until()
         eventually(lambda: self._until() > began, "the lease is renewed")
 
-    def _until(self):
+    def _until(self) -> float:
         held = self.station.coordinator.lease.current(self.station.clock.now())
         return held.until if held else 0.0
 
-    def close(self):
+    def close(self) -> None:
         self._ended.set()
         for thread in self.threads:
             thread.join(PATIENCE_S)
@@ -102,45 +107,45 @@ class Bench:
 class Script:
     """A REQ socket and JSON, and nothing of ours: as existing scripts do it."""
 
-    def __init__(self, endpoint, common):
-        self.context = zmq.Context()
-        self.socket = self.context.socket(zmq.REQ)
+    def __init__(self, endpoint: str, common: dict[str, Any]) -> None:
+        self.context: zmq.Context[Any] = zmq.Context()
+        self.socket: zmq.Socket[bytes] = self.context.socket(zmq.REQ)
         self.socket.linger = 0
         self.socket.connect(endpoint)
         self.common = common
 
-    def send(self, **message):
+    def send(self, **message: Any) -> Any:
         return self.raw(json.dumps(message | self.common).encode())
 
-    def raw(self, *frames):
+    def raw(self, *frames: bytes) -> Any:
         self.socket.send_multipart(frames)
         assert self.socket.poll(PATIENCE_MS), f"no answer to {frames!r:.200}"
         (answer,) = self.socket.recv_multipart()
         return json.loads(answer, parse_constant=_no_number)
 
-    def cmd(self, verb, **more):
+    def cmd(self, verb: str, **more: Any) -> Any:
         return self.send(cmd=f"web:{verb}", **more)
 
-    def command(self, kind, **arguments):
+    def command(self, kind: str, **arguments: Any) -> Any:
         return self.send(command=kind, arguments=arguments)
 
-    def query(self, name, **more):
+    def query(self, name: str, **more: Any) -> Any:
         answer = self.send(query=name, **more)
         assert answer["ok"], answer
         return answer["data"]
 
-    def result(self, answer):
+    def result(self, answer: Any) -> Any:
         """What became of a command that was accepted."""
         return eventually(lambda: self._over(answer["id"]), f"the end of {answer}")
 
-    def _over(self, identity):
+    def _over(self, identity: str) -> Any:
         found = self.query("result", id=identity)
         return found if found["result"] != "accepted" else None
 
-    def close(self):
+    def close(self) -> None:
         self.socket.close()
         self.context.term()
 
 
-def _no_number(word):
+def _no_number(word: str) -> None:
     raise AssertionError(f"{word} is not JSON")

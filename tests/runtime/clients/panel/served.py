@@ -91,6 +91,7 @@ class Served:
     def end(self) -> None:
         """End the process as its supervisor does, and the station."""
         killed = self.child.returncode is not None
+        assert self.child.stdin is not None
         self.child.stdin.close()
         code = self.child.wait(PATIENCE_S)
         self.station.end()

@@ -7,7 +7,6 @@ domain of the process, which on the wire is the tested one.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -70,11 +69,11 @@ class Peer:
 
     def matched(self, topic: str) -> None:
         """Wait until the topic has a peer."""
-        writer, reader = self._writers.get(topic), self._readers.get(topic)
-        count: Callable[[], int] = lambda: len(  # noqa: E731
-            writer.get_matched_subscriptions() if writer is not None else reader.get_matched_publications()
-        )
-        eventually(count, f"a peer of {topic}")
+        if topic in self._writers:
+            matched = self._writers[topic].get_matched_subscriptions
+        else:
+            matched = self._readers[topic].get_matched_publications
+        eventually(lambda: len(matched()), f"a peer of {topic}")
 
     def close(self) -> None:
         for entity in reversed(self._entities):
