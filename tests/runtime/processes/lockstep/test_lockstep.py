@@ -477,7 +477,10 @@ def test_a_lease_that_is_not_renewed_holds_the_robot(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("strategy", ["sync", "async", "naive", "ensemble"])
 def test_a_node_that_is_silent_for_a_moment_ends_no_run(tmp_path: Path, strategy: str) -> None:
-    station = Station(stubbed(tmp_path, strategy=strategy)).running(30)
+    def rows(observation: Observation, number: int) -> Float64:
+        return np.asarray(observation.qpos + ramp(1, 20) - STANDS, np.float64)
+
+    station = Station(stubbed(tmp_path, rows, strategy=strategy)).running(30)
     for ticks in (20, 28):
         before = station.robot.sent[-1].copy()
         station.robot.silent = True
@@ -486,12 +489,12 @@ def test_a_node_that_is_silent_for_a_moment_ends_no_run(tmp_path: Path, strategy
         station.robot.silent = False
         station.go(30)
         assert station.state is SessionState.RUNNING, station.reason
-        assert np.abs(station.robot.sent[-1] - stood).max() > 0.01  # it goes on
+        assert np.abs(station.robot.sent[-1] - stood).max() > 0.005  # it goes on
         assert np.abs(stood - before).max() < 0.05  # and stood meanwhile
     waits = strategy == "sync"  # it may stand for its next answer anyway
     assert len(station.events("joints_missing")) == len(station.events("joints_back"))
     assert waits or len(station.events("joints_back")) == 2
-    assert np.abs(np.diff(station.robot.sent, axis=0)).max() < 0.05  # like a first chunk
+    assert np.abs(np.diff(station.robot.sent, axis=0)).max() < 0.01
     assert finite_and_within_limits(station)
     station.close()
 
