@@ -76,8 +76,8 @@ class ControlSettings(Settings):
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)
     """Silence of control, guard or reception after which the robot is held [s]."""
     coordinator_timeout_s: float = Field(default=3.0, gt=0)
-    """Silence of the coordinator after which control holds, and the recorder ends its episode [s]: it decides what comes
-    next and stops nothing, so that a busy machine may keep it longer."""
+    """Silence of the coordinator after which control holds, and the recorder ends its episode [s]: it decides what
+    comes next and stops nothing, so that a busy machine may keep it longer."""
     orphan_hold_s: float = Field(default=5.0, ge=0, le=8)
     """How long control goes on holding after its supervisor has died [s]."""
     starvation_hold_s: float = Field(default=1.0, gt=0)
@@ -336,7 +336,11 @@ class Deployment(Settings):
         """Silence [s] after which `process` counts as gone: those that stop the robot have the shortest."""
         if process == "media":
             return self.recording.heartbeat_timeout_s
-        return self.control.coordinator_timeout_s if process == "coordinator" else self.control.heartbeat_timeout_s
+        return (
+            self.control.coordinator_timeout_s
+            if process == "coordinator"
+            else self.control.heartbeat_timeout_s
+        )
 
     @property
     def data(self) -> Path:

@@ -84,6 +84,15 @@ class Tune:
 
 
 @dataclass(frozen=True, slots=True)
+class PolicyAway:
+    """The policy of `run` is lost and asked again until `until` [s, monotonic clock]; an empty plan holds nothing till
+    then."""
+
+    run: int
+    until: float
+
+
+@dataclass(frozen=True, slots=True)
 class LockGrippers:
     """Positions at which grippers stay whatever is asked of them: float64 [D], NaN for what is not locked."""
 
@@ -365,6 +374,7 @@ Message = (
     Order
     | PostedChunk
     | Tune
+    | PolicyAway
     | LockGrippers
     | NodeRequest
     | TickDone

@@ -20,7 +20,8 @@ ROOT = Path(__file__).parents[2]
 ROBOT = "agilex_piper"
 FREE = "tcp://127.0.0.1:0"
 UNHURRIED = (  # deadlines that must not strike because a machine is slow; a test of one of them gives its own
-    "control.heartbeat_timeout_s=10.0", "control.coordinator_timeout_s=10.0",
+    "control.heartbeat_timeout_s=10.0",
+    "control.coordinator_timeout_s=10.0",
     "recording.heartbeat_timeout_s=20.0",
     "safety.joint_age_s=5.0",
     "safety.picture_age_s=10.0",

@@ -17,7 +17,8 @@ READER = ROOT / "tests" / "conformance" / "read_lerobot_v21.py"
 pytestmark = pytest.mark.slow
 # What holds a robot on a slow machine is asked elsewhere; here a whole run has to come about.
 PATIENCE = (
-    "control.heartbeat_timeout_s=10", "control.coordinator_timeout_s=10",
+    "control.heartbeat_timeout_s=10",
+    "control.coordinator_timeout_s=10",
     "control.starvation_hold_s=10",
     "recording.heartbeat_timeout_s=20",
     "safety.following_error=3",

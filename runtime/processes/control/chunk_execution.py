@@ -91,6 +91,9 @@ class ExecuteChunks(Behaviour):
         self._expecting = True
         self._useless = False  # the newest chunk was dropped though the robot had waited for it
         self._starved_since: float | None = None
+        self.borne_until = float(
+            "-inf"
+        )  # a lost policy is tried again: an empty plan alone holds nothing before
 
     def target(self, step: int, elapsed: float) -> Target | None:
         planned = self.timeline.at(step)

@@ -37,9 +37,7 @@ _BACK_ELSEWHERE = Pattern(
     "joints again after {seconds:.2f} s, but {joint} reads {distance:.2f} rad from its command, allowed {allowed:g} "
     "(safety.steady_error): look what moved it, then resume",
 )
-_NOT_BELIEVED = Pattern(
-    "control.not_believed", "joints again after {seconds:.2f} s, but not believed: {why}"
-)
+_NOT_BELIEVED = Pattern("control.not_believed", "joints again after {seconds:.2f} s, but not believed: {why}")
 _DISAGREE = fixed("control.disagree", "samples do not agree yet")
 _STARVED = Pattern("control.starved", "no usable chunk for {seconds:.1f} s")
 _STARVED_AT_ONCE = fixed("control.starved_at_once", "no usable chunk for this step")
@@ -260,7 +258,12 @@ class CommandPipeline:
         return action, (*locked, *kept)
 
     def _refuse(
-        self, step: int, planned: float, target: Target | None, notes: tuple[str, ...], seen: LatestObservation
+        self,
+        step: int,
+        planned: float,
+        target: Target | None,
+        notes: tuple[str, ...],
+        seen: LatestObservation,
     ) -> Sent:
         run, unseen = self.run, self._safety.unseen(self.actuator.state(seen, planned, None))
         self.refused += 1
@@ -331,7 +334,8 @@ class CommandPipeline:
         starved = run.starve(planned)
         if starved == 0.0:
             self._report.say("starved", _NO_ACTION)
-        if starved is not None and starved >= self._settings.starvation_patience:
+        borne = self._settings.starvation == "slow" and planned < run.borne_until
+        if starved is not None and starved >= self._settings.starvation_patience and not borne:
             self.hold_because("starvation", _STARVED(seconds=starved) if starved else _STARVED_AT_ONCE)
         return self._stand(step, planned, seen)
 

@@ -10,7 +10,16 @@ import numpy as np
 from runtime.core.errors import CodecError, ConfigurationError
 from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Float64
-from runtime.ipc.messages import LockGrippers, Message, NodeRequest, Order, PostedChunk, Tune, decode
+from runtime.ipc.messages import (
+    LockGrippers,
+    Message,
+    NodeRequest,
+    Order,
+    PolicyAway,
+    PostedChunk,
+    Tune,
+    decode,
+)
 from runtime.ipc.observation_reader import ObservationReader
 from runtime.ipc.shared_state import EStop, SharedState
 from runtime.processes.control.actuator import Actuator, RobotActuator, Sent, SimulatedActuator, TickSettings
@@ -197,6 +206,9 @@ class Tick:
             self._answer("word_refused", self._actuator.tell(message.word, message.data))
         elif isinstance(message, Tune):
             self._tune(message.strategy, step)
+        elif isinstance(message, PolicyAway):
+            if self._led.run is not None and self._led.run.number == message.run:
+                self._led.run.borne_until = message.until
         elif isinstance(message, LockGrippers):
             self._lock(message.values)
         elif isinstance(message, Order):

@@ -16,6 +16,7 @@ from runtime.ipc.messages import (
     NodeRequest,
     Order,
     OrderKind,
+    PolicyAway,
     PostedChunk,
     Tune,
     encode,
@@ -73,6 +74,10 @@ class ControlQueue:
     def tune(self, strategy: Mapping[str, Any]) -> None:
         """Have control merge by another strategy, or other parameters of it, from its next tick on."""
         self._push(Tune(strategy))
+
+    def bear(self, run: int, until: float) -> None:
+        """Have control stand, and not hold, where nothing is planned before `until` on the monotonic clock [s]."""
+        self._push(PolicyAway(run, until))
 
     def lock(self, values: Float64) -> None:
         """Lock grippers at these values [D]; NaN for what is not locked."""

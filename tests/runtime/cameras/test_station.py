@@ -154,7 +154,8 @@ def test_a_real_station_runs_with_a_camera_over_rtsp(tmp_path: Path) -> None:
             "safety.joint_age_s=10.0",
             "safety.picture_age_s=10.0",
             "control.starvation_hold_s=10.0",
-            "control.heartbeat_timeout_s=10.0", "control.coordinator_timeout_s=10.0",
+            "control.heartbeat_timeout_s=10.0",
+            "control.coordinator_timeout_s=10.0",
         ]
         given = [f'data_dir="{tmp_path}"', "run.duration_s=4.0", *sets, *patience]
         options = [part for one in given for part in ("--set", one)]

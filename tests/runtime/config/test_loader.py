@@ -239,7 +239,8 @@ def test_an_unknown_key_is_named_with_its_file_and_what_is_allowed(write):
     path = write(SMALL + "[control]\nrat = 30\n")
     assert refusal(path) == (
         f"{path}: control.rat = 30: unknown key (did you mean rate?); allowed here: "
-        "coordinator_timeout_s, heartbeat_timeout_s, orphan_hold_s, rate, realtime, realtime_priority, starvation_hold_s"
+        "coordinator_timeout_s, heartbeat_timeout_s, orphan_hold_s, rate, realtime, realtime_priority, "
+        "starvation_hold_s"
     )
 
 

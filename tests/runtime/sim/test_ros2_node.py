@@ -68,7 +68,8 @@ def test_a_pick_and_place_trial_runs_over_ros_2(start: Start, tmp_path: Path) ->
             "run.duration_s=24", "recording.enabled=false",
             "safety.joint_age_s=5.0", "safety.picture_age_s=5.0",
             # However busy the machine is: only what ROS does to a trial may fail it.
-            "control.heartbeat_timeout_s=10.0", "control.coordinator_timeout_s=10.0", "control.starvation_hold_s=10.0", "faults.patience_s=20.0",
+            "control.heartbeat_timeout_s=10.0", "control.coordinator_timeout_s=10.0",
+            "control.starvation_hold_s=10.0", "faults.patience_s=20.0",
             "recording.heartbeat_timeout_s=20.0",
             "safety.following_error=3.0", "transport.stalled_after_s=10.0",
         ]  # fmt: skip

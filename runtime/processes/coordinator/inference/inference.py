@@ -291,7 +291,10 @@ class Inference:
         """Count a failure; True if the policy will be tried again, False where patience is at its end."""
         if isinstance(error, PolicyLostError):
             self.metrics.count_lost()
-        return self.retry.failed(error)
+        if not self.retry.failed(error):
+            return False
+        self._orders.bear(self._run, self._clock.now() + self._patience.lost - self.retry.lost_for)
+        return True
 
     def _wants(self) -> bool:
         if self.retry.due_in:

@@ -12,6 +12,8 @@ from runtime.core.sentences import Pattern
 _LOST = Pattern("policy.lost", "{error}; trying again for {seconds:g} s")
 _ANSWERS_AGAIN = Pattern("policy.answers_again", "the policy answers again after {seconds:.1f} s")
 
+_LONGEST_S = 0.5  # between two tries: one that is back shortly before patience ends is found in time
+
 
 class Retry:
     """Failures in a row, from the first to the answer after the last; `say(kind, text)` tells of both."""
@@ -20,7 +22,7 @@ class Retry:
         self._clock = clock
         self._patience = patience  # without an answer, until the policy is given up [s]
         self._say = say
-        self._back_off = BackOff()
+        self._back_off = BackOff(longest=_LONGEST_S)
         self.failure = ""  # why the policy is being tried again
 
     @property

@@ -44,7 +44,9 @@ def test_a_run_stands_and_goes_on_by_itself(seconds):
 def test_it_says_for_how_long_it_stood():
     bench = gone(0.8)
     bench.run(8)
-    assert [event.text for event in bench.said("joints_back")] == ["joints again after 0.80 s: the run goes on"]
+    assert [event.text for event in bench.said("joints_back")] == [
+        "joints again after 0.80 s: the run goes on"
+    ]
 
 
 def test_its_next_chunk_is_blended_in_like_a_first_one():

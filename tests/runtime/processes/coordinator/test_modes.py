@@ -393,6 +393,34 @@ def test_slowly_means_going_on_with_what_is_planned_and_with_the_policy_when_it_
     station.close()
 
 
+@pytest.mark.parametrize("strategy", ["async", "sync", "naive", "ensemble"])
+def test_a_policy_that_is_back_within_its_patience_ends_no_run_though_nothing_is_planned(
+    tmp_path: Path, strategy: str
+) -> None:
+    policy = Failing(LOST, 6, 10**6)
+    station = Station(stubbed(tmp_path, policy, strategy=strategy)).running(10)
+    station.until(lambda: bool(station.events("policy_lost")), 10.0, "its loss")
+    station.go(60)  # 2 s: longer than control.starvation_hold_s, shorter than faults.patience_s
+    assert station.state is SessionState.RUNNING, station.reason
+    assert (station.robot.sent[-5:] == station.robot.sent[-1]).all()  # it stands
+    policy.left = 0
+    station.go(40)
+    assert station.state is SessionState.RUNNING, station.reason
+    assert len(station.events("policy_back")) == 1
+    assert (station.robot.sent[-1] != station.robot.sent[-5]).any()
+    station.close()
+
+
+def test_where_starvation_holds_it_holds_though_the_policy_is_tried_again(tmp_path: Path) -> None:
+    faults = {"policy_lost": "slow", "starvation": "hold"}
+    station = Station(stubbed(tmp_path, Failing(LOST, 6, 10**6), faults=faults)).running(10)
+    station.until(lambda: bool(station.events("policy_lost")), 10.0, "its loss")
+    station.go(45)
+    assert station.state is SessionState.HOLDING
+    assert "no usable chunk" in station.reason
+    station.close()
+
+
 @pytest.mark.parametrize("strategy", ["async", "sync"])
 def test_patience_ends_in_holding_and_the_run_can_be_resumed(tmp_path: Path, strategy: str) -> None:
     policy = Failing(LOST, 6, 10**6)
