@@ -106,7 +106,7 @@ def test_a_process_is_restarted_although_the_disk_is_full_and_found_when_there_i
         filler.unlink()
         eventually(
             lambda process=process, before=before: lab.pids()[process] != before[process],
-            *(10, f"the new process id of {process}"),
+            f"the new process id of {process}",
         )
         lab.answers_again()
         lab.reach("idle")

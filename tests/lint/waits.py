@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ast
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
@@ -62,7 +62,7 @@ def waits(tree: ast.Module) -> Iterator[tuple[int, str]]:
                 continue
             given = [keyword.value for keyword in node.keywords if keyword.arg in _WORDS]
             place = table[name]
-            given += [] if place is None else node.args[: place + 1]
+            given += [] if place is None else _unpacked(node.args)[: place + 1]
             for value in given:
                 number = (
                     value.value if isinstance(value, ast.Constant) else known.get(getattr(value, "id", ""))
@@ -74,6 +74,17 @@ def waits(tree: ast.Module) -> Iterator[tuple[int, str]]:
                             node.lineno,
                             f"{name} waits {number:g}; allowed: {word}, a turn of {LONGEST_S:g} s",
                         )
+
+
+def _unpacked(arguments: Sequence[ast.expr]) -> list[ast.expr]:
+    """Arguments of a call, those of `*(...)` one by one."""
+    return [
+        part
+        for one in arguments
+        for part in (
+            one.value.elts if isinstance(one, ast.Starred) and isinstance(one.value, ast.Tuple) else [one]
+        )
+    ]
 
 
 def main() -> int:
