@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from typing import Any
 from urllib.parse import urlsplit
 
 from django.conf import settings
@@ -10,10 +12,10 @@ from django.conf import settings
 _PORT = re.compile(r":([0-9]{1,5})$")
 
 
-def is_ours(origin: str, host: str, web_port: int | None = None) -> bool:
-    """True if pages of `origin` are the lab's, for a server that was asked as `host`.
+def is_ours(origin: str, host: str, scheme: str, web_port: int | None = None) -> bool:
+    """True if pages of `origin` are the lab's, for a server that was asked as `host` over `scheme`.
 
-    Ours are that host and port, and the trusted origins: CSRF_TRUSTED_ORIGINS, without wildcards. For a server
+    Ours are that scheme, host and port, and the trusted origins: CSRF_TRUSTED_ORIGINS, without wildcards. For a server
     beside the web it is `web_port` of that host too, over plain HTTP: behind a proxy all have one origin.
     """
     try:
@@ -26,7 +28,19 @@ def is_ours(origin: str, host: str, web_port: int | None = None) -> bool:
     beside = (
         web_port is not None and asked.scheme == "http" and _parts(asked_of) == (_parts(host)[0], web_port)
     )
-    return beside or asked_of == host or origin in settings.CSRF_TRUSTED_ORIGINS
+    same = (asked.scheme, asked_of) == (scheme, host)
+    return beside or same or origin in settings.CSRF_TRUSTED_ORIGINS
+
+
+def scheme_of(scope: Mapping[str, Any]) -> str:
+    """ "https" or "http", as the browser of this request or websocket has it; of a proxy that is believed, its word."""
+    if settings.SECURE_PROXY_SSL_HEADER is not None:
+        meta, https = settings.SECURE_PROXY_SSL_HEADER
+        wanted = meta.removeprefix("HTTP_").replace("_", "-").lower().encode()
+        said = next((value for name, value in scope["headers"] if name.lower() == wanted), None)
+        if said is not None:
+            return "https" if said.decode("latin-1").split(",")[0].strip() == https else "http"
+    return "https" if scope.get("scheme") in ("https", "wss") else "http"
 
 
 def at_port(host: str, web_port: int, port: int) -> str:

@@ -18,6 +18,7 @@ from uuid import uuid4
 from django.conf import settings
 from django.core.exceptions import DisallowedHost
 from django.core.handlers.asgi import ASGIRequest
+from django.http.request import split_domain_port, validate_host
 from django.utils import timezone
 from ninja.utils import check_csrf
 from pydantic import ValidationError
@@ -42,7 +43,7 @@ from evaweb.credentials import (
 )
 from evaweb.errors import EvaError, NotAllowed, refusal
 from evaweb.headers import BARE
-from evaweb.origins import is_ours
+from evaweb.origins import is_ours, scheme_of
 from evaweb.roles import Role
 from evaweb.stations import commands, stops
 from evaweb.stations import redaction as veil
@@ -77,6 +78,10 @@ _STOPS_ALONE = Pattern(
     "api.door.stops_alone",
     "this process answers stop, halt and e-stop alone; the web is at port {port}",
 )
+_UNKNOWN_HOST = Pattern(
+    "api.door.unknown_host",
+    "the host {host!r} is none of this lab's: EVA_ALLOWED_HOSTS names them",
+)
 _Receive = Callable[[], Awaitable[Any]]
 _Headers = Sequence[tuple[bytes, bytes]]
 Answered = tuple[int, dict[str, Any]]
@@ -100,6 +105,10 @@ class StopDoor:
         asked = _PATH.fullmatch(scope["path"])
         if asked is None or (scope["method"], asked[2]) not in _ASKED:
             await self._application(scope, receive, send)
+            return
+        presses = (scope["method"], asked[2]) == ("POST", "estop")
+        if not presses and self._web_port is not None and not _is_known(_header(scope, b"host")):
+            await _send(send, 400, refusal(_UNKNOWN_HOST(host=_header(scope, b"host")[:200])))
             return
         body = await _body(receive)
         if body is None:
@@ -138,8 +147,8 @@ class StopDoor:
 
     def _told_browsers(self, scope: dict[str, Any]) -> _Headers:
         """That a page of ours may read the answer, and no other."""
-        origin = _header(scope, b"origin")
-        if not is_ours(origin, _header(scope, b"host"), self._web_port):
+        origin, host = _header(scope, b"origin"), _header(scope, b"host")
+        if not _is_known(host) or not is_ours(origin, host, scheme_of(scope), self._web_port):
             return [(b"vary", b"origin")]
         return [
             (b"vary", b"origin"),
@@ -150,7 +159,8 @@ class StopDoor:
     def _as_of_here(self, scope: dict[str, Any]) -> dict[str, Any]:
         """A request of the web's own pages at its other port as one of this port's: Django knows of one origin."""
         host = _header(scope, b"host")
-        if self._web_port is None or not is_ours(_header(scope, b"origin"), host, self._web_port):
+        origin = _header(scope, b"origin")
+        if self._web_port is None or not is_ours(origin, host, scheme_of(scope), self._web_port):
             return scope
         others = [(name, value) for name, value in scope["headers"] if name != b"origin"]
         here = f"{scope['scheme']}://{host}".encode("latin-1")
@@ -303,6 +313,14 @@ def _again(body: bytes, receive: _Receive) -> _Receive:
         return first.pop() if first else await receive()
 
     return read
+
+
+def _is_known(host: str) -> bool:
+    """Whether the lab is reached by that name: a page of another one, which leads here, is no page of ours.
+
+    A press of the e-stop is refused for no name: whoever may press stops the robot, by whatever way he came.
+    """
+    return validate_host(split_domain_port(host)[0], settings.ALLOWED_HOSTS)
 
 
 def _header(scope: dict[str, Any], wanted: bytes) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from evaweb.origins import at_port, is_ours
+from evaweb.origins import at_port, is_ours, scheme_of
 from evaweb.stop_port import StopPort, origin_for, told
 
 
@@ -51,7 +51,7 @@ def test_a_file_that_says_nothing_is_none(folder, content):
 
 def test_port_80_is_not_written():
     assert at_port("lab", 80, 8001) == "http://lab:8001"
-    assert is_ours("http://lab", "lab:8001", 80)
+    assert is_ours("http://lab", "lab:8001", "http", 80)
 
 
 @pytest.mark.parametrize(
@@ -59,6 +59,7 @@ def test_port_80_is_not_written():
     [
         ("http://lab:8000", True),
         ("http://lab:8001", True),
+        ("https://lab:8001", False),
         ("https://lab:8000", False),
         ("http://lab:8002", False),
         ("http://other:8000", False),
@@ -69,7 +70,30 @@ def test_port_80_is_not_written():
     ],
 )
 def test_ours_are_the_webs_port_of_the_same_host_and_its_own(origin, ours):
-    assert is_ours(origin, "lab:8001", 8000) is ours
+    assert is_ours(origin, "lab:8001", "http", 8000) is ours
+
+
+@pytest.mark.parametrize(
+    ("scheme", "forwarded", "origin", "ours"),
+    [
+        ("ws", [], "http://lab", True),
+        ("ws", [], "https://lab", False),
+        ("wss", [], "https://lab", True),
+        ("wss", [], "http://lab", False),
+        ("ws", [b"https"], "https://lab", True),
+        ("ws", [b"https, http"], "https://lab", True),
+        ("ws", [b"https"], "http://lab", False),
+        ("ws", [b"http"], "https://lab", False),
+    ],
+)
+def test_a_page_has_the_scheme_that_its_proxy_says(settings, scheme, forwarded, origin, ours):
+    settings.SECURE_PROXY_SSL_HEADER = ("HTTP_X_FORWARDED_PROTO", "https")
+    scope = {"scheme": scheme, "headers": [(b"x-forwarded-proto", value) for value in forwarded]}
+    assert is_ours(origin, "lab", scheme_of(scope)) is ours
+    settings.SECURE_PROXY_SSL_HEADER = None  # nobody's word
+    assert scheme_of(scope) == {"ws": "http", "wss": "https"}[scheme]
+    settings.CSRF_TRUSTED_ORIGINS = [origin]
+    assert is_ours(origin, "lab", scheme_of(scope))
 
 
 def test_a_station_page_may_connect_there_and_knows_the_address(client, ann, live):

@@ -84,6 +84,21 @@ def test_an_odd_origin_presses_and_reads_nothing(live, session, runtime, origin)
     assert told["vary"] == "origin"
 
 
+def test_a_page_whose_name_leads_here_reads_nothing_and_stops_no_run_but_the_e_stop_is_never_refused(
+    live, session, runtime
+):
+    led = {"host": "evil.test:8001", "origin": "http://evil.test:8001", "of": ALONE}
+    given = {"cookie": f"{NAME}={session}", **led}
+    for method, what in (("GET", "estop"), ("OPTIONS", "estop"), ("POST", "commands")):
+        status, answer, told = asked(method, f"{live.name}/{what}", {"kind": "halt"}, **given)
+        assert status == 400
+        assert "EVA_ALLOWED_HOSTS" in answer["error"]
+        assert "access-control-allow-origin" not in told
+    status, _, told = asked("POST", f"{live.name}/estop", **given)
+    assert (status, len(runtime.pressed)) == (200, 1)
+    assert "access-control-allow-origin" not in told
+
+
 def test_a_port_of_any_length_refuses_no_press(live, session, runtime):
     odd = {"host": f"localhost:{'9' * 5000}", "origin": f"http://localhost:{'9' * 5000}", "of": ALONE}
     assert asked("POST", f"{live.name}/estop", cookie=f"{NAME}={session}", **odd)[0] == 200
