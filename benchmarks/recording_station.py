@@ -66,8 +66,9 @@ class Watch:
         settled = time.monotonic() + _SETTLED_S
         while not self._ending.wait(_SIZES_PERIOD_S) and time.monotonic() < settled:
             self._look()
+        self.memory.append(resident_mb(self._media))
         begun, before, received = time.monotonic(), _used(self._media), _used(self._reception)
-        next_memory = begun
+        next_memory = begun + _MEMORY_PERIOD_S
         while not self._ending.wait(_SIZES_PERIOD_S):
             self._look()
             if time.monotonic() >= next_memory:

@@ -68,6 +68,7 @@ class Link(Source, Sink):
             pictures={key: _rgb(bgr) for key, bgr in frame.pictures.items()},
             eef=frame.eef,
             truth=frame.truth,
+            drives=frame.drives,
         )
         self._seen(observation)
         return observation

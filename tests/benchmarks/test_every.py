@@ -7,20 +7,58 @@ import sys
 import pytest
 
 from benchmarks.__main__ import _BENCHMARKS
+from tests.e2e.lab import environment
 from tests.processes import PATIENCE_S
 from tests.sources import ROOT
+
+# What counts cases, and not seconds: fewer of them. Each attack on the e-stop is a lab of its own in test_estop.py.
+OPTIONS = {
+    "estop": {"attacks": ["none"]},
+    "pages": {"plans": 2, "trials": 40},
+    "results": {"plans": 2, "trials": 40, "runs": 20},
+}
+FEWER = {
+    "designs": {"designs.SIZES": [50], "designs._RUNS": 50},
+    "moving_target": {"moving_target.SEEDS": 1, "moving_target.DELAYS": [8]},
+    "pages": {"pages.LOADS": 1},
+    "start": {"start._STARTS": 1},
+    "strategies": {
+        "moving_target.SEEDS": 1,
+        "moving_target.DELAYS": [8],
+        "strategies.CONTROLS": [30.0],
+        "strategies.DELAYS": [3],
+        "strategies.RATES": [3.0],
+    },
+}
+CODE = """
+import importlib, json, pathlib, sys
+name, fewer, options, told = sys.argv[1:]
+for what, value in json.loads(fewer).items():
+    module, _, key = what.partition(".")
+    assert hasattr(importlib.import_module(f"benchmarks.{module}"), key), what
+    setattr(importlib.import_module(f"benchmarks.{module}"), key, value)
+if __name__ == "__main__":  # and not in a process that it starts
+    importlib.import_module(f"benchmarks.{name}").measure(1.0, **json.loads(options)).write(pathlib.Path(told))
+"""
 
 
 @pytest.mark.lab
 @pytest.mark.parametrize("name", _BENCHMARKS)
 def test_it_comes_to_its_end(name, tmp_path):
     told = tmp_path / "figures.json"
-    command = [sys.executable, "-m", "benchmarks", name, "--seconds", "1", "--json", str(told)]
-    if name == "estop":  # each attack is a lab of its own: tests/benchmarks/test_estop.py
-        code = "import pathlib, sys; from benchmarks.estop import measure; "
-        code += "measure(1.0, ['none']).write(pathlib.Path(sys.argv[1]))"
-        command = [sys.executable, "-c", code, str(told)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20 * PATIENCE_S)
+    if name in OPTIONS or name in FEWER:
+        fewer, options = json.dumps(FEWER.get(name, {})), json.dumps(OPTIONS.get(name, {}))
+        command = [sys.executable, "-c", CODE, name, fewer, options, str(told)]
+    else:
+        command = [sys.executable, "-m", "benchmarks", name, "--seconds", "1", "--json", str(told)]
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env=environment(tmp_path / "data"),
+        capture_output=True,
+        text=True,
+        timeout=20 * PATIENCE_S,
+    )
     assert done.returncode in (0, 1), done.stderr[-3000:]
     assert "Traceback" not in done.stderr, done.stderr[-3000:]
     assert json.loads(told.read_text())["figures"]
