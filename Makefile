@@ -58,7 +58,7 @@ lab: setup ## web, worker and stations of this machine; ARGS="deployments/MINE.t
 	$(PY) manage.py lab $(ARGS)
 
 test: setup-dev ## what decides about a change; ARGS="tests/runtime" for a selection of all tests
-ifdef ARGS
+ifeq ($(origin ARGS),command line)
 	$(PY) -m pytest $(ARGS)
 else
 	@gate=0; \

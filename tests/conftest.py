@@ -54,12 +54,22 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What starts a whole lab is a lab, unless it is one of the stories."""
+    unread: dict[Path, bool] = {}
     for item in items:
         story, lab = map(item.get_closest_marker, ("story", "lab"))
         if story and lab:
             raise pytest.UsageError(f"{item.nodeid} is both a story and a lab: neither command would make it")
-        if item.nodeid.startswith(_LABS) and not story:
-            item.add_marker("lab")
+        if item.nodeid.startswith(_LABS):
+            if not story:
+                item.add_marker("lab")
+        elif story or lab:
+            if item.path not in unread:
+                unread[item.path] = not _ALONE.search(item.path.read_text())
+            if unread[item.path]:
+                raise pytest.UsageError(
+                    f"{item.nodeid} is a story or a lab by a mark that does not stand in its file: write "
+                    "pytest.mark.story or pytest.mark.lab there, or neither command reads it"
+                )
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

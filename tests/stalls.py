@@ -75,6 +75,7 @@ class Stalls:
         self._begun: dict[str, float] = {}  # by file
         self.invalid: dict[str, str] = {}  # by test, the sentence
         self.failed: set[str] = set()
+        self._spoilt = 0  # reports of failures that are no result
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         """A file begins with its first test, before that one's fixtures."""
@@ -87,10 +88,12 @@ class Stalls:
         """Whether what failed is a result."""
         report = yield
         if report.failed:
-            gap = self._watch.since(self._begun[file_of(item.nodeid)])
+            alone = any(item.get_closest_marker(mark) for mark in ("story", "lab"))
+            gap = self._watch.since(self._begun[file_of(item.nodeid)]) if alone else None
             if gap is None:
                 self.failed.add(item.nodeid)
             else:
+                self._spoilt += 1
                 why = f"the machine stood still for {gap[1] - gap[0]:.1f} s"
                 self.invalid[item.nodeid] = vars(report)["stalled"] = why
         return report
@@ -100,7 +103,10 @@ class Stalls:
         return ("invalid", "I", "INVALID") if getattr(report, "stalled", "") else None
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """Each is named."""
+        """Each is named, with what it failed of."""
+        for report in terminalreporter.getreports("invalid"):
+            terminalreporter.write_sep("_", report.nodeid)
+            terminalreporter.write_line(report.longreprtext)
         for test, why in self.invalid.items():
             terminalreporter.write_line(f"INVALID {test}: {why}")
 
@@ -117,7 +123,9 @@ class Stalls:
         asked = session.config.option.markexpr or "story or lab"
         command = [sys.executable, "-m", "pytest", "-n", "0", "-m", asked, *files]
         again = subprocess.run(command, env=os.environ | {TRY: str(this + 1)}, check=False)
-        if not self.failed:
+        # Whatever else ended the session, or failed to be collected, is no matter of the machine.
+        whole = not session.shouldstop and not session.shouldfail and session.testsfailed == self._spoilt
+        if not self.failed and whole:
             session.exitstatus = again.returncode
 
     def pytest_unconfigure(self, config: pytest.Config) -> None:

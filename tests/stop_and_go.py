@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 
 import psutil
 
@@ -23,21 +24,33 @@ def everybody(root: psutil.Process) -> list[psutil.Process]:
 
 
 def main() -> int:
-    """Until the command ends."""
+    """Until the command ends; whoever ends this ends the command too, and leaves nothing stopped."""
     seconds, every, command = float(sys.argv[1]), float(sys.argv[2]), sys.argv[4:]
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda told, frame: sys.exit(128 + told))
     child = subprocess.Popen(command)
-    root = psutil.Process(child.pid)
-    while child.poll() is None:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(every)
-            break
-        stopped = everybody(root)
-        for number, pause in ((signal.SIGSTOP, seconds), (signal.SIGCONT, 0.0)):
-            for process in stopped:
-                with contextlib.suppress(psutil.NoSuchProcess):
-                    process.send_signal(number)
-            time.sleep(pause)
-    return child.wait()
+    root, stopped = psutil.Process(child.pid), list[psutil.Process]()
+    try:
+        while child.poll() is None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(every)
+                break
+            stopped = everybody(root)
+            _tell(stopped, signal.SIGSTOP)
+            time.sleep(seconds)
+            _tell(stopped, signal.SIGCONT)
+        return child.wait()
+    finally:
+        _tell(stopped, signal.SIGCONT)
+        if child.poll() is None:
+            _tell(everybody(root), signal.SIGTERM)
+            child.wait()
+
+
+def _tell(processes: Sequence[psutil.Process], number: int) -> None:
+    for process in processes:
+        with contextlib.suppress(psutil.Error):  # it has ended, or is somebody else's
+            process.send_signal(number)
 
 
 if __name__ == "__main__":

@@ -38,13 +38,22 @@ def test_one():
 """
 
 
-def run(folder, gap, passes_at):
+_WRONG = """
+def test_wrong():
+    raise AssertionError("never right")
+"""
+
+
+def run(folder, gap, passes_at, *options, more=""):
     (folder / "conftest.py").write_text(_CONFTEST.format(root=str(ROOT)))
     (folder / "test_it.py").write_text(_TESTS)
+    if more:
+        (folder / "test_more.py").write_text(more)
     environment = {name: value for name, value in os.environ.items() if name != TRY}
     environment |= {"GAP": json.dumps(gap) if gap else "", "PASSES_AT": str(passes_at)}
     (folder / "pytest.ini").write_text("[pytest]\naddopts = -p no:django -p no:cacheprovider\n")
-    command = [sys.executable, "-m", "pytest", "-m", "story", "test_it.py"]
+    files = ["test_it.py", *(["test_more.py"] if more else [])]
+    command = [sys.executable, "-m", "pytest", *(options or ("-m", "story")), *files]
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S
     )
@@ -63,6 +72,24 @@ def test_what_failed_across_a_gap_is_invalid_and_decided_by_the_next_run(tmp_pat
     assert "test_one: the machine stood still for 2.5 s" in said
     assert "1 invalid" in said
     assert "1 failed" not in said
+
+
+def test_it_is_said_what_an_invalid_one_failed_of(tmp_path):
+    _, _, said = run(tmp_path, (1.0, 3.5), 2)
+    assert 'int(os.environ.get("EVA_TESTS_TRY", "1")) >= ' in said
+
+
+def test_a_failure_of_what_is_no_story_stays_one_whatever_the_machine_did(tmp_path):
+    code, _, said = run(tmp_path, (1.0, 3.5), 2, "-v", more=_WRONG)
+    assert code == 1
+    assert "1 failed, 1 invalid" in said
+
+
+def test_a_session_that_was_ended_by_an_invalid_one_is_not_green(tmp_path):
+    two = _TESTS.replace("test_one", "test_two")
+    code, _, said = run(tmp_path, (1.0, 3.5), 2, "-x", "-m", "story", more=two)
+    assert code == 1
+    assert "test_two" not in said
 
 
 def test_what_is_invalid_a_third_time_is_an_error_of_its_own(tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
+import socket
 import ssl
 import threading
 import time
@@ -56,8 +58,19 @@ class _TurnTakingSocket(ssl.SSLSocket):
         return super().gettimeout() if self._turn is None else self._patience
 
     def read(self, len: int = 1024, buffer: Any = None) -> Any:
-        """What has arrived, in bytes; their number where they went to `buffer`."""
-        return self._in_turn(lambda: super(_TurnTakingSocket, self).read(len, buffer))
+        """What has arrived, in bytes; their number where they went to `buffer`. Nothing once it was shut down."""
+        try:
+            return self._in_turn(lambda: super(_TurnTakingSocket, self).read(len, buffer))
+        except ValueError:  # what ssl says of a read that another thread's `shutdown` has ended
+            if self._sslobj is not None:  # type: ignore[attr-defined]
+                raise
+            return b"" if buffer is None else 0
+
+    def _real_close(self) -> None:
+        """Wake whoever waits: a descriptor that is only closed wakes nobody who polls it."""
+        with contextlib.suppress(OSError):
+            super().shutdown(socket.SHUT_RDWR)
+        super()._real_close()  # type: ignore[misc]
 
     def send(self, data: Any, flags: int = 0) -> int:
         """Send; returns how many bytes went."""

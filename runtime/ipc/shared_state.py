@@ -259,6 +259,8 @@ class SharedState:
     def set_generation(self, process: str, count: int) -> None:
         """Written by the supervisor alone."""
         self._generations[process][0] = count
+        if process == "media":  # what the one before was at is over
+            self._stage[0] = RecorderStage.WAITING
 
     @property
     def releases(self) -> int:

@@ -193,6 +193,11 @@ class ExecuteChunks(Behaviour):
             shares=merged.shares,
         )
 
+    def bear(self, until: float) -> None:
+        """A lost policy is tried again until then; while nothing is planned one loss is borne, and not the next."""
+        if self._starved_since is None or self.borne_until < self._starved_since:
+            self.borne_until = until
+
     # --- nothing planned -----------------------------------------------------------------------------------
 
     @property

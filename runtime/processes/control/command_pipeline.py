@@ -38,6 +38,9 @@ _BACK_ELSEWHERE = Pattern(
     "(safety.steady_error): look what moved it, then resume",
 )
 _NOT_BELIEVED = Pattern("control.not_believed", "joints again after {seconds:.2f} s, but not believed: {why}")
+_BACK_LATE = Pattern(
+    "control.back_late", "joints were missing for {seconds:.2f} s, allowed {allowed:g} (safety.joint_gap_s)"
+)
 _DISAGREE = fixed("control.disagree", "samples do not agree yet")
 _STARVED = Pattern("control.starved", "no usable chunk for {seconds:.1f} s")
 _STARVED_AT_ONCE = fixed("control.starved_at_once", "no usable chunk for this step")
@@ -47,14 +50,15 @@ _NO_ACTION = fixed("control.no_action", "no action for this step: slowing down a
 _ARRIVED = 1e-4  # [rad] of a motion's end: it may have been limited on its last steps
 _QUIET_S = 1.0  # without a refusal: the next one is told again
 _BELIEVED_S = 0.5  # for joints that are back to be believed again
+_GAPS, _GAPS_S = 2, 10.0  # for which a run stands within so many seconds; the next one holds
 
 
 @dataclass(slots=True)
 class _Gap:
     """Gap in the joints for which a run stands."""
 
-    age: float  # of the newest joints, while they were too old [s]
-    seen: float  # our clock, when they last were
+    since: float  # our clock, when the last joints before it were measured [s]
+    unseen: float  # the newest tick without any that are fresh
 
 
 class CommandPipeline:
@@ -89,6 +93,7 @@ class CommandPipeline:
         self.refused = 0  # in a row
         self._unseen = 0  # of these the last ones, in a run, whose only fault was the age of the joints
         self._gap: _Gap | None = None
+        self._gaps: deque[float] = deque(maxlen=_GAPS)  # when the newest of them began, in this run
         self.behaviour: Behaviour = Silent()
         if actuator.engaged:
             self.hold_here()
@@ -164,6 +169,7 @@ class CommandPipeline:
     def _begin(self) -> None:
         self._standing, self._aim = None, None
         self.refused, self._unseen, self._gap = 0, 0, None
+        self._gaps.clear()
         self._verdicts.clear()
 
     def _go(self, goal: Float64, speed: float) -> None:
@@ -276,8 +282,9 @@ class CommandPipeline:
         refused = sum(self._verdicts)
         if refused < self._settings.safety.refusals_to_hold:
             pass
-        elif run is not None and self._unseen >= refused and self._settings.safety.joint_gap_s:
-            self._gap = _Gap(planned - seen.joints_captured, planned)
+        elif run is not None and self._unseen >= refused and self._may_wait(planned, seen):
+            self._gap = _Gap(seen.joints_captured, planned)
+            self._gaps.append(planned)
             run.begin_anew()
             seconds = self._settings.safety.joint_gap_s
             self._report.say("joints_missing", _JOINTS_MISSING(why=unseen, seconds=seconds))
@@ -292,36 +299,43 @@ class CommandPipeline:
     ) -> Sent:
         """Stand until the joints are seen and believed again; then go on with the next chunk, or hold."""
         state, why = self.actuator.state(seen, planned, None), ""
-        if unseen := self._safety.unseen(state):
-            gap.age, gap.seen = state.joint_age, planned
-            if gap.age > self._settings.safety.joint_gap_s:
-                why = _IN_A_ROW(count=self.refused, why=unseen)
-        elif state.doubt or not self._believed():
-            if planned - gap.seen > _BELIEVED_S:
-                why = _NOT_BELIEVED(seconds=gap.age, why=state.doubt or _DISAGREE)
-        else:
-            why = self._elsewhere(state, gap)
+        allowed, unseen = self._settings.safety.joint_gap_s, self._safety.unseen(state)
+        if unseen:
+            gap.unseen = planned
+        missing = gap.unseen - gap.since  # however old those are that come meanwhile
+        if missing > allowed:
+            why = _IN_A_ROW(count=self.refused, why=unseen or _BACK_LATE(seconds=missing, allowed=allowed))
+        elif planned - gap.since > allowed + _BELIEVED_S:  # or control itself did not look for so long
+            why = _NOT_BELIEVED(seconds=missing, why=state.doubt or _DISAGREE)
+        elif not unseen and not state.doubt and self._believed():
+            why = self._elsewhere(state, missing)
             if not why:
-                self._go_on(run, gap)
+                self._go_on(run, missing)
         if why:
             self.hold_because("refusals", why)
         return self._stand(step, planned, seen)._replace(refused=True)
 
-    def _elsewhere(self, state: RobotState, gap: _Gap) -> str:
+    def _may_wait(self, planned: float, seen: LatestObservation) -> bool:
+        """Whether a run may stand for its joints: not for long ones, nor again and again."""
+        often = len(self._gaps) == _GAPS and planned - self._gaps[0] < _GAPS_S
+        return not often and planned - seen.joints_captured < self._settings.safety.joint_gap_s
+
+    def _elsewhere(self, state: RobotState, missing: float) -> str:
         """Which joint is not where it was told to stand, "" where all are."""
         limits, allowed = self._settings.limits, self._settings.safety.steady_error
-        apart = np.where(limits.places & ~limits.grippers, np.abs(state.measured - state.previous), 0.0)
-        worst = int(np.nanargmax(apart))
+        apart = np.where(limits.places, np.abs(state.measured - state.previous), 0.0)
+        apart[np.isnan(apart)] = np.inf  # nobody knows
+        worst = int(apart.argmax())
         if apart[worst] <= allowed:
             return ""
         told = {"joint": limits.names[worst], "distance": apart[worst], "allowed": allowed}
-        return _BACK_ELSEWHERE(seconds=gap.age, **told)
+        return _BACK_ELSEWHERE(seconds=missing, **told)
 
-    def _go_on(self, run: ExecuteChunks, gap: _Gap) -> None:
+    def _go_on(self, run: ExecuteChunks, missing: float) -> None:
         run.begin_anew()  # what came meanwhile was meant for joints of before
         self.refused, self._unseen, self._gap = 0, 0, None
         self._verdicts.clear()
-        self._report.say("joints_back", _JOINTS_BACK(seconds=gap.age))
+        self._report.say("joints_back", _JOINTS_BACK(seconds=missing))
 
     def _nothing_planned(self, step: int, planned: float, seen: LatestObservation) -> Sent:
         run = self.run

@@ -208,7 +208,7 @@ class Tick:
             self._tune(message.strategy, step)
         elif isinstance(message, PolicyAway):
             if self._led.run is not None and self._led.run.number == message.run:
-                self._led.run.borne_until = message.until
+                self._led.run.bear(message.until)
         elif isinstance(message, LockGrippers):
             self._lock(message.values)
         elif isinstance(message, Order):

@@ -36,7 +36,8 @@ export class Asking {
       });
       this.#wake = null;
       if (this.#over) return null;
-      if (!this.#holds()) throw this.#refusal;
+      // A timer of a tab that was frozen wakes late.
+      if (performance.now() > until || !this.#holds()) throw this.#refusal;
     }
   }
 

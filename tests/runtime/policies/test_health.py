@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import ssl
 import threading
 from collections.abc import Iterator
 
@@ -15,6 +16,7 @@ from runtime.policies import openpi
 from runtime.policies.health import require_healthy
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
+from tests.processes import PATIENCE_S
 from tests.runtime.policies.peers import FRANKA, seen
 from tests.runtime.policies.tls import Certificate, encrypted, self_signed
 
@@ -145,6 +147,31 @@ def test_a_server_with_tls_and_a_path_is_reached(
         contextlib.closing(built(url, health_path="/healthz")) as policy,
     ):
         assert policy.connect().name == "/lab/policy?model=a"
+
+
+def test_a_server_that_shakes_hands_by_tls_and_then_says_nothing_is_given_up(
+    certificate: Certificate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate[0]))
+    context, kept = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), []
+    context.load_cert_chain(*certificate)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def serve_mutely() -> None:
+            found, _ = listening.accept()
+            kept.append(context.wrap_socket(found, server_side=True))
+
+        thread = threading.Thread(target=serve_mutely, daemon=True)
+        thread.start()
+        url = f"wss://localhost:{listening.getsockname()[1]}"
+        config = openpi.Config(url=url, connect_deadline=0.6)
+        with (
+            contextlib.closing(openpi.build(config, FRANKA, MonotonicClock(), 30.0)) as policy,
+            pytest.raises(PolicyLostError),
+        ):
+            policy.connect()
+        thread.join(PATIENCE_S)
+    kept[0].close()
 
 
 @pytest.mark.parametrize("health", [{}, {"health_path": "/healthz"}])

@@ -59,7 +59,7 @@ class Stub(Policy):
 def flown(monkeypatch: pytest.MonkeyPatch) -> Any:
     """A preflight of a policy of the test's own."""
 
-    def fly(policy: Policy, deadline: float = 30.0, **tables: Any) -> Report:
+    def fly(policy: Policy, deadline: float = PATIENCE_S, **tables: Any) -> Report:
         monkeypatch.setattr(variants("runtime.policies")["mock"], "build", lambda *given: policy)
         tables = {"policy": {"kind": "mock"}, **tables}
         return Course(planned(MOCK, "", **tables)).run(deadline)

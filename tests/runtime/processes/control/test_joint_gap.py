@@ -83,6 +83,60 @@ def test_joints_that_stay_away_for_longer_hold():
     assert not goes_on(bench)
 
 
+def test_joints_that_keep_coming_but_are_old_hold_too():
+    bench = gone(0.3)
+    bench.feed = False
+    for _ in range(60):
+        now = bench.clock.now()
+        bench.observe(captured={"joints": now - 0.3, "cam": now})
+        bench.run(1)
+    assert bench.behaviour == "hold"
+    assert not goes_on(bench)
+
+
+def test_a_control_that_itself_did_not_look_for_longer_holds():
+    bench = Bench({"kind": "async"}, refusals_to_hold=3)
+    gone(0.35, bench)
+    bench.clock.advance(3.0)
+    bench.run(1)
+    assert bench.behaviour == "hold"
+
+
+def test_the_third_gap_in_ten_seconds_holds():
+    bench = gone(0.8)
+    for _ in range(2):
+        assert goes_on(bench)
+        bench.chunk(3, wave(200, start=bench.sent[-1][0]))
+        bench.run(STARTED)
+        bench.feed = False
+        bench.run(round(0.8 / PERIOD))
+        bench.feed = True
+    assert bench.behaviour == "hold"
+    assert "actions refused" in bench.said("refusals")[0].text
+
+
+def test_two_gaps_and_one_much_later_do_not():
+    bench = gone(0.8)
+    for _ in range(2):
+        assert goes_on(bench)
+        for _ in range(round(10.0 / PERIOD / 30)):
+            bench.chunk(3, wave(200, start=bench.sent[-1][0], speed=0.01))
+            bench.run(30)
+        bench.feed = False
+        bench.run(round(0.8 / PERIOD))
+        bench.feed = True
+    assert goes_on(bench)
+
+
+def test_joints_that_are_nowhere_when_they_are_back_hold():
+    bench = gone(0.8)
+    bench.feed = False
+    for _ in range(12):
+        bench.observe(qpos=np.full(2, np.nan, np.float32))
+        bench.run(1)
+    assert not goes_on(bench)
+
+
 def test_the_bound_is_a_key():
     bench = gone(0.8, Bench({"kind": "async"}, joint_gap_s=0.3))
     assert bench.behaviour == "hold"

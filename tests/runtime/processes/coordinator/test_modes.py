@@ -411,6 +411,20 @@ def test_a_policy_that_is_back_within_its_patience_ends_no_run_though_nothing_is
     station.close()
 
 
+def test_a_policy_that_is_lost_again_and_again_and_gives_nothing_usable_is_borne_once(tmp_path: Path) -> None:
+    asked = iter(range(10**6))
+
+    def rows(observation: Any, number: int) -> Any:
+        if next(asked) % 4 == 3:
+            raise LOST
+        return ramp(observation.step, 3)  # over before it arrives
+
+    station = Station(stubbed(tmp_path, rows, delay=8)).running(0)
+    station.reach(SessionState.HOLDING)
+    assert "no usable chunk" in station.reason
+    station.close()
+
+
 def test_where_starvation_holds_it_holds_though_the_policy_is_tried_again(tmp_path: Path) -> None:
     faults = {"policy_lost": "slow", "starvation": "hold"}
     station = Station(stubbed(tmp_path, Failing(LOST, 6, 10**6), faults=faults)).running(10)
