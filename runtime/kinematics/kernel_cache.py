@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import json
 import logging
 import os
 import tempfile
@@ -40,13 +41,22 @@ def folder() -> Path | None:
 def is_compiled(robot: Robot) -> bool:
     """True if the robot's kernels are on disk: a solve loads them within a second, instead of compiling them."""
     kept = folder()
-    return kept is not None and (kept / _name(robot)).exists()
+    if kept is None:
+        return False
+    try:
+        noted = json.loads((kept / _name(robot)).read_text("utf-8"))
+    except (OSError, ValueError):
+        return False
+    here = _kernels(kept)
+    return bool(noted) and all(here.get(name) == size for name, size in noted.items())
 
 
 def note_compiled(robot: Robot) -> None:
-    """Remember that the robot's kernels are on disk."""
+    """Remember that the robot's kernels are on disk, and which files they are."""
     if (kept := folder()) is not None:
-        (kept / _name(robot)).touch()
+        part = kept / f"{_name(robot)}.{os.getpid()}"
+        part.write_text(json.dumps(_kernels(kept)), "utf-8")
+        part.replace(kept / _name(robot))
 
 
 def forget() -> bool:
@@ -56,6 +66,20 @@ def forget() -> bool:
     for file in files:
         file.unlink(missing_ok=True)
     return bool(files)
+
+
+def _kernels(kept: Path) -> dict[str, int]:
+    """Sizes of the files with machine code; numba's index of each function is there, or it has none."""
+    return {
+        file.relative_to(kept).as_posix(): file.stat().st_size
+        for file in sorted(kept.rglob("*.nbc"))
+        if any(index.stat().st_size for index in file.parent.glob(f"{_function(file)}*.nbi"))
+    }
+
+
+def _function(file: Path) -> str:
+    """Name of a kernel's function as numba begins its files with it: MODULE.FUNCTION-LINE.PYTHON.NUMBER.nbc."""
+    return file.name.rpartition(".nbc")[0].rpartition(".")[0]
 
 
 def _digest() -> str:
