@@ -120,7 +120,7 @@ class Clearance:
         return self._first[telling[:count]], self._second[telling[:count]], self._over[telling[count:]]
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=32)
 def clearance_of(robot: Robot) -> Clearance:
     """That of a robot, found once for all who judge it in a process."""
     return Clearance(robot)
