@@ -111,7 +111,7 @@ class ServedLockstep(Lockstep):
         around = Around(
             runner=self._asking,
             people=self._people,
-            waits=_Waiting(clock, self.tick),
+            waits=_Waiting(clock, self._tick_ahead),
             preview=self._previews,
             closer=in_background,
             on_disk=self._exports.start,
@@ -155,6 +155,11 @@ class ServedLockstep(Lockstep):
         self._figures.add(0.0, 0)
         if self.step % _FIGURES_EVERY == 0:
             self._figures.write()
+
+    def _tick_ahead(self) -> None:
+        """A tick that a press of the e-stop waits for: those after it come so much later, or presses would hurry time."""
+        self._next_at = max(self._next_at, self._people.now()) + 1.0 / self.spec.rate
+        self.tick()
 
     def _pass(self) -> None:
         """Time comes to a tick when that begins: the policy is asked between two, and it is now until it answers."""

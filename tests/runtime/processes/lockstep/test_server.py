@@ -410,3 +410,14 @@ def test_a_paced_station_is_no_faster_than_life_whatever_it_does(tmp_path: Path)
         assert client.turn(50) <= 1
         assert 45 <= client.turn(50, period) <= 50  # time stands still while the policy is asked
     client.close()
+
+
+def test_presses_of_the_e_stop_are_obeyed_at_once_and_hurry_no_paced_time(tmp_path: Path) -> None:
+    client = Client(stubbed(tmp_path), paced=True).ready().running()
+    period, begun = 1.0 / client.station.spec.rate, client.station.step
+    client.turn(1, period)
+    for _ in range(10):
+        assert client.ask("estop", guard=True, why="again").status == "done"  # in no time of people's
+    ahead = client.station.step - begun
+    assert client.turn(50, period) <= 50 - ahead + 2
+    client.close()
