@@ -157,7 +157,7 @@ class ServedLockstep(Lockstep):
             self._figures.write()
 
     def _tick_ahead(self) -> None:
-        """A tick that a press of the e-stop waits for: those after it come so much later, or presses would hurry time."""
+        """A tick that a press of the e-stop waits for: those after it come so much later, or it would hurry time."""
         self._next_at = max(self._next_at, self._people.now()) + 1.0 / self.spec.rate
         self.tick()
 
