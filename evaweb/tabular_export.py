@@ -18,7 +18,8 @@ Pages = Iterable[Iterable[Mapping[str, Any]]]
 def cell(value: object) -> str:
     """A value as it stands in CSV: None is empty, times are ISO 8601, and no text is a formula.
 
-    A text that a spreadsheet would take for a formula gets an apostrophe in front (OWASP, CSV injection).
+    A text that a spreadsheet would take for a formula gets an apostrophe in front (OWASP, CSV injection), and so does
+    one that looks as if it had got some: one apostrophe less is always what it was.
     """
     if value is None:
         return ""
@@ -29,7 +30,7 @@ def cell(value: object) -> str:
     if isinstance(value, int | float):
         return repr(value)
     text = str(value)
-    return f"'{text}" if text.startswith(_FORMULA) else text
+    return f"'{text}" if text.lstrip("'").startswith(_FORMULA) else text
 
 
 def csv_lines(columns: Sequence[str], pages: Pages) -> Iterator[str]:

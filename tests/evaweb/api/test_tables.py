@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.api.tables import cell, csv_answer
+from evaweb.results.reports.recompute import __main__ as recompute
 
 
 @pytest.mark.parametrize(
@@ -15,6 +16,13 @@ from evaweb.api.tables import cell, csv_answer
 )
 def test_no_text_is_a_formula(text):
     assert cell(text) == f"'{text}"
+
+
+@pytest.mark.parametrize("sign", ["", *"=+-@\t\r\n＝＋－＠"])
+@pytest.mark.parametrize("before", ["", "'", "''", "a", "'a"])
+def test_a_report_that_is_recomputed_reads_every_text_as_it_was(sign, before):
+    text = f"{before}{sign}1"
+    assert recompute._text(cell(text)) == text
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from .sealed import faults
 
 _SHOWN = 40
 _CLOSE = 1e-6  # relative: both ways to a number end in the last bits of different sums
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # as the export has it
 Rows = list[dict[str, str]]
 _BROKEN = (  # of what a cell or a number should not be
     *(ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError, csv.Error),
@@ -166,7 +166,7 @@ def _of(preferred: dict[str, str]) -> tuple[str, str]:
 
 def _text(cell: str) -> str:
     """Without the apostrophe that keeps a spreadsheet from taking a text for a formula."""
-    return cell[1:] if cell.startswith("'") and cell[1:].startswith(_FORMULA) else cell
+    return cell[1:] if cell.startswith("'") and cell.lstrip("'").startswith(_FORMULA) else cell
 
 
 def _trial(row: dict[str, str]) -> Trial:
