@@ -19,6 +19,8 @@ OPTIONS = {
 }
 FEWER = {
     "designs": {"designs.SIZES": [50], "designs._RUNS": 50},
+    "loop": {"loop.RATES": [30.0]},
+    "measures": {"measures._VARIANTS": ["", "fifo"]},
     "moving_target": {"moving_target.SEEDS": 1, "moving_target.DELAYS": [8]},
     "pages": {"pages.LOADS": 1},
     "start": {"start._STARTS": 1},
