@@ -95,8 +95,9 @@ def ann(browser, demo):
     bench.close()
 
 
-@pytest.mark.story
-def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(ann, demo):
+@pytest.fixture(scope="module")
+def collecting(ann):
+    """Ann, whose session is open and whose station is set up; nothing is armed."""
     page = ann.page
     ann.key("Shift+T")
     page.keyboard.type(TASK)
@@ -109,6 +110,12 @@ def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(an
     ann.key("u")
     ann.reaches("READY")
     page.locator("#big:not([data-settling])").wait_for()
+    return ann
+
+
+@pytest.mark.story
+def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(collecting, demo):
+    ann, page = collecting, collecting.page
     ann.key("Enter")
     ann.said("Start: arm first")
     assert ann.state() == "READY"
@@ -155,8 +162,8 @@ def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(an
     assert (told["kind"], told["task"], told["dataset_index"]) == ("demonstration", TASK, None)
 
 
-def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(ann):
-    page = ann.page
+def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(collecting):
+    ann, page, before = collecting, collecting.page, collecting.counts()
     page.evaluate("window.held = [0]")  # pressed before anybody looked
     eventually(lambda: "test pad" in page.locator("[data-pad=state]").inner_text(), "the pad is seen")
     page.wait_for_timeout(700)
@@ -236,9 +243,12 @@ def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(ann
         return ann.collect["last"]["discarded"]
 
     eventually(discarded, "the last one is discarded")
-    eventually(
-        lambda: (ann.counts()["saved"], ann.counts()["discarded"]) == (2, 2), "two and two are counted"
-    )
+
+    def counted():
+        now = ann.counts()
+        return (now["saved"] - before["saved"], now["discarded"] - before["discarded"]) == (0, 2)
+
+    eventually(counted, "two more are discarded and none is saved")
 
     ann.key("m")
     page.locator(".pad-row[data-action=fail] button").click()
@@ -248,8 +258,8 @@ def test_what_went_wrong_is_discarded_and_recorded_again_also_with_a_gamepad(ann
     ann.key("m")
 
 
-def test_another_day_the_session_goes_on_and_one_of_another_set_up_is_refused(ann, demo):
-    page = ann.page
+def test_another_day_the_session_goes_on_and_one_of_another_set_up_is_refused(collecting, demo):
+    ann, page = collecting, collecting.page
     mine = page.locator("[data-session-uuid]").get_attribute("data-session-uuid")
     ann.key("Shift+C")
     page.locator("#open-session").wait_for()
@@ -267,7 +277,7 @@ def test_another_day_the_session_goes_on_and_one_of_another_set_up_is_refused(an
     ann.key("Shift+O")
     page.locator(f"[data-session-uuid='{mine}']").wait_for()
     kinds = [event["kind"] for event in ann.api(f"sessions/{mine}")["events"]]
-    assert kinds == ["opened", "published", "closed", "resumed"]
+    assert [kind for kind in kinds if kind != "published"] == ["opened", "closed", "resumed"]
     page.locator("[data-open-keys]").dispatch_event("click")
     shown = page.locator("#keys-list").inner_text()
     assert "Start; stop and save" in shown
