@@ -1,12 +1,12 @@
 """What another computer answers at its ports, as JSON; to be run in a network namespace by root.
 
-    python scan.py ports HOST             `tcp`: where somebody listens; `refused`: how many TCP ports said that nobody
-                                          does; `udp`: from where anything came
-    python scan.py web ORIGIN PATH...     the status of each path without a session, and where it leads
-    python scan.py link HOST PORT         bytes that a stranger gets who speaks HTTP, ZMTP without keys, and ZMTP with
-                                          keys that nobody has enrolled: of ZMTP the messages alone
+    ports HOST           `tcp`: where somebody listens; `refused`: how many TCP ports said that nobody does;
+                         `udp`: from where anything came
+    web ORIGIN PATH...   the status of each path without a session, and where it leads
+    link HOST PORT       bytes that a stranger gets who speaks HTTP, ZMTP without keys, and ZMTP with keys that nobody
+                         has enrolled: of ZMTP the messages alone
 
-It imports nothing of the product's.
+Asked with one of these after `python -m tests.e2e.scan`; it imports nothing of the product's.
 """
 
 import http.client

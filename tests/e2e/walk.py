@@ -202,12 +202,7 @@ class Walk:
 
     def scan(self, *words):
         """What `scan.py` finds from the desk."""
-        found = [
-            *self.network.inside["desk"],
-            sys.executable,
-            str(ROOT / "tests" / "e2e" / "scan.py"),
-            *words,
-        ]
+        found = [*self.network.inside["desk"], sys.executable, "-m", "tests.e2e.scan", *words]
         done = subprocess.run(
             found, cwd=ROOT, check=True, capture_output=True, text=True, timeout=3 * PATIENCE_S
         )

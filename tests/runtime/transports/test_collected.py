@@ -184,7 +184,7 @@ class Waving:
 
 
 def relayed(ways: dict[str, Any], mode: str = "absolute") -> dict[str, Any]:
-    return {"source": "relay", "leader": ways["leader"], "mode": mode, "max_age_s": PATIENCE_S}
+    return {"source": "relay", "leader": ways["leader"], "mode": mode, "max_age_s": 2.0}
 
 
 @pytest.mark.lab
@@ -209,7 +209,7 @@ def led(kind: str, leader: Waving, **link: Any) -> dict[str, Any]:
     """Relayed from topics."""
     groups = {name: {"topic": topic} for name, topic in leader.topics.items()}
     leader_of = {"kind": kind, "groups": groups, **link}
-    return {"source": "relay", "leader": leader_of, "mode": "relative", "max_age_s": PATIENCE_S}
+    return {"source": "relay", "leader": leader_of, "mode": "relative", "max_age_s": 2.0}
 
 
 @pytest.mark.lab
