@@ -53,9 +53,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What starts a whole lab is a lab, unless it is one of the stories."""
+    """What starts a whole lab is a lab, unless it is one of the stories; of many cases the gate makes some."""
     unread: dict[Path, bool] = {}
+    cases: dict[tuple[str, str], list[pytest.Item]] = {}
     for item in items:
+        if item.get_closest_marker("some") and not item.get_closest_marker("exhaustive"):
+            cases.setdefault((item.path.as_posix(), item.nodeid.partition("[")[0]), []).append(item)
         story, lab = map(item.get_closest_marker, ("story", "lab"))
         if story and lab:
             raise pytest.UsageError(f"{item.nodeid} is both a story and a lab: neither command would make it")
@@ -70,6 +73,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                     f"{item.nodeid} is a story or a lab by a mark that does not stand in its file: write "
                     "pytest.mark.story or pytest.mark.lab there, or neither command reads it"
                 )
+    for every in cases.values():
+        _leave_to_labs(every)
+
+
+def _leave_to_labs(cases: list[pytest.Item]) -> None:
+    """The gate makes as many cases of a test as its mark `some` says, spread over all of them; `make labs` all."""
+    (count,) = next(mark.args for mark in cases[0].iter_markers("some"))
+    spread = {place * len(cases) // count for place in range(count)}
+    for place, case in enumerate(cases):
+        if place not in spread:
+            case.add_marker("exhaustive")
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import psutil
+import pytest
 
 from tests.processes import PATIENCE_S
 from tests.stalls import GAP_S, TRY, Watch
@@ -60,6 +61,7 @@ def run(folder, gap, passes_at, *options, more=""):
     return done.returncode, len((folder / "tries").read_text()), done.stdout
 
 
+@pytest.mark.exhaustive
 def test_a_failure_without_a_gap_stays_one_and_is_not_run_again(tmp_path):
     code, tries, said = run(tmp_path, None, 2)
     assert (code, tries) == (1, 1)
@@ -74,17 +76,20 @@ def test_what_failed_across_a_gap_is_invalid_and_decided_by_the_next_run(tmp_pat
     assert "1 failed" not in said
 
 
+@pytest.mark.exhaustive
 def test_it_is_said_what_an_invalid_one_failed_of(tmp_path):
     _, _, said = run(tmp_path, (1.0, 3.5), 2)
     assert 'int(os.environ.get("EVA_TESTS_TRY", "1")) >= ' in said
 
 
+@pytest.mark.exhaustive
 def test_a_failure_of_what_is_no_story_stays_one_whatever_the_machine_did(tmp_path):
     code, _, said = run(tmp_path, (1.0, 3.5), 2, "-v", more=_WRONG)
     assert code == 1
     assert "1 failed, 1 invalid" in said
 
 
+@pytest.mark.exhaustive
 def test_a_session_that_was_ended_by_an_invalid_one_is_not_green(tmp_path):
     two = _TESTS.replace("test_one", "test_two")
     code, _, said = run(tmp_path, (1.0, 3.5), 2, "-x", "-m", "story", more=two)
@@ -92,6 +97,7 @@ def test_a_session_that_was_ended_by_an_invalid_one_is_not_green(tmp_path):
     assert "test_two" not in said
 
 
+@pytest.mark.exhaustive
 def test_what_is_invalid_a_third_time_is_an_error_of_its_own(tmp_path):
     code, tries, said = run(tmp_path, (1.0, 3.5), 9)
     assert (code, tries) == (1, 3)

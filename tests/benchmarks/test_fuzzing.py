@@ -19,6 +19,7 @@ def seeds(*every):
     return [seed if seed in _GATE else pytest.param(seed, marks=pytest.mark.exhaustive) for seed in every]
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("seed", seeds(*range(30), *PUSHED_ON))
 def test_faulty_encoders_never_move_a_robot_beyond_its_limits_or_away_from_where_it_is(seed):
     assert encoders.once(seed) == []

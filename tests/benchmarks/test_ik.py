@@ -62,6 +62,7 @@ def guess(q: np.ndarray, away: float, flags: int = 0) -> Guess:
     return Guess(IkResult(q, np.full(shape, away), np.full(shape, 0.0), np.full(shape, flags, np.uint8)))
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("kind", ["smooth", "singular", "through", OUT_OF_REACH])
 def test_every_kind_has_chunks_of_all_arms_that_begin_where_their_seed_is(kind: str) -> None:
     assert len(chunks()[kind]) == CHUNKS

@@ -63,6 +63,7 @@ def test_every_strategy_has_a_cell_that_is_checked_in_lockstep() -> None:
     assert {case.strategy for case in CHECKED} == set(KINDS) == set(variants("runtime.strategies"))
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("case", [c for c in CHECKED if c.delay == 15 and c.inference_hz], ids=str)
 def test_the_whole_station_plans_what_the_step_loop_plans_to_the_bit(case: Cell) -> None:
     assert compare(case)[1] == 0

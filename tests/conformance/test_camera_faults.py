@@ -58,6 +58,7 @@ def test_what_was_found_in_its_place_is_said(kind: str, fault: str) -> None:
         assert camera.newest() is None
 
 
+@pytest.mark.some(2)
 @both
 @pytest.mark.parametrize("fault", WHILE_IT_PLAYS)
 def test_what_breaks_while_it_plays_is_lost_and_comes_back(kind: str, fault: str) -> None:

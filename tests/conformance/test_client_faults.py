@@ -128,6 +128,7 @@ FAULTS: dict[str, tuple[Callable[[], bytes], str]] = {
 }
 
 
+@pytest.mark.some(7)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_faulty_message_moves_nothing_and_is_refused_by_name(bench: Bench, fault: str) -> None:
     payload, reason = FAULTS[fault]

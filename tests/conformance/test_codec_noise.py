@@ -151,6 +151,7 @@ def test_random_bytes_are_a_value_or_the_readers_own_error(name: str, payload: b
     assert not isinstance(found, CodecError) or len(str(found)) > 10
 
 
+@pytest.mark.some(3)
 @on_every_reader
 @settings(max_examples=some(150))
 @given(data=st.data())

@@ -124,6 +124,7 @@ def test_a_message_cut_anywhere_is_refused(name: str) -> None:
             unpack(recorded[:size])
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("name", PICKLED_ACTIONS)
 def test_pickled_actions_cut_anywhere_are_refused(name: str) -> None:
     recorded = vector(name)

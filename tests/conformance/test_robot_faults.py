@@ -62,6 +62,7 @@ CASES = [
 ]
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize(("robot", "fault"), CASES, indirect=["robot"])
 def test_a_fault_is_counted_by_name_and_the_next_frame_comes(robot: Played, fault: str) -> None:
     name, words = robot.faults[fault]
@@ -115,6 +116,7 @@ def test_a_robot_that_falls_silent_is_named_once_and_again_after_it_was_there(ro
     assert robot.source.receive(0.0) is None
 
 
+@pytest.mark.some(1)
 @on_every_transport
 def test_a_robot_that_restarts_is_heard_again(robot: Played) -> None:
     seen(robot, 1)
@@ -125,6 +127,7 @@ def test_a_robot_that_restarts_is_heard_again(robot: Played) -> None:
     assert robot.source.faults()["clock_backwards"] == 1
 
 
+@pytest.mark.some(2)
 @on_every_transport
 @pytest.mark.parametrize(
     ("jump", "name"), [(-5.0, "clock_backwards"), (5.0, "clock_forwards"), (1e6, "clock_forwards")]
@@ -139,6 +142,7 @@ def test_a_clock_that_jumps_is_named_and_ages_nothing(robot: Played, jump: float
     assert "clock" in robot.source.why(name)
 
 
+@pytest.mark.some(1)
 @on_every_transport
 def test_a_frozen_camera_is_named_while_all_else_goes_on(
     robot: Played, monkeypatch: pytest.MonkeyPatch
@@ -183,6 +187,7 @@ def test_a_flood_of_noise_ends_nothing(robot: Played) -> None:
     assert len(robot.source.faults()) < 20, "one name each, however many"
 
 
+@pytest.mark.some(1)
 @on_every_transport
 def test_readers_of_one_robot_do_not_steal_from_each_other(robot: Played) -> None:
     with contextlib.closing(robot.another()) as other:
@@ -191,6 +196,7 @@ def test_readers_of_one_robot_do_not_steal_from_each_other(robot: Played) -> Non
             seen(robot, mark)
 
 
+@pytest.mark.some(1)
 @on_every_transport
 def test_who_waits_is_let_go_when_it_is_closed_and_it_can_be_connected_again(robot: Played) -> None:
     def wait() -> None:

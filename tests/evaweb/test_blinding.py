@@ -72,6 +72,7 @@ def test_nothing_that_an_operator_can_reach_tells_before_the_reveal(lab, looked_
     assert LATENCY in whispers(lab, lab.operator)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "who", ["alma", *(pytest.param(who, marks=pytest.mark.exhaustive) for who in ("operator", "owner"))]
 )
@@ -98,6 +99,7 @@ def lose(plan):
             row.delete()
 
 
+@pytest.mark.exhaustive
 def test_who_has_looked_is_told_everything(lab):
     lab.handed()
     lab.running()
@@ -134,6 +136,7 @@ SEAMS = {
 }
 
 
+@pytest.mark.exhaustive
 def test_without_one_seam_something_tells(lab, monkeypatch):
     client = Client()
     client.force_login(lab.operator)
@@ -145,6 +148,7 @@ def test_without_one_seam_something_tells(lab, monkeypatch):
             assert any(leaks(lab, client)), seam
 
 
+@pytest.mark.exhaustive
 def test_without_its_seam_a_filter_tells(lab, monkeypatch):
     client = Client()
     client.force_login(lab.operator)

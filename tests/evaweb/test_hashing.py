@@ -29,6 +29,7 @@ def slow(monkeypatch):
     may_end.set()
 
 
+@pytest.mark.exhaustive
 def test_a_hash_is_that_of_django(settings):
     settings.PASSWORD_HASHERS = ["django.contrib.auth.hashers.PBKDF2PasswordHasher"]
     before = make_password("three words")

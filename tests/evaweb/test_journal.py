@@ -75,6 +75,7 @@ def _only(known, said):
     return {name: value for name, value in said.items() if name in known}
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(
     ("folder", "kind", "rows", "written"),
     [

@@ -66,6 +66,7 @@ def shown_by_node(rows):
     return json.loads(done.stdout)
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize(
     ("said", "words"),
     [

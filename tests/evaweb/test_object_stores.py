@@ -177,6 +177,7 @@ def test_a_bucket_without_its_package_is_a_sentence(monkeypatch):
         environment.store()
 
 
+@pytest.mark.exhaustive
 def test_settings_are_read(monkeypatch, tmp_path):
     monkeypatch.setattr(environment, "find_spec", lambda name: object())
     assert environment.store() is None

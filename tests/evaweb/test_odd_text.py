@@ -124,6 +124,7 @@ def faults_of(answer):
         yield f"without {missing}"
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(
     "role",
     ["operator", *(pytest.param(role, marks=pytest.mark.exhaustive) for role in ("nobody", "vera", "alma"))],
@@ -246,6 +247,7 @@ def posts(known):
                 yield path, schema
 
 
+@pytest.mark.exhaustive
 def test_in_json(admin, bench, live):
     known, faults, asked = api.get_openapi_schema(), set(), 0
     trial = bench.prepare()
@@ -266,6 +268,7 @@ FORMS = ("/login/", "/password/", "/admin/login/", "/admin/auth/user/add/", "/ad
          "/admin/trials/scene/add/", "/admin/trials/checkpoint/add/", "/admin/plans/plan/add/")  # fmt: skip
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("path", FORMS)
 def test_in_forms(admin, path):
     if "login" in path:

@@ -67,6 +67,7 @@ def sampled(name: str, one: str, other: str, q: Float64) -> float:
     )
 
 
+@pytest.mark.some(1)
 @settings(max_examples=some(40))
 @given(seed=st.integers(0, 10**6))
 @pytest.mark.parametrize("name", ["agilex_piper", "ur5e"])
@@ -114,6 +115,7 @@ def test_the_table_is_looked_at_under_what_can_come_down_to_it() -> None:
     assert between("left_arm/link7", TABLE)  # a finger
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("name", NAMES)
 def test_fingers_may_touch_the_table_and_dip_in_a_little_but_no_more(name: str) -> None:
     robot, looked = robots.load(name), clearance(name)

@@ -40,6 +40,7 @@ every_standing = pytest.mark.parametrize("name", STANDING)
 robot = cache(load)
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize("name", EXTENTS)
 def test_the_drawn_shapes_of_links_fill_the_extents_of_the_real_ones(name: str) -> None:
     for link, wanted in EXTENTS[name]["links"].items():
@@ -73,6 +74,7 @@ def test_jaws_are_as_far_apart_as_the_gripper_says(name: str) -> None:
         assert apart == pytest.approx(said, abs=stands.jaws_within)
 
 
+@pytest.mark.some(1)
 @every_standing
 def test_from_home_to_ready_nothing_touches_and_the_fingertips_stay_up(name: str) -> None:
     clearance, height = from_home_to_ready(robot(name))

@@ -19,6 +19,7 @@ def said(found: Inspection, part: str) -> str:
     return matches[0]
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("name", names())
 def test_every_robot_is_told_whole(name: str) -> None:
     found = inspect(name)

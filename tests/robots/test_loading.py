@@ -77,6 +77,7 @@ def test_a_robot_travels_between_processes() -> None:
     np.testing.assert_array_equal(copy.arms[1].chain.pose(q), robot.arms[1].chain.pose(q))
 
 
+@pytest.mark.some(29)
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [

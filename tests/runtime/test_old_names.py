@@ -6,6 +6,7 @@ import pytest
 from tests.sources import ROOT
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(
     ("old", "new", "arguments"),
     [

@@ -125,6 +125,7 @@ def test_a_busy_database_is_a_sentence_and_503(rest, monkeypatch):
     assert "database is busy or gone" in body["error"]
 
 
+@pytest.mark.exhaustive
 def test_no_page_of_the_interface_fetches_anything_from_elsewhere(rest):
     assert rest.get("openapi.json")[1]["info"]["title"] == "EVA Web"
     assert Client().get("/api/v1/docs").status_code == 404

@@ -87,6 +87,7 @@ def hammer(port, over, answers):
             answers.update(one.recv(12).decode() for one in presses)
 
 
+@pytest.mark.exhaustive
 def test_presses_of_people_come_through_and_those_of_the_crowd_are_refused(port, sessions, bench):
     ann, bob, cyd = sessions
     assert press(port, ann, CROWDED) == 200, "and is remembered"

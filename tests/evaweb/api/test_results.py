@@ -19,6 +19,7 @@ def body(answer):
     return b"".join(answer.streaming_content)
 
 
+@pytest.mark.exhaustive
 def test_every_statistic(asked):
     found = asked("results").json()
     assert found["n"] == 16
@@ -65,6 +66,7 @@ def test_other_entities_in_all_formats(asked, what):
     assert parquet.read_table(io.BytesIO(body(asked(f"{what}?format=parquet")))).num_rows == n
 
 
+@pytest.mark.exhaustive
 def test_the_planner(asked, client):
     found = client.get("/api/v1/planner?rate=0.6&better=0.9").json()
     by_rule = {row["rule"]: row for row in found["designs"]}

@@ -143,6 +143,7 @@ const press = (key, target = theirs, repeat = false) => tell("keydown", { key, t
 """
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize(
     ("pressed", "others"),
     [

@@ -101,6 +101,7 @@ def test_after_three_seconds_the_refusal_is_said() -> None:
     assert found == [WAITING, REFUSED, 0]
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize(
     "change",
     [

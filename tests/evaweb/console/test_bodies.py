@@ -92,6 +92,7 @@ def asked(port, path, *headers, body=b"", method="POST"):
     return int(status.split()[1]), content
 
 
+@pytest.mark.some(6)
 @pytest.mark.slow
 @pytest.mark.parametrize("rest", [False, True])
 @pytest.mark.parametrize(
@@ -148,6 +149,7 @@ def test_what_is_too_long_is_refused_by_its_headers_alone(port, path, header, st
         assert set(json.loads(content)) - IDENTITY == {"error"}
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_a_file_is_read_of_an_administrator_alone(port, sessions):
     length, path = MEMBER + 1, "/admin/plans/plan/import/"
@@ -211,6 +213,7 @@ def test_what_follows_a_stop_over_its_connection_is_bounded_as_ever(port, method
     assert (answer.count(b"HTTP/1.1 401"), answer.count(b"HTTP/1.1 431")) == (1, 1)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_a_line_that_is_no_request_is_refused_with_a_word(port):
     with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as connection:

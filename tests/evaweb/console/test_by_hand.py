@@ -28,6 +28,7 @@ def test_every_mode_of_the_runtime_is_offered_with_a_line() -> None:
     assert all(line.endswith(".") for line in lines.values())
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize(
     ("state", "mode", "chunk", "button"),
     [
@@ -138,6 +139,7 @@ def test_who_does_not_command_is_told_how_to() -> None:
     ]
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize(
     ("kind", "situation", "reason"),
     [
@@ -262,6 +264,7 @@ def test_joints_come_in_the_robots_groups_with_their_limits() -> None:
     assert groups[2]["joints"][0]["lower"] == pytest.approx(-6.283, abs=0.001)  # turns without an end
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize(
     ("joints", "labels"),
     [

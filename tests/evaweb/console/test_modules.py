@@ -236,6 +236,7 @@ def test_the_film_of_a_chunk_takes_as_long_as_the_chunk_and_begins_again() -> No
     ]
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("direction", [[0.75, 0.62, 0.62], [0, 1, 0.12], [0.0, -0.002, 1], [-1, 1, 0.3]])
 @pytest.mark.parametrize("lower", [0.0, 0.02])
 def test_everything_that_has_to_be_in_view_is(direction: list[float], lower: float) -> None:
@@ -330,6 +331,7 @@ def test_of_nothing_there_is_no_quantile() -> None:
     assert run("debug/distribution.js", "return Number.isNaN(m.quantile([], 50))") is True
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize(
     ("panel", "state", "step"),
     [
@@ -760,6 +762,7 @@ const show = async (...words) => {
 """
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize(
     ("body", "shown", "decodings"),
     [

@@ -71,6 +71,7 @@ def test_what_is_announced_can_be_opened(host, shown):
         socket.create_connection((shown, address["port"])).close()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_it_serves_and_ends_with_its_lifeline(tmp_path):
     with served(tmp_path, "--lifeline") as (process, address):
@@ -127,6 +128,7 @@ def test_connections_that_ask_for_nothing_keep_nobody_out_and_are_closed(tmp_pat
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_the_process_for_stops_answers_says_where_it_is_and_ends_with_its_lifeline(tmp_path):
     with served(tmp_path, "--web-port", "8000", "--lifeline", command="stops") as (process, address):
@@ -158,6 +160,7 @@ def test_an_e_stop_whose_sender_dies_in_the_middle_of_its_body_is_pressed(tmp_pa
         eventually(lambda: _presses(tmp_path) == [("estop", {"why": "pressed"})], "it is pressed")
 
 
+@pytest.mark.some(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["serve", "stops"])
 def test_no_type_and_no_length_of_its_body_refuses_a_press(tmp_path, command):

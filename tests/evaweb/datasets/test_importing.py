@@ -58,6 +58,7 @@ def theirs(tmp_path: Path, **plan: Any) -> Path:
     return folder
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
 def test_episodes_of_any_version_are_those_of_the_lab_and_of_its_dataset(
     data: Path, tmp_path: Path, version: str
@@ -258,6 +259,7 @@ def test_it_is_published_nowhere_else(data: Path, tmp_path: Path) -> None:
     assert "it was imported" in told["why"]
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -287,6 +289,7 @@ def test_a_robot_of_as_many_joints_may_be_named(data: Path, tmp_path: Path) -> N
         imported(theirs(tmp_path), robot="agilex_piper")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(not SAMPLE, reason="EVA_SAMPLE_EPISODE does not name the real episode")
 def test_the_real_episode_is_imported_reviewed_and_converted_there_and_back(
     browser: Client, data: Path, tmp_path: Path

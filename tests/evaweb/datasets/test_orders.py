@@ -367,6 +367,7 @@ def own_folders() -> list[str]:
     return sorted({name for row in rows for name in re.findall(r"`([a-z_]+)/`", row)} - {"datasets"})
 
 
+@pytest.mark.some(8)
 @pytest.mark.parametrize("folder", own_folders())
 def test_no_dataset_is_written_into_a_folder_of_the_lab(foreign: Foreign, root: User, folder: str) -> None:
     foreign("cups")
@@ -411,6 +412,7 @@ def test_an_operator_sets_up_an_episode_by_its_name_and_no_path_of_theirs(
     assert (heard.role, heard.vouched) == ("operator", ["policy"])
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("uuid", ["../stations", "../episodes", ".", "", "/tmp", 7, None])
 def test_an_import_of_episodes_that_are_called_like_folders_touches_none(
     foreign: Foreign, data: Path, done: Done, uuid: object

@@ -185,6 +185,7 @@ def test_what_is_drawn_waits_for_pictures_and_for_none_that_never_come() -> None
     assert found == [True, False, False, False, True, False]
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize(
     ("camera", "row", "said"),
     [

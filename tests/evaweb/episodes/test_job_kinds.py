@@ -225,6 +225,7 @@ class Killed(BaseException):
     """As if the worker were killed: nothing of ours runs afterwards."""
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("at", ["first", "second", "last"])
 def test_a_worker_killed_while_publishing_leaves_a_dataset_that_the_next_one_completes(
     closed: Closed, data: Path, monkeypatch: pytest.MonkeyPatch, at: str

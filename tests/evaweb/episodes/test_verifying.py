@@ -133,6 +133,7 @@ def test_damage_is_kept_on_the_disk_and_shown_until_the_files_are_back(
     assert recorded_at(str(old.uuid)).rows == old.frames
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize(
     "name", ["rows.arrow", "raw.arrow", "smoothed.arrow", "events.jsonl", "cam_high.mp4"]
 )

@@ -60,6 +60,7 @@ def person() -> User:
 both = pytest.mark.parametrize("stored", ["folder", "s3"], indirect=True)
 
 
+@pytest.mark.some(1)
 @both
 def test_they_are_in_the_store_alone_and_can_be_played_and_judged(stored: Episode) -> None:
     assert list(preview_folder(stored.pk).glob("*.mp4")) == []
@@ -122,6 +123,7 @@ def test_an_index_that_cannot_be_read_is_named(stored: Episode, told: str) -> No
         video_file(stored.uuid, CAMERA)
 
 
+@pytest.mark.exhaustive
 def test_the_policy_of_pages_allows_the_store_and_nothing_else_that_is_new() -> None:
     plain, more = (content_security_policy(origin)["DIRECTIVES"] for origin in ("", "https://s3.example.org"))
     assert "media-src" not in plain

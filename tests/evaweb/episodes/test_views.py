@@ -175,6 +175,7 @@ def test_a_camera_that_the_row_does_not_name_never_reaches_the_disk(
     assert opened == []
 
 
+@pytest.mark.some(7)
 @pytest.mark.parametrize("identity", ["..", "%2e%2e", "not-a-uuid", "c86a888b"])
 @pytest.mark.parametrize(
     "what", ["thumbnail", "video/cam_high", "sheet/cam_high", "curves", "poses", "bench", "export"]
@@ -342,6 +343,7 @@ def test_the_list_shows_how_each_stands_and_looks_again_while_something_goes_on(
     assert rows.startswith("<tbody")
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize(
     ("query", "count"),
     [

@@ -122,6 +122,7 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
         worker.stdin.close()
 
 
+@pytest.mark.exhaustive
 def test_a_job_asked_for_before_the_worker_and_with_no_broker_is_done_and_the_lifeline_ends_it(
     lab: Lab,
 ) -> None:

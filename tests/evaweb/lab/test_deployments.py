@@ -238,6 +238,7 @@ def test_a_lab_is_seen_as_long_as_it_runs(data):
     assert not deployments.lab_runs()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_the_runtimes_own_check_finds_what_loading_does_not(data):
     kept = draft()

@@ -135,6 +135,7 @@ def test_a_slow_one_is_waited_for_as_long_as_it_works(processes, monkeypatch):
     assert told["url"].startswith("here")
 
 
+@pytest.mark.exhaustive
 def test_one_that_only_works_is_given_up(processes, monkeypatch):
     monkeypatch.setattr("evaweb.lab.processes._MOST_PROCESSOR_S", 0.2)
     with pytest.raises(LabError, match="busy does not get ready"):

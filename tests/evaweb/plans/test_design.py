@@ -100,6 +100,7 @@ def test_a_score_that_was_mistyped_can_be_corrected_before_the_next_trial_is_ask
     assert (early.state, findings_of(early).ended) == (PlanState.FROZEN, "")
 
 
+@pytest.mark.exhaustive
 def test_a_trial_that_is_under_way_elsewhere_is_finished_first_and_changes_nothing(bench, early, other):
     pair = [handed(bench, early, other)]
     scored(bench, pair[0])
@@ -148,6 +149,7 @@ def test_all_pairs_made_close_it_too(bench, draft, owner):
     )
 
 
+@pytest.mark.exhaustive
 def test_a_fixed_plan_of_three_makes_all_its_trials_and_says_not_what_they_show(bench, draft, owner):
     draft.checkpoints.add(Checkpoint.objects.create(name="pi0-third", policy={}))
     plan = frozen_plan(draft, owner, repetitions=4)
@@ -223,6 +225,7 @@ def test_a_correction_before_the_reveal_is_told_beside_the_headline(bench, draft
     assert "8/8 against 0/8" in said.at_first
 
 
+@pytest.mark.exhaustive
 def test_the_better_one_is_named_first_with_its_numbers(bench, draft, owner):
     draft.first, draft.second = draft.second, draft.first
     plan = frozen_plan(draft, owner, repetitions=4)
@@ -245,6 +248,7 @@ def test_versions_before_it_are_told(bench, draft, owner):
     assert headline(plan).versions == ()
 
 
+@pytest.mark.exhaustive
 def test_a_second_reveal_of_a_database_that_was_put_back_keeps_the_first(bench, draft, owner):
     plan = frozen_plan(draft, owner, repetitions=4)
     carry_out(bench, plan, 16)
@@ -337,6 +341,7 @@ def test_a_plan_does_not_close_itself_on_a_repetition_whose_trial_may_count_yet(
     scored(bench, handed(bench, early))
 
 
+@pytest.mark.exhaustive
 def test_the_worst_of_what_was_thrown_away_is_held_against_what_the_reveal_kept(bench, draft, owner):
     plan = frozen_plan(draft, owner, repetitions=5)
     thrown = handed(bench, plan)
@@ -390,6 +395,7 @@ def carry_out_three(bench, plan):
     return blocks
 
 
+@pytest.mark.exhaustive
 def test_all_checkpoints_are_compared_and_one_that_was_found_worse_is_tried_no_more(bench, three, owner):
     plan = frozen_plan(three, owner, stopping="early", comparing="all", drop_arms=True, repetitions=20)
     assert plan.document["comparisons"] == [
@@ -427,6 +433,7 @@ def until_one_is_dropped(bench, plan, stations):
     return name, at
 
 
+@pytest.mark.exhaustive
 def test_a_boundary_that_ends_a_plan_with_drops_closes_it_when_the_next_trial_is_asked_for(
     bench, three, owner
 ):
@@ -462,6 +469,7 @@ def test_while_a_trial_is_repeated_a_dropped_checkpoint_stays_dropped(bench, thr
         scored(bench, again, success=voided.trial.verdict.success)
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("margin", [None, 0.4])
 def test_a_control_stays_whatever_is_found_of_it(bench, three, owner, margin):
     control = Checkpoint.objects.get(name="pi0-block")
@@ -487,6 +495,7 @@ def test_a_control_stays_whatever_is_found_of_it(bench, three, owner, margin):
     assert dropped_of(plan) == {BETTER: ends[BETTER]}
 
 
+@pytest.mark.exhaustive
 def test_doubts_of_a_plan_that_dropped_a_checkpoint_are_judged_comparison_by_comparison(bench, three, owner):
     plan = frozen_plan(three, owner, stopping="early", comparing="all", drop_arms=True, repetitions=20)
     bob, thrown = builders.user("bob"), None
@@ -517,6 +526,7 @@ def test_doubts_of_a_plan_that_dropped_a_checkpoint_are_judged_comparison_by_com
     assert ways["without operator bob"]["sentence"].startswith(f"No pair of pi0-block and {BETTER} is left")
 
 
+@pytest.mark.exhaustive
 def test_each_checkpoint_is_compared_with_the_first_at_its_share_of_alpha(bench, three, owner):
     three.first = Checkpoint.objects.get(name="pi0-third")
     three.save()
@@ -533,6 +543,7 @@ def test_each_checkpoint_is_compared_with_the_first_at_its_share_of_alpha(bench,
     assert headline(plan).letters == ()
 
 
+@pytest.mark.exhaustive
 def test_checkpoints_in_random_order_are_judged_by_the_numbers_that_were_drawn(bench, draft, owner):
     plan = frozen_plan(draft, owner, stopping="early", allocation="random", repetitions=20)
     said = plan.document["stopping"]
@@ -598,6 +609,7 @@ def test_a_random_order_that_its_design_has_no_room_for_is_drawn_again(draft, ow
     assert sum(counts[-1]) == 20
 
 
+@pytest.mark.exhaustive
 def test_more_blocks_than_a_boundary_has_room_for_are_refused_in_random_order(draft, owner):
     with pytest.raises(
         EvaError, match=r"came to \d+ and \d+ trials; allowed: 1 to 250 of each: plan fewer of them"

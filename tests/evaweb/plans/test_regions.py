@@ -208,6 +208,7 @@ def margin(name, frames):
     return min(present), max(wrong), max(whole)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(not SAMPLE, reason="EVA_SAMPLE_EPISODE does not name the real episode")
 @pytest.mark.parametrize("name", OBJECTS)
 def test_on_the_real_episode_present_and_absent_or_moved_are_far_apart(name, frames):

@@ -111,6 +111,7 @@ def test_a_line_that_is_there_twice_is_one_review_and_the_last_counts(spoken, da
     assert reconcile().restored == 0
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("kind", ["review", "segment", "tag"])
 def test_what_is_said_of_another_episode_is_named(spoken, data, closed, kind):
     other = closed("interrupted")

@@ -94,6 +94,7 @@ def test_a_grid_is_laid_from_end_to_end_and_leaves_out_what_cannot_be() -> None:
     assert {bench["block"][2] for bench in made["benches"]} == {20}
 
 
+@pytest.mark.exhaustive
 def test_positions_at_random_keep_their_distance_and_a_seed_gives_the_same_again() -> None:
     made = generated(method="random", n=8, least=60)
     assert len(made["benches"]) == 8

@@ -39,6 +39,7 @@ def test_a_scale_changes_nothing_and_a_mirror_mirrors(outcomes):
     assert found.value - 1e-12 <= found.interval.high <= 1
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.wanted])
 def test_the_fewest_trials_that_have_an_interval_are_covered(name):
     """A bootstrap covers 70 % at five trials of lopsided scores: of 300 runs at least 93 % here."""

@@ -71,6 +71,7 @@ def test_over_all_orders_of_outcomes_the_truth_is_left_out_at_most_at_alpha(alph
             assert missed <= alpha
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(("rare", "much", "little"), [(0.02, 1.0, -0.1), (0.1, 1.0, -1.0), (0.9, 0.3, -0.5)])
 def test_lopsided_differences_keep_their_mean_in_it(rare, much, little):
     random = np.random.default_rng(3)

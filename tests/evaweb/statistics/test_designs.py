@@ -112,6 +112,7 @@ def test_a_boundary_comes_back_from_the_plan_as_it_was(margin):
     assert all(type(number) is int for row in rows for number in row)
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize(
     ("rates", "drift"), [((0.1, 0.9), 0.0), ((0.3, 0.5, 0.7), 0.0), ((0.2, 0.8), 0.2), ((0.5,), 0.0)]
 )

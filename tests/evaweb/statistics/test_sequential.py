@@ -111,6 +111,7 @@ def test_the_worth_of_partial_credit_is_a_martingale(history, low, high):
         assert expected == pytest.approx(worth)
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("rare", [0.02, 0.1, 0.5, 0.9, 0.98])
 def test_lopsided_differences_with_a_mean_of_zero_seldom_suffice(rare):
     """Each pair differs by much with a chance of `rare`, by little the other way else."""

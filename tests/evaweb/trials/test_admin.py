@@ -44,6 +44,7 @@ def errors(answer):
     return answer.content.decode()
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("where", LISTS)
 def test_every_list_and_row_opens_for_an_admin(admin, bench, where):
     trial = bench.scored()

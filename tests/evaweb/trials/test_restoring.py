@@ -139,6 +139,7 @@ def test_a_second_time_changes_nothing(judged):
     assert everything() == found
 
 
+@pytest.mark.exhaustive
 def test_what_is_all_there_is_left_alone(judged):
     found = everything()
     assert reconcile().restored == 0
@@ -180,6 +181,7 @@ def test_a_closed_recording_without_a_row_comes_back_as_an_attempt_that_does_not
     assert (Trial.objects.get().status, Trial.objects.get().episode.frames) == ("interrupted", 0)
 
 
+@pytest.mark.exhaustive
 def test_scenes_checkpoints_and_people_that_are_gone_too_are_made_switched_off(judged):
     before, counts = told(), counted()
     lose(*RECORDS, *CHOICES)
@@ -200,6 +202,7 @@ def test_scenes_checkpoints_and_people_that_are_gone_too_are_made_switched_off(j
     assert (ann.is_active, ann.has_usable_password(), ann.groups.count()) == (False, False, 0)
 
 
+@pytest.mark.exhaustive
 def test_a_rater_whom_nobody_knows_any_more_becomes_a_deactivated_user(judged, caplog):
     name = "dorothea"
     User.objects.filter(username="ann").update(username=name)
@@ -233,6 +236,7 @@ def test_a_judged_trial_whose_publication_was_lost_is_published(lab):
     assert sorted(Job.objects.values_list("key", flat=True)) == [f"preview:{uuid}", f"publish:{uuid}"]
 
 
+@pytest.mark.exhaustive
 def test_the_next_trial_goes_on_where_the_lost_ones_ended(judged):
     highest = Trial.objects.order_by("-pk")[0]
     lose(*RECORDS)
@@ -312,6 +316,7 @@ def test_a_line_cut_in_half_is_left_out_and_told(lab):
     assert (found.status, found.verdict.success, found.scores.count()) == ("scored", False, 1)
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
@@ -366,6 +371,7 @@ def test_lines_of_several_trials_without_a_recording_are_told(lab):
     assert Trial.objects.get().uuid == first.uuid
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("recorded", [True, False])
 def test_a_copy_of_the_scores_of_another_trial_takes_it_from_nobody(lab, recorded):
     if recorded:
@@ -393,6 +399,7 @@ def test_a_copy_of_the_scores_of_another_trial_takes_it_from_nobody(lab, recorde
     )
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("name", [lambda uuid: str(uuid).upper(), lambda uuid: uuid.hex])
 def test_a_file_that_would_not_be_found_by_its_name_is_told(lab, name):
     trial = lab.run()
@@ -444,6 +451,7 @@ def test_this_app_restores_what_the_episodes_hand_out():
     assert restoring.restore in reconciling._restorers
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("answer", ["", "agreed", "refused"])
 def test_voids_that_were_asked_for_and_their_answers_come_back(lab, monkeypatch, answer):
     monkeypatch.setattr(voids, "_rules", [lambda trial: True])

@@ -184,6 +184,7 @@ def test_nothing_is_written_over(tmp_path: Path) -> None:
         draft("mine", tmp_path / "from" / "made_up.urdf", tmp_path / "into")
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("robot", ["agilex_piper", "dual_franka", "agibot_g2"])
 def test_a_urdf_of_ours_gives_a_robot_with_the_same_kinematics(tmp_path: Path, robot: str) -> None:
     described = load(robot)

@@ -53,6 +53,7 @@ def file_camera(path: Path, **settings: str) -> list[str]:
     return [f'cameras.{CAMERA}.{key}="{value}"' for key, value in table.items()]
 
 
+@pytest.mark.exhaustive
 def test_a_video_is_recorded_at_its_own_pace_beside_the_nodes_joints(tmp_path: Path) -> None:
     film = movie(tmp_path / "film.mp4", pictures=10, rate=10, size=(640, 480))
     with served("tabletop", 1, tmp_path, [*RECORDED, *file_camera(film)]) as (_, station):
@@ -76,6 +77,7 @@ def test_a_video_is_recorded_at_its_own_pace_beside_the_nodes_joints(tmp_path: P
     assert set(numbers) == set(range(10))
 
 
+@pytest.mark.exhaustive
 def test_a_camera_that_ends_in_a_run_is_named_refuses_the_policy_and_recording_goes_on(
     tmp_path: Path,
 ) -> None:

@@ -145,6 +145,7 @@ def test_every_declared_key_is_read_by_what_it_is_for() -> None:
     assert used == set(ELSEWHERE), "no longer needed"
 
 
+@pytest.mark.exhaustive
 def test_a_key_that_is_only_checked_and_shown_is_found(tmp_path: Path) -> None:
     class Table(BaseModel):
         obeyed: int = 1

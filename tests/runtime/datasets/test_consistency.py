@@ -86,6 +86,7 @@ def test_a_published_dataset_is_whole(dataset: Path) -> None:
     assert check(dataset) == []
 
 
+@pytest.mark.some(6)
 @pytest.mark.parametrize(("spoil", "named"), SPOILED, ids=[named for _, named in SPOILED])
 def test_whatever_is_spoiled_is_found(dataset: Path, spoil: Callable[[Path], object], named: str) -> None:
     spoil(dataset)

@@ -97,6 +97,7 @@ def test_what_was_left_out_is_told(tmp_path: Path, run: Run) -> None:
     assert f"left out: {tmp_path / 'set/notes'}" in said
 
 
+@pytest.mark.some(6)
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

@@ -39,6 +39,7 @@ def plan(request: pytest.FixtureRequest) -> Plan:
     return made
 
 
+@pytest.mark.some(4)
 def test_every_episode_has_its_rows_pictures_and_task(tmp_path: Path, plan: Plan) -> None:
     write(tmp_path / "set", plan)
     dataset = open_dataset(tmp_path / "set")
@@ -67,6 +68,7 @@ def test_every_episode_has_its_rows_pictures_and_task(tmp_path: Path, plan: Plan
                     pictures[length]
 
 
+@pytest.mark.some(6)
 def test_what_others_write_is_whole(tmp_path: Path, plan: Plan) -> None:
     write(tmp_path / "set", plan)
     assert check(tmp_path / "set") == []

@@ -58,6 +58,7 @@ def loaded(dataset: Path, step: int = 1) -> dict[str, Any]:
     return report
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_what_we_publish_is_loaded_with_exact_values(tmp_path: Path, version: str) -> None:
     frames = (6, 9, 5)
@@ -78,6 +79,7 @@ def test_what_we_publish_is_loaded_with_exact_values(tmp_path: Path, version: st
     assert {"min", "max", "mean", "std"} <= set(report["stats"]["action"])
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_what_was_converted_merged_and_deleted_is_loaded_with_exact_values(
     tmp_path: Path, version: str

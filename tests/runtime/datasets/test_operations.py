@@ -84,6 +84,7 @@ SOURCES = {
 }
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 @pytest.mark.parametrize("plan", SOURCES.values(), ids=list(SOURCES))
 def test_what_others_wrote_is_the_same_in_every_version(tmp_path: Path, plan: Plan, version: str) -> None:
@@ -238,6 +239,7 @@ def test_a_target_that_holds_something_is_refused(tmp_path: Path) -> None:
 # --- episodes to and fro -----------------------------------------------------------------------------------
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_datasets_of_any_version_are_merged_in_order(tmp_path: Path, version: str) -> None:
     plans = [Plan("v2.1", lengths=(7, 5)), Plan(lengths=(4, 6, 3))]
@@ -330,6 +332,7 @@ def uuids(dataset: Path) -> list[str]:
     ]
 
 
+@pytest.mark.some(1)
 def test_deleted_episodes_are_gone_and_later_ones_move_up(ours: Path) -> None:
     names, before = uuids(ours), stranger(ours)
     made = delete(ours, [1])
@@ -366,6 +369,7 @@ def _renumber(root: Path, numbers: tuple[int, ...]) -> None:
         path.write_text("".join(json.dumps(line) + "\n" for line in renumbered))
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 @pytest.mark.parametrize("numbers", [(0, 1, 5), (1, 2, 3)])
 def test_episodes_whose_indices_have_gaps_are_all_kept(
@@ -383,6 +387,7 @@ def test_episodes_whose_indices_have_gaps_are_all_kept(
     assert check(theirs) == []
 
 
+@pytest.mark.some(1)
 def test_after_a_deletion_publishing_goes_on(ours: Path, tmp_path: Path) -> None:
     version = open_dataset(ours).version
     delete(ours, [0])
@@ -419,6 +424,7 @@ def _die_in(name: str, dataset: Path) -> None:
     delete(dataset, [0])
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize(("moment", "left"), [("before", 3), ("after", 2)])
 def test_a_crash_while_deleting_leaves_the_old_or_the_new_dataset(ours: Path, moment: str, left: int) -> None:
     process = multiprocessing.get_context("spawn").Process(target=_die_in, args=(moment, ours))
@@ -444,6 +450,7 @@ def _publish(episode: Path, dataset: Path) -> None:
     publish(episode, dataset)
 
 
+@pytest.mark.some(1)
 @pytest.mark.slow
 def test_who_waits_for_a_dataset_that_is_exchanged_publishes_into_the_new_one(
     ours: Path, tmp_path: Path

@@ -541,6 +541,7 @@ def contents(dataset: Path) -> dict[str, bytes]:
 RENAMES = 10
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("steps", range(RENAMES))
 def test_a_crash_at_any_rename_leaves_the_old_contents_and_a_second_run_completes(
     tmp_path: Path, interrupted_v21: Interrupted, steps: int
@@ -565,6 +566,7 @@ def test_recovery_takes_back_every_trace(
     assert check(dataset) == []
 
 
+@pytest.mark.exhaustive
 def test_a_refused_episode_after_a_crash_leaves_a_whole_dataset(tmp_path: Path) -> None:
     dataset = tmp_path / "set"
     publish(record(tmp_path / "episodes", frames=6), dataset)
@@ -600,6 +602,7 @@ def test_a_crash_at_the_very_first_episode_leaves_no_dataset(tmp_path: Path) -> 
         assert check(dataset) == []
 
 
+@pytest.mark.exhaustive
 def test_another_episode_after_a_crash_takes_the_index_and_leaves_no_traces(tmp_path: Path) -> None:
     dataset = tmp_path / "set"
     publish(record(tmp_path / "episodes", frames=6), dataset)
@@ -710,6 +713,7 @@ def test_in_v30_folders_hold_as_many_files_as_the_info_says(tmp_path: Path) -> N
     assert stranger(tmp_path / "set")["broken"] == []
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("steps", [2, 5, 7, RENAMES_V30 - 1])
 def test_in_v30_a_crash_between_renames_is_taken_back_without_a_trace(
     tmp_path: Path, interrupted_v30: Interrupted, steps: int
@@ -760,6 +764,7 @@ def test_rows_of_a_simulated_robot_are_refused_whatever_the_manifest_says(tmp_pa
         publish(folder, tmp_path / "set")
 
 
+@pytest.mark.exhaustive
 def test_an_episode_from_before_strategies_were_written_down_is_published(tmp_path: Path) -> None:
     folder = record(tmp_path / "episodes", frames=4)
     old_raw(folder / "raw.arrow")

@@ -325,6 +325,7 @@ def judge(robot: Robot, result: IkResult, targets: np.ndarray, seed: np.ndarray,
         np.testing.assert_array_equal(flags & IkFlag.NEAR_SINGULAR != 0, np.array(smallest) < 0.02)
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("off", [0.0, 0.02, 0.6])
 @pytest.mark.parametrize("chance", range(5))
 def test_another_optimiser_finds_nothing_cheaper_nearby(off: float, chance: int) -> None:
@@ -451,6 +452,7 @@ def test_where_numba_is_missing_the_error_says_what_to_do() -> None:
     assert "numba, which is not installed: pip install numba" in python(code).stdout
 
 
+@pytest.mark.exhaustive
 def test_without_a_folder_to_write_kernels_are_kept_in_memory_and_that_is_said(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()  # nobody can make a folder below a file, not even root
@@ -465,6 +467,7 @@ def test_without_a_folder_to_write_kernels_are_kept_in_memory_and_that_is_said(t
     assert "name a folder in NUMBA_CACHE_DIR" in done.stderr
 
 
+@pytest.mark.exhaustive
 def test_kernels_are_kept_in_the_folder_that_is_named(tmp_path: Path) -> None:
     code = """if True:
         import robots

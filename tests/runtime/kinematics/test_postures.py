@@ -93,6 +93,7 @@ def test_a_question_without_time_leaves_the_posture_as_it_is() -> None:
     np.testing.assert_allclose(kinematics.solve(np.repeat(poses, 5, axis=0), start).q[-1], start, atol=1e-4)
 
 
+@pytest.mark.exhaustive
 def test_six_joints_have_no_choice_and_are_as_without_a_home() -> None:
     for name in ("agilex_piper", "ur5e"):
         robot, kinematics = robot_of(name)

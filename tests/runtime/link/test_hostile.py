@@ -89,6 +89,7 @@ def test_bytes_that_are_no_handshake_end_nothing(lab, linked):
     assert lab.gate.linked() == {STATION}
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize(
     "frames",
     [
@@ -117,6 +118,7 @@ def test_a_message_that_is_too_large_costs_its_sender_the_connection(lab, hostil
     assert lab.press().status == "done"
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(
     ("said", "word"), [(write(Answer(1), bytes(1 << 20)), "MB"), (write(Beat()), "messages")]
 )

@@ -126,6 +126,7 @@ def _is_free(folder):
     return True
 
 
+@pytest.mark.exhaustive
 def test_a_name_that_a_station_of_the_labs_computer_has_is_refused(lab, robot):
     with take(lab.folder()) as lock:
         robot.dial()

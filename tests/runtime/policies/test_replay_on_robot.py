@@ -45,6 +45,7 @@ def set_up(folder: Path) -> dict[str, Any]:
     return {"policy": policy, "strategy": {"kind": "naive", "inference_rate": 5.0}}
 
 
+@pytest.mark.exhaustive
 def test_it_is_approached_then_run_and_goes_on_after_a_hold(station: Station, tmp_path: Path) -> None:
     folder, actions = recorded(station, tmp_path)
     station.ready(**set_up(folder))

@@ -158,6 +158,7 @@ def flown(line: dict[str, Any]) -> tuple[dict[str, Any], int]:
     return json.loads(said), code
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_the_program_asks_the_policy_of_the_changes_and_says_it_in_a_line() -> None:
     with served("openpi") as url:
@@ -167,6 +168,7 @@ def test_the_program_asks_the_policy_of_the_changes_and_says_it_in_a_line() -> N
     assert report["chunk"]["joints"] == FRANKA.dim
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_the_program_says_what_is_wrong_with_what_it_is_asked_and_ends_with_its_parent() -> None:
     report, code = flown({"tree": dict(OWN.tree), "changes": {"policy": {"uri": "ws://x"}}})
@@ -222,6 +224,7 @@ def test_a_policy_without_a_server_has_none() -> None:
     assert server_of(changed.deployment) == ""
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_the_program_leaves_a_server_with_a_close_frame() -> None:
     """Else servers of openpi print a traceback for each preflight."""

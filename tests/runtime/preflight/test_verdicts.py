@@ -112,6 +112,7 @@ CASES = [
 ]
 
 
+@pytest.mark.some(24)
 @pytest.mark.parametrize(("name", "fault", "verdict", "stage"), CASES)
 def test_a_fault_is_one_verdict_found_in_one_stage(name: str, fault: str, verdict: str, stage: str) -> None:
     waits = fault.partition(":")[0] in WAITING or (name, fault) == ("lerobot", "exception")
@@ -122,6 +123,7 @@ def test_a_fault_is_one_verdict_found_in_one_stage(name: str, fault: str, verdic
     assert report.advice == report.verdict.advice != ""
 
 
+@pytest.mark.some(7)
 @pytest.mark.parametrize("name", WIRES)
 def test_a_server_that_is_well_is_shown_with_its_figures(name: str) -> None:
     report = flown(name)

@@ -113,6 +113,7 @@ DEFECTS = {
 }
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("name", DEFECTS)
 def test_one_defect_is_flagged_where_it_is_and_nothing_else(tmp_path, name):
     spoil, expected = DEFECTS[name]
@@ -288,6 +289,7 @@ def test_a_folder_without_a_manifest_is_no_episode(tmp_path):
         inspect(tmp_path)
 
 
+@pytest.mark.exhaustive
 def test_memory_does_not_grow_with_the_episode(tmp_path):
     plain = {"cam_high": {"width": built.WIDTH, "height": built.HEIGHT}}
     peaks = []

@@ -42,6 +42,7 @@ def edit(dataset: Path, name: str, change) -> None:
     pq.write_table(table.set_column(place, name, change(table.column(name))), path)
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_what_is_published_is_judged_as_the_episode_was(dataset, tmp_path, version):
     if version != "v2.1":
@@ -146,6 +147,7 @@ def test_the_report_of_an_episode_is_plain_json(tmp_path):
     assert document["worst"] == "warning"
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(not SAMPLE, reason="EVA_SAMPLE_EPISODE does not name the real episode")
 def test_the_real_episode_is_flagged_for_standing_at_its_end_alone():
     report = inspect_dataset(Path(str(SAMPLE)), 0)

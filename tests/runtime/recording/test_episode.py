@@ -433,6 +433,7 @@ def test_a_fault_found_only_at_the_end_is_raised_by_the_end(
     assert open_episode(folder).outcome["status"] == "failed"  # type: ignore[index]
 
 
+@pytest.mark.exhaustive
 def test_a_disk_that_is_really_full_is_named_and_what_was_written_stays_readable(small_disk: Path) -> None:
     journal, folder = begun(small_disk / "episodes", patient=True)
     ballast = small_disk / "ballast"

@@ -190,6 +190,7 @@ NAMES = (
 )
 
 
+@pytest.mark.some(6)
 @pytest.mark.parametrize("harm", HARMS)
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=8)

@@ -113,6 +113,7 @@ def sample_videos() -> list[Path]:
     return sorted(Path(folder).glob("videos/*/*/*.mp4")) if folder else []
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(not sample_videos(), reason="EVA_SAMPLE_EPISODE names no dataset with videos")
 def test_real_pictures_keep_at_least_38_db(tmp_path: Path) -> None:
     for video in sample_videos():
@@ -155,6 +156,7 @@ def held(path: Path, counts: list[int], settings: RecordingSettings = SETTINGS) 
     return path
 
 
+@pytest.mark.some(5)
 @pytest.mark.parametrize("codec", list(CODECS))
 @pytest.mark.parametrize("counts", [[1, 2, 3], [4, 5, 90, 0, 7], [RUN, RUN + 1, 300]])
 def test_repeats_are_frames_of_their_own_however_they_were_made(
@@ -184,6 +186,7 @@ def test_no_thread_of_an_encoder_is_real_time(tmp_path: Path, codec: CodecName) 
     assert classes == {os.SCHED_OTHER}
 
 
+@pytest.mark.exhaustive
 def test_a_long_run_of_repeats_costs_three_codings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = AppendFile(tmp_path / "a.mp4")
     video = FragmentedVideo(file, SIZE, 30.0, SETTINGS)

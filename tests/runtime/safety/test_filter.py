@@ -333,6 +333,7 @@ def test_a_motion_of_ours_may_come_from_outside_its_box_and_not_go_there():
 # --- robots of every kind -----------------------------------------------------------------------------------
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("name", robots.names())
 @pytest.mark.parametrize("path", ["policy", "motion"])
 def test_every_robot_may_stand_at_its_poses_and_move_from_them_within_its_limits(name, path):

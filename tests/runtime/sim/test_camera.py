@@ -17,6 +17,7 @@ from tests.processes import PATIENCE_S
 MODULES = {"mjpeg": mjpeg, "rtsp": rtsp}
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("kind", MODULES)
 def test_the_command_serves_a_camera_until_its_lifeline_ends(kind):
     command = [

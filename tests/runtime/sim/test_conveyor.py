@@ -114,6 +114,7 @@ def test_who_is_too_far_from_it_fails_and_the_distance_is_told() -> None:
     assert truth["chase"]["distance"] == pytest.approx(1.5e3 * TOLERANCE_M, abs=4.0)
 
 
+@pytest.mark.exhaustive
 def test_two_thirds_of_the_time_are_enough_and_less_is_not() -> None:
     for part, enough in ((REQUIRED + 0.05, True), (REQUIRED - 0.05, False)):
         bench = Bench()

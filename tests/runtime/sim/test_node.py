@@ -149,6 +149,7 @@ def test_poses_are_those_of_the_joints(bench: Bench) -> None:
     np.testing.assert_allclose(said["eef"]["left_arm"][:7], expected, atol=1e-5)
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("name", [name for name in robots.names() if name != "agilex_piper"])
 def test_any_robot_goes_where_it_is_told_and_measures_what_its_chains_say(name: str) -> None:
     robot = robots.load(name)
@@ -537,6 +538,7 @@ def test_a_real_client_sees_it_and_moves_it(start: Any) -> None:
     assert observation.eef is not None
 
 
+@pytest.mark.exhaustive
 def test_a_restart_on_the_same_ports_with_a_smaller_clock_is_noticed(start: Any) -> None:
     first = start("runtime.sim.node", "--robot", "agilex_piper", *SMALL)
     ready = first.ready
@@ -588,6 +590,7 @@ def test_it_ends_when_its_lifeline_ends(start: Any) -> None:
     assert process.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

@@ -35,6 +35,7 @@ def test_a_good_policy_puts_the_block_on_the_plate_and_safety_has_nothing_to_cha
     assert outcome.notes == ()
 
 
+@pytest.mark.exhaustive
 def test_it_succeeds_from_home_with_a_slow_inference():
     outcome = Trial(GOOD, delay=8, pose="home").lay(5).run(20.0)
     assert outcome.success
@@ -45,6 +46,7 @@ def test_it_succeeds_when_each_chunk_is_nearly_used_up_before_the_next():
     assert Trial(GOOD, delay=20).lay(6).run(25.0).success
 
 
+@pytest.mark.exhaustive
 def test_the_same_seeds_give_the_same_commands():
     first, second, other = (Trial(Skill(0.01, 0.3, seed)).lay(4).run(6.0) for seed in (7, 7, 8))
     np.testing.assert_array_equal(first.sent, second.sent)
@@ -57,6 +59,7 @@ def test_one_connection_serves_trial_after_trial():
     assert [trial.lay(seed).run(20.0).success for seed in (8, 9)] == [True, True]
 
 
+@pytest.mark.exhaustive
 def test_afterwards_it_stands_still():
     trial = Trial(GOOD).lay(1)
     assert trial.run(17.0, to_the_end=True).success
@@ -71,6 +74,7 @@ def test_in_the_dark_it_does_not_move():
     assert outcome.milestones == NOTHING
 
 
+@pytest.mark.exhaustive
 def test_a_camera_that_goes_dark_on_the_way_stops_it():
     trial = Trial(GOOD).lay(0)
     trial.run(2.0)
@@ -109,6 +113,7 @@ def test_the_block_is_where_the_picture_shows_it_and_not_where_it_is(monkeypatch
     assert not outcome.milestones["grasped"]
 
 
+@pytest.mark.exhaustive
 def test_a_missed_grasp_is_noticed_and_tried_again():
     trial = Trial(GOOD).lay(0)
     trial.run(3.0)
@@ -118,6 +123,7 @@ def test_a_missed_grasp_is_noticed_and_tried_again():
     assert outcome.seconds > 15.0
 
 
+@pytest.mark.exhaustive
 def test_a_scene_that_changes_on_the_way_is_looked_at_again():
     trial = Trial(GOOD).lay(0)
     ticks(trial, 10)
@@ -125,6 +131,7 @@ def test_a_scene_that_changes_on_the_way_is_looked_at_again():
     assert trial.run(20.0).success
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "pause", [2.0, *(pytest.param(pause, marks=pytest.mark.exhaustive) for pause in (0.4, 60.0))]
 )
@@ -137,6 +144,7 @@ def test_a_pause_on_the_way_is_no_harm(pause):
     assert trial.run(15.0).success
 
 
+@pytest.mark.exhaustive
 def test_a_robot_that_was_moved_by_another_hand_is_no_longer_on_the_route():
     trial = Trial(GOOD).lay(3)
     trial.run(5.0)

@@ -51,6 +51,7 @@ def test_the_legs_follow_each_other_without_a_jump_of_the_arm():
         np.testing.assert_array_equal(route.rows[start], part.rows[0])
 
 
+@pytest.mark.some(13)
 @pytest.mark.parametrize("q", [READY, HOME], ids=["ready", "home"])
 @pytest.mark.parametrize("seed", range(20))
 def test_every_layout_is_reached_slowly_and_above_the_table(seed, q):
@@ -119,6 +120,7 @@ def test_the_other_arm_takes_what_the_nearer_one_cannot_bring_home():
     assert route.arm.name == RIGHT.name
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("name", [name for name in robots.names() if len(robots.load(name).arms) > 1])
 def test_arms_leave_each_other_room_wherever_block_and_plate_are(name):
     robot = robots.load(name)
@@ -193,6 +195,7 @@ def test_a_route_from_the_table_rises_first():
     assert bench.tip_in_world(ROBOT, LEFT, route.legs[0].end)[2, 3] == pytest.approx(CLEAR, abs=0.003)
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("name", [name for name in robots.names() if name != ROBOT.name])
 def test_every_robot_reaches_every_layout_slowly_and_above_the_table(name):
     robot = robots.load(name)

@@ -137,6 +137,7 @@ def test_it_ends_when_its_lifeline_ends(serve: Any) -> None:
     assert process.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.exhaustive
 def test_a_port_that_is_taken_is_said_so(serve: Any) -> None:
     port = str(serve().ready["port"])
     arguments = ["-m", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--port", port]
@@ -152,6 +153,7 @@ def test_an_unknown_fault_names_the_known_ones() -> None:
     assert "'boom' is no fault; allowed: mute_on_connect" in ended.stderr
 
 
+@pytest.mark.exhaustive
 def test_the_pick_and_place_policy_says_what_it_is_and_moves_only_for_a_block_that_it_sees(
     serve: Any,
 ) -> None:
@@ -173,6 +175,7 @@ def test_the_pick_and_place_policy_says_what_it_is_and_moves_only_for_a_block_th
     assert np.abs(moving[-1] - HOME).max() > 0.05
 
 
+@pytest.mark.exhaustive
 def test_the_chase_says_what_it_is_and_moves_only_for_a_block_that_it_sees(serve: Any) -> None:
     url = serve("--behaviour", "chase", "--horizon", "40").ready["url"]
     with conversation(url) as connection:
@@ -188,6 +191,7 @@ def test_the_chase_says_what_it_is_and_moves_only_for_a_block_that_it_sees(serve
     assert np.abs(moving[-1] - HOME).max() > 0.3
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(
     ("options", "said"),
     [

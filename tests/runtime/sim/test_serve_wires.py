@@ -42,6 +42,7 @@ def policy_of(kind: str, url: str, **settings: Any) -> Any:
     return module.build(module.Config(url=url, **settings), FRANKA, MonotonicClock(), 30.0)
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("name", SERVED)
 def test_it_is_reached_by_its_client(name: str, serve: Any) -> None:
     protocol, arguments, settings = SERVED[name]

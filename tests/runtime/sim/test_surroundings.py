@@ -17,6 +17,7 @@ ROBOT = robots.load("agilex_piper")
 OPTIONS = node.parser().parse_args(["--robot", "agilex_piper", "--width", "64", "--height", "48"])
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("kind", [Tabletop, Conveyor])
 def test_pictures_are_those_of_the_moment(kind: type[Tabletop]) -> None:
     bench = kind(ROBOT, 0)

@@ -15,6 +15,7 @@ from tests.runtime.sim.operator_hands import LEFT, OPEN, POSITIONS, RATE, READY,
 EDGE = 0.04
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("arm", [LEFT, RIGHT], ids=["left", "right"])
 @pytest.mark.parametrize("turn", [0.0, 0.3, -0.4])
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
@@ -54,6 +55,7 @@ def test_jaws_that_close_on_a_block_turn_it_straight_and_move_it_between_them():
     assert 0.002 < math.dist(hands.block[:2], (x, y)) < 0.02
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize(
     ("how", "stops_at"),
     [
@@ -215,6 +217,7 @@ def test_a_reset_that_cannot_be_leaves_everything_as_it_is():
     assert hands.truth == before
 
 
+@pytest.mark.exhaustive
 @settings(max_examples=some(25))
 @given(st.integers(0, 10_000), st.integers(1, 3))
 def test_whatever_is_commanded_blocks_stay_above_the_table_and_are_numbers(seed, blocks):

@@ -255,6 +255,7 @@ def r1_lite(tmp_path: Path, kind: str, told: list[float], **more: Any) -> tuple[
     return stubbed(tmp_path, rows, kind, robot="r1_lite", start=home, delay=2, **more), home
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(
     ("kind", "rate"),
     [
@@ -294,6 +295,7 @@ def test_an_r1_lite_is_told_open_or_closed_under_every_strategy(
     station.close()
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("kind", ["sync", "async", "ensemble", "naive"])
 def test_a_continuous_gripper_is_told_what_the_policy_says(tmp_path: Path, kind: str) -> None:
     made, _ = r1_lite(

@@ -41,6 +41,7 @@ def placed(robot: Robot, q: np.ndarray, name: str, arm: int) -> np.ndarray:
     return body.poses(q)[body.link_of(robot.arms[arm].name, name)]
 
 
+@pytest.mark.exhaustive
 @settings(max_examples=some(40))
 @given(st.sampled_from(FRAMES), st.integers(0, 1000), st.booleans())
 def test_a_pose_is_the_same_place_in_the_scene_whatever_frame_it_is_given_in(

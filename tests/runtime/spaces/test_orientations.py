@@ -187,6 +187,7 @@ def test_quaternions_keep_their_sign_from_row_to_row(scalar_first: bool, seed: i
     np.testing.assert_array_equal(later, rows[50:])
 
 
+@pytest.mark.exhaustive
 @settings(max_examples=some(60))
 @given(st.booleans(), st.integers(0, 1000))
 def test_rotation_vectors_do_not_jump_where_half_a_turn_is_passed(degrees: bool, seed: int) -> None:
@@ -211,6 +212,7 @@ def test_a_vector_turns_on_beyond_half_a_turn() -> None:
     np.testing.assert_allclose(rows[:, 0, 1], angles_, atol=1e-12)
 
 
+@pytest.mark.exhaustive
 @settings(max_examples=some(60))
 @given(st.sampled_from(ORDERS), st.booleans(), st.integers(0, 1000))
 def test_euler_angles_do_not_jump_by_turns_where_they_are_continuous(

@@ -37,6 +37,7 @@ def run(tmp_path: Path, mode: str, recorded: bool = False) -> Station:
     return Station(made).running(130)
 
 
+@pytest.mark.exhaustive
 def test_a_run_whose_arms_meet_goes_on_is_warned_of_once_and_each_tick_says_so_in_the_record(
     tmp_path: Path,
 ) -> None:
@@ -140,6 +141,7 @@ def test_control_itself_stops_a_motion_that_nobody_has_checked(tmp_path: Path) -
     assert bytes(shared.control.read()["behaviour"]) == b"hold"
 
 
+@pytest.mark.exhaustive
 def test_control_needs_no_compiler(tmp_path: Path) -> None:
     """Numba would cost it 130 MB of locked memory, and half a second at a restart while the robot is told nothing."""
     box = {"left_arm": {"lower": [-2.0] * 3, "upper": [2.0] * 3}}

@@ -62,6 +62,7 @@ def loop(kind, policy, delay, start=0.0, dim=1, dims=None, **given):
     return StepLoop(STRATEGIES[kind], config(kind, **given), policy, cycling(delay), RATE, begin, dims)
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("kind", MOVING)
 @given(delays, st.none() | st.sampled_from([1.0, 3.0, 10.0]), st.integers(45, 60))
 @settings(max_examples=some(40))
@@ -148,6 +149,7 @@ def _assert_placed_soundly(log, horizon):
         assert merged.delay == merged.arrival_step - log.observed[merged.chunk_id]
 
 
+@pytest.mark.some(30)
 @pytest.mark.parametrize("new", KINDS)
 @pytest.mark.parametrize("old", KINDS)
 @pytest.mark.parametrize("when", [11, 37])

@@ -109,6 +109,7 @@ def seams(station: Station) -> np.ndarray:
     )
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("dialect", ["prev_action", "openpi_rtc", "kai0", "async_rtc"])
 def test_a_chunk_continues_what_the_robot_is_committed_to_whatever_the_policy_would_rather(
     tmp_path: Path, dialect: str

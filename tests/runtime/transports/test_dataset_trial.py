@@ -65,6 +65,7 @@ def played(episode: Episode) -> dict[str, list[int]]:
     return numbers
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("version", VERSIONS)
 def test_every_frame_is_observed_once_and_every_recorded_action_is_executed(
     tmp_path: Path, version: str
@@ -81,6 +82,7 @@ def test_every_frame_is_observed_once_and_every_recorded_action_is_executed(
     assert episode.manifest["task"] == "stack the cups"
 
 
+@pytest.mark.exhaustive
 def test_a_trial_of_v30_is_published_as_v30_and_played_again(tmp_path: Path) -> None:
     spec = foreign(tmp_path / "set", "v3.0")
     done = lockstep.run(trial(tmp_path))
@@ -100,6 +102,7 @@ def test_a_trial_of_v30_is_published_as_v30_and_played_again(tmp_path: Path) -> 
     assert np.array_equal(stacked(episode.ticks, "executed"), column(EPISODE, "action", length, spec))
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_recording_slower_than_control_is_paced_by_its_own_rate(tmp_path: Path, version: str) -> None:
     foreign(tmp_path / "set", version, fps=12.5)

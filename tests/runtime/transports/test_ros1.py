@@ -194,6 +194,7 @@ def test_a_simulation_beside_the_robot_is_told_the_same(ros_master: RosMaster, n
         led(ros_master, source, READY, commands_to=["robot", "simulation"])
 
 
+@pytest.mark.exhaustive
 @needs_ros1
 def test_a_robot_that_starts_again_is_seen_again(ros_master: RosMaster, node: Node) -> None:
     first = node()
@@ -226,6 +227,7 @@ def test_a_topic_that_falls_silent_is_named_and_nothing_is_delivered(
         assert source.faults()["stalled_cam_high"] >= 1
 
 
+@pytest.mark.exhaustive
 @needs_ros1
 def test_joints_of_other_names_are_refused_by_name(ros_master: RosMaster, node: Node) -> None:
     node("--wrong-names")
@@ -252,6 +254,7 @@ def test_pictures_of_another_type_and_of_unknown_colours_are_named(ros_master: R
         assert "'yuv422'; allowed: bgr8" in said(source, "cam_high", "nothing usable")
 
 
+@pytest.mark.exhaustive
 @needs_ros1
 def test_a_clock_far_from_ours_ages_nothing(ros_master: RosMaster, node: Node) -> None:
     node("--clock-offset", "-86400")

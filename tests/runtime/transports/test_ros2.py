@@ -124,6 +124,7 @@ def test_observations_come_and_commands_arrive(domain: int, node: Node) -> None:
     assert json.loads(_end(process).splitlines()[-1])["refused"] == 0
 
 
+@pytest.mark.exhaustive
 def test_a_robot_that_starts_again_is_seen_again(domain: int, node: Node) -> None:
     first = node()
     with listening(domain) as source:
@@ -136,6 +137,7 @@ def test_a_robot_that_starts_again_is_seen_again(domain: int, node: Node) -> Non
         assert seen(source).sequence < seen(source).sequence
 
 
+@pytest.mark.exhaustive
 def test_a_topic_that_falls_silent_is_named_and_nothing_is_delivered(domain: int, node: Node) -> None:
     node("--silence", HEAD, "--silence-from", "45")
     with listening(domain) as source:
@@ -151,6 +153,7 @@ def test_a_topic_that_falls_silent_is_named_and_nothing_is_delivered(domain: int
         assert source.faults()["stalled_cam_high"] >= 1
 
 
+@pytest.mark.exhaustive
 def test_joints_of_other_names_are_refused_by_name(domain: int, node: Node) -> None:
     node("--wrong-names")
     with listening(domain) as source:
@@ -166,6 +169,7 @@ def test_joints_of_other_names_are_refused_by_name(domain: int, node: Node) -> N
         assert np.allclose(seen(source).qpos, ROBOT.poses["home"], atol=1e-4)
 
 
+@pytest.mark.exhaustive
 def test_pictures_of_another_type_are_named(domain: int, node: Node) -> None:
     node("--other-pictures")
     with listening(domain) as source:
@@ -175,6 +179,7 @@ def test_pictures_of_another_type_are_named(domain: int, node: Node) -> None:
     )
 
 
+@pytest.mark.exhaustive
 def test_a_quality_that_the_robot_does_not_offer_is_named(domain: int, node: Node) -> None:
     node()
     with listening(domain, qos={HEAD: Quality(reliability="reliable")}) as source:
@@ -182,6 +187,7 @@ def test_a_quality_that_the_robot_does_not_offer_is_named(domain: int, node: Nod
     assert f"a publisher of {HEAD} is incompatible in its reliability" in sentence
 
 
+@pytest.mark.exhaustive
 def test_a_clock_far_from_ours_ages_nothing(domain: int, node: Node) -> None:
     node("--clock-offset", "-86400")
     with listening(domain) as source:

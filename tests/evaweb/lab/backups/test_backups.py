@@ -80,6 +80,7 @@ def made(whole, tmp_path):
     return found
 
 
+@pytest.mark.exhaustive
 def test_every_row_and_file_comes_back(data, made, tmp_path):
     assert backup.verify(made.path, quiet)[1] == []
     again = tmp_path / "again"
@@ -117,6 +118,7 @@ def test_one_changed_bit_is_found(made, name):
             backup.restore(made.path, quiet)
 
 
+@pytest.mark.exhaustive
 def test_a_changed_file_is_never_put_back(made, tmp_path):
     damaged(made.path / "files/scores/0b7c.jsonl")
     code, said = manage(tmp_path / "again", "restore", made.path)

@@ -147,6 +147,7 @@ def test_a_folder_that_cannot_be_written_is_named(lab, tmp_path):
         call_command("diagnose", out=tmp_path / "nowhere" / "a.zip")
 
 
+@pytest.mark.exhaustive
 def test_the_job_leaves_three_bundles_for_who_asked_and_nobody_else(lab, alma, ann, client):
     told = []
     for number in range(4):

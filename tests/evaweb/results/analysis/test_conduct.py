@@ -51,6 +51,7 @@ def ways(plan):
     return {row["what"]: row for row in integrity_document(plan)["headline"]}
 
 
+@pytest.mark.exhaustive
 def test_delays_that_differ_have_a_banner_and_those_that_do_not_have_none(plan, make):
     for _ in range(16):
         make(wait={NEW: 300, OLD: 5})
@@ -65,6 +66,7 @@ def test_delays_that_differ_have_a_banner_and_those_that_do_not_have_none(plan, 
     assert delays_banner(record).startswith(f"Delays of {NEW} and {OLD} differ: from")
 
 
+@pytest.mark.exhaustive
 def test_delays_alike_have_no_banner(plan, make):
     for _ in range(16):
         make()
@@ -210,6 +212,7 @@ def test_cameras_that_nobody_had_confirmed_are_told_by_the_trial(bench, plan, ma
     assert check.at == found["checks"][0]["at"]
 
 
+@pytest.mark.exhaustive
 def test_what_the_headline_would_be_without_an_operator(bench, plan, make):
     sam = builders.user("sam")
     for n in range(16):
@@ -251,6 +254,7 @@ def test_nothing_is_left_out_of_a_design_that_did_not_end(plan, owner, make):
     assert "before the design ended" in ways(plan)["as it was decided"]["sentence"]
 
 
+@pytest.mark.exhaustive
 def test_the_page_and_the_program_have_it_once_the_plan_is_revealed_and_not_before(plan, owner, make, bench):
     for _ in range(16):
         make(wait={NEW: 300, OLD: 5})

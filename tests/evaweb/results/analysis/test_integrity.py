@@ -29,6 +29,7 @@ def tried(bench, plan):
     return one
 
 
+@pytest.mark.exhaustive
 def test_failures_of_one_checkpoint_that_were_voided_are_told_and_what_they_change(bench, plan, tried):
     voided, second = 0, builders.user("sam")
     for left in range(16, 0, -1):
@@ -48,6 +49,7 @@ def test_failures_of_one_checkpoint_that_were_voided_are_told_and_what_they_chan
     assert said.at_first.startswith(f"No significant difference between {NEW} and {OLD}: 0/8 against 0/8")
 
 
+@pytest.mark.exhaustive
 def test_attempts_thrown_away_unscored_are_told_by_the_worst_that_they_could_have_been(bench, plan, tried):
     for left in range(16, 0, -1):
         thrown = hand_out(user=bench.operator, station=bench.station, plan=plan).trial

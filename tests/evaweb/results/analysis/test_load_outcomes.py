@@ -41,6 +41,7 @@ def carry_out(bench, plan, n, success):
         )
 
 
+@pytest.mark.exhaustive
 def test_outcomes_of_a_plan_are_what_was_scored_in_its_order(bench, plan):
     carry_out(bench, plan, 16, lambda trial: trial.checkpoint.name == "pi0-new")
     found = outcomes_of_plan(plan)

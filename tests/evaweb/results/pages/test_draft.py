@@ -248,6 +248,7 @@ def asked(client, plan, **query):
     return text
 
 
+@pytest.mark.exhaustive
 def test_the_power_is_that_of_the_draft_at_the_rates_that_are_assumed(as_, alma, draft, bench, two):
     client = as_(alma)
     assert (
@@ -270,6 +271,7 @@ def test_the_power_is_that_of_the_draft_at_the_rates_that_are_assumed(as_, alma,
     assert "is not worse than 0.5 by 20 points" in asked(client, draft, rate="0.5", better="0.5")
 
 
+@pytest.mark.exhaustive
 def test_the_power_of_scores_is_that_of_their_own_test_and_says_what_is_assumed_of_them(
     as_, alma, draft, bench, two
 ):
@@ -346,6 +348,7 @@ def test_the_lines_of_a_question_are_no_change(as_, alma, draft):
     assert '<span class="strong">Question</span> three' in text
 
 
+@pytest.mark.exhaustive
 def test_a_row_of_the_planner_begins_a_plan_with_its_numbers(as_, alma, vera):
     planner = "/result/planner/?rate=0.3&better=0.8&alpha=0.02&cycle_s=30"
     assert "Use these numbers" not in as_(vera).get(planner).content.decode()

@@ -98,6 +98,7 @@ def test_the_owner_looks_by_an_act_of_their_own(plan, owner, bench, carry_out, a
     assert "Sealed" in as_(bench.operator).get(f"{PLAN}evidence/").content.decode()
 
 
+@pytest.mark.exhaustive
 def test_closed_and_revealed_on_the_page(plan, owner, carry_out, as_, viewer):
     carry_out(plan, 14)
     client = as_(owner)
@@ -146,6 +147,7 @@ def test_every_number_leads_to_its_trials(revealed, as_, viewer):
     assert "allowed: yes, no" in wrong.content.decode()
 
 
+@pytest.mark.exhaustive
 def test_every_count_of_failures_leads_to_its_trials_and_all_failures_are_counted(
     revealed, as_, viewer, bench
 ):
@@ -225,6 +227,7 @@ def test_side_by_side_lists_pairs_of_the_same_condition(revealed, as_, viewer):
     assert text.count("block-on-plate/") >= 8
 
 
+@pytest.mark.exhaustive
 def test_a_correction_and_a_void_are_seen_at_once(plan, owner, bench, carry_out, as_):
     carry_out(plan, 15)
     client = as_(owner)
@@ -406,6 +409,7 @@ def test_preferring_asks_why(plan, carry_out, as_):
     assert plan.preferences.count() == 1
 
 
+@pytest.mark.exhaustive
 def test_the_planner_answers_and_names_what_is_not_allowed(as_, viewer):
     client = as_(viewer)
     text = client.get("/result/planner/?rate=0.5&better=0.7").content.decode()

@@ -221,6 +221,7 @@ def test_it_is_sealed_while_another_blind_plan_compares_the_same_checkpoint(
     assert "pi0-new" not in page + client.get("/result/plans/blocks/1/integrity/").content.decode()
 
 
+@pytest.mark.exhaustive
 def test_an_open_plan_that_has_ended_is_cited_as_it_is_now(plan, owner, bench, carry_out, client):
     other = Plan.objects.create(
         name="open",

@@ -161,6 +161,7 @@ def test_what_it_said_is_kept_with_digests_of_what_it_was_asked(filmed, owner, c
         Judgement.objects.update(judge="me")
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(
     ("play", "reason"),
     [
@@ -247,6 +248,7 @@ def test_who_may_not_ask_a_judge_does_not_repeat_what_was_asked(truth, owner, ad
     assert try_again(user=admin, job=job).status == JobStatus.QUEUED
 
 
+@pytest.mark.exhaustive
 def test_each_trial_is_shown_to_a_version_once_however_often_it_is_asked_or_dies(
     filmed, owner, chat, monkeypatch
 ):
@@ -327,6 +329,7 @@ def everything(plan):
     return json.dumps(rows, default=str).encode()
 
 
+@pytest.mark.exhaustive
 def test_with_and_without_judges_the_analysis_is_the_same_to_the_byte(truth, owner, chat, bench):
     rater = builders.user("rita")
     for reached in (True, False, True):
@@ -357,6 +360,7 @@ def test_a_judge_is_held_against_the_score_that_stood_then(truth, owner, bench):
     assert judges_of(truth) == before
 
 
+@pytest.mark.exhaustive
 def test_what_judges_said_comes_back_from_the_disk(filmed, owner, chat):
     with serving(SAID) as server:
         chat(server.address)
@@ -371,6 +375,7 @@ def test_what_judges_said_comes_back_from_the_disk(filmed, owner, chat):
     assert reconcile().restored == 0
 
 
+@pytest.mark.exhaustive
 def test_before_the_reveal_it_works_and_nobody_sees_what_it_says(filmed, owner, chat, client, admin, bench):
     page, rows = (
         reverse("result-plan", args=["blocks", 1]),

@@ -103,6 +103,7 @@ def held_twice(bench):
     Milestone.objects.filter(scene=bench.scene, text="lifted").update(text="held")
 
 
+@pytest.mark.exhaustive
 def test_milestones_of_the_same_words_are_held_each_against_itself(held_twice, plan, carry_out, rater, bench):
     carry_out(plan, 16)
     trial = judging.to_rate(rater).found.trial
@@ -311,6 +312,7 @@ def test_who_may_be_asked_to_rate_a_trial_rates_it_before_they_say_why_it_failed
     assert trial_failure(user=rater, trial=asked.trial, failure="slid").rater == rater
 
 
+@pytest.mark.exhaustive
 def test_a_trial_without_pictures_is_asked_of_nobody_and_its_failure_corrected_by_anybody(
     plan, carry_out, rater
 ):

@@ -93,6 +93,7 @@ def test_it_counts_the_same_error(rule, margin):
     assert highest <= bound <= 0.05
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize("alpha", [0.0001, 0.01, 0.1])
 @pytest.mark.parametrize(("rule", "pairs"), [("late", 21), ("late", 44), ("early", 20), ("early", 45)])
 def test_what_is_below_alpha_is_found_to_be(rule, pairs, alpha):

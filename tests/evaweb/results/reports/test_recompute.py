@@ -75,6 +75,7 @@ def as_rows(runs):
     ]
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(
     ("checkpoints", "n", "scenes", "seed"),
     [(2, 80, 2, 1), (3, 45, 1, 2), (4, 40, 3, 3), (2, 2, 1, 4), (1, 5, 2, 5)],

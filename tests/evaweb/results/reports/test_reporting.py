@@ -136,6 +136,7 @@ WAYS = (
 )
 
 
+@pytest.mark.exhaustive
 def test_a_number_that_was_changed_is_named(report):
     path = report / "data" / "numbers.json"
     right = path.read_text("utf-8")
@@ -202,6 +203,7 @@ def test_sums_of_the_reveal_that_were_forged_with_their_digest_are_found(report)
     assert "sums of pi0-new" not in said
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("gone", ["at_reveal", "blocks", "arms"])
 def test_a_reveal_that_was_taken_out_is_missed(report, gone):
     path = report / "data" / "seal.json"
@@ -224,6 +226,7 @@ def test_a_reveal_that_was_taken_out_is_missed(report, gone):
     assert "Traceback" not in said
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize(
     ("name", "broken", "said"),
     [
@@ -250,6 +253,7 @@ def test_what_is_broken_is_told_in_a_sentence(report, name, broken, said):
     assert said in found.stdout
 
 
+@pytest.mark.exhaustive
 def test_letters_are_those_of_a_plan_that_compared_all(bench, owner, tmp_path):
     three = [
         bench.checkpoint,
@@ -289,6 +293,7 @@ def test_letters_are_those_of_a_plan_that_compared_all(bench, owner, tmp_path):
     assert "letters.pi0-block: 'a' is shown" in recompute(tmp_path / "report").stdout
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(("column", "value"), [("success", None), ("score", "0.125"), ("trial", "99999")])
 def test_a_score_that_is_not_that_of_its_trial_is_found(report, column, value):
     path = report / "data" / "scores.csv"

@@ -243,6 +243,7 @@ def test_a_script_that_dies_loses_its_lease_and_the_robot_holds(start):
     done(other.cmd("stop"))
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("scripts", ["together", "apart"])
 def test_a_dashboard_does_not_keep_a_dead_scripts_lease(start, scripts):
     bench = start(SessionState.READY, scripts=scripts)
@@ -273,6 +274,7 @@ def test_a_dashboards_stop_button_does_not_make_it_a_script(start):
     eventually(looked, "holding")
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("question", ["status", "result"])
 def test_a_script_waits_with_a_connection_for_every_question(start, question):
     bench = start(SessionState.READY)
@@ -284,6 +286,7 @@ def test_a_script_waits_with_a_connection_for_every_question(start, question):
         assert bench.station.state is SessionState.RUNNING
 
 
+@pytest.mark.exhaustive
 def test_a_script_that_asks_now_and_then_keeps_it(start):
     bench = start(SessionState.READY)
     script = bench.script()
@@ -322,6 +325,7 @@ def test_two_scripts_at_once_get_answers_of_their_own(start):
 # --- resets --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("verb", ["reset", "console_reset", "operator_action:rollout_reset:node"])
 def test_a_reset_ends_a_halted_run_and_goes_home(start, verb):
     script = start(SessionState.READY).script()

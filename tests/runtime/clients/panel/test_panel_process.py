@@ -229,6 +229,7 @@ def test_guesses_of_the_pin_are_refused_more_and_more_and_the_estop_is_not(panel
     assert panel.ask("POST", "/estop", {})[0] == 200
 
 
+@pytest.mark.exhaustive
 def test_a_panel_that_is_killed_costs_the_station_nothing_and_is_the_same_when_it_is_back(tmp_path):
     panel = Served(tmp_path)
     try:
@@ -272,6 +273,7 @@ def test_over_https_it_is_the_same_and_without_it_nothing_is_answered(tmp_path):
         panel.end()
 
 
+@pytest.mark.exhaustive
 def test_without_a_pin_the_page_offers_its_estop_alone(tmp_path):
     panel = Served(tmp_path, pin="")
     try:

@@ -134,6 +134,7 @@ PROTOCOLS: dict[str, tuple[Callable[[], Any], Callable[[str], dict[str, Any]]]] 
 }
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_every_protocol_goes_through_a_tunnel(protocol: str, ssh_server: Begin) -> None:
     """The server takes no connection but those that come out of the tunnel: its port is seen from there alone."""
@@ -378,6 +379,7 @@ def test_a_trial_through_a_tunnel_puts_the_block_on_the_plate(ssh_server: Begin,
     assert trial.state is SessionState.RUNNING
 
 
+@pytest.mark.exhaustive
 def test_a_run_holds_naming_the_tunnel_that_broke_and_goes_on_when_it_is_up_again(
     ssh_server: Begin, tmp_path: Path
 ) -> None:

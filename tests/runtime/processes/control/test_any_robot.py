@@ -49,6 +49,7 @@ def standing_at(robot: Robot, pose: Float64) -> Bench:
     return bench
 
 
+@pytest.mark.some(4)
 @EVERY
 def test_control_goes_from_pose_to_pose_and_arrives(name: str) -> None:
     robot = robots.load(name)
@@ -120,6 +121,7 @@ class Standing(Kinematics):
         raise AssertionError("nothing is to be solved")
 
 
+@pytest.mark.some(4)
 @EVERY
 def test_poses_are_gone_to_by_name_and_an_arm_that_there_is_not_is_refused(name: str) -> None:
     robot = robots.load(name)

@@ -65,6 +65,7 @@ def test_a_chunk_of_a_wrong_shape_is_dropped_by_name_and_control_goes_on(rows):
 NO_ROWS = np.zeros((0, 2))
 
 
+@pytest.mark.some(12)
 @pytest.mark.parametrize("mode", ["continuous", "step", "preview", "sim"])
 @pytest.mark.parametrize("kind", ["sync", "async", "naive", "ensemble", "rtc"])
 def test_a_run_of_whose_chunks_none_can_be_used_starves_and_holds(kind, mode):

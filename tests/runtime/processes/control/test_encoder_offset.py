@@ -59,6 +59,7 @@ def told(bench, state):
         bench.say("hold", run=1)
 
 
+@pytest.mark.some(8)
 @pytest.mark.parametrize("lag", [0, 5])
 @pytest.mark.parametrize("state", ["estop", "hold", "running, then hold", "running, then estop"])
 @pytest.mark.parametrize("fault", FAULTS)
@@ -79,6 +80,7 @@ def test_an_encoder_that_is_off_never_makes_a_robot_run_away(fault, state, lag):
     assert np.ptp(bench.moves[-round(FOR / 2 / PERIOD) :]) <= 1e-3  # it stands
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("state", ["estop", "hold"])
 @pytest.mark.parametrize("fault", ["offset", "offset below", "flipped", "alternating", "returning"])
 def test_a_joint_that_leapt_is_not_followed_at_all(fault, state):
@@ -130,6 +132,7 @@ def moved_by_hand(bench, way, speed=1.0):
     bench.run(30)
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("state", ["estop", "hold"])
 @pytest.mark.parametrize("speed", [0.5, 1.0, 3.0])
 @pytest.mark.parametrize("way", [0.7, -0.7])

@@ -253,6 +253,7 @@ def test_a_noisy_joint_that_is_fast_and_comes_to_rest_is_believed():
     assert watcher.judge.settled
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_of_a_broken_encoder_never_agrees_with_itself_for_long_enough(seed):
     watcher = stood()

@@ -61,6 +61,7 @@ def standing(error=0.05, **given):
     return bench.seconds(3.0)
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("noise", [0.0, 0.001])
 @pytest.mark.parametrize("error", ERRORS)
 def test_an_e_stop_leaves_an_arm_that_stands_where_it_stands(error, noise):
@@ -91,6 +92,7 @@ def test_a_restarted_control_takes_the_reading_where_that_is_farther_from_the_co
     assert bench.sent[-1, 1] > 0.15
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("error", ERRORS)
 def test_a_stop_in_motion_ends_as_it_would_without_a_load(error):
     """Of which the command is the reading and the error that the joint had when it last stood, not its lag."""
@@ -126,6 +128,7 @@ def test_an_arm_that_presses_on_something_is_let_go_to_where_it_reads(speed, pre
     assert bench.sent[-1] - bench.true == pytest.approx(np.full(2, 0.02), abs=3e-3)
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("error", ERRORS)
 @pytest.mark.parametrize("stopped", [True, False])
 def test_joints_that_are_missing_for_half_a_second_move_nothing(error, stopped):

@@ -479,6 +479,7 @@ def test_what_moved_a_robot_does_not_go_on_where_that_comes_back_elsewhere(kind,
     assert bench.sent[-1] == pytest.approx(bench.measured, abs=1e-6)
 
 
+@pytest.mark.some(15)
 @pytest.mark.parametrize("stretch", [1.0, 3.0])
 @pytest.mark.parametrize("before", ["follow", "motion", "hold", "estop"])
 @pytest.mark.parametrize("ordered", ["nothing", "follow", "motion", "lock", "hold", "estop", "clear"])
@@ -540,6 +541,7 @@ def test_an_arm_that_sags_a_little_is_held_at_its_target(bench):
     assert (bench.sink.sent[-1] == held).all()
 
 
+@pytest.mark.some(13)
 @pytest.mark.parametrize("ticks", range(20))
 def test_a_spike_that_a_joint_could_have_moved_does_not_move_an_arm_under_e_stop(bench, ticks):
     following(bench, wave(60, speed=0.0))

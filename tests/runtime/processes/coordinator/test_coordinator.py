@@ -92,6 +92,7 @@ def test_a_run_whose_chunks_all_come_too_late_is_ended_by_the_rule_of_starvation
     station.close()
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize(
     ("answer", "state"),
     [("slow", SessionState.HOLDING), ("hold", SessionState.HOLDING), ("stop", SessionState.READY)],

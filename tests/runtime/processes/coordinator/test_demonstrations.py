@@ -348,6 +348,7 @@ def test_nothing_begins_before_it_is_armed_and_the_arm_stays_for_the_next_episod
     station.close()
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize("cause", ["lease", "e-stop", "link", "set-up", "nothing", "leader", "moved"])
 def test_the_arm_falls_with_its_sentence(tmp_path: Path, cause: str) -> None:
     station = collecting(tmp_path).armed()

@@ -44,6 +44,7 @@ def alone(station: Station, seconds: float) -> Station:
     return station
 
 
+@pytest.mark.exhaustive
 def test_a_scored_run_goes_on_to_its_limit_without_its_holder(running: Running) -> None:
     station = alone(running(FINISH, **TRIAL), 6.0)
     assert station.state is SessionState.RUNNING
@@ -58,6 +59,7 @@ def test_a_scored_run_goes_on_to_its_limit_without_its_holder(running: Running) 
     assert (episode["status"], episode["reason"]) == ("finished", "the run's 9 s are over")
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize(
     ("settings", "served", "asked"),
     [
@@ -84,6 +86,7 @@ def test_it_holds_as_soon_as_nobody_could_stop_it_any_more(running: Running) -> 
     assert station.reason.startswith("nobody commands the station: its panel ended as well")
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("how", ["given up", "hidden"])
 def test_who_leaves_a_scored_run_of_his_own_will_holds_it(running: Running, how: str) -> None:
     station = running(FINISH, **TRIAL)
@@ -94,6 +97,7 @@ def test_who_leaves_a_scored_run_of_his_own_will_holds_it(running: Running, how:
     assert alone(station, 6.0).state is SessionState.HOLDING
 
 
+@pytest.mark.exhaustive
 def test_a_run_that_holds_without_its_holder_does_not_go_on_by_itself(running: Running) -> None:
     station = alone(running(FINISH, **TRIAL), 6.0)
     station.robot.silent = True

@@ -285,6 +285,7 @@ def test_a_trial_is_run_as_it_was_set_up_or_not_at_all(tmp_path: Path) -> None:
     station.close()
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("before", ["async", "sync", "ensemble", "naive"])
 @pytest.mark.parametrize("after", ["async", "sync", "ensemble", "naive"])
 def test_another_strategy_takes_over_within_a_run_without_a_gap_or_a_jump(
@@ -321,6 +322,7 @@ def test_another_instruction_reaches_the_policy_within_the_run(tmp_path: Path) -
     station.close()
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize(
     ("strategy", "sentence"),
     [
@@ -381,6 +383,7 @@ def test_a_policy_that_fails_is_answered_as_the_deployment_says(
     station.close()
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("error", [LOST, WRONG])
 def test_slowly_means_going_on_with_what_is_planned_and_with_the_policy_when_it_is_back(
     tmp_path: Path, error: Exception
@@ -393,6 +396,7 @@ def test_slowly_means_going_on_with_what_is_planned_and_with_the_policy_when_it_
     station.close()
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("strategy", ["async", "sync", "naive", "ensemble"])
 def test_a_policy_that_is_back_within_its_patience_ends_no_run_though_nothing_is_planned(
     tmp_path: Path, strategy: str
@@ -435,6 +439,7 @@ def test_where_starvation_holds_it_holds_though_the_policy_is_tried_again(tmp_pa
     station.close()
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("strategy", ["async", "sync"])
 def test_patience_ends_in_holding_and_the_run_can_be_resumed(tmp_path: Path, strategy: str) -> None:
     policy = Failing(LOST, 6, 10**6)
@@ -461,6 +466,7 @@ def test_the_outcome_of_a_run_tells_how_the_policy_did(tmp_path: Path) -> None:
     station.close()
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("strategy", ["async", "sync", "naive", "ensemble"])
 def test_a_run_whose_first_action_is_farther_than_a_jump_moves_nothing_and_holds(
     tmp_path: Path, strategy: str
@@ -490,6 +496,7 @@ def left_gripper(station: Station) -> float:
     return float(station.robot.position[LEFT_GRIPPER])
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("state", [SessionState.READY, SessionState.HOLDING])
 @pytest.mark.parametrize("locked", [False, True])
 def test_the_end_of_the_lease_stops_a_gripper_that_is_on_its_way(

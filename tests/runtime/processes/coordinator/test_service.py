@@ -115,6 +115,7 @@ def test_a_stop_that_cannot_be_verified_is_obeyed_and_recorded_so(
     assert bench.journalled()[-1]["role"] == "unverified"
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize("kind", ["setup", "run", "release", "lease_claim", "lease_renew", "aim"])
 def test_all_else_that_cannot_be_verified_is_refused_and_told(bench: Bench, kind: str) -> None:
     bench.led()

@@ -67,6 +67,7 @@ def speaking(station: Station, rows: Rows, pose: PoseFormat, mode: ActionMode = 
     return station
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("delay", [0, 3])
 @pytest.mark.parametrize("mode", ["absolute", "relative", "delta"])
 @pytest.mark.parametrize("pose", [SIX, EULER], ids=str)
@@ -150,6 +151,7 @@ def test_joint_chunks_say_nothing_of_poses(tmp_path: Path) -> None:
     station.close()
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("wanted", ["measured", "fk"])
 def test_the_recording_says_which_poses_there_were_and_which_the_policy_was_shown(
     tmp_path: Path, wanted: Any
@@ -189,6 +191,7 @@ def publishing(tmp_path: Path, pose: PoseFormat) -> Station:
     return Station(made)
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("pose", [SIX, EULER], ids=str)
 def test_published_poses_are_those_of_the_safe_joint_command(tmp_path: Path, pose: PoseFormat) -> None:
     station = publishing(tmp_path, pose).running(60)

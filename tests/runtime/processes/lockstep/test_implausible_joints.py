@@ -67,6 +67,7 @@ def test_nothing_that_moves_begins_while_a_joint_has_leapt(tmp_path):
         assert JOINT in said
 
 
+@pytest.mark.some(2)
 @pytest.mark.parametrize("fault", ["no numbers", "noise", "small noise"])
 def test_joints_that_are_no_numbers_or_noise_let_nothing_run_on(tmp_path, fault):
     """Noise that a joint can follow is none that can be told; what is sent then stays what the policy wants."""
@@ -90,6 +91,7 @@ def test_a_spike_costs_nothing_but_the_moment(tmp_path):
     assert station.state is SessionState.RUNNING
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("home", [True, False])
 def test_the_first_set_up_after_a_leap_takes_the_robot_over_where_it_is_read(tmp_path, home):
     """An arm that stands where it is read, and was seen on no way to there."""

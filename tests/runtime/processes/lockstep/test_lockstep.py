@@ -95,6 +95,7 @@ def test_sync_executes_every_action_once_and_in_order_and_stands_while_it_waits(
     station.close()
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("strategy", ["sync", "async"])
 @pytest.mark.parametrize("delay", DELAYS)
 def test_two_runs_are_recorded_equal_to_the_last_bit(tmp_path: Path, strategy: str, delay: int) -> None:
@@ -192,6 +193,7 @@ def test_a_policy_with_the_wrong_dimension_fails_the_set_up_with_a_sentence(tmp_
     station.close()
 
 
+@pytest.mark.some(4)
 @pytest.mark.parametrize("delay", DELAYS)
 @pytest.mark.parametrize("error", [RuntimeError("cuda out of memory"), KeyError("state")])
 def test_a_policy_that_raises_in_the_middle_of_a_run_is_held_and_not_asked_again(
@@ -240,6 +242,7 @@ def test_a_policy_that_is_always_too_late_is_held_and_not_running_for_ever(tmp_p
     station.close()
 
 
+@pytest.mark.exhaustive
 def test_of_a_policy_that_does_not_answer_it_is_said_since_when(tmp_path: Path) -> None:
     station = Station(stubbed(tmp_path, delay=300)).running(0)
     station.reach(SessionState.HOLDING, PATIENCE_S)

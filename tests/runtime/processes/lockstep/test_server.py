@@ -322,6 +322,7 @@ def test_a_run_ends_where_its_bench_says_so_and_its_episode_is_whole(made: Stubs
 # --- who stops it ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.exhaustive
 def test_a_lease_that_is_not_renewed_in_the_peoples_time_holds_the_robot(client: Client) -> None:
     client.ready().running(200)  # more than a lease lasts, of its own time
     assert client.state is SessionState.RUNNING
@@ -402,6 +403,7 @@ def test_when_it_ends_its_episode_is_closed_and_nothing_is_found_of_it(made: Stu
     Client(made).close()
 
 
+@pytest.mark.exhaustive
 def test_a_paced_station_is_no_faster_than_life_whatever_it_does(tmp_path: Path) -> None:
     client = Client(stubbed(tmp_path), paced=True)
     period = 1.0 / client.station.spec.rate

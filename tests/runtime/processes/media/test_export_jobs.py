@@ -21,6 +21,7 @@ def folder(tmp_path_factory):
     return recorded(tmp_path_factory.mktemp("data"))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.slow
 def test_a_closed_episode_is_exported_and_one_that_cannot_be_is_logged(folder, tmp_path, caplog):
     exports = Exports(tmp_path)

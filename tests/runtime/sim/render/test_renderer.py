@@ -156,6 +156,7 @@ def test_several_blocks_have_their_own_colours() -> None:
     assert np.diff(sorted(hues)).min() > 8
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("size", [(64, 48), (321, 239), (1280, 720)])
 def test_any_size_is_drawn(size: tuple[int, int]) -> None:
     pictures = Renderer(ROBOT, BENCH, *size).draw(DOWN, in_hand())

@@ -97,6 +97,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.some(3)
 @pytest.mark.parametrize(("arguments", "sentence"), REFUSED.values(), ids=REFUSED.keys())
 def test_a_refused_set_up_leaves_everything_as_it_was(
     tmp_path: Path, arguments: dict[str, Any], sentence: str

@@ -313,6 +313,7 @@ def test_no_more_steps_can_be_executed_of_an_answer_than_it_has(tmp_path: Path, 
     station.close()
 
 
+@pytest.mark.some(1)
 @pytest.mark.parametrize("strategy", ["sync", "async", "ensemble", "naive"])
 @pytest.mark.parametrize(("rate", "count"), [(60.0, 1), (45.0, 1), (60.0, 2), (10.0, 1)])
 def test_a_short_fast_chunk_is_set_up_and_moves_the_robot(
