@@ -62,7 +62,8 @@ class ActionChunk:
     `actions` is float32 [H, W] in `space`: "joint" rows are [D] in group order, "eef" rows are poses as `pose`
     says, None: 8 per arm. They are kept as the server gave them. `rate` is the rows' own rate [Hz], None where it is
     the control rate. `model_actions` are the rows in the model's own normalised space where the server returned
-    them. `timing` holds the server's own figures [ms].
+    them; `model_relative` says that these are relative to the observation whatever `mode` is, None that nobody
+    knows. `timing` holds the server's own figures [ms].
 
     `mode` says what the numbers are: "absolute" targets; "relative" to the observation the chunk answers; "delta",
     each row relative to the one before, the first to the observation. Grippers are absolute in every mode. `frame`
@@ -78,13 +79,15 @@ class ActionChunk:
     mode: ActionMode = "absolute"
     frame: RelativeFrame = "base"
     pose: PoseFormat | None = None
+    model_relative: bool | None = False
 
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
     """Commitments of the robot so far, for policies that continue their own last chunk (RTC).
 
-    Rows are in the policy's own space and at its own rate, as the server gave them.
+    Rows are in the policy's own space and at its own rate: absolute ones as the server gave them, others relative to
+    the observation that is asked about, as the answer will be.
     """
 
     previous: Float32  # [T, W] the chunk that is being executed, whole

@@ -59,7 +59,9 @@ class TornReadError(RuntimeFault):
 class Record:
     """One structured record, double-buffered: a preempted writer never leaves it unreadable.
 
-    One process writes, any number read. The checksum makes a read right also where memory is weakly ordered.
+    One process writes, any number read. The checksum, which begins with the version, makes a read right also where
+    memory is weakly ordered, and where a reader was kept waiting between version and content: what is written over it
+    is another version's, and not published yet.
     """
 
     def __init__(self, memory: mmap.mmap, offset: int, dtype: np.dtype[np.void]) -> None:
@@ -85,7 +87,7 @@ class Record:
         start = self._offset + _ALIGN + (version & 1) * self._slot
         payload = value.tobytes()
         self._memory[start + 4 : start + 4 + len(payload)] = payload
-        self._memory[start : start + 4] = zlib.crc32(payload).to_bytes(4, "little")
+        self._memory[start : start + 4] = _checksum(payload, version)
         self._version[0] = version
 
     def read(self) -> np.void:
@@ -97,9 +99,13 @@ class Record:
             start = self._offset + _ALIGN + (version & 1) * self._slot
             checksum = self._memory[start : start + 4]
             payload = self._memory[start + 4 : start + 4 + self._dtype.itemsize]
-            if zlib.crc32(payload).to_bytes(4, "little") == checksum:
+            if _checksum(payload, version) == checksum:
                 return _only(np.frombuffer(payload, self._dtype))
         raise TornReadError(f"record at offset {self._offset} could not be read in 100 tries")
+
+
+def _checksum(payload: bytes, version: int) -> bytes:
+    return zlib.crc32(payload, version & 0xFFFFFFFF).to_bytes(4, "little")
 
 
 def _only(records: np.ndarray[Any, np.dtype[np.void]]) -> np.void:

@@ -61,6 +61,15 @@ class Grip:
             made[:, column] = self._open[gripper] + share * self._travel[gripper]
         return made
 
+    def served(self, rows: Float32) -> Float32:
+        """The way back: rows of the robot's numbers [T, W] as the server counts them."""
+        if not self._converts:
+            return rows
+        made = rows.copy()
+        for column, gripper in self._columns:
+            made[:, column] = (rows[:, column] - self._open[gripper]) / self._travel[gripper]
+        return made
+
 
 def _columns(robot: Robot, poses: PoseRows | None) -> list[tuple[int, int]]:
     """Columns of a row that are grippers, each with the index of the robot's gripper."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -62,6 +63,10 @@ class Config(ServerSettings, RequestSettings, AnswerSettings):
     """With openpi_rtc and kai0: "aligned" sends the chunk before so that the server continues from the first row that
     the robot has not consumed; "whole" from its first row on, as these dialects' own clients do, which is right only
     where the robot has consumed what the server assumes."""
+    rtc_model_rows: Literal["absolute", "relative"] | None = None
+    """What the model's own rows are that an RTC server returns beside its actions: "relative" to the state that it is
+    shown (openpi's delta joint actions) they mean something else at the next observation, and are not continued. Not
+    given, they are taken for absolute, and a preflight says that nobody knows."""
     prefix_attention_schedule: Schedule = "exp"
     """With async_rtc: how the weight of the rows before falls after the predicted delay."""
     max_guidance_weight: Positive | None = None
@@ -100,6 +105,9 @@ class OpenpiPolicy(WebsocketPolicy):
             config.action_space == "eef" and config.action_mode != "absolute"
         )
         self._dialect = _dialect(config)
+        self._absolute = config.action_mode == "absolute"
+        self._converts = self._scale is not None or config.gripper != "robot"
+        self._own_relative = None if config.rtc_model_rows is None else config.rtc_model_rows == "relative"
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         """The chunk; `timing` has the server's figures [ms] and our `round_trip_ms`.
@@ -107,9 +115,9 @@ class OpenpiPolicy(WebsocketPolicy):
         PolicyLostError where the server is not there or does not answer: the next call opens another connection.
         PolicyError for conditioning that the dialect `policy.rtc` cannot carry.
         """
-        shown = self.request(observation)
+        shown, continued = self.request(observation), self._as_served(conditioning)
         with self._lock:
-            request = msgpack_arrays.pack(self._dialect.request(shown, conditioning))
+            request = msgpack_arrays.pack(self._dialect.request(shown, continued))
             self._require_open()
             answer, round_trip = self._exchange(request)
             result = self._result(self._unpacked(answer, "an answer"))
@@ -159,6 +167,7 @@ class OpenpiPolicy(WebsocketPolicy):
             )
         agreed(reply, self._declared, "answer")
         given = action_rows("actions", reply["actions"], self._width)
+        own = self._model_rows(reply)
         return ActionChunk(
             actions=self._grip.meant(given if self._scale is None else given * self._scale),
             space=self._config.action_space,
@@ -166,18 +175,23 @@ class OpenpiPolicy(WebsocketPolicy):
             mode=self._config.action_mode,
             frame=self._config.relative_frame,
             pose=self._config.action_pose,
-            model_actions=self._model_rows(reply, given),
+            model_actions=given if own is None and self._converts and self._absolute else own,
+            model_relative=False if own is None else self._own_relative,
             timing=_timing(reply) | {"round_trip_ms": round_trip},
         )
 
-    def _model_rows(self, reply: Mapping[str, Any], given: Float32) -> Float32 | None:
-        """Rows that are given back to be continued, where they are not the robot's rows."""
+    def _model_rows(self, reply: Mapping[str, Any]) -> Float32 | None:
         origin = reply.get("origin_actions") if self._dialect.continues_model_rows else None
-        if origin is not None:
-            return action_rows("origin_actions", origin)
-        converted = self._scale is not None or self._config.gripper != "robot"
-        # Rows that are relative to an observation that is over cannot be continued.
-        return given if converted and self._config.action_mode != "relative" else None
+        return None if origin is None else action_rows("origin_actions", origin)
+
+    def _as_served(self, conditioning: Conditioning | None) -> Conditioning | None:
+        """Rows of the robot's numbers as the server counts them; absolute ones are kept as it gave them."""
+        if conditioning is None or self._absolute or not self._converts:
+            return conditioning
+        rows = self._grip.served(conditioning.previous)
+        if self._scale is not None:
+            rows = np.divide(rows, self._scale, out=np.zeros_like(rows), where=self._scale != 0)
+        return replace(conditioning, previous=rows)
 
 
 def _refuse_others(metadata: Mapping[str, Any]) -> None:

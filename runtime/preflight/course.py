@@ -247,6 +247,7 @@ class Course:
             )
         if info is not None and info.horizon is not None and info.horizon != chunk.rows:
             made.append(f"the server says {info.horizon} rows per answer and gave {chunk.rows}")
+        made += self._rtc_remarks()
         answers = [call.ms for call in self._policy.calls if call.name == "infer"] if self._policy else []
         if len(answers) > 1 and answers[1] > 1000.0 * chunk.seconds:
             made.append(
@@ -254,3 +255,20 @@ class Course:
                 "stand and wait"
             )
         return made
+
+    def _rtc_remarks(self) -> list[str]:
+        """Where a strategy continues the model's own rows: what they are relative to decides whether it can."""
+        chunk = self._answered.chunk if self._answered else None
+        if chunk is None or chunk.model_actions is None or not strategy_of(self._plan).query.continues:
+            return []
+        if chunk.mode != "absolute" or chunk.model_relative:
+            return [
+                "the model's own rows are relative to what it was shown and are not continued: this strategy asks as "
+                "async does"
+            ]
+        if chunk.model_relative is None:
+            return [
+                "nobody says whether the model's own rows are absolute; relative ones (openpi's delta joint actions) "
+                'would be continued wrongly: set policy.rtc_model_rows = "absolute" or "relative"'
+            ]
+        return []

@@ -87,13 +87,16 @@ class PoseRows:
         Raises PolicyError for a quaternion without direction.
         """
         upright = self.upright(vectors)
-        turned = self.frame.express(upright, joints)
-        poses = np.empty((len(vectors), len(self._arms), self._each))
-        poses[..., _POSITION] = turned[..., _POSITION]
-        poses[..., self._turning] = self._turned(turned[..., _QUATERNION], previous)
-        if self.pose.gripper:
-            poses[..., -1] = np.where(self._gripped, turned[..., _GRIPPER], 0.0)
         appended = np.broadcast_to(joints, (len(vectors), joints.shape[-1]))[:, self.dims]
+        return self.written(self.frame.express(upright, joints), appended, previous)
+
+    def written(self, vectors: Float64, appended: Float64, previous: Float64 | None = None) -> Float64:
+        """Rows of vectors with unit quaternions as they are in the declared frame, and of what follows them [T, n]."""
+        poses = np.empty((len(vectors), len(self._arms), self._each))
+        poses[..., _POSITION] = vectors[..., _POSITION]
+        poses[..., self._turning] = self._turned(vectors[..., _QUATERNION], previous)
+        if self.pose.gripper:
+            poses[..., -1] = np.where(self._gripped, vectors[..., _GRIPPER], 0.0)
         return np.concatenate([poses.reshape(len(vectors), -1), appended], axis=1)
 
     def _turned(self, quaternions: Float64, previous: Float64 | None) -> Float64:

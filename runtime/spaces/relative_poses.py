@@ -42,6 +42,25 @@ def absolute(vectors: Float64, start: Float64, mode: ActionMode, frame: Relative
     return result
 
 
+def relative(vectors: Float64, start: Float64, mode: ActionMode, frame: RelativeFrame) -> Float64:
+    """The way back: absolute `vectors` with unit quaternions, as `mode` has them from the pose `start` [arms, 8] on."""
+    if mode == "absolute":
+        return vectors
+    before = np.broadcast_to(start, vectors.shape)
+    if mode == "delta":
+        before = np.concatenate([start[None], vectors[:-1]])
+    back = before[..., _QUATERNION] * (1.0, -1.0, -1.0, -1.0)
+    result = vectors.copy()
+    result[..., _POSITION] -= before[..., _POSITION]
+    if frame == "tool":
+        shifts = result[..., _POSITION]
+        result[..., _POSITION] = (matrix_of_quaternion(back) @ shifts[..., None])[..., 0]
+        result[..., _QUATERNION] = quaternion_product(back, vectors[..., _QUATERNION])
+    else:
+        result[..., _QUATERNION] = quaternion_product(vectors[..., _QUATERNION], back)
+    return result
+
+
 def _after(before: Float64, turns: Float64, frame: RelativeFrame) -> Float64:
     """Unit quaternions that `before` comes to by `turns`, about its own axes ("tool") or those that it is given in."""
     made = quaternion_product(before, turns) if frame == "tool" else quaternion_product(turns, before)

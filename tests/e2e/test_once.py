@@ -152,7 +152,6 @@ def test_a_taken_port_is_named_and_its_holder_lives(folder):
             assert call.recv(1) == b""
 
 
-@pytest.mark.story
 def test_two_blind_trials_are_made_revealed_and_compared(evaluated):
     found, done = evaluated
     trials = found["trials"]
@@ -176,7 +175,6 @@ def test_two_blind_trials_are_made_revealed_and_compared(evaluated):
     assert not any(trial["checkpoint"] in done.stderr for trial in trials)
 
 
-@pytest.mark.story
 def test_other_trials_on_the_same_data_come_after_the_first(first, evaluated, places, folder):
     assert min(trial["trial"] for trial in evaluated[0]["trials"]) > first["trial"]
     assert [dataset for dataset, _, _ in places] == [first["dataset"]] * 2
@@ -186,11 +184,21 @@ def test_other_trials_on_the_same_data_come_after_the_first(first, evaluated, pl
 
 
 @pytest.mark.story
-def test_a_second_process_that_knows_only_the_format_reads_all(first, places, folder):
-    found = read(folder / "data" / first["dataset"])
-    assert found["broken"] == []
+def test_a_second_process_that_knows_only_the_format_reads_it(first, folder):
+    assert_whole(folder / "data" / first["dataset"], {first["dataset_index"]: first["frames"]})
+
+
+def test_and_so_it_does_with_the_others_behind_it(first, places, folder):
     lengths = {first["dataset_index"]: first["frames"]} | {index: frames for _, index, frames in places}
-    assert [episode["length"] for episode in found["episodes"]] == [lengths[index] for index in range(3)]
+    assert_whole(folder / "data" / first["dataset"], lengths)
+
+
+def assert_whole(dataset, lengths):
+    """The episodes of these lengths by index are all there, each with its task and pictures that show something."""
+    found = read(dataset)
+    assert found["broken"] == []
+    assert [episode["length"] for episode in found["episodes"]] == [lengths[at] for at in sorted(lengths)]
+    assert sorted(lengths) == list(range(len(lengths)))
     for episode in found["episodes"]:
         assert episode["tasks"] == ["put the block on the plate"]
         for brightness in episode["brightness"].values():

@@ -58,6 +58,17 @@ def test_a_writer_cut_off_in_the_middle_leaves_the_last_record_readable():
     assert shared.read()["a"] == 1
 
 
+def test_what_is_not_published_yet_is_not_read_by_who_was_kept_waiting(monkeypatch):
+    """Else the next reading would be older than this one."""
+    shared = record()
+    for number in range(1, 4):
+        shared.write(value(number))
+    shared._version[0] = 2  # the third is whole in the half of the first, and its writer has not come to say so
+    seen = iter([1])
+    monkeypatch.setattr(Record, "version", property(lambda self: next(seen, int(self._version[0]))))
+    assert shared.read()["a"] == 2
+
+
 def _write_many(shared: Record, count: int) -> None:
     for number in range(1, count + 1):
         shared.write(value(number))

@@ -230,31 +230,36 @@ def test_it_keeps_the_models_own_rows_for_later_conditioning() -> None:
         chunk = policy.infer(observation())
     assert chunk.model_actions is not None
     np.testing.assert_array_equal(chunk.model_actions, np.ones((4, 32), np.float32))
+    assert chunk.model_relative is None  # nobody says
 
 
-def test_grippers_and_scales_of_a_checkpoint_are_the_robots_in_the_chunk_and_its_own_where_it_continues() -> (
-    None
-):
-    rows = np.tile(np.float32([0.5] * 6 + [0.25]), (4, 2))
-    scale = ([0.2] * 6 + [1.0]) * 2
-    settings: dict[str, Any] = {"gripper": "droid", "action_scale": scale, "action_mode": "delta"}
-    with stub(replying({"actions": rows})) as url, policy_at(url, **settings) as policy:
+@pytest.mark.parametrize("said", ["absolute", "relative"])
+def test_what_the_models_own_rows_are_is_declared(said: str) -> None:
+    reply = {"actions": np.zeros((4, ROBOT.dim)), "origin_actions": np.ones((4, 32), np.float32)}
+    with stub(replying(reply)) as url, policy_at(url, rtc_model_rows=said) as policy:
+        assert policy.infer(observation()).model_relative is (said == "relative")
+
+
+CONVERTED: dict[str, Any] = {"gripper": "droid", "action_scale": ([0.2] * 6 + [1.0]) * 2}
+
+
+@pytest.mark.parametrize("mode", ["absolute", "delta", "relative"])
+def test_grippers_and_scales_of_a_checkpoint_are_the_robots_in_the_chunk_and_its_own_where_it_continues(
+    mode: str,
+) -> None:
+    rows, seen = np.tile(np.float32([0.5] * 6 + [0.25]), (4, 2)), []
+    settings = CONVERTED | {"action_mode": mode, "rtc": "prev_action"}
+    with stub(replying({"actions": rows}, seen=seen)) as url, policy_at(url, **settings) as policy:
         chunk = policy.infer(observation())
         assert policy.request(observation(0.0))["state"][6] == 1.0  # type: ignore[index]
+        own = chunk.actions if chunk.model_actions is None else chunk.model_actions
+        policy.infer(observation(), Conditioning(own, 1, 2, 4))
     np.testing.assert_allclose(chunk.actions[0], ([0.1] * 6 + [0.075]) * 2, atol=1e-6)
-    np.testing.assert_array_equal(chunk.model_actions, rows)
+    np.testing.assert_allclose(msgpack_arrays.unpack(seen[1])["prev_action"], rows, atol=1e-6)
     with pytest.raises(
         ConfigurationError, match="action_scale has 1 numbers; the rows of this robot have 14"
     ):
         openpi.build(Config(action_scale=[1.0]), ROBOT, MonotonicClock(), 30.0)
-
-
-def test_relative_rows_that_were_converted_are_not_given_back_to_be_continued() -> None:
-    with (
-        stub(replying({"actions": np.zeros((2, 14))})) as url,
-        policy_at(url, gripper="droid", action_mode="relative") as policy,
-    ):
-        assert policy.infer(observation()).model_actions is None
 
 
 def test_a_chunk_says_what_its_numbers_are_and_how_fast_they_come() -> None:

@@ -35,6 +35,7 @@ class Stub(Policy):
         self.info = info or PolicyInfo("stub", horizon=len(self.rows))
         self.seen: list[Observation] = []
         self.said: list[str] = []
+        self.says: dict[str, Any] = {}  # of its chunks
         self.hangs = threading.Event()
         self.hangs.set()
 
@@ -46,7 +47,7 @@ class Stub(Policy):
         self.said.append("infer")
         self.seen.append(observation)
         self.hangs.wait(PATIENCE_S)
-        return ActionChunk(self.rows.astype(np.float32))
+        return replace(ActionChunk(self.rows.astype(np.float32)), **self.says)
 
     def reset(self) -> None:
         self.said.append("reset")
@@ -119,6 +120,27 @@ def test_what_works_and_is_worth_knowing_is_noted(flown: Any) -> None:
     assert report.chunk.first_joint == FRANKA.joint_names[0]
     assert [note.partition(" ")[0] for note in report.notes] == ["the", "4", "the"]
     assert "20 rows per answer and gave 10" in report.notes[2]
+
+
+@pytest.mark.parametrize(
+    ("relative", "noted"),
+    [
+        (None, "nobody says whether the model's own rows are absolute"),
+        (True, "are not continued"),
+        (False, ""),
+    ],
+)
+@pytest.mark.parametrize("kind", ["rtc", "async"])
+def test_with_rtc_it_is_named_what_of_the_models_own_rows_cannot_be_continued(
+    flown: Any, kind: str, relative: bool | None, noted: str
+) -> None:
+    policy = Stub(info=PolicyInfo("stub", horizon=10, supports_rtc=True))
+    policy.says = {"model_actions": np.zeros((10, 32), np.float32), "model_relative": relative}
+    report = flown(policy, strategy={"kind": kind})
+    assert report.ok, report.sentence
+    notes = report.notes
+    assert len(notes) == (1 if noted and kind == "rtc" else 0)
+    assert all(noted in note for note in notes)
 
 
 def test_a_server_that_cannot_continue_chunks_contradicts_the_strategy(flown: Any) -> None:

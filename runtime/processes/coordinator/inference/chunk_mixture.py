@@ -10,11 +10,12 @@ import numpy as np
 
 from runtime.core.errors import PolicyError
 from runtime.core.pose_format import CANONICAL
-from runtime.core.types import ActionChunk, Float64
+from runtime.core.types import EEF_WIDTH, ActionChunk, Float64, Observation
 from runtime.kinematics.forward import ChainForward
 from runtime.motion.timeline import DimensionKinds, difference
 from runtime.spaces.end_effectors import EndEffectors
 from runtime.spaces.pose_rows import PoseRows
+from runtime.spaces.relative_poses import relative
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -54,6 +55,32 @@ class Mixture:
         """The poses [N, W] of joints [N, D] in the format of `like`, each written as near to the newest as can be."""
         layout = self._layout_of(like)
         made = layout.encode(self._end_effectors.vectors(joints), joints, newest)
+        switched = self._switched(like)
+        made[:, switched] = newest[:, switched]
+        return made
+
+    def relative(
+        self, joints: Float64, newest: Float64, like: ActionChunk, observation: Observation
+    ) -> Float64:
+        """Joints [N, D] of successive rows as rows [N, W] like those of `like`, from `observation` on.
+
+        They come to these joints again where they answer that observation. Binary grippers are those of `newest`.
+        """
+        robot, qpos = self._known, np.asarray(observation.qpos, np.float64)
+        before = qpos if like.mode == "relative" else np.concatenate([qpos[None], joints[:-1]])
+        moved = difference(joints, before, self._dims.wrapping)
+        still = [*robot.gripper_dims, *robot.speed_dims]  # absolute in every mode
+        moved[:, still] = joints[:, still]
+        if like.space == "joint":
+            made = moved
+        else:
+            layout, at = self._layout_of(like), qpos[None]
+            seen = self._end_effectors.eef_of(qpos) if observation.eef is None else observation.eef
+            vectors = np.asarray(seen, np.float64).reshape(1, -1, EEF_WIDTH)
+            start = layout.frame.express(layout.upright(vectors), at)[0]
+            poses = layout.frame.express(self._end_effectors.vectors(joints), at)
+            poses = relative(poses, start, like.mode, like.frame)
+            made = layout.written(poses, moved[:, layout.dims], newest)
         switched = self._switched(like)
         made[:, switched] = newest[:, switched]
         return made

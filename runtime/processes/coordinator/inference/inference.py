@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError, RuntimeFault
 from runtime.core.sentences import Pattern, fixed
-from runtime.core.types import Conditioning, Float64
+from runtime.core.types import Conditioning, Float64, Observation
 from runtime.ipc.messages import ChunkMerged, Event, Mode, PolicyAnswer, PostedChunk
 from runtime.ipc.shared_state import SharedState
 from runtime.policies.base import Policy
@@ -326,10 +326,14 @@ class Inference:
         self._generation = self._commitment.generation
         return self.runner.ready(flight)
 
-    def _committed(self, step: int) -> Conditioning | None:
+    def _committed(self, observation: Observation) -> Conditioning | None:
         parameters = self._strategy.parameters
         found = self._commitment.conditioning(
-            step, list(self.metrics.delays)[-50:], parameters.delay_quantile, parameters.execution_horizon
+            observation.step,
+            list(self.metrics.delays)[-50:],
+            parameters.delay_quantile,
+            parameters.execution_horizon,
+            observation,
         )
         warning = self._commitment.warning
         if warning and not self.rtc_warning:  # its numbers change with every request

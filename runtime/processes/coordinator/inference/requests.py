@@ -33,7 +33,7 @@ _POSES_NOT_REACHED = Pattern(
     "near singular)",
 )
 _EARLY_S = 1e-6  # moments are sums of floats
-Committed = Callable[[int], Conditioning | None]  # by the step of the observation
+Committed = Callable[[Observation], Conditioning | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,8 +144,10 @@ class PolicyRequests:
         `k_max` is how many rows of the answer may be dropped as stale at most, None: as many as are.
         """
         observation = self.observe()
-        conditioning = committed(observation.step) if committed else None
         policy, fresh, held = self.policy, self._fresh, self._held
+        measured = observation.eef is not None and policy.observation_eef == "measured"
+        seen = observation if measured else replace(observation, eef=None)
+        conditioning = committed(seen) if committed else None
         self._fresh = self._held = False
 
         def infer() -> PolicyResponse:
@@ -154,10 +156,7 @@ class PolicyRequests:
             elif held:
                 policy.resume()
             begun = self._clock.now()
-            measured = observation.eef is not None and policy.observation_eef == "measured"
-            shown = observation
-            if not measured:
-                shown = replace(shown, eef=self._spaces.eef_of(shown.qpos))
+            shown = seen if measured else replace(seen, eef=self._spaces.eef_of(seen.qpos))
             age = self._clock.now() - min(shown.captured.values())
             chunk = policy.infer(shown, conditioning)
             seconds = self._clock.now() - begun

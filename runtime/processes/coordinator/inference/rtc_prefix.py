@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from runtime.core.sentences import Pattern, fixed
-from runtime.core.types import ActionChunk, Conditioning, Float32, Float64
+from runtime.core.types import ActionChunk, Conditioning, Float32, Float64, Observation
 from runtime.ipc.messages import ChunkMerged
 from runtime.motion.timeline import HELD
 from runtime.processes.coordinator.inference.chunk_mixture import Mixture, Parts
 
-_RELATIVE_ROWS_LOST = fixed(
-    "rtc.relative_rows_lost",
-    "RTC: the policy's rows are relative to an observation that is over and it returned none of its own"
-    " space: they cannot be continued, requests go out without them",
+_MODEL_ROWS_RELATIVE = fixed(
+    "rtc.model_rows_relative",
+    "RTC: the model's own rows are relative to an observation that is over, and nobody but the model can say what they"
+    " are from the next one on: they are not continued, requests go out without them",
 )
 _DELAY_BEYOND_PLAN = Pattern(
     "rtc.delay_beyond_plan",
@@ -59,7 +59,6 @@ class _Commitment:
     shares: Mapping[int, Shares] | None
     pace: float  # rows per control step
     delay: int  # control steps from its observation to its arrival
-    rebased: bool  # its rows are relative to an observation that is over
 
     @property
     def kind(self) -> tuple[object, ...]:
@@ -139,7 +138,6 @@ class RtcPrefix:
             shares=_shares(merged),
             pace=(chunk.rate or self._control_rate) / self._control_rate,
             delay=merged.delay,
-            rebased=chunk.mode == "relative" and chunk.model_actions is None,
         )
 
     def conditioning(
@@ -148,8 +146,11 @@ class RtcPrefix:
         delays: Sequence[int],
         quantile: float,
         execution_horizon: int | None,
+        observation: Observation | None = None,
     ) -> Conditioning | None:
         """Conditioning of a request about `observation_step`; None if nothing is left, or none merged.
+
+        Rows that are not absolute are said from `observation` on, in whose frame the answer will be: they need it.
 
         `delays` are recent measured ones in control steps (that of the chunk itself where there are none); their
         `quantile` is predicted, in rows rounded up. `execution_horizon` is that of the answer in control steps, None
@@ -162,8 +163,9 @@ class RtcPrefix:
         if not self._merged:
             return None
         held = self._merged[max(self._merged)]
-        if held.rebased:
-            self.warning = _RELATIVE_ROWS_LOST
+        chunk = held.chunk
+        if chunk.model_actions is not None and (chunk.mode != "absolute" or chunk.model_relative):
+            self.warning = _MODEL_ROWS_RELATIVE
             return None
         passed = math.floor((observation_step - held.anchor) * held.pace + 0.5 + _HAIR)
         consumed = max(0, passed)
@@ -174,7 +176,7 @@ class RtcPrefix:
         delay = _expected(delays or [held.delay], quantile)
         self.predicted_delay = max(0, math.ceil(delay * held.pace - _HAIR))
         self._judge(delay, held.end - observation_step)
-        previous = self._planned(held, steps, passed)
+        previous = self._planned(held, steps, passed, observation)
         if previous is None:
             return None
         last = held.usable
@@ -182,14 +184,17 @@ class RtcPrefix:
             last = min(last, math.ceil(execution_horizon * held.pace - _HAIR))
         return Conditioning(previous, consumed, min(self.predicted_delay, len(steps)), last)
 
-    def _planned(self, held: _Commitment, steps: Float64, passed: int) -> Float32 | None:
+    def _planned(
+        self, held: _Commitment, steps: Float64, passed: int, observation: Observation | None
+    ) -> Float32 | None:
         """The rows of `held`, those for control `steps` as they are planned; None where that is not known.
 
-        `passed` is the row nearest to the first of these. Rows that are no absolute numbers do not mix.
+        `passed` is the row nearest to the first of these. Rows that are not absolute do not mix: the joints do that
+        they became, and are said as such rows again.
         """
-        if held.chunk.mode != "absolute":
-            return held.rows if passed >= 0 else None
         made = [self._makers(at) for at in steps.tolist()]
+        if held.chunk.mode != "absolute":
+            return self._from_here(held, steps, made, passed, observation)
         known = [shares for shares in made if shares is not None and self._alike(held, shares)]
         if len(known) < len(made):
             return None
@@ -203,6 +208,28 @@ class RtcPrefix:
         if found is None:
             return None
         rows[max(0, passed) + np.array(mixed)] = found
+        return rows
+
+    def _from_here(
+        self,
+        held: _Commitment,
+        steps: Float64,
+        made: Sequence[Shares | None],
+        passed: int,
+        observation: Observation | None,
+    ) -> Float32 | None:
+        """The rows of `held`, those for `steps` as they come to what is planned from `observation` on."""
+        assert observation is not None, (
+            "rows that are not absolute need the observation that they are said from"
+        )
+        known = [shares for shares in made if shares is not None and shares.keys() <= self._merged.keys()]
+        if len(known) < len(made):
+            return None
+        places = max(0, passed) + np.arange(len(steps))
+        rows = held.rows.copy()
+        joints = self._mixture.joints(self._parts(steps, known, lambda one: (one.commands, 1.0)))
+        newest = rows[places].astype(np.float64)
+        rows[places] = self._mixture.relative(joints, newest, held.chunk, observation)
         return rows
 
     def _alike(self, held: _Commitment, shares: Shares) -> bool:

@@ -121,15 +121,6 @@ def test_rows_without_an_action_do_not_count_as_left() -> None:
     assert held.conditioning(110, [3], 0.9, None) is None
 
 
-def test_rows_relative_to_an_observation_that_is_over_are_not_handed_back() -> None:
-    held = committed(ActionChunk(rows(50), mode="relative"))
-    assert held.conditioning(110, [3], 0.9, None) is None
-    assert "relative to an observation that is over" in held.warning
-    assert asked(committed(ActionChunk(rows(50), mode="delta")), 110).consumed == 10
-    own = ActionChunk(rows(50), mode="relative", model_actions=rows(50, 32))
-    assert asked(committed(own), 110).consumed == 10
-
-
 # Rates
 
 
