@@ -63,7 +63,9 @@ def test_what_is_not_published_yet_is_not_read_by_who_was_kept_waiting(monkeypat
     shared = record()
     for number in range(1, 4):
         shared.write(value(number))
-    shared._version[0] = 2  # the third is whole in the half of the first, and its writer has not come to say so
+    shared._version[0] = (
+        2  # the third is whole in the half of the first, and its writer has not come to say so
+    )
     seen = iter([1])
     monkeypatch.setattr(Record, "version", property(lambda self: next(seen, int(self._version[0]))))
     assert shared.read()["a"] == 2
