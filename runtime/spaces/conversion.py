@@ -70,6 +70,7 @@ class ActionSpaces(EndEffectors):
         if not control_rate > 0:
             raise SetupError(f"control_rate = {control_rate} Hz; allowed: above zero")
         super().__init__(robot, kinematics)
+        self.arm_names = tuple(arm.name for arm in robot.arms)
         self._robot = robot
         self._kinematics = kinematics
         self._control_rate = control_rate

@@ -25,7 +25,7 @@ from runtime.processes.coordinator.health_monitor import HealthMonitor
 from runtime.processes.coordinator.inference.chunk_mixture import Mixture
 from runtime.processes.coordinator.inference.inference import Inference, Patience
 from runtime.processes.coordinator.inference.policy_observation import PolicyObservation, SightSettings
-from runtime.processes.coordinator.inference.requests import PolicyRequests
+from runtime.processes.coordinator.inference.requests import MissBound, PolicyRequests
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
 from runtime.processes.coordinator.inference.worker import Runner
 from runtime.processes.coordinator.lease import Lease
@@ -39,6 +39,7 @@ from runtime.processes.coordinator.session.tuning import strategy_of
 from runtime.processes.coordinator.setup.sequence import SetUp
 from runtime.processes.coordinator.snapshot import control_figures, facts
 from runtime.processes.coordinator.timing_report import TimingReport
+from runtime.safety.settings import SafetySettings
 from runtime.spaces.conversion import ActionSpaces
 from runtime.station.run import Provenance
 from runtime.station.spec import StationSpec
@@ -117,6 +118,11 @@ def assemble(
     return coordinator
 
 
+def _bound(safety: SafetySettings) -> MissBound | None:
+    refuses = safety.missed_pose == "refuse"
+    return MissBound(safety.missed_pose_m, safety.missed_pose_rad) if refuses else None
+
+
 def _inference(
     spec: StationSpec,
     shared: SharedState,
@@ -136,6 +142,7 @@ def _inference(
         PolicyObservation(shared, clock, ages),
         runner,
         clock,
+        _bound(settings.safety),
     )
     patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
     prefix = RtcPrefix(spec.rate, Mixture(spec.dims, spec.robot))

@@ -4,7 +4,7 @@ import { sentence as translated } from "../../site/sentences.js";
 import { verb, words } from "./words.js";
 
 const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "video_lost", "displaced", "moved_away", "implausible", "corrected", "too_far", "node_silent", "leader_lost"]);
-const WARN = new Set(["camera_absent", "camera_ended", "camera_is_a_video", "camera_lost", "commands_unheard", "refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "near", "far_start", "pictures_stopped", "recording_late", "chunk_dropped", "ik_unreached", "joints_missing", "not_journalled", "unmeasured", "zero_joints", "unreadable", "rtc_warning", "late_ticks", "scheduling", "episode_short"]);
+const WARN = new Set(["camera_absent", "camera_ended", "camera_is_a_video", "camera_lost", "commands_unheard", "refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "near", "far_start", "pictures_stopped", "recording_late", "chunk_dropped", "ik_unreached", "poses_refused", "joints_missing", "not_journalled", "unmeasured", "zero_joints", "unreadable", "rtc_warning", "late_ticks", "scheduling", "episode_short"]);
 const GOOD = new Set(["camera_back", "commands_heard", "joints_back", "pictures_back", "policy_back", "recording_goes_on", "recovered", "punctual", "released"]); // a trouble is over
 const NAMES = {
   camera_absent: "camera absent",
@@ -27,6 +27,7 @@ const NAMES = {
   far_start: "far from robot",
   implausible: "encoders",
   ik_unreached: "out of reach",
+  poses_refused: "poses refused",
   joints_back: "joints again",
   joints_missing: "joints missing",
   leader_lost: "leader lost",

@@ -32,15 +32,29 @@ _POSES_NOT_REACHED = Pattern(
     "degrees: nearest taken ({limit} at a joint limit, {velocity} as fast as joints may, {singular} "
     "near singular)",
 )
+_POSE_MISSED = Pattern(
+    "policy.pose_missed",
+    "row {row} of the answer is a pose of {arm} that its joints miss by {mm:.0f} mm and {deg:.0f} degrees; allowed: "
+    "{allowed_mm:g} mm and {allowed_deg:.0f} degrees (safety.missed_pose): too far, out of reach, or not in metres",
+)
+_ROWS_REFUSED = Pattern("policy.rows_refused", "{wrong}; the {kept} rows before it are executed")
 _EARLY_S = 1e-6  # moments are sums of floats
 Committed = Callable[[Observation], Conditioning | None]
+
+
+@dataclass(frozen=True, slots=True)
+class MissBound:
+    """Farthest that joints may miss a pose of a policy: [m] and [rad]."""
+
+    position: float
+    rotation: float
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyResponse:
     """An inference that came back: the chunk, how long it took [s], what it was asked about, what it means.
 
-    `made` are its rows in command space. `waited`: the robot stood meanwhile. `eef` says where the poses of the
+    `made` are its rows in command space, up to the first that was `refused`. `waited`: the robot stood meanwhile. `eef` says where the poses of the
     observation come from: the robot's own measurement, or its joints.
     """
 
@@ -54,6 +68,7 @@ class PolicyResponse:
     ik: Mapping[str, Any] = field(
         default_factory=dict
     )  # how its poses were met, as by `figures`; {} for joints
+    refused: str = ""
 
 
 class PolicyRequests:
@@ -70,8 +85,11 @@ class PolicyRequests:
         policy_observation: Eyes,
         runner: Runner,
         clock: Clock,
+        bound: MissBound | None = None,
     ) -> None:
+        """`bound`: poses that are missed by more are refused; None: they are flagged alone."""
         self.policy = policy
+        self._bound = bound
         self.task = task
         self.runner = runner
         self.policy_observation = policy_observation
@@ -164,7 +182,8 @@ class PolicyRequests:
             made = self._spaces.to_command(chunk, shown, onset)
             source: Literal["measured", "fk"] = "measured" if measured else "fk"
             ik = {} if made.solved is None else figures(made.solved)
-            return PolicyResponse(chunk, seconds, shown, made, waited, age, source, ik)
+            made, refused = self._within(made, onset.row, fresh or held)
+            return PolicyResponse(chunk, seconds, shown, made, waited, age, source, ik, refused)
 
         return self.runner.submit(infer)
 
@@ -183,6 +202,40 @@ class PolicyRequests:
         row = passed if k_max is None else min(passed, k_max)
         return Onset(commanded, qpos if rests else commanded, row)
 
+    def _within(self, made: CommandRows, first: int, begins: bool) -> tuple[CommandRows, str]:
+        """The rows before the first pose from row `first` on that is missed too far, and why no more; PolicyError for none.
+
+        How far away a run `begins` is control's to judge (safety.jump): rows until the first pose is met do not count.
+        """
+        solved, bound = made.solved, self._bound
+        if solved is None or bound is None:
+            return made, ""
+        over = (solved.position_error > bound.position) | (solved.rotation_error > bound.rotation)
+        first = min(first, len(over) - 1)
+        if begins:
+            met = np.flatnonzero(~over[first:].any(axis=1))
+            first += int(met[0]) if len(met) else len(over)
+        rows = first + np.flatnonzero(over[first:].any(axis=1))
+        if not len(rows):
+            return made, ""
+        row = int(rows[0])
+        arm = int(over[row].argmax())
+        wrong = _POSE_MISSED(
+            row=made.source[row],
+            arm=self._spaces.arm_names[arm],
+            mm=1000.0 * solved.position_error[row, arm],
+            deg=np.degrees(solved.rotation_error[row, arm]),
+            allowed_mm=1000.0 * bound.position,
+            allowed_deg=np.degrees(bound.rotation),
+        )
+        if row == first and not begins:
+            raise PolicyError(wrong)
+        kept = IkResult(
+            solved.q[:row], solved.position_error[:row], solved.rotation_error[:row], solved.flags[:row]
+        )
+        cut = replace(made, rows=made.rows[:row], source=made.source[:row], solved=kept)
+        return cut, _ROWS_REFUSED(wrong=wrong, kept=row - first)
+
     def compare(self, answered: PolicyResponse) -> None:
         """Hold the poses that the robot measures against those of its joints: they may be of another frame.
 
@@ -200,7 +253,11 @@ class PolicyRequests:
     def note(self, answered: PolicyResponse) -> None:
         """Say what could not be done of an answer."""
         ik = answered.ik
-        if ik.get("over"):
+        if answered.refused:
+            self.notes.append(
+                Event("poses_refused", answered.refused, self._clock.now(), answered.observation.step)
+            )
+        elif ik.get("over"):
             text = _POSES_NOT_REACHED(
                 over=ik["over"],
                 rows=ik["rows"],
