@@ -13,8 +13,8 @@ from PIL import Image, UnidentifiedImageError
 
 from evaweb.datasets.playing import Played
 from evaweb.errors import NotFound
+from runtime.core.picture_bounds import TooLargeError, require_size
 from runtime.core.sentences import Pattern
-from runtime.datasets.pictures import require_size
 from runtime.recording.files import RecordingError
 
 _PICTURES_VIDEO = Pattern("datasets.stills.pictures_video", "the pictures of {camera} are in a video")
@@ -31,11 +31,13 @@ def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
     content = _stored(episode, key, row)
     try:
         with Image.open(io.BytesIO(content)) as picture:
-            require_size(f"picture {row} of {key!r}", *picture.size)
+            require_size(*picture.size, f"picture {row} of {key!r} is")
             kind = _SHOWN.get(picture.format or "")
             if kind:
                 return content, kind
             pixels = np.ascontiguousarray(picture.convert("RGB"))
+    except TooLargeError as error:
+        raise RecordingError(str(error)) from None
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise RecordingError(f"picture {row} of {key!r} cannot be decoded: {error}") from error
     jpeg: bytes = simplejpeg.encode_jpeg(pixels, quality=QUALITY)

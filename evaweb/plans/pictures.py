@@ -22,6 +22,7 @@ from django.conf import settings
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import wire_to
+from runtime.core.picture_bounds import MOST_PIXELS
 from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CodecError, Subscriber
 
@@ -47,7 +48,6 @@ WIDTH, HEIGHT = (
     64,
     48,
 )  # to which both pictures are brought before they are compared; static/console/trial/match.js does too
-MOST_PIXELS = 2**24  # of a picture that is decoded: a small file can be a very large picture
 _TURN_S = 0.1
 
 

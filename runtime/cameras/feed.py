@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy as np
 
 from runtime.cameras.base import Address, CameraError
 from runtime.cameras.finding import found
+from runtime.core.picture_bounds import DECODING, TooLargeError, bound, require_size
 from runtime.core.types import UInt8
 
 _THERE_S = 0.003  # a packet that comes within was there before it was asked for
@@ -56,13 +58,14 @@ class Feed:
         self._address = address
         self._open_s, self._read_s = open_s, read_s
         self._seen = False  # a picture
+        self._newest: Any = None  # of its packets
         self._errors: Any = av.error
         begun = time.monotonic()
         try:
             self._container: Any = av.open(
                 address.url,
                 format=address.format,
-                options={**_QUICK, **address.options} if address.format else dict(address.options),
+                options={**(_QUICK if address.format else {}), **address.options, **DECODING},
                 timeout=(open_s, read_s),
                 metadata_errors="replace",  # a camera's title is written as its maker likes
             )
@@ -73,6 +76,11 @@ class Feed:
             others = "".join(f", but {kind}" for kind in sorted({s.type for s in self._container.streams}))
             self._container.close()
             raise CameraError(f"it has no video{others}")
+        try:
+            bound(self._container)
+        except TooLargeError as error:
+            self._container.close()
+            raise CameraError(str(error)) from None
         self._stream = videos[0]
         self._stream.codec_context.thread_count = 1  # frame threads hold pictures back
         # A stamp tells how old a picture is. Where there is none, it must not have lain in a socket for seconds.
@@ -92,7 +100,10 @@ class Feed:
             picture = None if frame is None else self._rgb(frame)
         except (self._errors.FFmpegError, OSError, ValueError) as error:
             waited = time.monotonic() - begun
-            raise CameraError(found(error, self._address, waited, self._read_s, not self._seen)) from None
+            too_large = self._too_large()
+            raise CameraError(
+                too_large or found(error, self._address, waited, self._read_s, not self._seen)
+            ) from None
         if frame is None or picture is None:
             return None
         self._seen = True
@@ -111,6 +122,7 @@ class Feed:
         """
         since = time.monotonic()
         for packet in self._packets():
+            self._newest = packet
             try:
                 frames = packet.decode()
             except self._errors.InvalidDataError:
@@ -121,6 +133,20 @@ class Feed:
             allowed = self._read_s if self._seen else max(self._open_s, self._read_s)
             if time.monotonic() - since > allowed:
                 raise CameraError(f"what it sent for {allowed:g} s cannot be decoded")
+
+    def _too_large(self) -> str:
+        """Sentence on the size of the newest picture, "" where it is none that no camera has."""
+        width, height = self._stream.width, self._stream.height
+        if self._stream.codec_context.name == "mjpeg" and self._newest is not None:
+            import simplejpeg
+
+            with contextlib.suppress(ValueError):  # no whole header
+                height, width, _, _ = simplejpeg.decode_jpeg_header(bytes(self._newest))
+        try:
+            require_size(width, height)
+        except TooLargeError as error:
+            return str(error)
+        return ""
 
     def _packets(self) -> Iterator[Any]:
         """As they come; of a stream without stamps whose every packet is a picture, without those of a backlog."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from runtime.core.errors import RecordingError
+from runtime.core.picture_bounds import TooLargeError, open_video
 from runtime.datasets.entries import Span
 from runtime.datasets.pictures import Pictures, Stretch
 from runtime.datasets.remux import copied_stream
@@ -97,7 +98,7 @@ def _copy(source: Path, target: Path, ticks: list[int], fps: float) -> None:
     rank = {tick: number for number, tick in enumerate(ticks)}
     try:
         with (
-            av.open(str(source), metadata_errors="replace") as recorded,
+            open_video(source) as recorded,
             av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
         ):
             packets = list(_coded(source, recorded, rank))
@@ -110,7 +111,7 @@ def _copy(source: Path, target: Path, ticks: list[int], fps: float) -> None:
                 packet.duration, packet.time_base = 1, 1 / rate
                 packet.stream = copy
                 container.mux(packet)
-    except (av.FFmpegError, OSError, IndexError) as error:
+    except (av.FFmpegError, OSError, IndexError, TooLargeError) as error:
         raise RecordingError(f"{source} cannot be copied: {error}") from error
 
 

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from runtime.core.errors import RecordingError
+from runtime.core.picture_bounds import TooLargeError, open_video, require_size
 from runtime.core.types import UInt8
 
 if TYPE_CHECKING:
     import av
 
 
-MOST_PIXELS = 2**24  # of a picture that is decoded
 KEPT_BYTES = (
     16 << 20
 )  # decoded frames that are kept of a video: going backwards decodes a group of pictures once
@@ -80,7 +80,7 @@ class Pictures(PictureSequence):
         if not path.is_file():
             raise RecordingError(f"there is no video {path}")
         try:
-            self._container = av.open(str(path), metadata_errors="replace")
+            self._container = open_video(path)
         except self._errors as error:
             raise RecordingError(f"{path} cannot be opened as a video: {error}") from error
         try:
@@ -223,14 +223,6 @@ class Pictures(PictureSequence):
         self._container.close()
 
 
-def require_size(name: str, width: int, height: int) -> None:
-    """Raise RecordingError where a picture's header says that it is larger than any camera's: a small file can be."""
-    if width * height > MOST_PIXELS:
-        raise RecordingError(
-            f"{name} is {width} x {height}; allowed: {MOST_PIXELS} pixels in all, such as 4096 x 4096"
-        )
-
-
 class StoredPictures(PictureSequence):
     """The pictures of an image column: coded as PNG or JPEG in the rows, or in files that the rows name."""
 
@@ -249,8 +241,10 @@ class StoredPictures(PictureSequence):
             raise IndexError(f"{self._name} has pictures 0 to {len(self) - 1}, asked for {index}")
         try:
             with Image.open(io.BytesIO(self._coded(index))) as image:
-                require_size(f"{self._name}, picture {index}", *image.size)
+                require_size(*image.size, f"{self._name}, picture {index} is")
                 picture = np.array(image.convert("RGB"), dtype=np.uint8)
+        except TooLargeError as error:
+            raise RecordingError(str(error)) from None
         except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
             raise RecordingError(f"{self._name}, picture {index} cannot be decoded: {error}") from error
         picture.flags.writeable = False

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from runtime.core.errors import RecordingError
+from runtime.core.picture_bounds import TooLargeError, open_video
 
 if TYPE_CHECKING:
     import av
@@ -29,9 +30,9 @@ def coded(video: Path) -> str:
     import av
 
     try:
-        with av.open(str(video), metadata_errors="replace") as container:
+        with open_video(video) as container:
             return str(container.streams.video[0].codec.canonical_name)
-    except (av.FFmpegError, OSError, IndexError) as error:
+    except (av.FFmpegError, OSError, IndexError, TooLargeError) as error:
         raise RecordingError(f"{video} cannot be read: {error}") from error
 
 
@@ -52,7 +53,7 @@ def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
     copied = 0
     try:
         with (
-            av.open(str(source), metadata_errors="replace") as recorded,
+            open_video(source) as recorded,
             av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
         ):
             stream = recorded.streams.video[0]
@@ -66,7 +67,7 @@ def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
                 container.mux(packet)
                 copied += 1
             facts = VideoFacts(stream.height, stream.width, stream.codec.canonical_name, str(stream.pix_fmt))
-    except (av.FFmpegError, OSError, IndexError) as error:
+    except (av.FFmpegError, OSError, IndexError, TooLargeError) as error:
         raise RecordingError(f"{source} cannot be copied after frame {copied}: {error}") from error
     if copied != frames:
         raise RecordingError(f"{source} has {copied} frames for {frames} rows")
@@ -83,7 +84,7 @@ def cut(source: Path, target: BinaryIO, begin: float, end: float) -> float:
     first = None
     try:
         with (
-            av.open(str(source)) as recorded,
+            open_video(source) as recorded,
             av.open(target, "w", format="mp4") as container,
         ):
             stream = recorded.streams.video[0]
@@ -102,7 +103,7 @@ def cut(source: Path, target: BinaryIO, begin: float, end: float) -> float:
                 packet.pts, packet.dts = packet.pts - first, packet.dts - first
                 packet.stream = copy
                 container.mux(packet)
-    except (av.FFmpegError, OSError, IndexError) as error:
+    except (av.FFmpegError, OSError, IndexError, TooLargeError) as error:
         raise RecordingError(f"{source} cannot be copied from {begin:.2f} s: {error}") from error
     if first is None:
         raise RecordingError(f"{source} has no pictures from {begin:.2f} to {end:.2f} s")

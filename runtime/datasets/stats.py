@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.core.errors import RecordingError
+from runtime.core.picture_bounds import open_video
 from runtime.core.types import UInt8
 from runtime.datasets.pictures import PictureSequence
 
@@ -51,7 +52,7 @@ def video_statistic(path: Path, frames: int) -> Statistic:
     sums = _Histogram()
     decoded = 0
     try:
-        with av.open(str(path), metadata_errors="replace") as container:
+        with open_video(path) as container:
             for frame in container.decode(video=0):
                 if decoded in wanted:
                     sums.add(np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)[::2, ::2])

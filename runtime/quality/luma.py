@@ -11,6 +11,7 @@ import av
 import numpy as np
 
 from runtime.core.errors import RecordingError
+from runtime.core.picture_bounds import open_video
 from runtime.core.types import Float32
 from runtime.datasets.pictures import PictureSequence, Stretch
 
@@ -53,7 +54,7 @@ class VideoFilm:
         self._sampling = sampling
         self._stretch = stretch
         try:
-            self._container = av.open(str(path), metadata_errors="replace")
+            self._container = open_video(path)
         except (av.FFmpegError, ValueError) as error:
             raise RecordingError(f"{path} cannot be opened as a video: {error}") from error
         if not self._container.streams.video:

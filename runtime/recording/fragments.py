@@ -11,6 +11,7 @@ from typing import Any, BinaryIO
 import av
 
 from runtime.core.errors import RecordingError
+from runtime.core.picture_bounds import TooLargeError, open_video
 
 _HEADER = struct.Struct(">I4s")
 _LONG = struct.Struct(">Q")
@@ -79,9 +80,9 @@ def count_frames(path: Path) -> int:
     try:
         if whole_bytes(path) == 0:
             return 0
-        with av.open(str(path), metadata_errors="replace") as container:
+        with open_video(path) as container:
             return _count(container)
-    except av.FFmpegError:
+    except (av.FFmpegError, TooLargeError):
         return 0
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error

@@ -38,8 +38,8 @@ class SafetySettings(Settings):
     jump: float = Field(default=0.5, gt=0)
     """Farthest that an action may be from the last command [rad]."""
     missed_pose: Literal["refuse", "flag"] = "refuse"
-    """What becomes of a pose of the policy that joints miss by more than the two below: "refuse" executes the rows before
-    it, and holds where there are none; "flag" lets joints go as near as they can, as fast as they may, and says so."""
+    """What becomes of a pose of the policy that joints miss by more than the two below: "refuse" executes the rows
+    before it, and holds where there are none; "flag" goes as near as joints can, as fast as they may, and says so."""
     missed_pose_m: float = Field(default=0.02, gt=0)
     """Farthest that joints may miss the position of a pose [m]."""
     missed_pose_rad: float = Field(default=0.2, gt=0)

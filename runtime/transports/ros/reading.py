@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from runtime.core.errors import CodecError
+from runtime.core.picture_bounds import MOST_PIXELS
 from runtime.core.types import Float32, Float64, UInt8
 from runtime.transports.ros.messages import CompressedImage, Image, JointState, PoseStamped
 from runtime.transports.ros.topics import Part
@@ -14,7 +15,6 @@ from runtime.transports.ros.topics import Part
 Names = Literal["check", "ignore"]
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4}
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
-PIXELS_LIMIT = 16 * 1024 * 1024
 
 
 class Unusable(CodecError):
@@ -137,9 +137,9 @@ def _check_raw(message: Image) -> None:
 
 
 def _check_size(height: int, width: int) -> None:
-    if not 0 < height * width <= PIXELS_LIMIT:
+    if not 0 < height * width <= MOST_PIXELS:
         raise Unusable(
-            "wrong_dimension", f"a picture has {width} x {height} pixels; allowed: 1 to {PIXELS_LIMIT}"
+            "wrong_dimension", f"a picture has {width} x {height} pixels; allowed: 1 to {MOST_PIXELS}"
         )
 
 

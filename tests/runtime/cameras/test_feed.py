@@ -11,6 +11,7 @@ import pytest
 from runtime.cameras.base import Address, CameraError
 from runtime.cameras.feed import Backlog, Feed
 from runtime.sim.mjpeg_server import MjpegServer
+from tests.processes import PATIENCE_S
 from tests.runtime.cameras.movies import movie, number_of
 
 
@@ -48,6 +49,21 @@ def test_a_stream_without_a_time_of_its_own_has_no_stamps() -> None:
     frame = feed.read()
     assert frame is not None
     assert frame.stamp is None
+    feed.close()
+    server.close()
+
+
+def test_pictures_that_are_larger_than_any_cameras_are_refused_with_their_size(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        "runtime.sim.mjpeg_server.picture", lambda *given: np.zeros((4096, 4112, 3), np.uint8)
+    )
+    server = MjpegServer()
+    url = server.start()
+    feed = Feed(Address(url, url, "mpjpeg", stamped=False), PATIENCE_S, PATIENCE_S)
+    with pytest.raises(CameraError, match="its pictures are 4112 x 4096; allowed: 16777216 pixels"):
+        feed.read()
     feed.close()
     server.close()
 

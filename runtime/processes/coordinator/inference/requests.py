@@ -54,8 +54,8 @@ class MissBound:
 class PolicyResponse:
     """An inference that came back: the chunk, how long it took [s], what it was asked about, what it means.
 
-    `made` are its rows in command space, up to the first that was `refused`. `waited`: the robot stood meanwhile. `eef` says where the poses of the
-    observation come from: the robot's own measurement, or its joints.
+    `made` are its rows in command space, up to the first that was `refused`. `waited`: the robot stood meanwhile. `eef`
+    says where the poses of the observation come from: the robot's own measurement, or its joints.
     """
 
     chunk: ActionChunk
@@ -203,9 +203,10 @@ class PolicyRequests:
         return Onset(commanded, qpos if rests else commanded, row)
 
     def _within(self, made: CommandRows, first: int, begins: bool) -> tuple[CommandRows, str]:
-        """The rows before the first pose from row `first` on that is missed too far, and why no more; PolicyError for none.
+        """The rows before the first pose from row `first` on that is missed too far, and why no more.
 
-        How far away a run `begins` is control's to judge (safety.jump): rows until the first pose is met do not count.
+        PolicyError where none is left. How far away a run `begins` is control's to judge (safety.jump): rows until the
+        first pose is met do not count.
         """
         solved, bound = made.solved, self._bound
         if solved is None or bound is None:

@@ -81,7 +81,7 @@ def in_millimetres(count: int) -> np.ndarray:
 
 
 def test_a_later_answer_that_begins_far_away_is_refused_by_name() -> None:
-    with pytest.raises(PolicyError, match="row 1 of the answer is a pose of left_arm .* or not in metres"):
+    with pytest.raises(PolicyError, match=r"row 1 of the answer is a pose of left_arm .* or not in metres"):
         asked(in_millimetres(20), first=False)
 
 
