@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import threading
 from collections import Counter
 from collections.abc import Mapping
@@ -90,6 +91,10 @@ _CLOCK_BACK = fixed(
 _CLOCK_AHEAD = fixed(
     "node.clock_ahead",
     "the node's clock leapt ahead: it was set",
+)
+_NOT_NEWER = fixed(
+    "node.not_newer",
+    "its stamps run backwards: what is older than what came before it is passed over",
 )
 _FRAMES_LOST = fixed(
     "node.frames_lost",
@@ -207,6 +212,7 @@ class NodeSource(Source):
 
     def _forget(self) -> None:
         self._map = ClockMap(tolerance=_BACKWARDS_S)
+        self._stamp = -math.inf  # of the newest message
         self._freshness = Freshness()
         self._faults: Counter[str] = Counter()
         self._sentences: dict[str, str] = {}  # by fault, the newest
@@ -273,7 +279,14 @@ class NodeSource(Source):
         if frame.truth is not None and not self._simulated:
             self._ignore_truth()
             frame = replace(frame, truth=None)
-        captured = self._captured(frame, arrived)
+        time = self._mapped(frame.stamp, arrived)
+        if time is None:
+            with self._changed:
+                self._count_lost(frame.sequence)
+            self._blame("not_newer", _NOT_NEWER)
+            self._refused = "not_newer", _NOT_NEWER
+            return
+        captured = self._captured(frame, time)
         with self._changed:
             self._count_lost(frame.sequence)
             self._count += 1
@@ -288,9 +301,8 @@ class NodeSource(Source):
             text = _TRUTH_UNDECLARED
             self._blame("truth_ignored", text)
 
-    def _captured(self, frame: NodeFrame, arrived: float) -> dict[str, float]:
+    def _captured(self, frame: NodeFrame, time: float) -> dict[str, float]:
         """The time of each stream: the message's, but for pictures that are no new ones."""
-        time = self._mapped(frame.stamp, arrived)
         times = dict.fromkeys(["joints", *(["eef"] if frame.eef is not None else []), *frame.pictures], time)
         if self._detect_frozen:
             times |= self._freshness.captured(frame.pictures, time)
@@ -298,14 +310,20 @@ class NodeSource(Source):
                 self._blame(f"frozen_{camera}", _FROZEN_PICTURE(camera=camera, seconds=FROZEN_S))
         return times
 
-    def _mapped(self, stamp: float, arrived: float) -> float:
-        """The node's stamp on our clock; where its clock jumps, that is said and the map begins anew."""
+    def _mapped(self, stamp: float, arrived: float) -> float | None:
+        """The node's stamp on our clock, None where it is older than the newest: time never goes back.
+
+        Where the node's clock jumps, that is said and the map begins anew.
+        """
         restarts, leaps = self._map.restarts, self._map.leaps
         time = self._map.map(stamp, arrived)
         if self._map.restarts > restarts:
             self._blame("clock_backwards", _CLOCK_BACK)
         if self._map.leaps > leaps:
             self._blame("clock_forwards", _CLOCK_AHEAD)
+        if self._map.restarts == restarts and stamp < self._stamp:
+            return None
+        self._stamp = stamp
         return time
 
     def _count_lost(self, sequence: int | None) -> None:

@@ -264,6 +264,26 @@ def test_the_newest_counts_by_arrival_when_a_node_restarts_with_a_smaller_clock(
     assert observation.captured["joints"] <= observation.arrived
 
 
+def test_stamps_that_run_backwards_are_named_and_never_recorded_as_time(node: Node) -> None:
+    """Each a little before the last: none by so much that the node's clock was set."""
+    with listening(node) as source:
+        joined(node, source)
+        begun, times = time.monotonic(), []
+        for mark in range(40):
+            node.say(frame(begun - 0.02 * mark, mark))
+            observation = source.receive(0.05)
+            if observation is not None:
+                times.append(observation.captured["joints"])
+
+        def told() -> bool:
+            return source.faults().get("not_newer", 0) >= 20
+
+        wait_for(told)
+    assert times == sorted(times)
+    assert len(times) <= 20
+    assert source.why("not_newer").startswith("its stamps run backwards")
+
+
 @pytest.mark.parametrize(
     ("jump", "name"), [(1e6, "clock_forwards"), (0.9, "clock_forwards"), (-0.3, "clock_backwards")]
 )
