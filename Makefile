@@ -49,6 +49,7 @@ $(VENV)/.setup-dev: $(VENV)/.setup
 	@echo 'installing what tests of pages need'; $(TICKING) $(call fetch,what tests of pages need,$(call npm,ci))
 	@echo "compiling every robot's inverse kinematics"; $(TICKING) $(PY) -m runtime.kinematics
 	@echo 'compiling the tests'; $(TICKING) $(PY) -m pytest --collect-only -q >/dev/null
+	@echo "making the tests' empty database"; $(TICKING) $(PY) -m tests.migrated
 	@touch $@
 
 demo: setup ## a small lab on this machine, no robot needed; ARGS="--once --json FILE" for one trial
@@ -95,4 +96,4 @@ bench: setup-dev ## ARGS="loop --json FILE"
 	$(PY) -m benchmarks $(ARGS)
 
 clean: ## remove the environment and caches, never data
-	rm -rf $(VENV) node_modules *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) node_modules build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

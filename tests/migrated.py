@@ -1,7 +1,11 @@
-"""An empty database with every table, made once, for labs and for tests that begin with a copy of it."""
+"""An empty database with every table, made once, for labs and for tests that begin with a copy of it.
+
+`python -m tests.migrated` makes it beforehand: it is kept for as long as nothing that it is made of has changed.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import sqlite3
@@ -14,6 +18,7 @@ from pathlib import Path
 from tests.once import made_once
 
 ROOT = Path(__file__).parents[1]
+KEPT = ROOT / "build" / "migrated"
 
 
 def copy(folder: Path) -> None:
@@ -30,7 +35,28 @@ def copy_to(database: Path) -> None:
 
 @cache
 def _made() -> Path:
-    return made_once("migrated", _make) / "whole.sqlite3"
+    kept = _kept()
+    return kept if kept.exists() else made_once("migrated", _make) / "whole.sqlite3"
+
+
+def _kept() -> Path:
+    """Its place, which says what it is made of: our code, which migrations may use, and the versions of all else."""
+    made_of = hashlib.sha256((ROOT / "constraints.txt").read_bytes())
+    for path in sorted(ROOT.glob("evaweb/**/*.py")):
+        made_of.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return KEPT / f"{made_of.hexdigest()}.sqlite3"
+
+
+def _keep() -> None:
+    kept = _kept()
+    if kept.exists():
+        return
+    shutil.rmtree(KEPT, ignore_errors=True)
+    draft = KEPT / f"draft-{os.getpid()}"
+    draft.mkdir(0o700, parents=True)
+    _make(draft)
+    (draft / "whole.sqlite3").rename(kept)
+    shutil.rmtree(draft)
 
 
 def _make(folder: Path) -> None:
@@ -46,3 +72,7 @@ def _make(folder: Path) -> None:
         closing(sqlite3.connect(folder / "whole.sqlite3")) as copied,
     ):
         made.backup(copied)  # whatever its journal still has
+
+
+if __name__ == "__main__":
+    _keep()
