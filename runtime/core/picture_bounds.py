@@ -40,5 +40,7 @@ def bound(container: Any) -> None:
     TooLargeError where the container says already that they are.
     """
     for stream in container.streams.video:
+        if stream.codec_context is None:  # nobody can decode it
+            continue
         require_size(stream.width, stream.height)
         stream.codec_context.options = {**stream.codec_context.options, **DECODING}

@@ -315,7 +315,7 @@ class Inference:
         waited = self._mode in ON_DEMAND or self._strategy.query.waits
         try:
             committed = self._committed if self.continues else None
-            flight = self.requests.ask(waited, committed, self._strategy.parameters.k_max)
+            flight = self.requests.ask(waited, committed, self._strategy.parameters.k_max, executed=True)
         except StaleObservationError:
             if self._stale_since is None:
                 self._stale_since = now

@@ -155,11 +155,16 @@ class PolicyRequests:
         return self.policy_observation.now(self.task, self.policy.sees_pictures)
 
     def ask(
-        self, waited: bool = False, committed: Committed | None = None, k_max: int | None = None
+        self,
+        waited: bool = False,
+        committed: Committed | None = None,
+        k_max: int | None = None,
+        executed: bool = False,
     ) -> Future[PolicyResponse]:
         """Send one request about the newest observation; raises PolicyError where that is too old.
 
-        `k_max` is how many rows of the answer may be dropped as stale at most, None: as many as are.
+        `k_max` is how many rows of the answer may be dropped as stale at most, None: as many as are. The answer of one
+        that is to be `executed` ends before the first pose that is missed by far.
         """
         observation = self.observe()
         policy, fresh, held = self.policy, self._fresh, self._held
@@ -182,7 +187,7 @@ class PolicyRequests:
             made = self._spaces.to_command(chunk, shown, onset)
             source: Literal["measured", "fk"] = "measured" if measured else "fk"
             ik = {} if made.solved is None else figures(made.solved)
-            made, refused = self._within(made, onset.row, fresh or held)
+            made, refused = self._within(made, onset.row, fresh or held) if executed else (made, "")
             return PolicyResponse(chunk, seconds, shown, made, waited, age, source, ik, refused)
 
         return self.runner.submit(infer)

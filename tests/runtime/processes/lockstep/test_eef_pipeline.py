@@ -92,8 +92,9 @@ def test_poses_of_any_format_and_mode_move_the_joints_as_they_are_meant(
     station.close()
 
 
-def test_poses_out_of_reach_are_executed_as_near_as_can_be_and_recorded_as_missed(tmp_path: Path) -> None:
-    station = speaking(Station(stubbed(tmp_path)), on_time, PoseFormat())
+def stretching(station: Station) -> Station:
+    """The tenth row of each answer, and all that follow, are far out of reach."""
+    speaking(station, on_time, PoseFormat())
     infer = station.policy.infer
 
     def stretched(observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
@@ -102,7 +103,25 @@ def test_poses_out_of_reach_are_executed_as_near_as_can_be_and_recorded_as_misse
         return chunk
 
     station.policy.infer = stretched  # type: ignore[method-assign]
-    station.running(40)
+    return station
+
+
+def test_poses_out_of_reach_are_not_driven_to(tmp_path: Path) -> None:
+    station = stretching(Station(stubbed(tmp_path))).running(40)
+    episode = station.stop()
+    assert "row 10 of the answer is a pose of right_arm" in station.events("poses_refused")[-1]
+    assert "the 10 rows before it are executed" in station.events("poses_refused")[-1]
+    raw = episode.raw.to_pylist()
+    assert {row["target_step"] >= 0 for row in raw if row["index"] < 10} >= {True}
+    assert {row["target_step"] for row in raw if row["index"] >= 10} == {-1}
+    assert np.nanmax([row["ik_position_error"][1] for row in raw if row["index"] < 10]) < 0.001
+    station.close()
+
+
+def test_poses_out_of_reach_may_be_executed_as_near_as_can_be_and_are_recorded_as_missed(
+    tmp_path: Path,
+) -> None:
+    station = stretching(Station(stubbed(tmp_path, safety={"missed_pose": "flag"}))).running(40)
     shown = station.coordinator.snapshot()["policy"]["ik"]
     assert shown["over"] == 10
     assert shown["worst_mm"] > 300

@@ -59,9 +59,9 @@ def asked(rows: np.ndarray, first: bool, bound: MissBound | None = BOUND, passed
     requests = PolicyRequests(policy, "pick", SPACES, eyes, LockstepRunner(0), clock, bound)
     if not first:
         policy.rows = near(4)
-        requests.ask().result()
+        requests.ask(executed=True).result()
         policy.rows = rows
-    answered = requests.ask().result()
+    answered = requests.ask(executed=True).result()
     requests.note(answered)
     assert bool(answered.refused) == ("poses_refused" in [note.kind for note in requests.notes])
     return answered
@@ -112,6 +112,16 @@ def test_a_deployment_may_have_them_flagged_alone() -> None:
     answered = asked(in_millimetres(20), first=False, bound=None)
     assert len(answered.made.rows) == 20
     assert answered.ik["over"] > 0
+
+
+def test_who_only_looks_sees_all_of_it() -> None:
+    """A set-up asks twice, and compares where the policy means to begin."""
+    requests = PolicyRequests(
+        Answers(in_millimetres(20)), "pick", SPACES, Eyes(0), LockstepRunner(0), VirtualClock(0.0), BOUND
+    )
+    for _ in range(2):
+        answered = requests.ask().result()
+        assert (len(answered.made.rows), answered.refused) == (20, "")
 
 
 def test_the_arm_is_named() -> None:
