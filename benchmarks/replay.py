@@ -120,7 +120,7 @@ def _visits(url: str, password: str, episode: str, size: int) -> Iterator[dict[s
             page.wait_for_url(lambda address: "/login" not in address)
             page.add_init_script(_WATCH)
             page.goto(f"{url}/replay/{episode}/", wait_until="commit")
-            page.wait_for_function("window.shownAt !== undefined", timeout=_SHOWN_MS)
+            page.wait_for_function("() => window.shownAt !== undefined", timeout=_SHOWN_MS)
             shown, fetched = page.evaluate("[window.shownAt, window.fetched()]")
             browser.close()
             if visit:
