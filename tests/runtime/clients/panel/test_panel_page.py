@@ -106,7 +106,7 @@ def test_a_page_of_another_origin_presses_nothing(panel, browser, tmp_path):
     evil = "http://evil.example/"
     page.route(evil, lambda route: route.fulfill(body=form, content_type="text/html"))
     page.goto(evil)
-    page.wait_for_function("document.title === 'refused'")
+    page.wait_for_function("() => document.title === 'refused'")
     with page.expect_response("**/estop") as answer:
         page.get_by_role("button").click()
     assert answer.value.status == 403
