@@ -161,7 +161,10 @@ class Feed:
 
     def _rgb(self, frame: Any) -> UInt8:
         try:
+            require_size(frame.width, frame.height)
             return np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+        except TooLargeError as error:
+            raise CameraError(str(error)) from None
         except ValueError:
             raise CameraError(f"its pixel format {frame.format.name} cannot be made RGB") from None
 

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 MOST_PIXELS = 2**24  # such as 4096 x 4096
-DECODING = {"max_pixels": str(MOST_PIXELS)}  # FFmpeg's option: looked at before memory is taken
+# FFmpeg's option, looked at before memory is taken: of sizes that decoders have rounded up, so that ours decides.
+DECODING = {"max_pixels": str(MOST_PIXELS * 5 // 4)}
 
 
 class TooLargeError(ValueError):

@@ -38,12 +38,13 @@ class SafetySettings(Settings):
     jump: float = Field(default=0.5, gt=0)
     """Farthest that an action may be from the last command [rad]."""
     missed_pose: Literal["refuse", "flag"] = "refuse"
-    """What becomes of a pose of the policy that joints miss by more than the two below: "refuse" executes the rows
-    before it, and holds where there are none; "flag" goes as near as joints can, as fast as they may, and says so."""
+    """What becomes of a pose of the policy that no joints meet within the two below, or that is a `jump` ahead of where
+    joints can be by then: "refuse" executes the rows before it, and holds where there are none; "flag" goes as near as
+    joints can, as fast as they may, and says so."""
     missed_pose_m: float = Field(default=0.02, gt=0)
-    """Farthest that joints may miss the position of a pose [m]."""
+    """Farthest that the nearest joints may miss the position of a pose [m]."""
     missed_pose_rad: float = Field(default=0.2, gt=0)
-    """Farthest that joints may miss its orientation [rad]."""
+    """Farthest that they may miss its orientation [rad]."""
     velocity_scale: float = Field(default=1.0, gt=0, le=1)
     """Part of the robot's joint velocities that may be used."""
     acceleration: float = Field(default=60.0, gt=0)

@@ -44,14 +44,15 @@ class CommandRows:
     """A chunk in command space at control rate.
 
     `rows` float64 [H', D] are absolute joint targets; `source` int64 [H'] is the policy's row that each was made
-    from; `solved` says how well poses were met, None for a joint chunk. `first` [D] is where the first pose would
-    have the robot however far that is, None where rows[0] says so.
+    from; `solved` says how well poses were met, and `targets` [H', arms, 7] are these, None for a joint chunk. `first`
+    [D] is where the first pose would have the robot however far that is, None where rows[0] says so.
     """
 
     rows: Float64
     source: NDArray[np.int64]
     solved: IkResult | None
     first: Float64 | None = None
+    targets: Float64 | None = None
 
     @property
     def meant(self) -> Float64:
@@ -213,7 +214,14 @@ class ActionSpaces(EndEffectors):
             free = self._kinematics.solve(targets[:1], qpos)
             alone = self._assembled(free.q, poses[:1], layout, joints[:1], onset)
             first = self._unwrapped(alone, qpos, self._all)[0]
-        return CommandRows(self._unwrapped(commands, qpos, self._all), source, solved, first)
+        return CommandRows(self._unwrapped(commands, qpos, self._all), source, solved, first, targets)
+
+    def meet(self, made: CommandRows, row: int) -> tuple[IkResult, float]:
+        """The pose of a row as joints near that row's would meet it however fast, and how far those are away [rad]."""
+        assert made.solved is not None
+        assert made.targets is not None
+        free = self._kinematics.solve(made.targets[row : row + 1], made.solved.q[row])
+        return free, float(np.abs(free.q[0] - made.solved.q[row]).max())
 
     def _assembled(
         self, solved: Float64, poses: Float64, layout: PoseRows, joints: Float64, onset: Onset

@@ -270,10 +270,11 @@ class NodeSource(Source):
                 self._blame(error.fault, str(error))
                 self._refused = error.fault, str(error)
             else:
-                self._keep(frame, arrived)
-                return
+                if self._keep(frame, arrived):
+                    return
 
-    def _keep(self, frame: NodeFrame, arrived: float) -> None:
+    def _keep(self, frame: NodeFrame, arrived: float) -> bool:
+        """Keep it for who receives; False where it is older than what came before it."""
         for fault, text in frame.remarks:
             self._blame(fault, text)
         if frame.truth is not None and not self._simulated:
@@ -285,7 +286,7 @@ class NodeSource(Source):
                 self._count_lost(frame.sequence)
             self._blame("not_newer", _NOT_NEWER)
             self._refused = "not_newer", _NOT_NEWER
-            return
+            return False
         captured = self._captured(frame, time)
         with self._changed:
             self._count_lost(frame.sequence)
@@ -294,6 +295,7 @@ class NodeSource(Source):
             self._status = frame.status
             self._newest = (self._count, arrived, captured, frame)
             self._changed.notify_all()
+        return True
 
     def _ignore_truth(self) -> None:
         """Said once: every message of such a node has it."""

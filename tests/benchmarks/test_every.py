@@ -31,6 +31,7 @@ FEWER = {
         "strategies.DELAYS": [3],
         "strategies.RATES": [3.0],
     },
+    "wires": {"wires_policies._ROUNDS": 1},
 }
 CODE = """
 import importlib, json, pathlib, sys

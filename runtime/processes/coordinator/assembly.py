@@ -120,7 +120,7 @@ def assemble(
 
 def _bound(safety: SafetySettings) -> MissBound | None:
     refuses = safety.missed_pose == "refuse"
-    return MissBound(safety.missed_pose_m, safety.missed_pose_rad) if refuses else None
+    return MissBound(safety.missed_pose_m, safety.missed_pose_rad, safety.jump) if refuses else None
 
 
 def _inference(

@@ -53,18 +53,18 @@ def test_a_stream_without_a_time_of_its_own_has_no_stamps() -> None:
     server.close()
 
 
+@pytest.mark.parametrize("size", [4112, 4800])  # ours to refuse, and the decoder's
 def test_pictures_that_are_larger_than_any_cameras_are_refused_with_their_size(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:
     monkeypatch.setattr(
-        "runtime.sim.mjpeg_server.picture", lambda *given: np.zeros((4096, 4112, 3), np.uint8)
+        "runtime.sim.mjpeg_server.picture", lambda *given: np.zeros((size, size, 3), np.uint8)
     )
     server = MjpegServer()
     url = server.start()
-    feed = Feed(Address(url, url, "mpjpeg", stamped=False), PATIENCE_S, PATIENCE_S)
-    with pytest.raises(CameraError, match="its pictures are 4112 x 4096; allowed: 16777216 pixels"):
-        feed.read()
-    feed.close()
+    address = Address(url, url, "mpjpeg", stamped=False)
+    with pytest.raises(CameraError, match=f"its pictures are {size} x {size}; allowed: 16777216 pixels"):
+        Feed(address, PATIENCE_S, PATIENCE_S).read()
     server.close()
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError, RuntimeFault, SetupError
@@ -32,10 +33,15 @@ _POSES_NOT_REACHED = Pattern(
     "degrees: nearest taken ({limit} at a joint limit, {velocity} as fast as joints may, {singular} "
     "near singular)",
 )
-_POSE_MISSED = Pattern(
-    "policy.pose_missed",
-    "row {row} of the answer is a pose of {arm} that its joints miss by {mm:.0f} mm and {deg:.0f} degrees; allowed: "
-    "{allowed_mm:g} mm and {allowed_deg:.0f} degrees (safety.missed_pose): too far, out of reach, or not in metres",
+_OUT_OF_REACH = Pattern(
+    "policy.out_of_reach",
+    "row {row} of the answer is a pose of {arm} that no joints meet: {mm:.0f} mm and {deg:.0f} degrees are left; "
+    "allowed: {allowed_mm:g} mm and {allowed_deg:.0f} degrees (safety.missed_pose): out of reach, or not in metres",
+)
+_TOO_FAR = Pattern(
+    "policy.pose_too_far",
+    "row {row} of the answer is a pose that is {distance:.2f} rad from where the joints can be by then; allowed: "
+    "{allowed:g} (safety.jump)",
 )
 _ROWS_REFUSED = Pattern("policy.rows_refused", "{wrong}; the {kept} rows before it are executed")
 _EARLY_S = 1e-6  # moments are sums of floats
@@ -44,10 +50,18 @@ Committed = Callable[[Observation], Conditioning | None]
 
 @dataclass(frozen=True, slots=True)
 class MissBound:
-    """Farthest that joints may miss a pose of a policy: [m] and [rad]."""
+    """Farthest that any joints may miss a pose of a policy, [m] and [rad], and that they may lag behind it [rad]."""
 
     position: float
     rotation: float
+    jump: float
+
+    def misses(self, solved: IkResult) -> NDArray[np.bool_]:
+        """bool [T, arms]: by more than that."""
+        over: NDArray[np.bool_] = (solved.position_error > self.position) | (
+            solved.rotation_error > self.rotation
+        )
+        return over
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,39 +222,47 @@ class PolicyRequests:
         return Onset(commanded, qpos if rests else commanded, row)
 
     def _within(self, made: CommandRows, first: int, begins: bool) -> tuple[CommandRows, str]:
-        """The rows before the first pose from row `first` on that is missed too far, and why no more.
+        """The rows before the first pose from row `first` on that is refused, and why no more; PolicyError for none.
 
-        PolicyError where none is left. How far away a run `begins` is control's to judge (safety.jump): rows until the
-        first pose is met do not count.
+        Refused is what no joints meet, and what is farther from where joints can be by then than a jump: joints that
+        lag behind a pose by less are those of joint rows that the limits of safety hold back. Where a run `begins` so,
+        control says it, by that one row.
         """
         solved, bound = made.solved, self._bound
         if solved is None or bound is None:
             return made, ""
-        over = (solved.position_error > bound.position) | (solved.rotation_error > bound.rotation)
-        first = min(first, len(over) - 1)
-        if begins:
-            met = np.flatnonzero(~over[first:].any(axis=1))
-            first += int(met[0]) if len(met) else len(over)
-        rows = first + np.flatnonzero(over[first:].any(axis=1))
-        if not len(rows):
+        first = min(first, len(made.rows) - 1)
+        missed = first + np.flatnonzero(bound.misses(solved)[first:].any(axis=1))
+        found = ((int(row), *self._refused(made, int(row), bound)) for row in missed)
+        row, wrong, in_reach = next((one for one in found if one[1]), (-1, "", False))
+        if not wrong:
             return made, ""
-        row = int(rows[0])
-        arm = int(over[row].argmax())
-        wrong = _POSE_MISSED(
-            row=made.source[row],
-            arm=self._spaces.arm_names[arm],
-            mm=1000.0 * solved.position_error[row, arm],
-            deg=np.degrees(solved.rotation_error[row, arm]),
-            allowed_mm=1000.0 * bound.position,
-            allowed_deg=np.degrees(bound.rotation),
-        )
-        if row == first and not begins:
+        kept = row + 1 if row == first and begins and in_reach else row
+        if kept <= first:
             raise PolicyError(wrong)
-        kept = IkResult(
-            solved.q[:row], solved.position_error[:row], solved.rotation_error[:row], solved.flags[:row]
+        met = IkResult(
+            solved.q[:kept], solved.position_error[:kept], solved.rotation_error[:kept], solved.flags[:kept]
         )
-        cut = replace(made, rows=made.rows[:row], source=made.source[:row], solved=kept)
-        return cut, _ROWS_REFUSED(wrong=wrong, kept=row - first)
+        cut = replace(made, rows=made.rows[:kept], source=made.source[:kept], solved=met)
+        return cut, _ROWS_REFUSED(wrong=wrong, kept=kept - first)
+
+    def _refused(self, made: CommandRows, row: int, bound: MissBound) -> tuple[str, bool]:
+        """Why that row is, "" where it is not, and whether any joints meet it."""
+        free, distance = self._spaces.meet(made, row)
+        over = bound.misses(free)[0]
+        if over.any():
+            arm = int(over.argmax())
+            return _OUT_OF_REACH(
+                row=made.source[row],
+                arm=self._spaces.arm_names[arm],
+                mm=1000.0 * free.position_error[0, arm],
+                deg=np.degrees(free.rotation_error[0, arm]),
+                allowed_mm=1000.0 * bound.position,
+                allowed_deg=np.degrees(bound.rotation),
+            ), False
+        if distance > bound.jump:
+            return _TOO_FAR(row=made.source[row], distance=distance, allowed=bound.jump), True
+        return "", True
 
     def compare(self, answered: PolicyResponse) -> None:
         """Hold the poses that the robot measures against those of its joints: they may be of another frame.

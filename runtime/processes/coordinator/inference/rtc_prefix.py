@@ -39,6 +39,7 @@ class _Answer:
     observation_step: int
     waited: bool
     commands: Float64
+    made: int  # of its rows, those that there are commands of
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,9 @@ class RtcPrefix:
         """
         if generation is None or generation == self.generation:
             rows = chunk.actions.astype(np.float64) if commands is None else commands
-            self._on_the_way[chunk_id] = _Answer(chunk, observation_step, waited, rows)
+            pace = (chunk.rate or self._control_rate) / self._control_rate
+            made = len(rows) if commands is None else _made_of(len(commands), pace)
+            self._on_the_way[chunk_id] = _Answer(chunk, observation_step, waited, rows, made)
 
     def merged(self, merged: ChunkMerged) -> None:
         """Control has put a chunk on the timeline, or dropped it: what was dropped commits nobody."""
@@ -124,6 +127,7 @@ class RtcPrefix:
             return
         chunk = answer.chunk
         rows = chunk.actions if chunk.model_actions is None else chunk.model_actions
+        pace = (chunk.rate or self._control_rate) / self._control_rate
         over = [number for number, held in self._merged.items() if held.end < answer.observation_step]
         for number in over:  # no later request is about a step that it has made
             del self._merged[number]
@@ -131,12 +135,12 @@ class RtcPrefix:
             chunk=chunk,
             rows=rows,
             commands=answer.commands,
-            usable=min(len(rows), len(chunk.actions)),
+            usable=min(len(rows), len(chunk.actions), answer.made),
             anchor=merged.arrival_step if answer.waited else answer.observation_step + merged.mistimed,
             first=merged.arrival_step,
             end=int(merged.targets.max(initial=merged.arrival_step - 1)) + 1,
             shares=_shares(merged),
-            pace=(chunk.rate or self._control_rate) / self._control_rate,
+            pace=pace,
             delay=merged.delay,
         )
 
@@ -180,6 +184,8 @@ class RtcPrefix:
         if previous is None:
             return None
         last = held.usable
+        if held.chunk.mode != "absolute":  # what is not planned is not said from here
+            last = min(last, len(steps))
         if execution_horizon is not None:
             last = min(last, math.ceil(execution_horizon * held.pace - _HAIR))
         return Conditioning(previous, consumed, min(self.predicted_delay, len(steps)), last)
@@ -198,12 +204,13 @@ class RtcPrefix:
         known = [shares for shares in made if shares is not None and self._alike(held, shares)]
         if len(known) < len(made):
             return None
+        whole = _held_on(held.rows, held.usable)  # without those that were refused
         exact = abs((steps[0] - held.anchor) * held.pace - max(0, passed)) < _HAIR
         alone = {max(self._merged): 1.0}
         mixed = [place for place, shares in enumerate(known) if not exact or shares != alone]
         if not mixed:
-            return held.rows
-        rows = held.rows.copy()
+            return whole
+        rows = whole.copy()
         found = self._mixed(steps[mixed], [known[place] for place in mixed])
         if found is None:
             return None
@@ -230,7 +237,7 @@ class RtcPrefix:
         joints = self._mixture.joints(self._parts(steps, known, lambda one: (one.commands, 1.0)))
         newest = rows[places].astype(np.float64)
         rows[places] = self._mixture.relative(joints, newest, held.chunk, observation)
-        return rows
+        return _held_on(rows, int(places[-1]) + 1)
 
     def _alike(self, held: _Commitment, shares: Shares) -> bool:
         """True if all these are chunks in the numbers of `held`."""
@@ -297,6 +304,20 @@ class RtcPrefix:
         """RTC needs steps to go on with until the answer arrives."""
         if delay > left:
             self.warning = _DELAY_BEYOND_PLAN(steps=delay, left=left)
+
+
+def _made_of(commands: int, pace: float) -> int:
+    """How many rows of a policy's so many commands were made of."""
+    return math.ceil((commands - 1) * pace - _HAIR) + 1
+
+
+def _held_on(rows: Float32, count: int) -> Float32:
+    """The first `count` rows [T, W], the last of them held to their length, which servers may want."""
+    return (
+        rows
+        if count >= len(rows)
+        else np.concatenate([rows[:count], np.repeat(rows[count - 1 : count], len(rows) - count, axis=0)])
+    )
 
 
 def _expected(delays: Sequence[int], quantile: float) -> float:

@@ -18,7 +18,7 @@ from runtime.spaces.conversion import ActionSpaces
 ROBOT = load("agilex_piper")
 SPACES = ActionSpaces(ROBOT, CompiledKinematics(ROBOT), 30.0)
 START = np.asarray(ROBOT.poses["ready"], np.float64)
-BOUND = MissBound(0.02, 0.2)
+BOUND = MissBound(0.02, 0.2, 0.5)
 
 
 class Answers(Policy):
@@ -81,7 +81,9 @@ def in_millimetres(count: int) -> np.ndarray:
 
 
 def test_a_later_answer_that_begins_far_away_is_refused_by_name() -> None:
-    with pytest.raises(PolicyError, match=r"row 1 of the answer is a pose of left_arm .* or not in metres"):
+    with pytest.raises(
+        PolicyError, match=r"row 1 of the answer is a pose of left_arm that no joints .* not in metres"
+    ):
         asked(in_millimetres(20), first=False)
 
 
@@ -95,11 +97,44 @@ def test_rows_before_the_first_that_is_missed_are_executed(first: bool) -> None:
     assert np.abs(answered.made.rows - START).max() < 0.1
 
 
-def test_where_a_run_begins_is_for_control_to_judge() -> None:
-    far = near(20)
-    far[:, 0] += 0.1
-    answered = asked(far, first=True)
-    assert (len(answered.made.rows), answered.refused) == (20, "")
+@pytest.mark.parametrize("first", [True, False])
+def test_a_first_answer_is_no_licence(first: bool) -> None:
+    """Its first row may be near, and none of its poses be met."""
+    rows = near(20)
+    rows[1:, [8, 9, 10]] *= 1000.0
+    if first:
+        assert len(asked(rows, first, passed=-1).made.rows) == 1
+    else:
+        with pytest.raises(PolicyError, match="right_arm that no joints meet"):
+            asked(rows, first)
+
+
+def shifted(joint: float, count: int) -> np.ndarray:
+    """Poses of where both arms are when their first joints are that far away."""
+    there = START.copy()
+    there[[0, 7]] += joint
+    return np.repeat(SPACES.eef_of(there)[None], count, axis=0).astype(np.float64)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_joints_that_lag_behind_by_less_than_a_jump_are_held_back_as_those_of_joint_rows_are(
+    first: bool,
+) -> None:
+    assert asked(shifted(0.45, 20), first).refused == ""
+
+
+def test_where_a_run_begins_farther_away_control_says_it_by_its_first_row() -> None:
+    answered = asked(shifted(0.9, 20), first=True, passed=-1)
+    assert len(answered.made.rows) == 1
+    assert answered.made.first is not None
+    assert np.abs(answered.made.meant - START).max() == pytest.approx(0.9, abs=0.01)
+
+
+def test_a_later_answer_that_begins_farther_away_is_refused() -> None:
+    with pytest.raises(
+        PolicyError, match=r"row 1 of the answer is a pose that is 0\.\d+ rad from where the joints"
+    ):
+        asked(shifted(0.9, 20), first=False)
 
 
 def test_stale_rows_do_not_count() -> None:

@@ -111,6 +111,34 @@ def test_of_a_blend_the_rows_told_are_those_of_the_blended_joints(form: dict[str
     np.testing.assert_allclose(again, between, atol=1e-3)
 
 
+@pytest.mark.parametrize("mode", ["delta", "relative"])
+@pytest.mark.parametrize("cut", ["horizon", "refused"])
+def test_what_is_not_planned_is_not_said(mode: str, cut: str) -> None:
+    """Rows beyond the horizon, and those that were refused, are of the old observation."""
+    chunk = answer(mode, None, 1, space="joint")
+    planned = SPACES.to_command(chunk, seen(100, START)).rows[: 20 if cut == "refused" else None]
+    held = prefix()
+    held.answered(1, chunk, 100, commands=planned)
+    held.merged(merged(1, 100, 3, 20))
+    found, again = continued(held, seen(106, planned[6] - 0.05), chunk)
+    assert found.execution_horizon == 14
+    assert len(found.left_over) == COUNT - 6  # a server may want as many
+    np.testing.assert_allclose(again[:14], planned[6:20], atol=1e-6)
+    if mode == "relative":
+        np.testing.assert_array_equal(found.left_over[14:], np.tile(found.left_over[13], (COUNT - 20, 1)))
+
+
+def test_absolute_rows_that_were_refused_are_not_said_either() -> None:
+    chunk = ActionChunk(np.tile(np.arange(COUNT, dtype=np.float32)[:, None], 14))
+    held = prefix()
+    held.answered(1, chunk, 100, commands=chunk.actions[:20].astype(np.float64))
+    held.merged(merged(1, 100, 3, 20))
+    found = held.conditioning(106, [3], 0.9, None, seen(106, START))
+    assert found is not None
+    assert found.execution_horizon == 20
+    np.testing.assert_array_equal(found.previous[:, 0], [*range(20), *[19] * (COUNT - 20)])
+
+
 def test_poses_are_relative_to_those_that_the_policy_is_shown() -> None:
     chunk = answer("relative", None, 1, space="eef")
     planned = SPACES.to_command(chunk, seen(100, START)).rows
