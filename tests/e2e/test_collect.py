@@ -57,8 +57,15 @@ class Collector(BenchPage):
         uuid = self.page.locator("[data-session-uuid]").get_attribute("data-session-uuid")
         return self.api(f"sessions/{uuid}")["counts"]
 
+    def answered(self):
+        """Wait until no press is on its way: the page takes no other meanwhile, and says so."""
+        eventually(
+            lambda: "pressed …" not in self.page.locator("#outcome").inner_text(), "the press is answered"
+        )
+
     def can_start(self):
         """Wait until an episode can start; armed again where the leader was late on a busy machine."""
+        self.answered()
 
         def can():
             if self.page.locator("#arm[aria-checked=false][aria-disabled=false]").count():
@@ -135,6 +142,7 @@ def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(co
 
     ann.key("a")
     page.locator("#arm[aria-checked=false]").wait_for()
+    ann.answered()
     ann.key("Enter")  # a start that does not take
     ann.said("Start: arm first")
     ann.key("1")
