@@ -17,7 +17,7 @@ import struct
 import sys
 import time
 
-from tests.processes import PATIENCE_MS, PATIENCE_S
+from tests.processes import PATIENCE_S
 
 PORTS = range(1, 65536)
 _AT_ONCE = 256
@@ -108,7 +108,7 @@ def link(host, port):
             asking.curve_serverkey = zmq.curve_keypair()[0]
         asking.connect(f"tcp://{host}:{port}")
         asking.send_multipart([b"hello", b"{}"])
-        messages.append(len(asking.recv_multipart()) if asking.poll(PATIENCE_MS) else 0)
+        messages.append(len(asking.recv_multipart()) if asking.poll(1000 * _LAST_S) else 0)
         asking.close()
     return {"http": got.hex(), "messages": messages}
 
