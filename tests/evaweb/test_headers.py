@@ -38,7 +38,6 @@ def policy(answer):
     return {part[0]: part[1:] for part in parts}
 
 
-@pytest.mark.exhaustive
 def test_every_address_answers_with_the_policy_and_no_cache_keeps_it(alma):
     client, stranger = Client(raise_request_exception=False), Client()
     client.force_login(alma)

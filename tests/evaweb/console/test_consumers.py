@@ -588,7 +588,6 @@ def test_the_chunk_and_every_sample_of_the_joints_are_shown(live, ann, runtime):
     run(scenario())
 
 
-@pytest.mark.exhaustive
 def test_a_flood_of_presses_at_a_dead_station_is_two_and_another_station_is_stopped_meanwhile(
     ann, vera, make_stand_in, settings
 ):

@@ -63,7 +63,6 @@ def test_each_kind_is_found_by_its_names(bench):
     assert found("no such thing", ann) == {}
 
 
-@pytest.mark.exhaustive
 def test_an_address_leads_to_a_page_that_the_user_may_open(bench, settings):
     for role in ("viewer", "operator", "admin"):
         user = builders.user(f"a-{role}", role)
