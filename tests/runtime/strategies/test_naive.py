@@ -13,3 +13,13 @@ def test_the_newest_chunk_replaces_the_rest_of_the_old_one():
     assert timeline.remaining(4) == 17
     assert timeline.at(4).makers == ((2, 1.0),)
     assert merged.overlap == 0
+
+
+def test_a_chunk_that_comes_so_late_that_it_is_shifted_is_faded_over_to():
+    timeline, merge = Timeline(1), naive.merge(naive.Config(k_max=2), DimensionKinds())
+    merge(timeline, Arrival(1, 0, np.zeros((400, 1))), 0)
+    merged = merge(timeline, Arrival(2, 0, np.full((400, 1), 0.5)), 300)
+    assert merged.mistimed == 298
+    planned = timeline.span(300)[0][:, 0]
+    assert np.diff(planned, prepend=0.0).max() < 0.1
+    assert planned[-1] == 0.5
