@@ -177,7 +177,9 @@ def join(
     placed = merge.place(timeline, arrival, free_step)
     if placed.merged.dropped:
         return placed.merged
-    joining = joining or placed.merged.mistimed > 0  # its rows are for other steps: nothing says that they continue
+    joining = (
+        joining or placed.merged.mistimed > 0
+    )  # its rows are for other steps: nothing says that they continue
     planned = timeline.at(free_step)
     standing = commanded if held is None and joining and planned is None else held
     going_on = commanded if planned is None else planned.action

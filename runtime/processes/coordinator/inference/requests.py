@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.core.clock import Clock
-from runtime.core.errors import PolicyError, RuntimeFault, SetupError
+from runtime.core.errors import PolicyError, PolicyLostError, RuntimeFault, SetupError
 from runtime.core.sentences import Pattern
 from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.ipc.messages import Event
@@ -188,14 +188,18 @@ class PolicyRequests:
         self._fresh = self._held = False
 
         def infer() -> PolicyResponse:
-            if fresh:
-                policy.reset()
-            elif held:
-                policy.resume()
-            begun = self._clock.now()
-            shown = seen if measured else replace(seen, eef=self._spaces.eef_of(seen.qpos))
-            age = self._clock.now() - min(shown.captured.values())
-            chunk = policy.infer(shown, conditioning)
+            try:
+                if fresh:
+                    policy.reset()
+                elif held:
+                    policy.resume()
+                begun = self._clock.now()
+                shown = seen if measured else replace(seen, eef=self._spaces.eef_of(seen.qpos))
+                age = self._clock.now() - min(shown.captured.values())
+                chunk = policy.infer(shown, conditioning)
+            except PolicyLostError:  # the one that is there again has heard nothing of it
+                self._fresh, self._held = self._fresh or fresh, self._held or held
+                raise
             seconds = self._clock.now() - begun
             onset = self._onset(shown, waited, waited or fresh, k_max)
             made = self._spaces.to_command(chunk, shown, onset)

@@ -298,6 +298,17 @@ def test_a_dropped_chunk_is_followed_by_a_new_query(desk: Desk) -> None:
     assert desk.inference.pump() is not None
 
 
+def test_a_policy_that_is_there_again_is_told_what_the_lost_one_was() -> None:
+    """A server that was started anew has heard of no reset."""
+    desk = Desk().going()
+    desk.policy.answer = PolicyLostError("gone")
+    with pytest.raises(PolicyLostError):
+        desk.inference.pump()
+    desk.policy.answer = None
+    desk.inference.pump()
+    assert desk.policy.calls == ["reset", "infer", "reset", "infer"]
+
+
 def test_nothing_is_asked_while_a_request_is_in_flight() -> None:
     desk = Desk(LockstepRunner(3)).going()
     answers = []
