@@ -36,6 +36,10 @@ _FILES_OF_WEB = Pattern(
     "rights.files_of_web",
     "a table from the web may name files below {where}, and {listed}",
 )
+_RECORDINGS_OF_WEB = Pattern(
+    "rights.recordings_of_web",
+    "a table from the web may name the folder of a recording or of a dataset below {where}, and {listed}",
+)
 
 # Roles of who gives a command: a program of the station's account, a script on the channel.
 OWN_ACCOUNT = (LOCAL, SCRIPT)
@@ -83,7 +87,8 @@ def _is_allowed(own: Deployment, what: Names, value: str) -> bool:
     if what is Names.VARIABLE:
         return any(fnmatchcase(value, pattern) for pattern in own.security.variables)
     if what is Names.RECORDING:
-        return _within(value, (*_recordings(own), *own.security.files))
+        ours = _within(value, _recordings(own)) and _is_recording(value)
+        return ours or _within(value, own.security.files)
     listed = own.security.files if what is Names.FILE else ()
     if value == "none":  # of ssh's configuration: none is read
         return True
@@ -96,14 +101,20 @@ def _advice(own: Deployment, what: Names) -> str:
         return _VARIABLES_OF_WEB(allowed=allowed)
     if what is Names.WRITTEN:
         return _WRITTEN_FILES_OF_WEB(folder=own.ssh_dir)
-    where = own.data if what is Names.RECORDING else own.ssh_dir
-    listed = _LISTED_FILES
-    return _FILES_OF_WEB(where=where, listed=listed)
+    if what is Names.RECORDING:
+        return _RECORDINGS_OF_WEB(where=own.data, listed=_LISTED_FILES)
+    return _FILES_OF_WEB(where=own.ssh_dir, listed=_LISTED_FILES)
 
 
 def _recordings(own: Deployment) -> Iterable[Path]:
     """The data folder, also where the lab has put a part of it on another disk."""
     return own.data, own.episodes_dir, own.data / "datasets"
+
+
+def _is_recording(value: str) -> bool:
+    """True for the folder of a recording or of a dataset: the data folder has other files, which nobody names."""
+    path = _place(value)
+    return (path / "manifest.json").is_file() or (path / "meta" / "info.json").is_file()
 
 
 def _within(value: str, allowed: Iterable[str | Path]) -> bool:

@@ -115,11 +115,31 @@ def test_a_list_of_everything_is_no_list(own, wrong):
         own(security={"variables": [wrong]})
 
 
+def dataset(folder):
+    """What tells a folder as a dataset."""
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text("{}")
+
+
+def test_of_the_data_folder_recordings_and_datasets_alone_may_be_named(own):
+    kept = own()
+    data = kept.deployment.data
+    dataset(data / "mine" / "cups")
+    (data / "episodes" / "one").mkdir(parents=True)
+    (data / "episodes" / "one" / "manifest.json").write_text("{}")
+    (data / "scores").mkdir()
+    for name in ("mine/cups", "episodes/one"):
+        rights.require(given("admin", policy={"kind": "replay", "path": f"{data}/{name}"}), kept)
+    for name in ("", "scores", "mine", "episodes/one/manifest.json", "eva.sqlite3", "mine/none"):
+        said = refusal(given("admin", policy={"kind": "replay", "path": f"{data}/{name}"}), kept)
+        assert "may name the folder of a recording or of a dataset below" in said
+
+
 def test_neither_links_nor_dots_lead_out_of_a_folder(own, tmp_path):
     kept = own()
     ssh, recordings = kept.deployment.ssh_dir, kept.deployment.data / "datasets"
-    for folder in (ssh, recordings):
-        folder.mkdir(parents=True)
+    ssh.mkdir(parents=True)
+    dataset(recordings / "cups")
     (ssh / "out").symlink_to("/etc/passwd")
     (recordings / "out").symlink_to("/etc")
     (ssh / "round").symlink_to(ssh / "round")
@@ -134,7 +154,7 @@ def test_neither_links_nor_dots_lead_out_of_a_folder(own, tmp_path):
 def test_datasets_on_another_disk_are_the_labs_own(own, tmp_path):
     kept = own()
     kept.deployment.data.mkdir()
-    (tmp_path / "disk" / "cups").mkdir(parents=True)
+    dataset(tmp_path / "disk" / "cups")
     (kept.deployment.data / "datasets").symlink_to(tmp_path / "disk")
     path = f"{kept.deployment.data}/datasets/cups"
     rights.require(given("operator", vouched=["policy"], policy={"kind": "replay", "path": path}), kept)
