@@ -108,7 +108,7 @@ def link(host, port):
             asking.curve_serverkey = zmq.curve_keypair()[0]
         asking.connect(f"tcp://{host}:{port}")
         asking.send_multipart([b"hello", b"{}"])
-        messages.append(len(asking.recv_multipart()) if asking.poll(1000 * _LAST_S) else 0)
+        messages.append(len(asking.recv_multipart()) if asking.poll(round(1000 * _LAST_S)) else 0)
         asking.close()
     return {"http": got.hex(), "messages": messages}
 
