@@ -28,27 +28,30 @@ _WATCH_S = 0.5
 class Lab:
     """The processes of one machine; `up` starts them, `watch` stays until it is ended."""
 
-    STEPS = 4  # of a start, and one for each station
+    STEPS = 3  # of a start, and one for each station
 
     def __init__(
         self, processes: Processes, host: str, port: int, listener: socket.socket, progress: Progress
     ) -> None:
-        """`listener` is that of stops: open as long as the lab, so that presses wait in it for a restarted process."""
+        """Worker and web begin at once: a machine with a second core starts them beside benches and stations.
+
+        `listener` is that of stops: open as long as the lab, so that presses wait in it for a restarted process.
+        """
         self.processes, self.progress = processes, progress
-        self._host, self._port, self._listener = host, port, listener
+        self._listener = listener
         self.stops = ""  # the address of the process for stops, once it is up
+        self.processes.start(programs.worker())
+        self._web = self.processes.begin(programs.web(host, port))
 
     def up(self, benches: Sequence[Bench]) -> str:
-        """Start worker, stations, web and the process for stops; returns the address of the web."""
-        with self.progress.step("the worker"):
-            self.processes.start(programs.worker())
+        """Start the stations and the process for stops; returns the address of the web."""
         names = [registered(bench) for bench in benches]
         for name, bench in zip(names, benches, strict=True):
             with self.progress.step(f"the station {name}"):
                 if not bench.runs:
                     self.processes.start(program_of(bench))
         with self.progress.step("the web"):
-            web = self.processes.start(programs.web(self._host, self._port))
+            web = self._web()
             web_port = programs.port_of(web)
         if settings.EVA_GATE is not None:
             with self.progress.during("the gate"):
@@ -72,7 +75,7 @@ class Lab:
 def a_lab(
     host: str, port: int, stop_port: int | None = None, progress: Progress | None = None
 ) -> Iterator[Lab]:
-    """A lab that is not up yet, on a migrated database; everything it started ends with the block.
+    """A lab that is coming up, on a migrated database; everything it started ends with the block.
 
     `stop_port` is by itself the one after `port`. Port 0 takes a free one.
     """

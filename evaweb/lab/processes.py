@@ -84,13 +84,26 @@ class Processes:
 
         It may be slow, as its machine is: LabError where it does nothing for `ready_s`, or far too much.
         """
+        return self.begin(program, ready_s)()
+
+    def begin(self, program: Program, ready_s: float = 60.0) -> Callable[[], Mapping[str, Any]]:
+        """Start it, while others are being started; what is returned waits until it is ready, as `start` does."""
         begun = self.starting(program, ready_s, wait_s=0.2)
-        while True:
+        found: list[Mapping[str, Any]] = []
+
+        def look() -> None:
             try:
                 next(begun)
             except StopIteration as ready:
-                addresses: Mapping[str, Any] = ready.value
-                return addresses
+                found.append(ready.value)
+
+        def wait() -> Mapping[str, Any]:
+            while not found:
+                look()
+            return found[0]
+
+        look()
+        return wait
 
     def starting(self, program: Program, ready_s: float = 60.0, wait_s: float = 0.0) -> Starting:
         """The same, a look at a time of at most `wait_s`: what else there is to watch is watched between two looks.
@@ -197,6 +210,7 @@ class Processes:
         output = child.process.stdout
         assert output is not None
         used, since = 0.0, time.monotonic()
+        yield  # it has begun
         with selectors.DefaultSelector() as selector:
             selector.register(output, selectors.EVENT_READ)
             while not selector.select(wait_s):

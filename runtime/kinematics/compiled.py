@@ -166,6 +166,10 @@ class CompiledKinematics(Kinematics):
             poses = np.ascontiguousarray(targets[begin:, index : index + 1])
             sweep = partial(self._sweep, self._arms[index : index + 1])
             plan = replanned(sweep, poses, start, dt, dims, self._postures[index], room, least)
+            if plan is None and index in late and arm["joints"] > POSED:
+                # Going home may be what leads away from later poses: the posture stays as it is.
+                plan = sweep(poses, start, dt, start, 0, home_rate=0.0)
+                plan = plan if plan.reached.all() else None
             if plan is not None:
                 found.q[begin:, dims] = plan.q[:, dims]
                 found.position_error[begin:, index] = plan.position_error[:, 0]
@@ -181,14 +185,16 @@ class CompiledKinematics(Kinematics):
         anchor: Float64,
         anchor_row: int,
         guide: Float64 | None = None,
+        home_rate: float | None = None,
     ) -> IkResult:
         """One call of the loop, for some of the arms; contiguous arrays, anchor_row -1: no anchor."""
+        costs = self._costs if home_rate is None else self._costs._replace(home_rate=home_rate)
         frames = (len(targets), len(arms))
         q, away, astray = np.empty((len(targets), self._dim)), np.empty(frames), np.empty(frames)
         flags = np.empty(frames, dtype=np.uint8)
         wrong = self._solve_chunk(
             arms,
-            self._costs,
+            costs,
             self._tolerances,
             targets,
             seed[None],

@@ -96,6 +96,19 @@ def test_a_chunk_that_ends_by_a_limit_has_another_posture_so_that_the_next_ones_
     assert worst(FRANKA, SEVEN, joints, ROWS).max() > 15e-3
 
 
+@pytest.mark.parametrize("number", [206, 202])  # missed by 115 and 77 mm while the posture goes home
+def test_a_path_that_going_home_leads_away_from_is_met_by_a_posture_that_stays(
+    monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    joints = path(FRANKA, number, 1, np.inf)
+    q = followed(SEVEN, FRANKA, SEVEN.forward(joints), joints[0], len(joints)).q
+    assert worst(FRANKA, SEVEN, joints).max() < 1e-3
+    assert (np.abs(np.diff(q, axis=0)) <= FRANKA.velocity / FRANKA.control_rate + 1e-9).all()
+    swept = SEVEN._sweep
+    monkeypatch.setattr(SEVEN, "_sweep", lambda *given, home_rate=None, **named: swept(*given, **named))
+    assert worst(FRANKA, SEVEN, joints).max() > 50e-3
+
+
 def test_room_is_that_of_the_nearest_limit_and_none_is_missed_where_home_has_less_or_there_is_no_choice() -> (
     None
 ):

@@ -149,11 +149,13 @@ class Command(BaseCommand):
     def _bench(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> Bench:
         """Bench, policies and station in processes of their own."""
         robot, how = options["robot"], benches_of(options)
-        node = lab.processes.start(programs.tabletop(robot, how.options))
-        served = {}
+        bench = lab.processes.begin(programs.tabletop(robot, how.options))
+        servers = {
+            name: lab.processes.begin(programs.policy(name, robot, how.skill(name), known_port(name)))
+            for name in POLICIES
+        }
+        node, served = bench(), {name: server()["url"] for name, server in servers.items()}
         for name, (description, _) in POLICIES.items():
-            serving = programs.policy(name, robot, how.skill(name), known_port(name))
-            served[name] = lab.processes.start(serving)["url"]
             seed.demo_checkpoint(name=name, description=description, policy={"url": served[name]})
         assignments = [
             f'robot="{robot}"',
