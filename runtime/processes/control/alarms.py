@@ -11,6 +11,7 @@ from runtime.core.types import Float64
 from runtime.ipc.observation_reader import LatestObservation
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.control.actuator import RobotActuator, TickSettings
+from runtime.processes.control.led import Led
 from runtime.processes.control.plausibility import Plausibility
 
 _SIBLING_SILENT = Pattern("control.sibling_silent", "no sign of life from {process} {since}")
@@ -23,7 +24,6 @@ _HELD_ELSEWHERE = Pattern(
 _RETURNED_AWAY = 0.1  # [rad] that an arm may be off after it was not seen, by sagging
 _AGREES_S = 1.0  # that a joint reads where it is told to be, before its readings lead its command again
 _THERE = 1e-6  # [rad]
-_ALONG = 0.2  # [rad] of a way on which the reading of a joint that stands comes nearer by more than half
 
 
 def silent_sibling(shared: SharedState, now: float, allowed: Callable[[str], float]) -> str:
@@ -56,7 +56,7 @@ class Displacement:
         self._apart_at = np.full(dim, float("-inf"))  # when each was last read away from its command
         self._meeting = False  # a set-up takes the robot over where it is read, and not yet there
         self.goal: Float64 | None = None  # where the command is being led to
-        self._from = np.zeros((2, dim))  # command and reading as it began to be
+        self._led: Led | None = None  # how far, while it is
         self.begins = False  # whether it has been since this tick
         self._doubt = ""  # which joints are not followed since this tick, and why
 
@@ -80,9 +80,15 @@ class Displacement:
             return None
         if self.goal is not None:  # joints that are pushed on, past it or back, are left where they are
             on = (self.goal - robot.commanded) * (measured - robot.commanded) > 0.0
-            self._off |= (along := self._along(robot, measured))
+            assert self._led is not None
+            along = self._angles & self._led.look(
+                robot.commanded, measured, self.goal, self._plausibility.speed(), now
+            )
+            self._off |= along
             self._doubt = self._named(along, robot, measured)
             self.goal = np.where((on & ~along) | ~self._angles, self.goal, robot.commanded)
+            if self._led.proven:  # it was a hand: what it does next is followed as well
+                self._followed &= self._off
             if self.distance(robot, self.goal) <= _THERE:
                 self.goal = None
         allowed = _RETURNED_AWAY if returned or self._meeting else self._settings.safety.following_error
@@ -94,9 +100,9 @@ class Displacement:
             if self._away(robot, where, allowed):
                 limits = self._settings.limits
                 self.goal = np.clip(self.trusted(robot, where), limits.lower, limits.upper)
-                self._from = np.array([robot.commanded, measured])
+                self._led = Led(robot.commanded, measured, self._plausibility.speed(), now)
                 self.begins = True
-        return self.goal
+        return None if self.goal is None or self._led is None else self._led.end(self.goal)
 
     def distance(self, robot: RobotActuator, measured: Float64) -> float:
         """Distance of the farthest joint from its command [rad]."""
@@ -114,15 +120,6 @@ class Displacement:
         self._off |= off
         self._followed |= away
         self._doubt = self._named(off, robot, measured)
-
-    def _along(self, robot: RobotActuator, measured: Float64) -> np.ndarray:
-        """The joints, bool [D], whose readings go along with the command that a set-up leads to them."""
-        if not self._meeting:
-            return np.zeros(len(self._angles), bool)
-        command, reading = self._from
-        way = np.abs(robot.commanded - command)
-        nearer = np.abs(reading - command) - np.abs(measured - robot.commanded)
-        return np.asarray(self._angles & (way > _ALONG) & (nearer < way / 2.0))
 
     def _named(self, off: np.ndarray, robot: RobotActuator, measured: Float64) -> str:
         return "; ".join(
@@ -147,8 +144,9 @@ class Displacement:
 
     @property
     def speed(self) -> Float64:
-        """Velocity at which the command is led [D]: as joints move by hand, in a set-up as in its motions."""
-        scale = self._settings.safety.motion_velocity_scale if self._meeting else 1.0
+        """Velocity at which the command is led [D]: as motions of ours, and as a hand moves what is proven."""
+        proven = not self._meeting and self._led is not None and self._led.proven
+        scale = 1.0 if proven else self._settings.safety.motion_velocity_scale
         return self._settings.limits.velocity * scale
 
     def meet(self) -> None:

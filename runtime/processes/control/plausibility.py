@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -172,6 +172,16 @@ class Plausibility:
         newest = [] if self._chain is None else islice(reversed(self._chain.samples), _CONSISTENT)
         lately = [joints + difference(sample.joints, joints, self._wrapping) for sample in newest]
         return np.asarray(np.median(lately, axis=0)) if lately else joints
+
+    def speed(self) -> Float64:
+        """Median velocity [D] between the newest believed samples that have to agree: a step among them is none."""
+        lately = [] if self._chain is None else self._chain.lately(CONSISTENT_S)
+        steps = [
+            difference(after.joints, before.joints, self._wrapping)
+            / max(after.captured - before.captured, _EPSILON)
+            for after, before in pairwise(lately)
+        ]
+        return np.asarray(np.median(steps, axis=0)) if steps else np.zeros(len(self._limits.names))
 
     def _take(self, sample: _Sample, commanded: Float64 | None) -> str:
         unseen, self._unseen = self._unseen, 0.0

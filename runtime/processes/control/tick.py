@@ -416,7 +416,8 @@ class Tick:
         if self._plausibility.dead:
             self._leave(_AFTER_MISSING_JOINTS(what=self._plausibility.dead))
             return
-        away = self._displacement.distance(self._actuator, where)
+        goal = where if self._displacement.goal is None else self._displacement.goal
+        away = self._displacement.distance(self._actuator, goal)
         farthest = self._displacement.speed * self._actuator.elapsed(now)
         self._actuator.step_to(where, _WHAT_HELD, farthest)
         if isinstance(behaviour, EStopped):

@@ -3,6 +3,7 @@ import pytest
 
 from runtime.motion.timeline import DimensionKinds
 from runtime.processes.control.alarms import Displacement, silent_sibling
+from runtime.processes.control.led import PART
 from runtime.processes.control.plausibility import Plausibility
 from tests.runtime.processes.control.test_actuator import robot, seen, settings
 from tests.runtime.tick_bench import PERIOD, Bench
@@ -61,7 +62,10 @@ def test_a_robot_is_displaced_beyond_the_following_error_and_only_while_it_is_he
     held = Held()
     assert moved(held, 0.4) == [None] * 8
     assert moved(held, 0.6, held=False) == [None] * 8
-    assert moved(held, 0.6)[-1] == pytest.approx([0.6, 0.0])
+    assert moved(held, 0.6)[-1] == pytest.approx(
+        [PART, 0.0]
+    )  # a part of the way, to see whether it goes along
+    assert held.displacement.goal == pytest.approx([0.6, 0.0])
 
 
 def test_a_robot_is_displaced_where_several_samples_agree():

@@ -129,7 +129,7 @@ def moved_by_hand(bench, way, speed=1.0):
     for _ in range(round(abs(way) / speed / PERIOD)):
         bench.moved_by_hand = bench.measured = bench.measured + step
         bench.run()
-    bench.run(30)
+    bench.run(45)
 
 
 @pytest.mark.some(4)
@@ -150,6 +150,57 @@ def test_an_arm_that_a_hand_moves_is_still_followed_no_faster_than_it_moves(stat
     before = bench.sent[-1, 0]
     moved_by_hand(bench, -way, speed)
     assert abs(bench.sent[-1, 0] - before) >= 0.5
+
+
+SLIPS = {  # how far the encoder is off, so long after it began
+    "at 0.05 rad/s": lambda since: 0.05 * since,
+    "at 0.3 rad/s": lambda since: 0.3 * since,
+    "at 1 rad/s": lambda since: 1.0 * since,
+    "to 0.55 rad": lambda since: min(1.0 * since, 0.55),
+    "to 0.9 rad": lambda since: min(1.0 * since, 0.9),
+    "to -0.7 rad": lambda since: max(-0.4 * since, -0.7),
+    "in steps": lambda since: 0.15 * (since // 0.5),
+    "faster and faster": lambda since: 0.05 * since**2,
+}
+MOST_LED = 0.34  # [rad]
+
+
+@pytest.mark.some(6)
+@pytest.mark.parametrize("lag", [0, 5, 8])
+@pytest.mark.parametrize("state", ["estop", "hold"])
+@pytest.mark.parametrize("slip", SLIPS)
+def test_a_held_arm_whose_encoder_slips_is_led_by_no_more_than_is_needed_to_see_it(slip, state, lag):
+    bench = following(Servo(lambda true, since: true + SLIPS[slip](since), lag), wave(60, 0.0))
+    bench.go(1.0)
+    told(bench, state)
+    bench.go(1.0)
+    bench.break_encoder()
+    bench.go(14.0)
+    assert np.ptp(bench.moves[30:]) <= MOST_LED
+    assert bench.shared.doubt or bench.said("implausible")
+
+
+def smoothly(share):
+    """A way as hands make it: that of least jerk (Flash and Hogan 1985)."""
+    return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+
+
+@pytest.mark.some(4)
+@pytest.mark.parametrize("state", ["estop", "hold"])
+@pytest.mark.parametrize("seconds", [0.7, 1.5, 3.0, 6.0])
+@pytest.mark.parametrize("way", [0.8, -1.6])
+def test_an_arm_that_a_hand_moves_as_hands_do_is_followed(way, seconds, state):
+    bench = following(Bench(), wave(60, 0.0))
+    told(bench, state)
+    bench.run(60)
+    start, count = bench.measured.copy(), round(seconds / PERIOD)
+    for tick in range(1, count + 1):
+        at = start + np.array([way * smoothly(tick / count), 0.0])
+        bench.moved_by_hand = bench.measured = at
+        bench.run()
+    bench.run(120)
+    assert abs(bench.sent[-1, 0] - bench.measured[0]) <= bench.safety.following_error
+    assert not bench.said("implausible")
 
 
 def test_a_joint_is_followed_again_after_it_agreed_for_a_second_or_a_set_up():
