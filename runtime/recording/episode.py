@@ -36,14 +36,15 @@ from runtime.recording.tables import read_table, rows_schema
 from runtime.recording.writer import DiskWriter, Faults
 
 _LEAST_DISK_SECONDS = 1.0  # for the last writes
+_PATIENCE = 6.0  # times as long as a robot would wait: lockstep loses nothing to a busy machine
 
 
 class EpisodeJournal(Journal):
     """Writes `root`/<uuid>/, one episode after the other; one thread appends.
 
     A picture that is missing, or for which an encoder has no time, becomes a flagged repeat, so that `append` never
-    waits for an encoder. With `patient` (lockstep has no deadline) it waits for a place, up to
-    settings.drain_timeout_s. An encoder that fails, or a file of its own that cannot be written, costs the video of
+    waits for an encoder. With `patient` (lockstep has no deadline) it waits for a place and for the end of encoders, as
+    long as ones that do not end at all may be told from slow ones. An encoder that fails, or a file of its own that cannot be written, costs the video of
     its camera: `losses` names it, and all else is recorded on. Pictures are handed over, not copied: they must not
     change any more.
     """
@@ -53,7 +54,7 @@ class EpisodeJournal(Journal):
     ) -> None:
         self._root = root
         self._settings = settings or RecordingSettings()
-        self._patience = self._settings.drain_timeout_s if patient else 0.0
+        self._patience = _PATIENCE * self._settings.drain_timeout_s if patient else 0.0
         self._recording: _Recording | None = None
         self._losses: list[Loss] = []
 
@@ -222,11 +223,12 @@ class _Recording:
         return new
 
     def end(self, outcome: Outcome) -> None:
-        deadline = time.monotonic() + self._settings.drain_timeout_s
+        drain_s = max(self._settings.drain_timeout_s, self._patience)
+        deadline = time.monotonic() + drain_s
         self._ending = True
         stuck = self._drain(deadline)
         # Of its own, also where the encoders took all of theirs: without an outcome the episode waits for a repair.
-        last = time.monotonic() + max(self._settings.drain_timeout_s, _LEAST_DISK_SECONDS)
+        last = time.monotonic() + max(drain_s, _LEAST_DISK_SECONDS)
         ended = [encoder for encoder in self._encoders.values() if encoder not in stuck]
         if not self._writer.finish(
             last, leave=[encoder.file for encoder in stuck], others=[encoder.save for encoder in ended]

@@ -100,7 +100,13 @@ class Displacement:
             if self._away(robot, where, allowed):
                 limits = self._settings.limits
                 self.goal = np.clip(self.trusted(robot, where), limits.lower, limits.upper)
-                self._led = Led(robot.commanded, measured, self._plausibility.speed(), now)
+                self._led = Led(
+                    robot.commanded,
+                    measured,
+                    self._plausibility.speed(),
+                    now,
+                    at_once=bool(returned) and not self._meeting,
+                )
                 self.begins = True
         return None if self.goal is None or self._led is None else self._led.end(self.goal)
 
@@ -145,8 +151,8 @@ class Displacement:
     @property
     def speed(self) -> Float64:
         """Velocity at which the command is led [D]: as motions of ours, and as a hand moves what is proven."""
-        proven = not self._meeting and self._led is not None and self._led.proven
-        scale = 1.0 if proven else self._settings.safety.motion_velocity_scale
+        whole = not self._meeting and self._led is not None and self._led.whole
+        scale = 1.0 if whole else self._settings.safety.motion_velocity_scale
         return self._settings.limits.velocity * scale
 
     def meet(self) -> None:

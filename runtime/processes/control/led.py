@@ -21,8 +21,14 @@ class Led:
     where that is more than half of the command's way in two parts, the encoder is off.
     """
 
-    def __init__(self, commanded: Float64, measured: Float64, speed: Float64, now: float) -> None:
-        """From `commanded` [D], while joints are read at `measured` [D] and go at `speed` [D] by themselves."""
+    def __init__(
+        self, commanded: Float64, measured: Float64, speed: Float64, now: float, *, at_once: bool = False
+    ) -> None:
+        """From `commanded` [D], while joints are read at `measured` [D] and go at `speed` [D] by themselves.
+
+        `at_once`: without parts, or an arm that was switched off and on again would be pulled back meanwhile.
+        """
+        self.at_once = at_once
         self._along = np.zeros(len(commanded), np.int64)
         self._parts = 0
         self._begin(commanded, measured, speed, now)
@@ -33,19 +39,24 @@ class Led:
 
     @property
     def proven(self) -> bool:
-        """Whether nothing is left to find out."""
+        """Whether readings were seen not to go along."""
         return self._parts > _SAY or (self._parts == _SAY and not self._along.any())
+
+    @property
+    def whole(self) -> bool:
+        """Whether the rest of the way is led without a rest."""
+        return self.at_once or self.proven
 
     def end(self, goal: Float64) -> Float64:
         """How far the command may be led to `goal` now [D]."""
-        return goal if self.proven else np.clip(goal, self._from - PART, self._from + PART)
+        return goal if self.whole else np.clip(goal, self._from - PART, self._from + PART)
 
     def look(
         self, commanded: Float64, measured: Float64, goal: Float64, speed: Float64, now: float
     ) -> np.ndarray:
         """The joints, bool [D], whose readings have gone along with the command."""
         none = np.zeros(len(commanded), bool)
-        if self.proven or np.abs(self.end(goal) - commanded).max() > _THERE:
+        if self.whole or np.abs(self.end(goal) - commanded).max() > _THERE:
             return none
         self._rests = now if self._rests is None else self._rests
         if now - self._rests < _REST_S:

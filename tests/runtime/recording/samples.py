@@ -15,6 +15,7 @@ from runtime.recording.base import ExecutedTick, RawChunk, Row
 from runtime.recording.layout import Layout
 from runtime.recording.sealing import OUTCOME, SECOND, digests_of, sealed, told, write_outcome
 from runtime.recording.settings import RecordingSettings
+from tests.processes import PATIENCE_S
 
 HEIGHT, WIDTH = 48, 64
 DIM, EEF_DIM = 3, 8
@@ -22,7 +23,9 @@ STARTED = 1000.0
 CAMERAS = ("observation.images.front", "observation.images.wrist")
 BITS = 16
 
-SETTINGS = RecordingSettings(min_free_bytes=0, queue_frames=64, flush_period_s=0.05, max_lag_s=10.0)
+SETTINGS = RecordingSettings(
+    min_free_bytes=0, queue_frames=64, flush_period_s=0.05, max_lag_s=10.0, drain_timeout_s=PATIENCE_S
+)
 
 
 def manifest(**changes: Any) -> dict[str, Any]:

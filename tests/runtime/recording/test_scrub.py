@@ -39,12 +39,13 @@ from runtime.recording.sealing import DIGESTS, SEAL, digest_of, digests_of, read
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.tables import SCHEMAS, read_table
 from runtime.recording.verdict import UNSEALED, DamagedError
+from tests.processes import PATIENCE_S
 from tests.runtime.datasets.small import manifest, robot, row
 
 from .samples import unended, unsealed
 
 FRAMES, DIM = 45, 6
-SETTINGS = RecordingSettings(min_free_bytes=0, flush_period_s=0.02)
+SETTINGS = RecordingSettings(min_free_bytes=0, flush_period_s=0.02, drain_timeout_s=PATIENCE_S)
 
 
 def tick(step: int) -> ExecutedTick:
