@@ -43,10 +43,10 @@ class EpisodeJournal(Journal):
     """Writes `root`/<uuid>/, one episode after the other; one thread appends.
 
     A picture that is missing, or for which an encoder has no time, becomes a flagged repeat, so that `append` never
-    waits for an encoder. With `patient` (lockstep has no deadline) it waits for a place and for the end of encoders, as
-    long as ones that do not end at all may be told from slow ones. An encoder that fails, or a file of its own that cannot be written, costs the video of
-    its camera: `losses` names it, and all else is recorded on. Pictures are handed over, not copied: they must not
-    change any more.
+    waits for an encoder. With `patient` (lockstep has no deadline) it waits for a place and for the end of
+    encoders, as long as ones that do not end at all may be told from slow ones. An encoder that fails, or a file of
+    its own that cannot be written, costs the video of its camera: `losses` names it, and all else is recorded on.
+    Pictures are handed over, not copied: they must not change any more.
     """
 
     def __init__(

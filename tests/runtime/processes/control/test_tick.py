@@ -429,7 +429,9 @@ def test_an_arm_that_was_moved_while_held_is_held_where_it_is_now(bench):
     bench.run(45)
     assert np.allclose(bench.sink.sent[-1], [0.65, 0.1])
     notes = [note for record in bench.records() for note in record.notes]
-    assert notes[0] == "held where the robot is: a stepped 0.030 rad"  # in parts, no faster than motions of ours
+    assert (
+        notes[0] == "held where the robot is: a stepped 0.030 rad"
+    )  # in parts, no faster than motions of ours
     assert notes[-1] == "held where the robot is: a stepped 0.030 rad"  # the rest
     assert "held where the robot is: a stepped 0.100 rad" in notes  # no faster than it moves
     assert len(bench.said("displaced")) == 1
