@@ -63,14 +63,14 @@ ifeq ($(origin ARGS),command line)
 	$(PY) -m pytest $(ARGS)
 else
 	@gate=0; \
-	$(PY) -m pytest -n auto --dist loadfile -m "not story and not lab and not exhaustive" || gate=$$?; \
+	$(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not story and not lab and not exhaustive" || gate=$$?; \
 	$(PY) -m pytest -n 0 -m "story" && exit $$gate
 endif
 
 labs: setup-dev ## every other whole lab, one after the other, and properties with random examples: before an issue is resolved
 	@labs=0; \
 	$(PY) -m pytest -n 0 -m "lab" || labs=$$?; \
-	$(PY) -m pytest -n auto --dist loadfile -m "(hypothesis or exhaustive) and not story and not lab" --hypothesis-profile=random && exit $$labs
+	$(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "(hypothesis or exhaustive) and not story and not lab" --hypothesis-profile=random && exit $$labs
 
 lint: setup-dev ## ruff, mypy, the contracts of .importlinter, and how tests wait
 	$(PY) -m ruff check .
