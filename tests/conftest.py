@@ -142,7 +142,9 @@ def pytest_collection() -> Iterator[None]:
         return (yield)
     finally:
         gc.freeze()
-        gc.set_threshold(20_000)  # with the usual 700 a tenth of the processor time of pages and rows is its looking
+        gc.set_threshold(
+            20_000
+        )  # with the usual 700 a tenth of the processor time of pages and rows is its looking
         gc.enable()
 
 
