@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import soak
-from benchmarks.fuzzing import answers, boxes, encoders, rtc_prefix
+from benchmarks.fuzzing import answers, boxes, compliant, encoders, rtc_prefix
 
 # Found by a soak of half an hour: an arm that is pushed on while the command is led to it.
 PUSHED_ON = (1025813277, 1025813317, 1025813379)
@@ -23,6 +23,22 @@ def seeds(*every):
 @pytest.mark.parametrize("seed", seeds(*range(30), *PUSHED_ON))
 def test_faulty_encoders_never_move_a_robot_beyond_its_limits_or_away_from_where_it_is(seed):
     assert encoders.once(seed) == []
+
+
+@pytest.mark.parametrize("seed", seeds(*range(20)))
+def test_nothing_that_is_done_to_an_arm_that_stands_below_its_command_moves_it(seed):
+    assert compliant.once(seed) == []
+
+
+@pytest.mark.exhaustive
+def test_an_arm_that_sinks_is_noticed(monkeypatch):
+    """As before: an e-stop leads the command to the reading."""
+    monkeypatch.setattr(
+        "runtime.processes.control.steady_error.SteadyError.keeps",
+        lambda self, actuator, measured, now: np.zeros(len(measured), bool),
+    )
+    found = [text for seed in range(3) for text in compliant.once(seed)]
+    assert any("moves an arm that stands" in text for text in found)
 
 
 @pytest.mark.parametrize("seed", seeds(*range(75)))

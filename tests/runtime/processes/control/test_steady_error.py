@@ -3,62 +3,10 @@
 import numpy as np
 import pytest
 
-from runtime.ipc.shared_state import EStop
-from tests.runtime.tick_bench import PERIOD, Bench, following, wave
+from tests.runtime.compliant import Compliant, standing
+from tests.runtime.tick_bench import PERIOD, following, wave
 
 ERRORS = [0.01, 0.03, -0.05, 0.098]
-SUBSTEP_S = 1e-3
-STIFFNESS, DAMPING = 900.0, 60.0  # [1/s2], [1/s]: critically damped, a lag of 67 ms
-
-
-class Compliant(Bench):
-    """Servos with a proportional and a derivative part under a steady load; they stand `error` below their command.
-
-    Its node holds it where it stands until it is told otherwise. Nothing passes `wall` [D].
-    """
-
-    def __init__(self, error=0.05, noise=0.0, **given):
-        self.error = np.broadcast_to(np.asarray(error, float), 2).copy()
-        self.wall = np.full(2, np.inf)
-        self.true, self.speed = np.zeros(2), np.zeros(2)
-        self.node = self.error.copy()
-        self.course = []
-        self._random, self._noise = np.random.default_rng(1), noise
-        super().__init__({"kind": "naive"}, **given)
-
-    def observe(self, **changes):
-        read = self.true + self._noise * self._random.standard_normal(2)
-        super().observe(**{"qpos": read.astype(np.float32), **changes})
-
-    def move(self, seconds):
-        told = self.sent[-1] if len(self.sent) else self.node
-        for _ in range(round(seconds / SUBSTEP_S)):
-            push = STIFFNESS * (told - self.error - self.true) - DAMPING * self.speed
-            self.speed = self.speed + push * SUBSTEP_S
-            self.true = self.true + self.speed * SUBSTEP_S
-            self.speed[self.true > self.wall] = 0.0
-            self.true = np.minimum(self.true, self.wall)
-        self._measured = self.true.copy()
-        self.course.append(self.true.copy())
-
-    def seconds(self, seconds):
-        self.run(round(seconds / PERIOD))
-        return self
-
-    def stop(self):
-        self.shared.set_estop(EStop.LATCHED)
-        return self
-
-    def release(self):
-        self.shared.set_estop(EStop.CLEAR)
-        return self
-
-
-def standing(error=0.05, **given):
-    """At 0 for three seconds, told by a motion."""
-    bench = Compliant(error, **given)
-    bench.say("motion", goal=np.zeros(2))
-    return bench.seconds(3.0)
 
 
 @pytest.mark.some(4)
