@@ -17,6 +17,8 @@ from tests.lint.waits import waits
         "SOON = 20\nthread.join(SOON)",
         "pytestmark = pytest.mark.timeout(300)",
         "deadline = time.monotonic() + 10",
+        "heard.get(timeout=30)",
+        "TURN = 2\nLONG = 10 * TURN\nthread.join(LONG - 1)",
     ],
 )
 def test_a_wait_with_a_number_of_its_own_is_refused(line: str) -> None:

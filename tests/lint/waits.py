@@ -8,8 +8,9 @@ product passes.
 from __future__ import annotations
 
 import ast
+import operator
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
@@ -35,22 +36,24 @@ _SECONDS = {  # calls that wait, and where their seconds may stand
     "HTTPSConnection": None,
 }
 _MILLISECONDS = {"poll": 0, "set_default_timeout": 0, "wait_for_selector": None, "wait_for_timeout": 0}
-_WORDS = ("timeout", "seconds", "patience")
+_WORDS = ("timeout", "seconds", "patience")  # the first in whatever is called
+_MADE: dict[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+}
 
 
 def waits(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Line and sentence of each wait that has a number of its own."""
-    known = {
-        target.id: statement.value.value
-        for statement in tree.body
-        if isinstance(statement, ast.Assign) and isinstance(statement.value, ast.Constant)
-        for target in statement.targets
-        if isinstance(target, ast.Name)
-    }
+    known: dict[str, float] = {}
+    for statement in tree.body:
+        if isinstance(statement, ast.Assign) and (value := _number(statement.value, known)) is not None:
+            known |= {target.id: value for target in statement.targets if isinstance(target, ast.Name)}
     for node in ast.walk(tree):
         if isinstance(node, ast.BinOp) and ast.unparse(node.left) == "time.monotonic()":
-            number = node.right.value if isinstance(node.right, ast.Constant) else 0.0
-            if isinstance(node.op, ast.Add) and isinstance(number, (int, float)) and number > LONGEST_S:
+            number = _number(node.right, known) or 0.0
+            if isinstance(node.op, ast.Add) and number > LONGEST_S:
                 yield node.lineno, f"a deadline of {number:g} s; allowed: PATIENCE_S"
         if not isinstance(node, ast.Call):
             continue
@@ -58,22 +61,32 @@ def waits(tree: ast.Module) -> Iterator[tuple[int, str]]:
         if name == "timeout" and isinstance(node.func, ast.Attribute):
             yield node.lineno, "pytest.mark.timeout: allowed: the one of pyproject.toml"
         for table, unit, word in ((_SECONDS, 1.0, "PATIENCE_S"), (_MILLISECONDS, 1000.0, "PATIENCE_MS")):
-            if name not in table:
+            if name not in table and (table is _MILLISECONDS or name in _MILLISECONDS):
                 continue
-            given = [keyword.value for keyword in node.keywords if keyword.arg in _WORDS]
-            place = table[name]
+            words = _WORDS if name in table else _WORDS[:1]
+            given = [keyword.value for keyword in node.keywords if keyword.arg in words]
+            place = table.get(name)
             given += [] if place is None else _unpacked(node.args)[: place + 1]
             for value in given:
-                number = (
-                    value.value if isinstance(value, ast.Constant) else known.get(getattr(value, "id", ""))
-                )
-                if isinstance(number, (int, float)) and not isinstance(number, bool):
-                    playwright = name == "wait_for" and number > 1000
-                    if number > LONGEST_S * (1000.0 if playwright else unit):
-                        yield (
-                            node.lineno,
-                            f"{name} waits {number:g}; allowed: {word}, a turn of {LONGEST_S:g} s",
-                        )
+                number = _number(value, known) or 0.0
+                playwright = name == "wait_for" and number > 1000
+                if number > LONGEST_S * (1000.0 if playwright else unit):
+                    yield (
+                        node.lineno,
+                        f"{name} waits {number:g}; allowed: {word}, a turn of {LONGEST_S:g} s",
+                    )
+
+
+def _number(value: ast.expr, known: Mapping[str, float]) -> float | None:
+    """Of a constant, a name of this module that is one, and what is made of them; None of anything else."""
+    if isinstance(value, ast.Constant):
+        return value.value if isinstance(value.value, (int, float)) else None
+    if isinstance(value, ast.Name):
+        return known.get(value.id)
+    if isinstance(value, ast.BinOp) and type(value.op) in _MADE:
+        left, right = _number(value.left, known), _number(value.right, known)
+        return None if left is None or right is None else _MADE[type(value.op)](left, right)
+    return None
 
 
 def _unpacked(arguments: Sequence[ast.expr]) -> list[ast.expr]:

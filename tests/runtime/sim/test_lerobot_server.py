@@ -21,6 +21,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.policies import lerobot
 from runtime.sim.script import Script
 from runtime.station.spec import StationSpec
+from tests.processes import PATIENCE_S
 from tests.runtime.sim.tabletop_station import HORIZON, pick_and_place, planned
 
 grpc = pytest.importorskip("grpc", reason="the extra lerobot-grpc is not installed")
@@ -42,14 +43,14 @@ class Client:
 
     def call(self, name: str, message: Any) -> bytes:
         made = self._channel.unary_unary(self._path(name), request_serializer=type(message).SerializeToString)
-        return bytes(made(message, timeout=15))
+        return bytes(made(message, timeout=PATIENCE_S))
 
     def observe(self, data: bytes) -> None:
         message = wire.MESSAGES["Observation"](transfer_state=3, data=data)
         made = self._channel.stream_unary(
             self._path("SendObservations"), request_serializer=type(message).SerializeToString
         )
-        made(iter([message]), timeout=15)
+        made(iter([message]), timeout=PATIENCE_S)
 
     def act(self) -> bytes:
         return bytes(
