@@ -17,14 +17,14 @@ from evaweb.plans import commitment as blinding
 from evaweb.plans.blinding_rules import has_looked_at_a_version
 from evaweb.plans.canonical import digest
 from evaweb.plans.design import dropped_of, ended_because, findings_of, told_reason
-from evaweb.plans.documents import checkpoint_of, scene_of, units_of
+from evaweb.plans.documents import checkpoint_of, require_scene, units_of
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.selectors import without_dropped
 from evaweb.plans.services import plan_end
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials import lifecycle
-from evaweb.trials.models import Position, Trial, TrialStatus
+from evaweb.trials.models import Trial, TrialStatus
 from evaweb.trials.services import trial_create
 from evaweb.trials.voids import voids_lapse, voids_waiting
 from runtime.core.sentences import Pattern
@@ -51,10 +51,6 @@ _ALL_TRIALS_MADE = Pattern("plans.allocation.all_trials_made", "all {count} tria
 _SCENE_CHECKPOINT_RENAMED_SINCE_FROZEN = Pattern(
     "plans.allocation.scene_checkpoint_renamed_since_frozen",
     "a scene or a checkpoint was renamed since {plan} was frozen: give it its old name back",
-)
-_SCENE_CHANGED_SINCE_FROZEN_CHANGE = Pattern(
-    "plans.allocation.scene_changed_since_frozen_change",
-    "scene {name} was changed since {plan} was frozen: change it back, or amend the plan",
 )
 _CHECKPOINT_SWITCHED_OFF_OWNER_CAN = Pattern(
     "plans.allocation.checkpoint_switched_off_owner_can",
@@ -212,11 +208,7 @@ def _check_unchanged(plan: Plan, slot: Slot) -> None:
         unit.checkpoint,
     ):  # not which: the operator must not learn what comes next
         raise Conflict(_SCENE_CHECKPOINT_RENAMED_SINCE_FROZEN(plan=plan))
-    frozen = {scene["name"]: scene for scene in document["scenes"]}[slot.scene.name]
-    numbers = [position["number"] for position in frozen["positions"]]
-    positions = list(Position.objects.filter(scene=slot.scene, number__in=numbers).order_by("number"))
-    if digest(scene_of(slot.scene, positions)) != digest(frozen):
-        raise Conflict(_SCENE_CHANGED_SINCE_FROZEN_CHANGE(name=slot.scene.name, plan=plan))
+    require_scene(plan, slot.scene)
     # Not which one: the operator must not learn what comes next.
     if not slot.checkpoint.active:
         raise Conflict(_CHECKPOINT_SWITCHED_OFF_OWNER_CAN(plan=plan))

@@ -18,6 +18,7 @@ from evaweb.journal import text
 from evaweb.plans import pictures, regions
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.blinding_rules import has_looked_at_a_version
+from evaweb.plans.documents import require_scene
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
@@ -303,6 +304,8 @@ def _before(what: str, trial: Trial, user: Any) -> None:
         raise Conflict(_CLOSED_TRIAL_COULD_NOT_REPEATED(plan=handout.plan, trial=trial.pk))
     if what == "void agreed" and handout.plan.state == PlanState.CLOSED and not _repeated(handout):
         raise Conflict(_CLOSED_TRIAL_NOT_REPEATED_SO(plan=handout.plan, trial=trial.pk))
+    if what in ("run", "judged"):
+        require_scene(handout.plan, trial.scene)
     judged = what in ("scored", "voided", "void answered")
     if judged and handout.plan.sealed and has_looked_at_a_version(handout.plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_OPERATOR(plan=handout.plan))

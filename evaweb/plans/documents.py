@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator
 from typing import Any
 
-from evaweb.errors import EvaError
+from evaweb.errors import Conflict, EvaError
 from evaweb.plans.design import drafted, planned
 from evaweb.plans.models import Allocation, Plan
 from evaweb.plans.schedule import PAIRED, Condition, Unit, counts_of, schedule
@@ -20,7 +21,18 @@ _RANDOM_ORDER_TWO_CHECKPOINTS_CAME = Pattern(
     "plan {which} of them",
 )
 
-FORMAT = 4  # 2 had no outcome, margin, looks or boundary; 3 one "comparison" at most, of paired blocks
+_SCENE_RENAMED_SINCE_FROZEN = Pattern(
+    "plans.documents.scene_renamed_since_frozen",
+    "a scene was renamed since {plan} was frozen: give it its old name back",
+)
+_SCENE_CHANGED_SINCE_FROZEN = Pattern(
+    "plans.documents.scene_changed_since_frozen",
+    "scene {name} was changed since {plan} was frozen ({differs}): change it back, or amend the plan",
+)
+
+# 2 had no outcome, margin, looks or boundary; 3 one "comparison" at most, of paired blocks; 4 was scored by its scenes
+# as they were then.
+FORMAT = 5
 
 
 def document_of(plan: Plan, key: bytes) -> dict[str, Any]:
@@ -111,6 +123,38 @@ def scene_of(scene: Scene, positions: list[Position]) -> dict[str, Any]:
             for m in scene.milestones.order_by("order")
         ],
     }
+
+
+def require_scene(plan: Plan, scene: Scene) -> None:
+    """Conflict, with what differs, where the scene is not as the plan froze it: success would be something else."""
+    frozen = next((row for row in (plan.document or {})["scenes"] if row["name"] == scene.name), None)
+    if frozen is None:
+        raise Conflict(_SCENE_RENAMED_SINCE_FROZEN(plan=plan))
+    numbers = [position["number"] for position in frozen["positions"]]
+    now = scene_of(scene, list(scene.positions.filter(number__in=numbers).order_by("number")))
+    differs = list(_differences(frozen, now))
+    if differs:
+        raise Conflict(_SCENE_CHANGED_SINCE_FROZEN(name=scene.name, plan=plan, differs="; ".join(differs)))
+
+
+def _differences(frozen: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
+    """Each value that is another one now, in words."""
+    for key, value in frozen.items():
+        if not isinstance(value, list):
+            if value != now.get(key):
+                yield f"{key} was {value!r}, is {now.get(key)!r}"
+            continue
+        named, kind = ("order", "milestone") if key == "milestones" else ("number", "position")
+        before, after = ({row[named]: row for row in rows} for rows in (value, now[key]))
+        for number in sorted({*before, *after}):
+            if number not in after or number not in before:
+                yield f"{kind} {number} {'is gone' if number in before else 'is new'}"
+                continue
+            changed = [name for name, was in before[number].items() if was != after[number].get(name)]
+            yield from (
+                f"{kind} {number}: {name} was {before[number][name]!r}, is {after[number].get(name)!r}"
+                for name in changed
+            )
 
 
 def checkpoint_of(checkpoint: Checkpoint) -> dict[str, Any]:

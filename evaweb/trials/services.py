@@ -104,6 +104,7 @@ _TRIES = 5  # to get a number that nobody else takes at the same moment
 def declare_check(check: Check) -> None:
     """`check` is asked before a trial is "run", "scored", "voided" or the like, with the trial and the user.
 
+    And of "judged" while the trial is locked, whenever its scene says what is success: scored, corrected, rated again.
     Before a correction that leaves success and milestones as they were it is asked of "scored", then of "reworded".
 
     It raises EvaError.
@@ -304,6 +305,7 @@ def trial_score(
     checked("scored", trial, user)
     with transaction.atomic():
         held = locked(trial)
+        checked("judged", held, user)
         rows = list(held.scene.milestones.order_by("order"))
         when = _times_before(held, rows, milestones) if times is None else times
         judged = partial(verdict, rows, milestones, success, times=when, ordered=held.scene.ordered)

@@ -30,6 +30,7 @@ from evaweb.results.ratings.video_available import seen
 from evaweb.roles import Role, require
 from evaweb.trials.models import Milestone, Trial, TrialStatus
 from evaweb.trials.record import file_of
+from evaweb.trials.services import checked
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
 
@@ -148,6 +149,7 @@ def judge_next(*, plan: Plan, name: str) -> bool:
     handout = next(_showable(plan, found), None)
     if handout is None:
         return False
+    checked("judged", handout.trial, None)
     judgement = Judgement(trial=handout.trial, judge=found.name, version=found.version)
     milestones = list(handout.trial.scene.milestones.order_by("order"))
     said = [Said()] * len(milestones)

@@ -26,7 +26,7 @@ from evaweb.roles import Role, require
 from evaweb.trials import failures
 from evaweb.trials.models import Score, Trial, TrialStatus
 from evaweb.trials.record import file_of
-from evaweb.trials.services import declare_check
+from evaweb.trials.services import checked, declare_check
 from evaweb.trials.verdicts import LONGEST_NOTE, verdict
 from runtime.core.sentences import Pattern, fixed
 
@@ -173,6 +173,7 @@ def rate(
         raise Conflict(_TRIAL_NOT_ONE_THOSE_RATED(code=code, plan=plan))
     if trial.operator_id == user.pk or trial.scores.filter(rater=user).exists():
         raise NotAllowed(_YOU_RAN_SCORED_TRIAL_SOMEONE(code=code))
+    checked("judged", trial, user)
     twice = f"you have rated trial {code} already"
     found = verdict(list(trial.scene.milestones.order_by("order")), milestones, success)
     said = {

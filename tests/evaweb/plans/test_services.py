@@ -10,13 +10,13 @@ from evaweb.plans.allocation import give_back, hand_out, progress
 from evaweb.plans.blinding_rules import look, sealed_for
 from evaweb.plans.canonical import digest
 from evaweb.plans.commitment import commitment, schedule_digest
-from evaweb.plans.documents import conditions_of
+from evaweb.plans.documents import conditions_of, scene_of
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.schedule import schedule
 from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
 from evaweb.stations.models import Station
 from evaweb.trials import services as trials
-from evaweb.trials.models import Trial
+from evaweb.trials.models import Milestone, Scene, Trial
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import unguarded
 
@@ -209,6 +209,53 @@ def test_a_scene_or_a_checkpoint_that_was_changed_stops_the_plan(bench, plan):
     with pytest.raises(Conflict, match="is switched off") as said:
         hand_out(user=bench.operator, station=bench.station, plan=plan)
     assert not any(row.name in str(said.value) for row in plan.checkpoints.all())
+
+
+CHANGES = {  # of a scene, each with what is said of it
+    "required": (
+        lambda scene: scene.milestones.filter(order=1).update(required=True),
+        "milestone 1: required was False",
+    ),
+    "points": (lambda scene: scene.milestones.filter(order=2).update(points=7), "milestone 2: points was"),
+    "one more": (
+        lambda scene: Milestone.objects.create(scene=scene, order=9, text="and back", points=1),
+        "milestone 9 is new",
+    ),
+    "criterion": (
+        lambda scene: Scene.objects.filter(pk=scene.pk).update(criterion="anything"),
+        "criterion was",
+    ),
+    "order": (
+        lambda scene: Scene.objects.filter(pk=scene.pk).update(ordered=True),
+        "ordered was False, is True",
+    ),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_trial_is_scored_and_corrected_by_the_scene_that_was_frozen_and_by_no_other(bench, plan, change):
+    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    before = scene_of(bench.scene, list(bench.scene.positions.all()))
+    builders.over(trial, 10.0)
+    changed, said = CHANGES[change]
+
+    ticks = bench.ticks(True, True, True)
+
+    def score(**words):
+        return trials.trial_score(user=bench.operator, trial=trial, milestones=ticks, **words)
+
+    with transaction.atomic():
+        changed(bench.scene)
+        with pytest.raises(Conflict, match=f"scene block-on-plate was changed since .*{said}"):
+            score()
+        assert not trial.scores.exists()
+        transaction.set_rollback(True)
+    assert scene_of(Scene.objects.get(), list(bench.scene.positions.all())) == before
+    assert score().success
+    changed(bench.scene)
+    with pytest.raises(Conflict, match=said):
+        score(reason="looked again")
+    assert trial.scores.count() == 1
 
 
 def test_an_amendment_is_the_next_version_and_ends_the_one_before(bench, plan, owner):

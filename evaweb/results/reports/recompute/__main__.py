@@ -16,6 +16,7 @@ from typing import Any
 from .designs import error, kept_faults, planned, planned_letters, share_of
 from .judged import agreement, by_words, calibration, on_milestone, preferences, score_alpha
 from .numbers import Drawn, Trial, numbers
+from .scenes import scene_faults
 from .sealed import faults
 
 _SHOWN = 40
@@ -41,6 +42,7 @@ def main() -> int:
     found = {}
     try:
         trials = [_trial(row) for row in rows]
+        wrong += scene_faults(plan, rows, scores, ratings)
         people = Counter(map(_of, preferred))
         found = numbers(trials, plan)
         found |= {

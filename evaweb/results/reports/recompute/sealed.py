@@ -106,7 +106,8 @@ def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapp
     if not seal["key"]:
         return found
     version = plan.get("format", 1)  # from 3 on a reveal kept what counts, from 4 on blocks and sums
-    wanted = {3: ("digest",), 4: ("digest", "blocks", "arms")}.get(version, ()) if arms_of(plan) else ()
+    kinds = () if version < 3 else ("digest",) if version == 3 else ("digest", "blocks", "arms")
+    wanted = kinds if arms_of(plan) else ()
     found += [f"the reveal kept no {name}" for name in wanted if name not in (kept or {})]
     key = bytes.fromhex(seal["key"])
     units = schedule(plan, key)

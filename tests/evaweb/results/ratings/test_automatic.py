@@ -13,6 +13,7 @@ from evaweb.episodes.reconcile import reconcile
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import cancel, try_again, work
+from evaweb.plans.documents import scene_of
 from evaweb.plans.models import Plan, PlanEvent
 from evaweb.plans.services import plan_reveal
 from evaweb.results import job_kinds
@@ -24,7 +25,7 @@ from evaweb.results.ratings.stills import CAMERAS, OF_EACH, sample, stills_of
 from evaweb.results.reports.reporting import numbers_of
 from evaweb.results.reports.tables import outcome_pages
 from evaweb.trials import services
-from evaweb.trials.models import Milestone, Score, Trial
+from evaweb.trials.models import Milestone, Scene, Score, Trial
 from tests.evaweb.results.judges.server import http, message, said, serving
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import unguarded
@@ -60,11 +61,20 @@ def filmed(plan, carry_out, filming):
     return plan
 
 
+def freeze_as_it_is(plan):
+    """As if its scene had been like this when it was frozen."""
+    scene = Scene.objects.get()
+    document = {**plan.document, "scenes": [scene_of(scene, list(scene.positions.order_by("number")))]}
+    with unguarded("plans"):
+        Plan.objects.filter(pk=plan.pk).update(document=document)
+
+
 @pytest.fixture
 def truth(filmed):
     """The bench of its trials knows of two milestones; of one trial it says the opposite of its score."""
     for order, name in ((1, "held"), (3, "on_plate")):
         Milestone.objects.filter(order=order).update(truth=name)
+    freeze_as_it_is(filmed)
     for handout in filmed.handouts.select_related("trial__verdict"):
         reached = handout.trial.verdict.success != (handout.number == 1)
         told = {
@@ -118,12 +128,14 @@ def test_the_benchs_truth_is_held_against_the_scores(truth, owner):
 
 def test_what_was_reached_too_late_the_bench_does_not_count(truth, owner):
     Milestone.objects.filter(truth="held").update(time_limit_s=1.5)
+    freeze_as_it_is(truth)
     asked(truth, owner, "truth")
     assert {tuple(row.milestones[0]) for row in Judgement.objects.all()} == {("held", False, 0.0)}
 
 
 def test_pictures_and_criteria_are_sent_and_nothing_that_tells_what_it_is_of(filmed, owner, chat, bench):
-    bench.scene.__class__.objects.update(criterion="it rests on the plate")
+    Scene.objects.update(criterion="it rests on the plate")
+    freeze_as_it_is(filmed)
     with serving(SAID) as server:
         chat(server.address)
         assert asked(filmed, owner, "seer").result["shown"] == 16
@@ -358,6 +370,20 @@ def test_a_judge_is_held_against_the_score_that_stood_then(truth, owner, bench):
     ticks = bench.ticks(True, turned, turned)
     services.trial_score(user=bench.operator, trial=trial, milestones=ticks, reason="the bench is right")
     assert judges_of(truth) == before
+
+
+def test_neither_a_judge_nor_a_second_rater_judges_by_another_scene_than_the_frozen_one(filmed, owner, chat):
+    Milestone.objects.filter(order=1).update(required=True)
+    handout, _ = judging.to_rate(rita := builders.user("rita"))[:2]
+    ticks = dict.fromkeys(handout.trial.scene.milestones.values_list("pk", flat=True), True)
+    with pytest.raises(Conflict, match="milestone 1: required was False, is True"):
+        judging.rate(user=rita, plan=filmed, code=handout.code, milestones=ticks)
+    with serving(SAID) as server:
+        chat(server.address)
+        job = asked(filmed, owner, "seer")
+        assert "milestone 1: required was False, is True" in job.error
+        assert server.heard == []
+    assert not Judgement.objects.exists()
 
 
 @pytest.mark.exhaustive

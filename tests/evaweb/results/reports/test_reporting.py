@@ -310,6 +310,17 @@ def test_a_score_that_is_not_that_of_its_trial_is_found(report, column, value):
     assert "newest score" in found.stdout or "no such trial" in found.stdout
 
 
+def test_scores_by_another_scene_than_the_plans_are_found_although_they_agree_with_each_other(report):
+    """As if a milestone had not been required when it was scored: the same in every file, digests of a reveal aside."""
+    plan = json.loads((report / "data" / "plan.json").read_text("utf-8"))
+    for scene in plan["scenes"]:
+        scene["milestones"][0]["points"] += 1
+    (report / "data" / "plan.json").write_text(json.dumps(plan), "utf-8")
+    found = recompute(report)
+    assert found.returncode == 1
+    assert "the plan's points give" in found.stdout
+
+
 def test_the_page_needs_no_network_and_shows_the_checklist(report):
     page = (report / "index.html").read_text("utf-8")
     assert "<svg" in page

@@ -1,0 +1,44 @@
+"""Scores held against the scenes of the plan: their milestones, which of them are required, and their points."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+_JUDGED_AS_FROZEN = 5  # format of the plans whose trials are judged by the scenes that were frozen
+
+
+def scene_faults(
+    plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]], *judged: Sequence[Mapping[str, str]]
+) -> list[str]:
+    """Scores and second ratings that do not follow from the scene of their trial, as the plan has it."""
+    if plan.get("format", 1) < _JUDGED_AS_FROZEN:
+        return []
+    scenes = {scene["name"]: scene["milestones"] for scene in plan["scenes"]}
+    played = {row["trial"]: row["scene"] for row in rows}
+    return [
+        f"trial {said['trial']}, judged by {said['rater']}: {fault}"
+        for one in judged
+        for said in one
+        if said["trial"] in played
+        for fault in _faults(said, scenes.get(played[said["trial"]], []))
+    ]
+
+
+def _faults(said: Mapping[str, str], milestones: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    reached = json.loads(said["milestones"] or "[]")
+    if [text for text, _ in reached] != [row["text"] for row in milestones]:
+        yield "its milestones are not those of the plan"
+        return
+    ticks = [bool(done) for _, done in reached]
+    success = said["success"] == "true"
+    required = [done for done, row in zip(ticks, milestones, strict=True) if row["required"]]
+    if required and success != all(required):
+        yield f"success is {success}, its required milestones say {all(required)}"
+    points = [row["points"] for row in milestones]
+    total = sum(points)
+    share = sum(p for p, done in zip(points, ticks, strict=True) if done) / total if total else float(success)
+    if not math.isclose(float(said["score"]), share, abs_tol=1e-9):
+        yield f"its score is {said['score']}, the plan's points give {share:g}"
