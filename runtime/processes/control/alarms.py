@@ -24,6 +24,7 @@ _HELD_ELSEWHERE = Pattern(
 _RETURNED_AWAY = 0.1  # [rad] that an arm may be off after it was not seen, by sagging
 _AGREES_S = 1.0  # that a joint reads where it is told to be, before its readings lead its command again
 _THERE = 1e-6  # [rad]
+_LATELY_S = 1.0  # ago a command that moved went away from a joint that was blocked, and not the joint from it
 
 
 def silent_sibling(shared: SharedState, now: float, allowed: Callable[[str], float]) -> str:
@@ -57,6 +58,7 @@ class Displacement:
         self._meeting = False  # a set-up takes the robot over where it is read, and not yet there
         self.goal: Float64 | None = None  # where the command is being led to
         self._led: Led | None = None  # how far, while it is
+        self._free_at = float("-inf")  # when the command was last free to move
         self.begins = False  # whether it has been since this tick
         self._doubt = ""  # which joints are not followed since this tick, and why
 
@@ -75,6 +77,8 @@ class Displacement:
         if measured is None:
             return None
         returned = self._plausibility.returned()
+        if not held:
+            self._free_at = now
         if not (held or (returned and robot.engaged)) or self._settings.safety.report_only:
             self.goal = None
             return None
@@ -105,7 +109,7 @@ class Displacement:
                     measured,
                     self._plausibility.speed(),
                     now,
-                    at_once=bool(returned) and not self._meeting,
+                    at_once=not self._meeting and (bool(returned) or now - self._free_at < _LATELY_S),
                 )
                 self.begins = True
         return None if self.goal is None or self._led is None else self._led.end(self.goal)

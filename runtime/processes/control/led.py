@@ -26,7 +26,8 @@ class Led:
     ) -> None:
         """From `commanded` [D], while joints are read at `measured` [D] and go at `speed` [D] by themselves.
 
-        `at_once`: without parts, or an arm that was switched off and on again would be pulled back meanwhile.
+        `at_once`: without parts, or an arm that was switched off and on again would be pulled back meanwhile, and one
+        that is blocked would go on pressing.
         """
         self.at_once = at_once
         self._along = np.zeros(len(commanded), np.int64)

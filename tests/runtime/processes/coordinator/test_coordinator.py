@@ -119,7 +119,7 @@ def test_an_arm_that_was_moved_while_ready_makes_the_station_idle_and_stays_wher
         moved[0] += 0.02
         station.robot.position = moved.copy()
         station.go(1)
-    station.go(30)
+    station.go(75)
     assert station.state is SessionState.IDLE
     assert "0.5" in station.reason  # by which it is known that it was moved; where it ends is followed
     assert "from where it was told to hold" in station.reason

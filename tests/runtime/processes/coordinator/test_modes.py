@@ -594,7 +594,7 @@ def test_an_arm_that_was_moved_while_a_person_looks_holds_the_run(tmp_path: Path
     for _ in range(28):  # by a hand, which is seen on its way
         station.robot.position = station.robot.position + 0.02 * np.eye(14)[0]
         station.go(1)
-    station.go(30)
+    station.go(75)
     assert station.state is SessionState.HOLDING
     assert "from where it was told to hold" in station.reason
     assert station.coordinator.inference.proposal is None
