@@ -17,7 +17,7 @@ from runtime.datasets.catalog import Catalog, info_of, own_line
 from runtime.datasets.columns import column_statistics
 from runtime.datasets.cut import NotCopyableError, cut, encode
 from runtime.datasets.entries import entry, statistic_lines, task_lines
-from runtime.datasets.features import arrow_schema, differences, stored
+from runtime.datasets.features import arrow_schema, differences, figure_shapes, holds_nothing, stored
 from runtime.datasets.layout import Line
 from runtime.datasets.parquet_lists import EPISODES_FOLDER
 from runtime.datasets.pictures import StoredPictures
@@ -26,7 +26,7 @@ from runtime.datasets.renaming import Names
 from runtime.datasets.rows import numbers, write_table
 from runtime.datasets.sides import FOLDER, side_file, side_files
 from runtime.datasets.staging import Draft
-from runtime.datasets.stats import Statistic, picture_statistic, video_statistic
+from runtime.datasets.stats import Statistic, fault, picture_statistic, video_statistic
 from runtime.recording.files import disk_fault
 
 if TYPE_CHECKING:
@@ -181,7 +181,12 @@ class _Assembly:
         self._reencode = reencode
         self._sources = _sources(parts)
         first = self._sources[0]
-        self._features = {key: dict(feature) for key, feature in first.features.items()}
+        self._left_out: dict[str, None] = {}  # in order, each once
+        self._features = {
+            key: dict(feature) | ({} if list(feature["shape"]) else {"shape": [1]})
+            for key, feature in first.features.items()
+            if not self._empty(key, feature)
+        }
         self._tasks = tuple(dict.fromkeys(task for source in self._sources for task in source.tasks))
         self._fps = first.dataset.fps
         self._info = info_of(
@@ -192,7 +197,12 @@ class _Assembly:
             version=version,
         )
         self._encoded: list[str] = []
-        self._left_out: dict[str, None] = {}  # in order, each once
+
+    def _empty(self, key: str, feature: Mapping[str, Any]) -> bool:
+        if holds_nothing(feature):
+            self._left_out[f"feature {key!r}: its shape is {list(feature['shape'])}, it holds nothing"] = None
+            return True
+        return False
 
     def write(self, tell: Tell) -> Assembled:
         lines, statistics, eva, first = [], [], [], 0
@@ -234,11 +244,7 @@ class _Assembly:
         table = self._table(part, line, first)
         placed.data.parent.mkdir(parents=True, exist_ok=True)
         write_table(table, placed.data)
-        statistics = {
-            key: statistic
-            for key, statistic in part.source.statistics.get(part.index, {}).items()
-            if key in self._features and key not in _PLACED
-        }
+        statistics = self._given(part)
         for key, span in placed.videos.items():
             span.path.parent.mkdir(parents=True, exist_ok=True)
             self._video(part, key, span.path, placed.length)
@@ -246,18 +252,38 @@ class _Assembly:
                 statistics[key] = video_statistic(span.path, placed.length)
         for key in layout.image_keys(self._features):
             if key not in statistics:
-                rows = StoredPictures(f"{placed.data}, {key!r}", table.column(key).to_pylist(), self._root)
-                statistics[key] = picture_statistic(rows)
+                name = f"{part.source.dataset.root}, episode {part.index}, column {key!r}"
+                made = picture_statistic(StoredPictures(name, table.column(key).to_pylist(), self._root))
+                if made is not None:
+                    statistics[key] = made
+        if self._info["codebase_version"] == layout.V21:
+            statistics |= {key: _of_three(statistics[key]) for key in self._shown if key in statistics}
         return statistics | _completed(statistics, self._computed(table))
+
+    @property
+    def _shown(self) -> list[str]:
+        return [*layout.video_keys(self._features), *layout.image_keys(self._features)]
+
+    def _given(self, part: Part) -> dict[str, Statistic]:
+        """The source's statistics of an episode, but for those that are made anew."""
+        found = {}
+        for key, statistic in part.source.statistics.get(part.index, {}).items():
+            if key not in self._features or key in _PLACED:
+                continue
+            if why := fault(statistic, figure_shapes(self._features[key])):
+                where = f"{part.source.dataset.root}, episode {part.index}"
+                self._left_out[f"statistics of {where}, {key!r}: {why}; they are made anew"] = None
+            else:
+                found[key] = statistic
+        return found
 
     def _computed(self, table: pa.Table) -> dict[str, Statistic]:
         columns = {
-            key: numbers(table, key).reshape(table.num_rows, -1)
+            key: numbers(table, key).reshape(table.num_rows, *feature["shape"])
             for key, feature in stored(self._features).items()
             if feature["dtype"] not in ("string", "image")
         }
-        plain = {key: rows.reshape(-1) if rows.shape[1] == 1 else rows for key, rows in columns.items()}
-        return column_statistics(plain, {key: self._features[key] for key in plain})
+        return column_statistics(columns, {key: self._features[key] for key in columns})
 
     def _table(self, part: Part, line: Line, first: int) -> pa.Table:
         """The rows of an episode in their new place, exactly the declared columns."""
@@ -273,13 +299,13 @@ class _Assembly:
                 f"{source.dataset.root}, episode {index} lacks the columns {missing}, it has {table.column_names}"
             )
         for name in table.column_names:
-            if name not in columns:
+            if name not in columns and name not in source.features:
                 self._left_out[f"column {name!r}: it is declared nowhere"] = None
         rows, schema = table.num_rows, arrow_schema(self._features)
         fresh = {
             "episode_index": np.full(rows, line["episode_index"], np.int64),
             "index": np.arange(first, first + rows, dtype=np.int64),
-            "task_index": self._task_numbers(part, numbers(table, "task_index")),
+            "task_index": self._task_numbers(part, numbers(table, "task_index").reshape(-1)),
         }
         arrays = []
         for field in schema:
@@ -361,6 +387,12 @@ def _folders(source: Source) -> set[str]:
     listed = source.dataset.episodes
     files = [path for one in listed for path in (one.data, *(span.path for span in one.videos.values()))]
     return {"meta", FOLDER, EPISODES_FOLDER, *(path.relative_to(root).parts[0] for path in files)}
+
+
+def _of_three(statistic: Statistic) -> Statistic:
+    """The figures of one channel for three: what reads v2.1 refuses any other number of them."""
+    figures = (name for name in statistic if name != "count")
+    return statistic | {name: (statistic[name] * 3)[:3] for name in figures}
 
 
 def _completed(given: Mapping[str, Statistic], computed: Mapping[str, Statistic]) -> dict[str, Statistic]:

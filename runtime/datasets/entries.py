@@ -106,7 +106,7 @@ def statistic_lines(root: Path, info: Info) -> list[Line]:
     for line in lines:
         if not isinstance(line.get("episode_index"), int):
             raise RecordingError(f"{path}: a line says no episode_index: {_short(line)}")
-    return lines
+    return [line if isinstance(line.get("stats"), dict) else line | {"stats": {}} for line in lines]
 
 
 def entry(root: Path, info: Info, line: Line) -> EpisodeEntry:

@@ -37,8 +37,8 @@ def read_statistics(root: Path) -> list[Line]:
         for row in _read(path, ["episode_index", *names]).to_pylist():
             statistics: dict[str, dict[str, Any]] = {}
             for name in names:
-                if row[name] is not None:
-                    key, figure = name.removeprefix(_STATS).rsplit("/", 1)
+                key, _, figure = name.removeprefix(_STATS).rpartition("/")
+                if row[name] is not None and key:
                     statistics.setdefault(key, {})[figure] = row[name]
             lines.append({"episode_index": row["episode_index"], "stats": statistics})
     return lines
