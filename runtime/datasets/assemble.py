@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -16,15 +18,24 @@ from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog, info_of, own_line
 from runtime.datasets.columns import column_statistics
 from runtime.datasets.cut import NotCopyableError, cut, encode
-from runtime.datasets.entries import entry, statistic_lines, task_lines
-from runtime.datasets.features import arrow_schema, differences, figure_shapes, holds_nothing, stored
+from runtime.datasets.entries import entry, episode_lines, own_keys, statistic_lines, task_lines
+from runtime.datasets.features import (
+    LANGUAGE,
+    WORDS,
+    arrow_schema,
+    differences,
+    figure_shapes,
+    holds_nothing,
+    stored,
+)
 from runtime.datasets.layout import Line
-from runtime.datasets.parquet_lists import EPISODES_FOLDER
+from runtime.datasets.parquet_lists import EPISODES_FOLDER, is_storable
 from runtime.datasets.pictures import StoredPictures
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.datasets.renaming import Names
 from runtime.datasets.rows import numbers, write_table
 from runtime.datasets.sides import FOLDER, side_file, side_files
+from runtime.datasets.splits import TRAIN, episodes_of, written
 from runtime.datasets.staging import Draft
 from runtime.datasets.stats import Statistic, fault, picture_statistic, video_statistic
 from runtime.recording.files import disk_fault
@@ -61,6 +72,7 @@ class Source:
     dataset: Dataset
     names: Names
     tasks: tuple[str, ...]  # in the order of their numbers
+    lines: Mapping[int, Line]  # of the list of episodes, what the format does not know
     statistics: Mapping[int, Mapping[str, Statistic]]
     eva: Mapping[int, Line]
 
@@ -77,6 +89,7 @@ class Source:
             dataset,
             names,
             tuple(str(line["task"]) for line in tasks),
+            {int(line["episode_index"]): own_keys(line) for line in episode_lines(root, dataset.info)},
             {line["episode_index"]: names.keys(line["stats"]) for line in statistics},
             {line["episode_index"]: line for line in eva},
         )
@@ -190,13 +203,60 @@ class _Assembly:
         self._tasks = tuple(dict.fromkeys(task for source in self._sources for task in source.tasks))
         self._fps = first.dataset.fps
         self._info = info_of(
-            first.dataset.info if len(self._sources) == 1 else {},
+            self._common(),
             robot=first.dataset.info.get("robot_type"),
             fps=self._fps,
             features=self._features,
             version=version,
         )
         self._encoded: list[str] = []
+
+    def _common(self) -> dict[str, Any]:
+        """What info.json of all sources says alike; what else they say is left out, with a word."""
+        said = [source.dataset.info for source in self._sources]
+        for info, source in zip(said, self._sources, strict=True):
+            for key in sorted(set(info) - layout.INFO_KEYS):
+                if any(other.get(key) != info[key] for other in said):
+                    self._left_out[f"{key!r} in info.json of {source.dataset.root}: others say another"] = (
+                        None
+                    )
+        return {key: value for key, value in said[0].items() if all(one.get(key) == value for one in said)}
+
+    def _splits(self) -> dict[str, str]:
+        """The sources' splits with the new indices; without any all is for training."""
+        found: dict[str, list[int]] = {}
+        for source in self._sources:
+            named, given = {}, source.dataset.info.get("splits") or {}
+            for name, value in given.items():
+                try:
+                    named[name] = set(episodes_of(name, value))
+                except RecordingError as error:
+                    self._left_out[f"{source.dataset.root}: {error}"] = None
+            there = [listed.index for listed in source.dataset.episodes]
+            # Where numbers have gaps, splits that name 0 to the last of so many count places, as LeRobot does.
+            counted = set().union(*named.values()) == set(range(len(there)))
+            for place, part in enumerate(self._parts):
+                if part.source is source:
+                    number = there.index(part.index) if counted else part.index
+                    for name in named or (TRAIN,):
+                        if not named or number in named[name]:
+                            found.setdefault(name, []).append(place)
+        return written(found)
+
+    def _told(self, lines: Sequence[Line]) -> list[Line]:
+        """The lines of the list of episodes, with those of the sources' own keys that can be written."""
+        v30 = self._info["codebase_version"] == layout.V30
+        owns = [part.source.lines.get(part.index, {}) for part in self._parts]
+        kept: list[Line] = [{} for _ in owns]
+        for key in dict.fromkeys(key for own in owns for key in own):
+            values = [_without_nan(own.get(key)) for own in owns]
+            if is_storable(values) if v30 else _is_json(values):
+                for line, own, value in zip(kept, owns, values, strict=True):
+                    line |= {key: value} if key in own else {}
+            else:
+                kind = "parquet" if v30 else "JSON"
+                self._left_out[f"{key!r} of the episodes: it cannot be written as {kind}"] = None
+        return [own | line for own, line in zip(kept, lines, strict=True)]
 
     def _empty(self, key: str, feature: Mapping[str, Any]) -> bool:
         if holds_nothing(feature):
@@ -218,8 +278,9 @@ class _Assembly:
                 self._sides(part, str(told["uuid"]))
             first += line["length"]
         tasks = tuple({"task_index": number, "task": task} for number, task in enumerate(self._tasks))
-        catalog = Catalog(self._root, self._info, tuple(lines), tasks, tuple(statistics), tuple(eva))
-        catalog = replace(catalog, info={**self._info, **catalog.totals()})
+        listed = tuple(self._told(lines))
+        catalog = Catalog(self._root, self._info, listed, tasks, tuple(statistics), tuple(eva))
+        catalog = replace(catalog, info={**self._info, **catalog.totals(), "splits": self._splits()})
         for name, content in (catalog.documents_before_data() | catalog.documents_after_data()).items():
             path = self._root / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -281,7 +342,7 @@ class _Assembly:
         columns = {
             key: numbers(table, key).reshape(table.num_rows, *feature["shape"])
             for key, feature in stored(self._features).items()
-            if feature["dtype"] not in ("string", "image")
+            if feature["dtype"] not in WORDS
         }
         return column_statistics(columns, {key: self._features[key] for key in columns})
 
@@ -301,7 +362,9 @@ class _Assembly:
         for name in table.column_names:
             if name not in columns and name not in source.features:
                 self._left_out[f"column {name!r}: it is declared nowhere"] = None
-        rows, schema = table.num_rows, arrow_schema(self._features)
+        worded = [key for key, feature in columns.items() if feature["dtype"] == LANGUAGE]
+        given = {key: table.schema.field(key).type for key in worded}
+        rows, schema = table.num_rows, arrow_schema(self._features, given)
         fresh = {
             "episode_index": np.full(rows, line["episode_index"], np.int64),
             "index": np.arange(first, first + rows, dtype=np.int64),
@@ -379,6 +442,18 @@ class _Assembly:
                     shutil.copyfile(path, self._root / name)
                 else:
                     self._left_out[str(path)] = None
+
+
+def _without_nan(value: Any) -> Any:
+    """Pandas' word for what is not said is null."""
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _is_json(values: Sequence[Any]) -> bool:
+    try:
+        return bool(json.dumps(values, allow_nan=False))
+    except (TypeError, ValueError):
+        return False
 
 
 def _folders(source: Source) -> set[str]:

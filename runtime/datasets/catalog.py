@@ -20,6 +20,7 @@ from runtime.datasets.entries import (
 )
 from runtime.datasets.features import Features, differences, figure_shapes, plain_rate
 from runtime.datasets.layout import Line
+from runtime.datasets.splits import with_more
 from runtime.datasets.stats import Statistic, aggregate, fault
 
 
@@ -193,7 +194,7 @@ class Catalog:
             "total_episodes": count,
             "total_frames": sum(line["length"] for line in self.episodes),
             "total_tasks": len(self.tasks),
-            "splits": {"train": f"0:{count}"},
+            "splits": with_more(self.info.get("splits") or {}, int(self.info["total_episodes"]), count),
         }
         if self.version == layout.V30:
             return totals

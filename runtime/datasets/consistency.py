@@ -22,16 +22,20 @@ from runtime.datasets.entries import (
 )
 from runtime.datasets.features import (
     INDEX_COLUMNS,
+    LANGUAGE,
+    WORDS,
     arrow_type,
     figure_shapes,
     holds_nothing,
     is_depth,
+    is_language,
     picture_size,
     stored,
 )
 from runtime.datasets.pictures import Pictures, StoredPictures, Stretch
 from runtime.datasets.rows import numbers, read_rows
 from runtime.datasets.sides import strays
+from runtime.datasets.splits import episodes_of
 from runtime.datasets.stats import FIGURES, fault, finite
 
 if TYPE_CHECKING:
@@ -96,7 +100,6 @@ def _totals(info: layout.Info, episodes: list[Line], tasks: list[Line]) -> Itera
         "total_episodes": len(episodes),
         "total_frames": sum(line["length"] for line in episodes),
         "total_tasks": len(tasks),
-        "splits": {"train": f"0:{len(episodes)}"},
     }
     if info["codebase_version"] != layout.V30:
         chunks_size = int(info.get("chunks_size", layout.CHUNKS_SIZE))
@@ -105,10 +108,26 @@ def _totals(info: layout.Info, episodes: list[Line], tasks: list[Line]) -> Itera
     for key, value in expected.items():
         if info.get(key) != value:
             yield f"info.json says {key} {info.get(key)}, the lists give {value}"
+    yield from _splits(info, {int(line["episode_index"]) for line in episodes})
     if [line["episode_index"] for line in episodes] != list(range(len(episodes))):
         yield f"the list of episodes does not have episodes 0 to {len(episodes) - 1} in order"
     if sorted(line["task_index"] for line in tasks) != list(range(len(tasks))):
         yield f"the list of tasks does not number them 0 to {len(tasks) - 1}"
+
+
+def _splits(info: layout.Info, listed: set[int]) -> Iterator[str]:
+    left = set(listed)
+    for name, value in (info.get("splits") or {}).items():
+        try:
+            named = set(episodes_of(name, value))
+        except RecordingError as error:
+            yield f"info.json: {error}"
+            continue
+        if absent := sorted(named - listed):
+            yield f"info.json: splits name episode {absent[0]} for {name!r}, which is not there"
+        left -= named
+    if left:
+        yield f"info.json: splits leave out {len(left)} episodes, the first is {min(left)}"
 
 
 def _places(info: layout.Info, episodes: list[Line]) -> Iterator[str]:
@@ -174,7 +193,12 @@ def _table(table: pa.Table, info: layout.Info, index: int, length: int, first: i
     for key, feature in columns.items():
         if key not in table.column_names or holds_nothing(feature):
             continue
-        given, declared = table.schema.field(key).type, arrow_type(key, feature)
+        given = table.schema.field(key).type
+        if feature["dtype"] == LANGUAGE:
+            if not is_language(given):
+                yield f"{key!r} is stored as {given}, expected a list of structs with role and content"
+            continue
+        declared = arrow_type(key, feature)
         if not _same_type(given, declared):
             yield f"{key!r} is stored as {given}, declared {declared}"
     if table.num_rows != length:
@@ -214,7 +238,7 @@ def _timestamps(table: pa.Table, info: layout.Info) -> Iterator[str]:
 def _values(table: pa.Table, info: layout.Info) -> Iterator[str]:
     """What no loader makes a number of: null, infinite, something else."""
     for key, feature in stored(info["features"]).items():
-        if key not in table.column_names or feature["dtype"] == "image":
+        if key not in table.column_names or feature["dtype"] in ("image", LANGUAGE):
             continue
         column = table.column(key)
         if column.null_count:
@@ -290,7 +314,7 @@ def _statistics(
     for key in (*layout.video_keys(info["features"]), *layout.image_keys(info["features"])):
         yield from _picture_statistic(key, info["features"][key], statistics.get(key))
     for key, feature in stored(info["features"]).items():
-        if feature["dtype"] in ("string", "image") or key not in table.column_names or holds_nothing(feature):
+        if feature["dtype"] in WORDS or key not in table.column_names or holds_nothing(feature):
             continue
         try:
             values = numbers(table, key).astype(np.float64)

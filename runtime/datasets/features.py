@@ -24,6 +24,10 @@ INDEX_COLUMNS = {
 }
 
 
+LANGUAGE = "language"  # of LeRobot 0.6: a list of structs per row, of the writer's own fields, may be null
+WORDS = ("string", "image", LANGUAGE)  # of which there are no statistics of numbers
+
+
 def scalar(dtype: str) -> Feature:
     """One value per row: float32, float64, int64, bool or string."""
     return {"dtype": dtype, "shape": [1], "names": None}
@@ -135,15 +139,33 @@ def arrow_type(key: str, feature: Mapping[str, Any]) -> pa.DataType:
     return kind
 
 
-def arrow_schema(features: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
-    """The schema of an episode's parquet file, with metadata from which `datasets` knows the features."""
+def is_language(kind: pa.DataType) -> bool:
+    """True of the type that a column of LeRobot's language annotations has."""
+    import pyarrow as pa
+
+    rows = kind.value_type if pa.types.is_list(kind) or pa.types.is_large_list(kind) else None
+    return rows is not None and pa.types.is_struct(rows) and {"role", "content"} <= {one.name for one in rows}
+
+
+def arrow_schema(
+    features: Mapping[str, Mapping[str, Any]], given: Mapping[str, pa.DataType] | None = None
+) -> pa.Schema:
+    """The schema of an episode's parquet file, with metadata from which `datasets` knows the features.
+
+    Columns of language have the types that are `given`.
+    """
     import pyarrow as pa
 
     columns = stored(features)
-    declared = {key: _hugging_face(feature) for key, feature in columns.items()}
+    worded = {key: (given or {})[key] for key, feature in columns.items() if feature["dtype"] == LANGUAGE}
+    declared = {key: _hugging_face(feature) for key, feature in columns.items() if key not in worded}
     metadata = {"huggingface": json.dumps({"info": {"features": declared}})}
     return pa.schema(
-        [pa.field(key, arrow_type(key, feature)) for key, feature in columns.items()], metadata=metadata
+        [
+            pa.field(key, worded[key] if key in worded else arrow_type(key, feature))
+            for key, feature in columns.items()
+        ],
+        metadata=metadata,
     )
 
 

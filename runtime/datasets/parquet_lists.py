@@ -72,6 +72,16 @@ def episode_files(lines: Sequence[Line], statistics: Sequence[Line]) -> dict[str
     }
 
 
+def is_storable(values: Sequence[Any]) -> bool:
+    """True if one column of a parquet file can hold these values."""
+    import pyarrow as pa
+
+    try:
+        return bool(_bytes(pa.table({"values": pa.array(values)})))
+    except (pa.ArrowException, TypeError, OverflowError):
+        return False
+
+
 def tasks_file(tasks: Iterable[Line]) -> bytes:
     """meta/tasks.parquet as pandas writes a frame whose index is the task."""
     import json
