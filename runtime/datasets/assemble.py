@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 _PLACED = ("episode_index", "index", "task_index")  # columns that depend on where an episode is
 _OURS = {layout.INFO, layout.EPISODES, layout.TASKS, layout.EPISODES_STATS, layout.STATS, layout.TASKS_V30}
 _OURS |= {layout.EVA_EPISODES}
+SUBTASKS = "meta/subtasks.parquet"  # of LeRobot 0.6: what subtask_index numbers
 COPIED_FROM = (
     "copied_from"  # in our line about an episode: the dataset it was copied from, absent where published
 )
@@ -165,12 +166,20 @@ def _require_same(parts: Sequence[Part]) -> None:
             for key in layout.video_keys(first.features)
             if (mine := _codec(first, key)) != (theirs := _codec(source, key))
         ]
+        if "subtask_index" in first.features and _bytes(one, SUBTASKS) != _bytes(other, SUBTASKS):
+            found.append(f"{SUBTASKS} differ, so that a subtask_index would mean another subtask")
         if found:
             raise RecordingError(f"{one.root} and {other.root} do not belong together: {'; '.join(found)}")
     uuids = Counter(part.source.eva[part.index]["uuid"] for part in parts if part.index in part.source.eva)
     twice = [uuid for uuid, count in uuids.items() if count > 1]
     if twice:
         raise RecordingError(f"the same episode would be there twice: {twice}")
+
+
+def _bytes(dataset: Dataset, name: str) -> bytes | None:
+    """A file of the dataset, None where it has none."""
+    path = dataset.root / name
+    return path.read_bytes() if path.is_file() else None
 
 
 def _codec(source: Source, key: str) -> Any:
@@ -438,7 +447,7 @@ class _Assembly:
                 if name == layout.MODALITY:
                     if source is self._sources[0] and source.names.empty:
                         shutil.copyfile(path, self._root / name)
-                elif len(self._sources) == 1 and path.is_file():
+                elif path.is_file() and (len(self._sources) == 1 or name == SUBTASKS):
                     shutil.copyfile(path, self._root / name)
                 else:
                     self._left_out[str(path)] = None

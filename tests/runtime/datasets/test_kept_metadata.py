@@ -199,3 +199,19 @@ def test_columns_of_language_are_kept(tmp_path: Path, version: str) -> None:
     for index, made in rows.items():
         assert open_dataset(tmp_path / "again").table(index)["language_events"].to_pylist() == made
         assert open_dataset(tmp_path / "again").episode(index).length == len(made)
+
+
+def test_subtasks_that_are_numbered_otherwise_are_not_merged(tmp_path: Path) -> None:
+    roots = [tmp_path / "one", tmp_path / "other"]
+    for root in roots:
+        write(root, Plan("v2.1", lengths=(3,), videos=()))
+        features = json.loads((root / "meta/info.json").read_text())["features"]
+        tell(root, features=features | {"subtask_index": {"dtype": "int64", "shape": [1], "names": None}})
+        path = root / "data/chunk-000/episode_000000.parquet"
+        pq.write_table(pq.read_table(path).append_column("subtask_index", pa.array([0, 0, 1])), path)
+        pq.write_table(pa.table({"subtask": ["reach", "grasp"]}), root / "meta/subtasks.parquet")
+    merge(roots, tmp_path / "both")
+    assert pq.read_table(tmp_path / "both/meta/subtasks.parquet")["subtask"].to_pylist() == ["reach", "grasp"]
+    pq.write_table(pa.table({"subtask": ["grasp", "reach"]}), roots[1] / "meta/subtasks.parquet")
+    with pytest.raises(RecordingError, match=r"meta/subtasks\.parquet differ"):
+        merge(roots, tmp_path / "never")
