@@ -183,7 +183,7 @@ def aggregate(episodes: Iterable[Mapping[str, Statistic]]) -> dict[str, Statisti
     """The statistics of all episodes together, each episode weighted by its count.
 
     Source: the parallel form of the variance (Chan, Golub, LeVeque 1979). Quantiles are the mean of those of the
-    episodes, as LeRobot makes them; there are none where an episode has none.
+    episodes, as LeRobot makes them; there are none where an episode has none. ValueError for counts that are not above 0.
     """
     collected: dict[str, list[Statistic]] = {}
     for statistics in episodes:
@@ -195,6 +195,8 @@ def aggregate(episodes: Iterable[Mapping[str, Statistic]]) -> dict[str, Statisti
 def _together(parts: list[Statistic]) -> Statistic:
     means, deviations = (np.array([part[name] for part in parts], np.float64) for name in ("mean", "std"))
     counts = np.array([part["count"][0] for part in parts], np.float64)
+    if not (counts > 0).all():
+        raise ValueError(f"counts are {counts.tolist()}, expected all above 0")
     weights = (counts / counts.sum()).reshape(-1, *[1] * (means.ndim - 1))
     mean = (weights * means).sum(axis=0)
     variance = (weights * (deviations**2 + (means - mean) ** 2)).sum(axis=0)
