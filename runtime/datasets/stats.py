@@ -183,7 +183,7 @@ def aggregate(episodes: Iterable[Mapping[str, Statistic]]) -> dict[str, Statisti
     """The statistics of all episodes together, each episode weighted by its count.
 
     Source: the parallel form of the variance (Chan, Golub, LeVeque 1979). Quantiles are the mean of those of the
-    episodes, as LeRobot makes them; there are none where an episode has none. ValueError for counts that are not above 0.
+    episodes, as LeRobot makes them; there are none where an episode has none. ValueError for a count not above 0.
     """
     collected: dict[str, list[Statistic]] = {}
     for statistics in episodes:
