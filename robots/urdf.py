@@ -137,6 +137,8 @@ def parsed(path: Path, comments: bool = False) -> ET.Element:
     parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=comments))
     try:
         content = path.read_bytes()
+        if content.startswith(codecs.BOM_UTF8):  # it is that, whatever is declared behind it
+            content = _ENCODING.sub(b"", content.removeprefix(codecs.BOM_UTF8), count=1)
         declared = _ENCODING.match(content)
         if declared is None:
             parser.feed(content)
@@ -150,7 +152,7 @@ def parsed(path: Path, comments: bool = False) -> ET.Element:
                 ) from None
             parser.feed(content[declared.end() :].decode(encoding))
         root: ET.Element = parser.close()
-    except (OSError, ET.ParseError, LookupError, UnicodeError) as error:
+    except (OSError, ET.ParseError, LookupError, ValueError) as error:
         raise RobotError(f"{path}: cannot be read as URDF: {error}") from error
     return root
 
@@ -172,7 +174,8 @@ def _joint(path: Path, element: ET.Element) -> Joint:
     if kind not in KINDS:
         raise RobotError(f"{path}: joint {name!r} has type {kind!r}; allowed: {', '.join((*KINDS, *HELD))}")
     endless, moves = kind == "continuous", kind != "fixed"  # what does not count may be anything
-    lower, upper = (None if endless else _limit(path, element, name, key) for key in ("lower", "upper"))
+    bounded = moves and not endless
+    lower, upper = (_limit(path, element, name, key) if bounded else None for key in ("lower", "upper"))
     return Joint(
         name=name,
         kind=kind,
@@ -182,7 +185,7 @@ def _joint(path: Path, element: ET.Element) -> Joint:
         axis=_axis(path, element, name) if moves else np.array([1.0, 0.0, 0.0]),
         lower=-math.inf if endless else lower,
         upper=math.inf if endless else upper,
-        velocity=_limit(path, element, name, "velocity"),
+        velocity=_limit(path, element, name, "velocity") if moves else None,
         mimic=_mimic(path, element, name),
     )
 

@@ -53,7 +53,7 @@ def imported(
     target = _target(dataset, to)
     if target.resolve() != dataset.resolve():
         tell(f"{dataset} is copied to {target}")
-    copied = named_copy(dataset, target, rename=rename, reencode=reencode)
+    copied = named_copy(dataset, target, rename=rename, reencode=reencode, tell=tell)
     told = whose(copied, state, robot)
     uuids, made = [], 0
     for entry in copied.episodes:

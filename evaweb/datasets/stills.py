@@ -15,6 +15,7 @@ from evaweb.datasets.playing import Played
 from evaweb.errors import NotFound
 from runtime.core.picture_bounds import TooLargeError, require_size
 from runtime.core.sentences import Pattern
+from runtime.datasets.pictures import shown, stored_row
 from runtime.recording.files import RecordingError
 
 _PICTURES_VIDEO = Pattern("datasets.stills.pictures_video", "the pictures of {camera} are in a video")
@@ -33,9 +34,9 @@ def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
         with Image.open(io.BytesIO(content)) as picture:
             require_size(*picture.size, f"picture {row} of {key!r} is")
             kind = _SHOWN.get(picture.format or "")
-            if kind:
+            if kind and not picture.mode.startswith("I"):  # depth, which a browser shows black
                 return content, kind
-            pixels = np.ascontiguousarray(picture.convert("RGB"))
+            pixels = np.ascontiguousarray(shown(picture))
     except TooLargeError as error:
         raise RecordingError(str(error)) from None
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
@@ -55,13 +56,14 @@ def _stored(episode: Played, key: str, row: int) -> bytes:
         found = table[key][row].as_py()
     except (OSError, pa.ArrowException, KeyError, IndexError) as error:
         raise RecordingError(f"{path}: no picture {row} of {key!r}: {error}") from error
-    if not isinstance(found, dict) or not (found.get("bytes") or found.get("path")):
+    stored = stored_row(found)
+    if stored is None or not (stored.get("bytes") or stored.get("path")):
         raise RecordingError(
             f"{path}: picture {row} of {key!r} is {type(found).__name__}, expected a coded picture"
         )
-    if found.get("bytes"):
-        return bytes(found["bytes"])
-    return _file(episode, key, str(found["path"]))
+    if stored.get("bytes"):
+        return bytes(stored["bytes"])
+    return _file(episode, key, str(stored["path"]))
 
 
 def _file(episode: Played, key: str, name: str) -> bytes:

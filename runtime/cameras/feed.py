@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 
 from runtime.cameras.base import Address, CameraError
-from runtime.cameras.finding import found
+from runtime.cameras.finding import ended, found, others
+from runtime.cameras.jpegs import Jpegs
 from runtime.core.picture_bounds import DECODING, TooLargeError, bound, require_size
 from runtime.core.types import UInt8
 
 _THERE_S = 0.003  # a packet that comes within was there before it was asked for
 _AT_ONCE = 2
 _SHOWN = 100
+_PARTS = "mpjpeg"  # FFmpeg's name; its reader refuses streams whose parts are not described to the letter
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,7 @@ class Feed:
     """One stream opened by PyAV; used by one thread, which waits in FFmpeg without the interpreter's lock.
 
     FFmpeg looks at the deadlines while it waits (PyAV's `timeout`); packets that never become a picture are bounded
-    here. Opening raises CameraError that says what was found.
+    here. Of JPEG pictures in parts FFmpeg fetches the bytes alone. Opening raises CameraError that says what was found.
     """
 
     def __init__(self, address: Address, open_s: float, read_s: float) -> None:
@@ -60,12 +62,18 @@ class Feed:
         self._seen = False  # a picture
         self._newest: Any = None  # of its packets
         self._errors: Any = av.error
+        self._jpegs = Jpegs() if address.format == _PARTS else None
         begun = time.monotonic()
         try:
             self._container: Any = av.open(
                 address.url,
-                format=address.format,
-                options={**(_QUICK if address.format else {}), **address.options, **DECODING},
+                format=address.format if self._jpegs is None else "mjpeg",
+                options={
+                    **(_QUICK if address.format else {}),
+                    **({} if self._jpegs is None else _PIECES),
+                    **address.options,
+                    **DECODING,
+                },
                 timeout=(open_s, read_s),
                 metadata_errors="replace",  # a camera's title is written as its maker likes
             )
@@ -100,11 +108,15 @@ class Feed:
             picture = None if frame is None else self._rgb(frame)
         except (self._errors.FFmpegError, OSError, ValueError) as error:
             waited = time.monotonic() - begun
+            if self._jpegs is not None and self._is_still and not isinstance(error, self._errors.ExitError):
+                raise CameraError(ended(self._address, True, self._jpegs.stated)) from None
             too_large = self._too_large()
             raise CameraError(
                 too_large or found(error, self._address, waited, self._read_s, not self._seen)
             ) from None
         if frame is None or picture is None:
+            if self._jpegs is not None and (not self._seen or self._is_still):
+                raise CameraError(ended(self._address, self._is_still, self._jpegs.stated))
             return None
         self._seen = True
         stamp = frame.time if self._address.stamped else None
@@ -124,15 +136,24 @@ class Feed:
         for packet in self._packets():
             self._newest = packet
             try:
-                frames = packet.decode()
+                frames = self._stream.codec_context.decode(packet)
             except self._errors.InvalidDataError:
                 frames = []
             for frame in frames:
                 yield frame
                 since = time.monotonic()
-            allowed = self._read_s if self._seen else max(self._open_s, self._read_s)
-            if time.monotonic() - since > allowed:
-                raise CameraError(f"what it sent for {allowed:g} s cannot be decoded")
+            if time.monotonic() - since > self._allowed:
+                raise CameraError(others(self._allowed, "" if self._jpegs is None else self._jpegs.stated))
+
+    @property
+    def _is_still(self) -> bool:
+        """True if the answer was one picture and not a stream of them."""
+        return self._jpegs is not None and self._jpegs.is_single
+
+    @property
+    def _allowed(self) -> float:
+        """Seconds until the next picture, at the most."""
+        return self._read_s if self._seen else max(self._open_s, self._read_s)
 
     def _too_large(self) -> str:
         """Sentence on the size of the newest picture, "" where it is none that no camera has."""
@@ -150,7 +171,8 @@ class Feed:
 
     def _packets(self) -> Iterator[Any]:
         """As they come; of a stream without stamps whose every packet is a picture, without those of a backlog."""
-        backlog, packets = Backlog(), self._container.demux(self._stream)
+        backlog = Backlog()
+        packets = self._container.demux(self._stream) if self._jpegs is None else self._parts(self._jpegs)
         while True:
             begun = time.monotonic()
             packet = next(packets, None)
@@ -158,6 +180,20 @@ class Feed:
                 return
             if not (self._passes_over and backlog.passes(time.monotonic() - begun)):
                 yield packet
+
+    def _parts(self, jpegs: Jpegs) -> Iterator[Any]:
+        """Whole JPEG pictures; CameraError where none comes in time, however many bytes do."""
+        import av
+
+        since = time.monotonic()
+        for piece in self._container.demux(self._stream):
+            for picture in jpegs.add(bytes(piece)):
+                yield av.Packet(picture)
+                since = time.monotonic()
+            if time.monotonic() - since > self._allowed:
+                if jpegs.is_other:
+                    raise CameraError(others(self._allowed, jpegs.stated))
+                raise CameraError(f"mute: it sent no picture within {self._allowed:g} s")
 
     def _rgb(self, frame: Any) -> UInt8:
         try:
@@ -171,3 +207,6 @@ class Feed:
 
 # A live stream is not studied for long, and nothing is kept back for order's sake.
 _QUICK = {"fflags": "nobuffer", "flags": "low_delay", "analyzeduration": "500000", "fpsprobesize": "0"}
+# Bytes as they come, unparsed: a parser knows a picture by the beginning of the next. At the most so many, and some of
+# them before it counts as open: the first picture may take as long as that.
+_PIECES = {"fflags": "noparse+nofillin", "raw_packet_size": str(1 << 16), "probesize": "32"}

@@ -39,11 +39,33 @@ def found(error: Exception, address: Address, waited: float, allowed: float, ope
         return "there is no such file"
     if isinstance(error, PermissionError):
         return "this user may not read it"
-    if not opening and address.format == "mpjpeg":
-        return "it closed the connection, or sent what is no picture"
+    if not opening and address.format == "mpjpeg":  # an answer without a length ends in an error
+        return "it closed the connection"
     if not opening:
         return f"the stream broke: {getattr(error, 'strerror', '') or type(error).__name__}"
     return _no_video(error, address)
+
+
+def ended(address: Address, single: bool, stated: str) -> str:
+    """One clause for a stream that ended without pictures in parts, which it called `stated`.
+
+    `single`: it was a picture by itself.
+    """
+    if _is_other(stated):
+        return f"it ended, and sent parts of type {stated}, no JPEG"
+    if single:
+        return "it answers with one picture and ends, not multipart/x-mixed-replace: take the address of its stream"
+    return _no_video(EOFError(), address)
+
+
+def others(allowed: float, stated: str) -> str:
+    """One clause for what came for `allowed` seconds and is no picture; `stated` is the type that it was said to be."""
+    kind = f": parts of type {stated}, no JPEG" if _is_other(stated) else ""
+    return f"what it sent for {allowed:g} s cannot be decoded{kind}"
+
+
+def _is_other(stated: str) -> bool:
+    return bool(stated) and "jp" not in stated.lower()
 
 
 def _device(error: Exception, address: Address) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -16,17 +18,26 @@ from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog, info_of, own_line
 from runtime.datasets.columns import column_statistics
 from runtime.datasets.cut import NotCopyableError, cut, encode
-from runtime.datasets.entries import entry, statistic_lines, task_lines
-from runtime.datasets.features import arrow_schema, differences, stored
+from runtime.datasets.entries import entry, episode_lines, own_keys, statistic_lines, task_lines
+from runtime.datasets.features import (
+    LANGUAGE,
+    WORDS,
+    arrow_schema,
+    differences,
+    figure_shapes,
+    holds_nothing,
+    stored,
+)
 from runtime.datasets.layout import Line
-from runtime.datasets.parquet_lists import EPISODES_FOLDER
+from runtime.datasets.parquet_lists import EPISODES_FOLDER, is_storable
 from runtime.datasets.pictures import StoredPictures
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.datasets.renaming import Names
 from runtime.datasets.rows import numbers, write_table
 from runtime.datasets.sides import FOLDER, side_file, side_files
+from runtime.datasets.splits import TRAIN, episodes_of, written
 from runtime.datasets.staging import Draft
-from runtime.datasets.stats import Statistic, picture_statistic, video_statistic
+from runtime.datasets.stats import Statistic, fault, picture_statistic, video_statistic
 from runtime.recording.files import disk_fault
 
 if TYPE_CHECKING:
@@ -35,6 +46,7 @@ if TYPE_CHECKING:
 _PLACED = ("episode_index", "index", "task_index")  # columns that depend on where an episode is
 _OURS = {layout.INFO, layout.EPISODES, layout.TASKS, layout.EPISODES_STATS, layout.STATS, layout.TASKS_V30}
 _OURS |= {layout.EVA_EPISODES}
+SUBTASKS = "meta/subtasks.parquet"  # of LeRobot 0.6: what subtask_index numbers
 COPIED_FROM = (
     "copied_from"  # in our line about an episode: the dataset it was copied from, absent where published
 )
@@ -61,6 +73,7 @@ class Source:
     dataset: Dataset
     names: Names
     tasks: tuple[str, ...]  # in the order of their numbers
+    lines: Mapping[int, Line]  # of the list of episodes, what the format does not know
     statistics: Mapping[int, Mapping[str, Statistic]]
     eva: Mapping[int, Line]
 
@@ -77,6 +90,7 @@ class Source:
             dataset,
             names,
             tuple(str(line["task"]) for line in tasks),
+            {int(line["episode_index"]): own_keys(line) for line in episode_lines(root, dataset.info)},
             {line["episode_index"]: names.keys(line["stats"]) for line in statistics},
             {line["episode_index"]: line for line in eva},
         )
@@ -152,12 +166,20 @@ def _require_same(parts: Sequence[Part]) -> None:
             for key in layout.video_keys(first.features)
             if (mine := _codec(first, key)) != (theirs := _codec(source, key))
         ]
+        if "subtask_index" in first.features and _bytes(one, SUBTASKS) != _bytes(other, SUBTASKS):
+            found.append(f"{SUBTASKS} differ, so that a subtask_index would mean another subtask")
         if found:
             raise RecordingError(f"{one.root} and {other.root} do not belong together: {'; '.join(found)}")
     uuids = Counter(part.source.eva[part.index]["uuid"] for part in parts if part.index in part.source.eva)
     twice = [uuid for uuid, count in uuids.items() if count > 1]
     if twice:
         raise RecordingError(f"the same episode would be there twice: {twice}")
+
+
+def _bytes(dataset: Dataset, name: str) -> bytes | None:
+    """A file of the dataset, None where it has none."""
+    path = dataset.root / name
+    return path.read_bytes() if path.is_file() else None
 
 
 def _codec(source: Source, key: str) -> Any:
@@ -181,18 +203,75 @@ class _Assembly:
         self._reencode = reencode
         self._sources = _sources(parts)
         first = self._sources[0]
-        self._features = {key: dict(feature) for key, feature in first.features.items()}
+        self._left_out: dict[str, None] = {}  # in order, each once
+        self._features = {
+            key: dict(feature) | ({} if list(feature["shape"]) else {"shape": [1]})
+            for key, feature in first.features.items()
+            if not self._empty(key, feature)
+        }
         self._tasks = tuple(dict.fromkeys(task for source in self._sources for task in source.tasks))
         self._fps = first.dataset.fps
         self._info = info_of(
-            first.dataset.info if len(self._sources) == 1 else {},
+            self._common(),
             robot=first.dataset.info.get("robot_type"),
             fps=self._fps,
             features=self._features,
             version=version,
         )
         self._encoded: list[str] = []
-        self._left_out: dict[str, None] = {}  # in order, each once
+
+    def _common(self) -> dict[str, Any]:
+        """What info.json of all sources says alike; what else they say is left out, with a word."""
+        said = [source.dataset.info for source in self._sources]
+        for info, source in zip(said, self._sources, strict=True):
+            for key in sorted(set(info) - layout.INFO_KEYS):
+                if any(other.get(key) != info[key] for other in said):
+                    self._left_out[f"{key!r} in info.json of {source.dataset.root}: others say another"] = (
+                        None
+                    )
+        return {key: value for key, value in said[0].items() if all(one.get(key) == value for one in said)}
+
+    def _splits(self) -> dict[str, str]:
+        """The sources' splits with the new indices; without any all is for training."""
+        found: dict[str, list[int]] = {}
+        for source in self._sources:
+            named, given = {}, source.dataset.info.get("splits") or {}
+            for name, value in given.items():
+                try:
+                    named[name] = set(episodes_of(name, value))
+                except RecordingError as error:
+                    self._left_out[f"{source.dataset.root}: {error}"] = None
+            there = [listed.index for listed in source.dataset.episodes]
+            # Where numbers have gaps, splits that name 0 to the last of so many count places, as LeRobot does.
+            counted = set().union(*named.values()) == set(range(len(there)))
+            for place, part in enumerate(self._parts):
+                if part.source is source:
+                    number = there.index(part.index) if counted else part.index
+                    for name in named or (TRAIN,):
+                        if not named or number in named[name]:
+                            found.setdefault(name, []).append(place)
+        return written(found)
+
+    def _told(self, lines: Sequence[Line]) -> list[Line]:
+        """The lines of the list of episodes, with those of the sources' own keys that can be written."""
+        v30 = self._info["codebase_version"] == layout.V30
+        owns = [part.source.lines.get(part.index, {}) for part in self._parts]
+        kept: list[Line] = [{} for _ in owns]
+        for key in dict.fromkeys(key for own in owns for key in own):
+            values = [_without_nan(own.get(key)) for own in owns]
+            if is_storable(values) if v30 else _is_json(values):
+                for line, own, value in zip(kept, owns, values, strict=True):
+                    line |= {key: value} if key in own else {}
+            else:
+                kind = "parquet" if v30 else "JSON"
+                self._left_out[f"{key!r} of the episodes: it cannot be written as {kind}"] = None
+        return [own | line for own, line in zip(kept, lines, strict=True)]
+
+    def _empty(self, key: str, feature: Mapping[str, Any]) -> bool:
+        if holds_nothing(feature):
+            self._left_out[f"feature {key!r}: its shape is {list(feature['shape'])}, it holds nothing"] = None
+            return True
+        return False
 
     def write(self, tell: Tell) -> Assembled:
         lines, statistics, eva, first = [], [], [], 0
@@ -208,8 +287,9 @@ class _Assembly:
                 self._sides(part, str(told["uuid"]))
             first += line["length"]
         tasks = tuple({"task_index": number, "task": task} for number, task in enumerate(self._tasks))
-        catalog = Catalog(self._root, self._info, tuple(lines), tasks, tuple(statistics), tuple(eva))
-        catalog = replace(catalog, info={**self._info, **catalog.totals()})
+        listed = tuple(self._told(lines))
+        catalog = Catalog(self._root, self._info, listed, tasks, tuple(statistics), tuple(eva))
+        catalog = replace(catalog, info={**self._info, **catalog.totals(), "splits": self._splits()})
         for name, content in (catalog.documents_before_data() | catalog.documents_after_data()).items():
             path = self._root / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -234,11 +314,7 @@ class _Assembly:
         table = self._table(part, line, first)
         placed.data.parent.mkdir(parents=True, exist_ok=True)
         write_table(table, placed.data)
-        statistics = {
-            key: statistic
-            for key, statistic in part.source.statistics.get(part.index, {}).items()
-            if key in self._features and key not in _PLACED
-        }
+        statistics = self._given(part)
         for key, span in placed.videos.items():
             span.path.parent.mkdir(parents=True, exist_ok=True)
             self._video(part, key, span.path, placed.length)
@@ -246,18 +322,38 @@ class _Assembly:
                 statistics[key] = video_statistic(span.path, placed.length)
         for key in layout.image_keys(self._features):
             if key not in statistics:
-                rows = StoredPictures(f"{placed.data}, {key!r}", table.column(key).to_pylist(), self._root)
-                statistics[key] = picture_statistic(rows)
+                name = f"{part.source.dataset.root}, episode {part.index}, column {key!r}"
+                made = picture_statistic(StoredPictures(name, table.column(key).to_pylist(), self._root))
+                if made is not None:
+                    statistics[key] = made
+        if self._info["codebase_version"] == layout.V21:
+            statistics |= {key: _of_three(statistics[key]) for key in self._shown if key in statistics}
         return statistics | _completed(statistics, self._computed(table))
+
+    @property
+    def _shown(self) -> list[str]:
+        return [*layout.video_keys(self._features), *layout.image_keys(self._features)]
+
+    def _given(self, part: Part) -> dict[str, Statistic]:
+        """The source's statistics of an episode, but for those that are made anew."""
+        found = {}
+        for key, statistic in part.source.statistics.get(part.index, {}).items():
+            if key not in self._features or key in _PLACED:
+                continue
+            if why := fault(statistic, figure_shapes(self._features[key])):
+                where = f"{part.source.dataset.root}, episode {part.index}"
+                self._left_out[f"statistics of {where}, {key!r}: {why}; they are made anew"] = None
+            else:
+                found[key] = statistic
+        return found
 
     def _computed(self, table: pa.Table) -> dict[str, Statistic]:
         columns = {
-            key: numbers(table, key).reshape(table.num_rows, -1)
+            key: numbers(table, key).reshape(table.num_rows, *feature["shape"])
             for key, feature in stored(self._features).items()
-            if feature["dtype"] not in ("string", "image")
+            if feature["dtype"] not in WORDS
         }
-        plain = {key: rows.reshape(-1) if rows.shape[1] == 1 else rows for key, rows in columns.items()}
-        return column_statistics(plain, {key: self._features[key] for key in plain})
+        return column_statistics(columns, {key: self._features[key] for key in columns})
 
     def _table(self, part: Part, line: Line, first: int) -> pa.Table:
         """The rows of an episode in their new place, exactly the declared columns."""
@@ -273,13 +369,15 @@ class _Assembly:
                 f"{source.dataset.root}, episode {index} lacks the columns {missing}, it has {table.column_names}"
             )
         for name in table.column_names:
-            if name not in columns:
+            if name not in columns and name not in source.features:
                 self._left_out[f"column {name!r}: it is declared nowhere"] = None
-        rows, schema = table.num_rows, arrow_schema(self._features)
+        worded = [key for key, feature in columns.items() if feature["dtype"] == LANGUAGE]
+        given = {key: table.schema.field(key).type for key in worded}
+        rows, schema = table.num_rows, arrow_schema(self._features, given)
         fresh = {
             "episode_index": np.full(rows, line["episode_index"], np.int64),
             "index": np.arange(first, first + rows, dtype=np.int64),
-            "task_index": self._task_numbers(part, numbers(table, "task_index")),
+            "task_index": self._task_numbers(part, numbers(table, "task_index").reshape(-1)),
         }
         arrays = []
         for field in schema:
@@ -349,10 +447,22 @@ class _Assembly:
                 if name == layout.MODALITY:
                     if source is self._sources[0] and source.names.empty:
                         shutil.copyfile(path, self._root / name)
-                elif len(self._sources) == 1 and path.is_file():
+                elif path.is_file() and (len(self._sources) == 1 or name == SUBTASKS):
                     shutil.copyfile(path, self._root / name)
                 else:
                     self._left_out[str(path)] = None
+
+
+def _without_nan(value: Any) -> Any:
+    """Pandas' word for what is not said is null."""
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def _is_json(values: Sequence[Any]) -> bool:
+    try:
+        return bool(json.dumps(values, allow_nan=False))
+    except (TypeError, ValueError):
+        return False
 
 
 def _folders(source: Source) -> set[str]:
@@ -361,6 +471,12 @@ def _folders(source: Source) -> set[str]:
     listed = source.dataset.episodes
     files = [path for one in listed for path in (one.data, *(span.path for span in one.videos.values()))]
     return {"meta", FOLDER, EPISODES_FOLDER, *(path.relative_to(root).parts[0] for path in files)}
+
+
+def _of_three(statistic: Statistic) -> Statistic:
+    """The figures of one channel for three: what reads v2.1 refuses any other number of them."""
+    figures = (name for name in statistic if name != "count")
+    return statistic | {name: (statistic[name] * 3)[:3] for name in figures}
 
 
 def _completed(given: Mapping[str, Statistic], computed: Mapping[str, Statistic]) -> dict[str, Statistic]:

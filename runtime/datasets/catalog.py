@@ -18,9 +18,10 @@ from runtime.datasets.entries import (
     statistic_lines,
     task_lines,
 )
-from runtime.datasets.features import Features, differences, plain_rate
+from runtime.datasets.features import Features, differences, figure_shapes, plain_rate
 from runtime.datasets.layout import Line
-from runtime.datasets.stats import Statistic, aggregate
+from runtime.datasets.splits import with_more
+from runtime.datasets.stats import Statistic, aggregate, fault
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +194,7 @@ class Catalog:
             "total_episodes": count,
             "total_frames": sum(line["length"] for line in self.episodes),
             "total_tasks": len(self.tasks),
-            "splits": {"train": f"0:{count}"},
+            "splits": with_more(self.info.get("splits") or {}, int(self.info["total_episodes"]), count),
         }
         if self.version == layout.V30:
             return totals
@@ -216,7 +217,23 @@ class Catalog:
         return documents
 
     def documents_after_data(self) -> dict[str, bytes]:
-        """Files that say what there is, in the order in which they are written; info.json is the last."""
+        """Files that say what there is, in the order in which they are written; info.json is the last.
+
+        RecordingError names the episode and the feature of statistics that cannot be written, or summed up.
+        """
+        try:
+            return self._documents()
+        except (KeyError, TypeError, ValueError) as error:
+            for line in self.statistics:
+                for key, statistic in line["stats"].items():
+                    if key in self.features and (why := fault(statistic, figure_shapes(self.features[key]))):
+                        raise RecordingError(
+                            f"{self.root / 'meta'}: statistics of episode {line['episode_index']}, {key!r}: {why}. "
+                            "`convert` makes them anew in a copy"
+                        ) from error
+            raise
+
+    def _documents(self) -> dict[str, bytes]:
         shared = {
             layout.STATS: _object(aggregate(line["stats"] for line in self.statistics)),
             layout.EVA_EPISODES: _lines(self.eva),

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.core.errors import RecordingError
-from runtime.datasets.features import INDEX_COLUMNS, Feature, Features, arrow_schema, scalar, stored, vector
+from runtime.datasets.features import (
+    INDEX_COLUMNS,
+    WORDS,
+    Feature,
+    Features,
+    arrow_schema,
+    scalar,
+    stored,
+    vector,
+)
 from runtime.datasets.journal import RecordedJournal
 from runtime.datasets.stats import Statistic, column_statistic
 
@@ -158,7 +167,7 @@ def column_statistics(columns: Columns, features: Mapping[str, Feature]) -> dict
     """
     statistics = {}
     for key, feature in stored(features).items():
-        if feature["dtype"] == "string" or "image" in key:
+        if feature["dtype"] in WORDS or "image" in key:
             continue
         statistic = column_statistic(columns[key])
         if statistic is not None:

@@ -20,10 +20,23 @@ from runtime.datasets.entries import (
     statistic_lines,
     task_lines,
 )
-from runtime.datasets.features import INDEX_COLUMNS, arrow_type, stored
-from runtime.datasets.pictures import Pictures, Stretch
+from runtime.datasets.features import (
+    INDEX_COLUMNS,
+    LANGUAGE,
+    WORDS,
+    arrow_type,
+    figure_shapes,
+    holds_nothing,
+    is_depth,
+    is_language,
+    picture_size,
+    stored,
+)
+from runtime.datasets.pictures import Pictures, StoredPictures, Stretch
 from runtime.datasets.rows import numbers, read_rows
 from runtime.datasets.sides import strays
+from runtime.datasets.splits import episodes_of
+from runtime.datasets.stats import FIGURES, fault, finite
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -72,7 +85,7 @@ def _said(root: Path) -> list[str]:
             *_totals(info, lines, tasks),
             *(_places(info, lines) if v30 else ()),
             *_declarations(info),
-            *_episodes(info, entries, statistics, {line["task_index"] for line in tasks}),
+            *_episodes(root, info, entries, statistics, {line["task_index"] for line in tasks}),
             *_strays(root, info, entries),
             *_sides(root, lines),
         ]
@@ -87,7 +100,6 @@ def _totals(info: layout.Info, episodes: list[Line], tasks: list[Line]) -> Itera
         "total_episodes": len(episodes),
         "total_frames": sum(line["length"] for line in episodes),
         "total_tasks": len(tasks),
-        "splits": {"train": f"0:{len(episodes)}"},
     }
     if info["codebase_version"] != layout.V30:
         chunks_size = int(info.get("chunks_size", layout.CHUNKS_SIZE))
@@ -96,10 +108,26 @@ def _totals(info: layout.Info, episodes: list[Line], tasks: list[Line]) -> Itera
     for key, value in expected.items():
         if info.get(key) != value:
             yield f"info.json says {key} {info.get(key)}, the lists give {value}"
+    yield from _splits(info, {int(line["episode_index"]) for line in episodes})
     if [line["episode_index"] for line in episodes] != list(range(len(episodes))):
         yield f"the list of episodes does not have episodes 0 to {len(episodes) - 1} in order"
     if sorted(line["task_index"] for line in tasks) != list(range(len(tasks))):
         yield f"the list of tasks does not number them 0 to {len(tasks) - 1}"
+
+
+def _splits(info: layout.Info, listed: set[int]) -> Iterator[str]:
+    left = set(listed)
+    for name, value in (info.get("splits") or {}).items():
+        try:
+            named = set(episodes_of(name, value))
+        except RecordingError as error:
+            yield f"info.json: {error}"
+            continue
+        if absent := sorted(named - listed):
+            yield f"info.json: splits name episode {absent[0]} for {name!r}, which is not there"
+        left -= named
+    if left:
+        yield f"info.json: splits leave out {len(left)} episodes, the first is {min(left)}"
 
 
 def _places(info: layout.Info, episodes: list[Line]) -> Iterator[str]:
@@ -121,7 +149,11 @@ def _declarations(info: layout.Info) -> Iterator[str]:
         if "/" in key:
             yield f"feature {key!r} has a slash in its name"
         names, shape = feature.get("names"), list(feature["shape"])
-        if isinstance(names, list) and feature["dtype"] not in ("video", "image") and len(names) != shape[0]:
+        if feature["dtype"] in ("video", "image"):
+            continue
+        if not shape or holds_nothing(feature):
+            yield f"feature {key!r} has shape {shape}: LeRobot reads lengths above 0 alone, of one number [1]"
+        elif isinstance(names, list) and len(names) != shape[0]:
             yield f"feature {key!r} has {len(names)} names for shape {shape}"
     for key, dtype in INDEX_COLUMNS.items():
         if info["features"].get(key, {}).get("dtype") != dtype:
@@ -129,17 +161,21 @@ def _declarations(info: layout.Info) -> Iterator[str]:
 
 
 def _episodes(
-    info: layout.Info, entries: list[EpisodeEntry], statistics: Mapping[int, Any], tasks: set[int]
+    root: Path, info: layout.Info, entries: list[EpisodeEntry], statistics: Mapping[int, Any], tasks: set[int]
 ) -> Iterator[str]:
     first = 0
     for listed in entries:
         try:
             table = read_rows(listed.data, listed.index if listed.shared else None)
             problems = [
-                *_table(table, info, listed.index, listed.length, first),
-                *_task_indices(table, tasks),
+                *_until_unreadable(_table(table, info, listed.index, listed.length, first)),
+                *_until_unreadable(_timestamps(table, info)),
+                *_values(table, info),
+                *_stored_pictures(table, info, root),
+                *_until_unreadable(_task_indices(table, tasks)),
                 *_statistics(table, info, statistics.get(listed.index)),
             ]
+            problems = list(dict.fromkeys(problems))
         except RecordingError as error:
             problems = [str(error)]
         for key, span in listed.videos.items():
@@ -150,13 +186,21 @@ def _episodes(
 
 def _table(table: pa.Table, info: layout.Info, index: int, length: int, first: int) -> Iterator[str]:
     columns = stored(info["features"])
-    if set(table.column_names) != set(columns):
-        yield f"columns differ from the features: {sorted(set(table.column_names) ^ set(columns))}"
+    for key in sorted(set(columns) - set(table.column_names)):
+        yield f"there is no column {key!r}, though info.json declares it"
+    for key in sorted(set(table.column_names) - set(columns)):
+        yield f"column {key!r} is declared nowhere in info.json: loaders pass it over, or refuse the dataset"
     for key, feature in columns.items():
-        if key in table.column_names and not _same_type(
-            table.schema.field(key).type, arrow_type(key, feature)
-        ):
-            yield f"{key!r} is stored as {table.schema.field(key).type}, declared {arrow_type(key, feature)}"
+        if key not in table.column_names or holds_nothing(feature):
+            continue
+        given = table.schema.field(key).type
+        if feature["dtype"] == LANGUAGE:
+            if not is_language(given):
+                yield f"{key!r} is stored as {given}, expected a list of structs with role and content"
+            continue
+        declared = arrow_type(key, feature)
+        if not _same_type(given, declared):
+            yield f"{key!r} is stored as {given}, declared {declared}"
     if table.num_rows != length:
         yield f"{table.num_rows} rows, listed are {length}"
     frames = np.arange(table.num_rows)
@@ -164,13 +208,83 @@ def _table(table: pa.Table, info: layout.Info, index: int, length: int, first: i
         "frame_index": frames,
         "episode_index": np.full(table.num_rows, index),
         "index": frames + first,
-        "timestamp": (frames / float(info["fps"])).astype(np.float32),
     }
     if "next.done" in table.column_names:
         expected["next.done"] = frames == table.num_rows - 1
     for key, values in expected.items():
-        if key in table.column_names and not np.array_equal(numbers(table, key), values):
+        if key in table.column_names and not np.array_equal(numbers(table, key).reshape(-1), values):
             yield f"{key!r} is not {values[:2].tolist()} to {values[-1:].tolist()}"
+
+
+def _until_unreadable(problems: Iterator[str]) -> Iterator[str]:
+    try:
+        yield from problems
+    except RecordingError as error:
+        yield str(error)
+
+
+def _timestamps(table: pa.Table, info: layout.Info) -> Iterator[str]:
+    if "timestamp" not in table.column_names or not table.num_rows:
+        return
+    given = numbers(table, "timestamp").astype(np.float64)[:, :1].reshape(-1)
+    expected = np.arange(table.num_rows) / float(info["fps"])
+    allowed = TOLERANCE + np.spacing(np.float32(expected[-1]))  # that of the format's float32
+    near = np.abs(given - expected) <= allowed
+    if not near.all():
+        row = int(near.argmin())
+        yield f"'timestamp' is not k / fps: row {row} has {given[row]:g}, expected {expected[row]:g} s"
+
+
+def _values(table: pa.Table, info: layout.Info) -> Iterator[str]:
+    """What no loader makes a number of: null, infinite, something else."""
+    for key, feature in stored(info["features"]).items():
+        if key not in table.column_names or feature["dtype"] in ("image", LANGUAGE):
+            continue
+        column = table.column(key)
+        if column.null_count:
+            yield f"{key!r} is null in {_rows(column.is_null().to_numpy())}"
+        if feature["dtype"] == "string" or holds_nothing(feature):
+            continue
+        try:
+            values = numbers(table, key)
+        except RecordingError as error:
+            yield str(error)
+            continue
+        if (infinite := np.isinf(values.astype(np.float64)).any(axis=1)).any():
+            yield f"{key!r} is infinite in {_rows(infinite)}"
+
+
+def _stored_pictures(table: pa.Table, info: layout.Info, root: Path) -> Iterator[str]:
+    for key in layout.image_keys(info["features"]):
+        if key not in table.column_names:
+            continue
+        pictures = StoredPictures(repr(key), table.column(key).to_pylist(), root)
+        missing = np.array([pictures.is_missing(k) for k in range(len(pictures))], bool)
+        if missing.any():
+            yield f"{key!r} has no picture in {_rows(missing)}"
+        for number in np.flatnonzero(~missing).tolist():
+            try:
+                wrong = _other_size(
+                    f"picture {number} of {key!r}", pictures.size(number), info["features"][key]
+                )
+            except RecordingError as error:
+                wrong = str(error)
+            if wrong:
+                yield wrong
+                break
+
+
+def _rows(marked: np.ndarray[Any, Any]) -> str:
+    return f"{int(marked.sum())} rows, the first is {int(marked.argmax())}"
+
+
+def _other_size(what: str, size: tuple[int, int], feature: Mapping[str, Any]) -> str:
+    """Sentence on pictures of another height and width than declared, "" where they are the same."""
+    declared = picture_size(feature)[:2]
+    if size == declared:
+        return ""
+    turned = ": rows and columns are exchanged" if size == declared[::-1] else ""
+    return f"{what} is {size[0]} rows by {size[1]} columns, declared {declared[0]} by {declared[1]}{turned}"
 
 
 def _same_type(given: pa.DataType, expected: pa.DataType) -> bool:
@@ -184,7 +298,7 @@ def _same_type(given: pa.DataType, expected: pa.DataType) -> bool:
 def _task_indices(table: pa.Table, tasks: set[int]) -> Iterator[str]:
     if "task_index" not in table.column_names:
         return
-    unknown = set(numbers(table, "task_index").tolist()) - tasks
+    unknown = set(numbers(table, "task_index").reshape(-1).tolist()) - tasks
     if unknown:
         yield f"task_index {sorted(unknown)} is not in the list of tasks"
 
@@ -198,29 +312,39 @@ def _statistics(
         yield f"no statistics in {layout.EPISODES_STATS if info['codebase_version'] == layout.V21 else 'meta'}"
         return
     for key in (*layout.video_keys(info["features"]), *layout.image_keys(info["features"])):
-        yield from _picture_statistic(key, statistics.get(key))
+        yield from _picture_statistic(key, info["features"][key], statistics.get(key))
     for key, feature in stored(info["features"]).items():
-        if feature["dtype"] in ("string", "image") or key not in table.column_names:
+        if feature["dtype"] in WORDS or key not in table.column_names or holds_nothing(feature):
             continue
-        values = numbers(table, key).astype(np.float64).reshape(table.num_rows, -1)
-        known = values[~np.isnan(values).any(axis=1)]
+        try:
+            values = numbers(table, key).astype(np.float64)
+        except RecordingError:
+            continue  # `_values` has said it
+        known = values[finite(values)]
         if key in statistics:
-            yield from _column_statistic(key, known, statistics[key])
+            yield from _column_statistic(key, feature, known, statistics[key])
         elif len(known) and "image" not in key and key not in INDEX_COLUMNS:
             yield f"{key!r} has no statistics"
 
 
-def _picture_statistic(key: str, statistic: Mapping[str, Any] | None) -> Iterator[str]:
+def _picture_statistic(key: str, feature: Mapping[str, Any], statistic: Any) -> Iterator[str]:
     if statistic is None:
         yield f"{key!r} has no statistics"
+    elif why := fault(statistic, figure_shapes(feature)):
+        yield f"statistics of {key!r}: {why}"
+    elif not is_depth(feature):  # whose unit is its writer's
+        for name in FIGURES:
+            value = np.asarray(statistic[name], dtype=np.float64)
+            if not ((value >= 0) & (value <= 1)).all():
+                yield f"{name} of {key!r} is {value.reshape(-1).tolist()}, expected 0 to 1"
+
+
+def _column_statistic(
+    key: str, feature: Mapping[str, Any], known: np.ndarray[Any, Any], statistic: Any
+) -> Iterator[str]:
+    if why := fault(statistic, figure_shapes(feature)):
+        yield f"statistics of {key!r}: {why}"
         return
-    for name in ("min", "max", "mean", "std"):
-        value = np.asarray(statistic[name], dtype=np.float64)
-        if value.shape != (3, 1, 1) or not ((value >= 0) & (value <= 1)).all():
-            yield f"{name} of {key!r} has shape {value.shape}, expected (3, 1, 1) in 0 to 1"
-
-
-def _column_statistic(key: str, known: np.ndarray[Any, Any], statistic: Mapping[str, Any]) -> Iterator[str]:
     if list(statistic["count"]) != [len(known)]:
         yield f"count of {key!r} is {statistic['count']}, known are {len(known)} rows"
         return
@@ -231,7 +355,7 @@ def _column_statistic(key: str, known: np.ndarray[Any, Any], statistic: Mapping[
         "std": known.std(axis=0),
     }
     for name, value in figures.items():
-        given = np.asarray(statistic[name], dtype=np.float64)
+        given = np.asarray(statistic[name], dtype=np.float64).reshape(-1)
         if given.shape == value.shape and np.allclose(given, value, rtol=1e-4, atol=1e-5):
             continue
         text = f"{name} of {key!r} is {given.tolist()}, the rows give {value.tolist()}"
@@ -262,12 +386,16 @@ def _video(span: Span, key: str, info: layout.Info, length: int) -> Iterator[str
     try:
         stretch = None if span.start is None else Stretch(span.start, length, fps)
         with Pictures(span.path, stretch) as pictures:
-            size, times = [*pictures.size, 3], np.array(pictures.times)
+            size, times = pictures.size, np.array(pictures.times)
     except RecordingError as error:
         yield str(error)
         return
-    if size != list(info["features"][key]["shape"]):
-        yield f"{key!r} is {size}, declared {info['features'][key]['shape']}"
+    try:
+        wrong = _other_size(repr(key), size, info["features"][key])
+    except RecordingError as error:
+        wrong = f"{key!r}: {error}"
+    if wrong:
+        yield wrong
     if len(times) != length:
         yield f"{key!r} has {len(times)} frames for {length} rows"
     off = np.abs(times - (span.start or 0.0) - np.arange(len(times)) / fps)

@@ -55,6 +55,11 @@ def encode(span: Span, target: Path, frames: int, fps: float) -> None:
             Pictures(span.path, stretch) as pictures,
             av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
         ):
+            if pictures.is_deep:
+                raise RecordingError(
+                    f"{span.path} has depth of more than 8 bits, of which coding it again would leave 8: "
+                    "cut it with the program that made it"
+                )
             stream = container.add_stream("libx264", rate=rate, options=dict(ENCODING))
             stream.height, stream.width = pictures.size
             stream.pix_fmt = "yuv420p"

@@ -106,7 +106,16 @@ def statistic_lines(root: Path, info: Info) -> list[Line]:
     for line in lines:
         if not isinstance(line.get("episode_index"), int):
             raise RecordingError(f"{path}: a line says no episode_index: {_short(line)}")
-    return lines
+    return [line if isinstance(line.get("stats"), dict) else line | {"stats": {}} for line in lines]
+
+
+_OF_FORMAT = ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index", "file_stem")
+
+
+def own_keys(line: Line) -> Line:
+    """What a line of the list of episodes says beyond the format, which its writer alone knows."""
+    places = ("data/", "videos/", "stats/", "meta/episodes/", "__")  # "__": pandas' index
+    return {key: line[key] for key in line if key not in _OF_FORMAT and not key.startswith(places)}
 
 
 def entry(root: Path, info: Info, line: Line) -> EpisodeEntry:

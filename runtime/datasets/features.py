@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,10 @@ INDEX_COLUMNS = {
     "index": "int64",
     "task_index": "int64",
 }
+
+
+LANGUAGE = "language"  # of LeRobot 0.6: a list of structs per row, of the writer's own fields, may be null
+WORDS = ("string", "image", LANGUAGE)  # of which there are no statistics of numbers
 
 
 def scalar(dtype: str) -> Feature:
@@ -62,6 +67,41 @@ def stored(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, 
     return {key: feature for key, feature in features.items() if feature["dtype"] != "video"}
 
 
+def picture_size(feature: Mapping[str, Any]) -> tuple[int, int, int]:
+    """Declared height, width and channels, whichever order they have; RecordingError where they are not three."""
+    shape, names = list(feature.get("shape") or ()), feature.get("names")
+    if len(shape) != 3:
+        raise RecordingError(f"pictures are declared of shape {shape}, expected height, width and channels")
+    said = [str(name).rstrip("s") for name in names] if isinstance(names, list) else []
+    if {"height", "width"} <= set(said) and len(said) == 3:
+        height, width = (int(shape[said.index(name)]) for name in ("height", "width"))
+        (channels,) = (int(n) for n, name in zip(shape, said, strict=True) if name not in ("height", "width"))
+        return height, width, channels
+    first = shape[0] in (1, 3) and shape[2] not in (1, 3, 4)
+    height, width, channels = (int(n) for n in (*shape[1:], shape[0])) if first else (int(n) for n in shape)
+    return height, width, channels
+
+
+def is_depth(feature: Mapping[str, Any]) -> bool:
+    """True of pictures that measure distances: LeRobot says so by one channel, or `is_depth_map`."""
+    told = {**(feature.get("info") or {}), **(feature.get("video_info") or {})}
+    flagged = any(told.get(name) for name in ("is_depth_map", "video.is_depth_map"))
+    return flagged or picture_size(feature)[2] == 1
+
+
+def figure_shapes(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], ...]:
+    """Shapes that a feature's minimum, maximum, mean and deviation may have."""
+    if feature["dtype"] in ("video", "image"):
+        return ((3, 1, 1), (1, 1, 1)) if is_depth(feature) else ((3, 1, 1),)
+    shape = tuple(feature["shape"]) or (1,)
+    return tuple(dict.fromkeys((shape, (math.prod(shape),))))
+
+
+def holds_nothing(feature: Mapping[str, Any]) -> bool:
+    """True of a shape with an axis of length 0: no loader reads such a column."""
+    return 0 in list(feature["shape"])
+
+
 NUMBERS = (
     "float16",
     "float32",
@@ -85,12 +125,12 @@ def arrow_type(key: str, feature: Mapping[str, Any]) -> pa.DataType:
     if dtype == "image":
         return pa.struct({"bytes": pa.binary(), "path": pa.string()})
     known = (*NUMBERS, "bool", "string")
-    if dtype not in known or not shape:
+    if dtype not in known or 0 in shape:
         raise RecordingError(
-            f"feature {key!r} is {dtype!r} of shape {shape}, stored are image and {known} with one axis or more"
+            f"feature {key!r} is {dtype!r} of shape {shape}, stored are image and {known} of lengths above 0"
         )
     kind: pa.DataType = pa.type_for_alias(dtype)
-    if shape == [1]:
+    if shape in ([], [1]):
         return kind
     if len(shape) == 1:
         return pa.list_(kind, shape[0])
@@ -99,15 +139,33 @@ def arrow_type(key: str, feature: Mapping[str, Any]) -> pa.DataType:
     return kind
 
 
-def arrow_schema(features: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
-    """The schema of an episode's parquet file, with metadata from which `datasets` knows the features."""
+def is_language(kind: pa.DataType) -> bool:
+    """True of the type that a column of LeRobot's language annotations has."""
+    import pyarrow as pa
+
+    rows = kind.value_type if pa.types.is_list(kind) or pa.types.is_large_list(kind) else None
+    return rows is not None and pa.types.is_struct(rows) and {"role", "content"} <= {one.name for one in rows}
+
+
+def arrow_schema(
+    features: Mapping[str, Mapping[str, Any]], given: Mapping[str, pa.DataType] | None = None
+) -> pa.Schema:
+    """The schema of an episode's parquet file, with metadata from which `datasets` knows the features.
+
+    Columns of language have the types that are `given`.
+    """
     import pyarrow as pa
 
     columns = stored(features)
-    declared = {key: _hugging_face(feature) for key, feature in columns.items()}
+    worded = {key: (given or {})[key] for key, feature in columns.items() if feature["dtype"] == LANGUAGE}
+    declared = {key: _hugging_face(feature) for key, feature in columns.items() if key not in worded}
     metadata = {"huggingface": json.dumps({"info": {"features": declared}})}
     return pa.schema(
-        [pa.field(key, arrow_type(key, feature)) for key, feature in columns.items()], metadata=metadata
+        [
+            pa.field(key, worded[key] if key in worded else arrow_type(key, feature))
+            for key, feature in columns.items()
+        ],
+        metadata=metadata,
     )
 
 
@@ -118,7 +176,7 @@ def _hugging_face(feature: Mapping[str, Any]) -> dict[str, Any]:
     if len(shape) > 1:
         return {"shape": shape, "dtype": dtype, "_type": f"Array{len(shape)}D"}
     value = {"dtype": dtype, "_type": "Value"}
-    return value if shape == [1] else {"feature": value, "length": shape[0], "_type": "Sequence"}
+    return value if shape in ([], [1]) else {"feature": value, "length": shape[0], "_type": "Sequence"}
 
 
 def differences(stated: Mapping[str, Mapping[str, Any]], new: Mapping[str, Mapping[str, Any]]) -> list[str]:

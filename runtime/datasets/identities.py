@@ -16,6 +16,7 @@ import pyarrow as pa
 
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
+from runtime.datasets.assemble import Tell, silent
 from runtime.datasets.catalog import Catalog
 from runtime.datasets.operations import convert
 from runtime.datasets.reader import Dataset, open_dataset
@@ -27,9 +28,16 @@ _INDEX = ("index", "task_index")  # of a dataset, not of the episode
 
 
 def named_copy(
-    dataset: Path, target: Path, *, rename: Mapping[str, str] | None = None, reencode: bool = False
+    dataset: Path,
+    target: Path,
+    *,
+    rename: Mapping[str, str] | None = None,
+    reencode: bool = False,
+    tell: Tell = silent,
 ) -> Dataset:
     """The dataset at `target`, with a uuid for each episode: a copy, or itself where both are one folder.
+
+    What a copy leaves out is told.
 
     A copy keeps the version, v2.0 becomes v2.1; it appears whole or not at all. One that is there already is taken
     where its episodes have the same uuids, else RecordingError.
@@ -43,7 +51,7 @@ def named_copy(
     elif target.exists():
         _require_same(dataset, target)
     else:
-        _copy(dataset, target, rename or {}, reencode)
+        _copy(dataset, target, rename or {}, reencode, tell)
     return open_dataset(target)
 
 
@@ -72,12 +80,12 @@ def identity(dataset: Dataset, index: int, place: int | None = None) -> str:
     return str(uuid5(NAMESPACE_URL, f"eva-imported:{hashlib.sha256(told.encode()).hexdigest()}"))
 
 
-def _copy(dataset: Path, target: Path, rename: Mapping[str, str], reencode: bool) -> None:
+def _copy(dataset: Path, target: Path, rename: Mapping[str, str], reencode: bool, tell: Tell) -> None:
     version = str(layout.read_info(dataset)["codebase_version"])
     draft = target.with_name(f".{target.name}.{IMPORTED}")
     try:
         shutil.rmtree(draft, ignore_errors=True)  # what a crash left
-        convert(
+        made = convert(
             dataset,
             draft,
             version if version in layout.WRITABLE_VERSIONS else layout.DEFAULT_VERSION,
@@ -87,6 +95,8 @@ def _copy(dataset: Path, target: Path, rename: Mapping[str, str], reencode: bool
         _name(draft)
         os.rename(draft, target)
         sync_folder(target.parent)
+        for thing in made.left_out:
+            tell(f"left out: {thing}")
     except OSError as error:
         raise disk_fault("importing into", target, error) from error
     finally:

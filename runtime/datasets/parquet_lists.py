@@ -37,8 +37,8 @@ def read_statistics(root: Path) -> list[Line]:
         for row in _read(path, ["episode_index", *names]).to_pylist():
             statistics: dict[str, dict[str, Any]] = {}
             for name in names:
-                if row[name] is not None:
-                    key, figure = name.removeprefix(_STATS).rsplit("/", 1)
+                key, _, figure = name.removeprefix(_STATS).rpartition("/")
+                if row[name] is not None and key:
                     statistics.setdefault(key, {})[figure] = row[name]
             lines.append({"episode_index": row["episode_index"], "stats": statistics})
     return lines
@@ -70,6 +70,16 @@ def episode_files(lines: Sequence[Line], statistics: Sequence[Line]) -> dict[str
         layout.EPISODES_V30.format(chunk_index=chunk, file_index=file): _episodes(rows)
         for (chunk, file), rows in files.items()
     }
+
+
+def is_storable(values: Sequence[Any]) -> bool:
+    """True if one column of a parquet file can hold these values."""
+    import pyarrow as pa
+
+    try:
+        return bool(_bytes(pa.table({"values": pa.array(values)})))
+    except (pa.ArrowException, TypeError, OverflowError):
+        return False
 
 
 def tasks_file(tasks: Iterable[Line]) -> bytes:

@@ -6,6 +6,7 @@ import io
 from abc import ABC, abstractmethod
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +20,8 @@ from runtime.core.types import UInt8
 
 if TYPE_CHECKING:
     import av
+    from numpy.typing import NDArray
+    from PIL import Image
 
 
 KEPT_BYTES = (
@@ -154,6 +157,12 @@ class Pictures(PictureSequence):
         """Height and width, as the stream says."""
         return self._stream.height, self._stream.width
 
+    @property
+    def is_deep(self) -> bool:
+        """True if it is depth, one number of more than 8 bits per point."""
+        given = self._stream.codec_context.format
+        return given is not None and [part.bits > 8 for part in given.components] == [True]
+
     def __len__(self) -> int:
         return len(self._times)
 
@@ -223,10 +232,38 @@ class Pictures(PictureSequence):
         self._container.close()
 
 
-class StoredPictures(PictureSequence):
-    """The pictures of an image column: coded as PNG or JPEG in the rows, or in files that the rows name."""
+def stored_row(found: object) -> Mapping[str, Any] | None:
+    """What a row of an image column holds, as "bytes" and "path"; some write the bytes or the path alone."""
+    if isinstance(found, Mapping):
+        return found
+    if isinstance(found, bytes):
+        return {"bytes": found, "path": None}
+    return {"bytes": None, "path": found} if isinstance(found, str) else None
 
-    def __init__(self, name: str, rows: Sequence[Mapping[str, Any] | None], root: Path) -> None:
+
+def shown(image: Image.Image) -> UInt8:
+    """An open picture as RGB uint8 [H, W, 3]; one of depth in shades of grey, its most distant point white."""
+    depth = _depth(image)
+    if depth is None:
+        return np.array(image.convert("RGB"), dtype=np.uint8)
+    known = np.where(np.isfinite(depth), depth, 0.0)
+    grey = np.clip(known * (255.0 / max(known.max(), 1e-9)), 0, 255).round().astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+def _depth(image: Image.Image) -> NDArray[np.float64] | None:
+    if image.mode == "F":
+        return np.asarray(image, np.float64)
+    return np.asarray(image, np.float64) / 65535 if image.mode.startswith("I") else None
+
+
+class StoredPictures(PictureSequence):
+    """The pictures of an image column: coded as PNG, JPEG or TIFF in the rows, or in files that the rows name.
+
+    Depth is shown in shades of grey, the most distant of a picture white, what is not known (0) black.
+    """
+
+    def __init__(self, name: str, rows: Sequence[object], root: Path) -> None:
         self._name = name
         self._rows = rows
         self._root = root
@@ -235,31 +272,51 @@ class StoredPictures(PictureSequence):
         return len(self._rows)
 
     def __getitem__(self, index: int) -> UInt8:
-        from PIL import Image, UnidentifiedImageError
-
         if not 0 <= index < len(self._rows):
             raise IndexError(f"{self._name} has pictures 0 to {len(self) - 1}, asked for {index}")
+        with self._opened(index) as image:
+            picture = shown(image)
+        picture.flags.writeable = False
+        return picture
+
+    def size(self, index: int) -> tuple[int, int]:
+        """Height and width of picture `index`, as its header says; raises RecordingError."""
+        with self._opened(index) as image:
+            return image.height, image.width
+
+    def depth(self, index: int) -> NDArray[np.float64] | None:
+        """Picture `index` as float64 [H, W] where it is of more than 8 bits: shares of 65535, or floats as they are."""
+        with self._opened(index) as image:
+            return _depth(image)
+
+    def is_missing(self, index: int) -> bool:
+        """True if nothing is stored of picture `index`."""
+        row = stored_row(self._rows[index])
+        return row is None or (row.get("bytes") is None and not row.get("path"))
+
+    def row(self, index: int) -> dict[str, Any] | None:
+        """Stored row of picture `index`, with a file of its own read in; None where nothing is stored."""
+        if self.is_missing(index):
+            return None
+        path = (stored_row(self._rows[index]) or {}).get("path")
+        return {"bytes": self._coded(index), "path": Path(str(path or f"{index}.png")).name}
+
+    @contextmanager
+    def _opened(self, index: int) -> Iterator[Image.Image]:
+        from PIL import Image, UnidentifiedImageError
+
         try:
             with Image.open(io.BytesIO(self._coded(index))) as image:
                 require_size(*image.size, f"{self._name}, picture {index} is")
-                picture = np.array(image.convert("RGB"), dtype=np.uint8)
+                yield image
         except TooLargeError as error:
             raise RecordingError(str(error)) from None
         except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
             raise RecordingError(f"{self._name}, picture {index} cannot be decoded: {error}") from error
-        picture.flags.writeable = False
-        return picture
-
-    def row(self, index: int) -> dict[str, Any] | None:
-        """Stored row of picture `index`, with a file of its own read in; None where nothing is stored."""
-        stored = self._rows[index]
-        if stored is None:
-            return None
-        return {"bytes": self._coded(index), "path": Path(str(stored.get("path") or f"{index}.png")).name}
 
     def _coded(self, index: int) -> bytes:
-        row = self._rows[index]
-        if row is None or (row.get("bytes") is None and not row.get("path")):
+        row = stored_row(self._rows[index])
+        if row is None or self.is_missing(index):
             raise RecordingError(f"{self._name}, picture {index} is missing")
         if row.get("bytes") is not None:
             return bytes(row["bytes"])

@@ -201,9 +201,10 @@ class _Columns:
         if not self.has(name):
             raise RecordingError(f"{self._path} has no column {name!r}, there are {self._table.column_names}")
         column = self._table.column(name).combine_chunks()
-        if not pa.types.is_struct(column.type) or not {"bytes", "path"} <= {
-            field.name for field in column.type
-        }:
+        kind = column.type
+        fields = {field.name for field in kind} if pa.types.is_struct(kind) else set()
+        alone = pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or pa.types.is_string(kind)
+        if not (alone or {"bytes", "path"} <= fields):
             raise RecordingError(f"{self._path}: column {name!r} is {column.type}, expected coded pictures")
         return StoredPictures(f"{self._path}, {name!r}", _Rows(column), root)
 

@@ -46,13 +46,41 @@ def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -
 
 
 def numbers(table: pa.Table, name: str) -> np.ndarray[Any, Any]:
-    """Column `name` as an array [N] or [N * W], whatever lists it is nested in."""
+    """Column `name` as an array [N, W], whatever lists it is nested in; NaN where it is null.
+
+    Raises RecordingError naming the column where its rows differ in length, or hold no numbers.
+    """
     import pyarrow as pa
+    import pyarrow.compute as pc
 
     column = table.column(name).combine_chunks()
-    while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
-        column = column.flatten()
-    return np.asarray(column.to_numpy(zero_copy_only=False))
+    known = column.is_valid().to_numpy(zero_copy_only=False)
+    flat = column.drop_null()
+    while is_list(flat.type):
+        lengths = pc.unique(pc.list_value_length(flat)).to_pylist()
+        if len(lengths) > 1:
+            raise RecordingError(f"rows of {name!r} have lengths {sorted(lengths, key=str)}, expected one")
+        flat = flat.flatten()
+    if pa.types.is_boolean(flat.type) and flat.null_count:
+        flat = flat.cast(pa.int8())
+    if not (
+        pa.types.is_floating(flat.type) or pa.types.is_integer(flat.type) or pa.types.is_boolean(flat.type)
+    ):
+        raise RecordingError(f"{name!r} is stored as {column.type}, expected numbers")
+    values = np.asarray(flat.to_numpy(zero_copy_only=False))
+    found = values.reshape(known.sum(), -1) if values.size else np.empty((known.sum(), 0))
+    if known.all():
+        return found
+    rows = np.full((len(known), found.shape[1]), np.nan)
+    rows[known] = found
+    return rows
+
+
+def is_list(kind: pa.DataType) -> bool:
+    """True of lists of any kind."""
+    import pyarrow as pa
+
+    return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
 
 
 def write_table(table: pa.Table, path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +12,23 @@ from numpy.typing import NDArray
 from runtime.core.errors import RecordingError
 from runtime.core.picture_bounds import open_video
 from runtime.core.types import UInt8
-from runtime.datasets.pictures import PictureSequence
+from runtime.datasets.pictures import StoredPictures
 
 # min, max, mean, std and the quantiles: lists of the feature's shape; count: [n]
 Statistic = dict[str, list[Any]]
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+FIGURES = ("min", "max", "mean", "std")  # without which a statistic is none, beside the count
 SAMPLED_PICTURES = 100  # per video and episode
 
 
 def column_statistic(values: NDArray[Any]) -> Statistic | None:
-    """Of one column [N] or [N, W], over the rows where it is known; None where it is known nowhere.
+    """Of one column [N] or [N, ...], over the rows where it is known; None where it is known nowhere.
 
-    The deviation is that of the population. Unknown rows are NaN and not counted.
+    The deviation is that of the population. Rows that are not finite are not counted.
     """
-    rows = values.reshape(len(values), -1)
-    known = rows[~np.isnan(rows).any(axis=1)] if np.issubdtype(rows.dtype, np.floating) else rows
-    if not len(known):
+    rows = values if values.ndim > 1 else values.reshape(-1, 1)
+    known = rows[finite(rows)]
+    if not known.size:
         return None
     exact = known.astype(np.float64)
     quantiles = np.quantile(exact, list(QUANTILES.values()), axis=0)
@@ -41,37 +42,109 @@ def column_statistic(values: NDArray[Any]) -> Statistic | None:
     }
 
 
+def finite(rows: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where all of a row of [N, ...] is finite, [N]."""
+    good: NDArray[np.bool_] = np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))
+    return good
+
+
+def fault(statistic: object, shapes: Sequence[tuple[int, ...]]) -> str:
+    """What makes a statistic unusable, "" where nothing does; its figures are to have one of `shapes`."""
+    if not isinstance(statistic, Mapping):
+        return f"is {statistic!r:.80}, expected {', '.join(FIGURES)} and count"
+    for name in FIGURES + tuple(name for name in QUANTILES if name in statistic):
+        if name not in statistic:
+            return f"has no {name}"
+        try:
+            figure = np.asarray(statistic[name], np.float64)
+        except (TypeError, ValueError):
+            return f"{name} is {statistic[name]!r:.80}, expected numbers"
+        if figure.shape not in shapes:
+            return f"{name} has shape {figure.shape}, expected {' or '.join(map(str, shapes))}"
+        if not np.isfinite(figure).all():
+            return f"{name} is {statistic[name]!r:.80}, expected finite numbers"
+    count = statistic.get("count")
+    (rows,) = count if isinstance(count, Sequence) and len(count) == 1 else (None,)
+    if isinstance(rows, bool) or not isinstance(rows, int | float) or not 0 < rows < np.inf:
+        return f"count is {count!r:.80}, expected [n] of the rows that it is of"
+    return ""
+
+
 def video_statistic(path: Path, frames: int) -> Statistic:
     """Of a video's pictures per channel in 0..1, shape (3, 1, 1), from an even subsample.
 
-    Every frame is decoded on the way; raises RecordingError where there are not exactly `frames`.
+    Depth of more than 8 bits counts with all of them. Every frame is decoded on the way; raises RecordingError where
+    there are not exactly `frames`.
     """
     import av
 
     wanted = set(np.linspace(0, frames - 1, min(frames, SAMPLED_PICTURES)).round().astype(int).tolist())
-    sums = _Histogram()
+    sums, deep = _Histogram(), _Deep()
     decoded = 0
     try:
         with open_video(path) as container:
             for frame in container.decode(video=0):
                 if decoded in wanted:
-                    sums.add(np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)[::2, ::2])
+                    (bits, *others) = (component.bits for component in frame.format.components)
+                    if bits > 8 and not others:
+                        deep.add(frame.to_ndarray()[::2, ::2] / (2.0**bits - 1))
+                    else:
+                        sums.add(np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)[::2, ::2])
                 decoded += 1
     except (av.FFmpegError, ValueError) as error:
         raise RecordingError(f"{path} cannot be decoded after frame {decoded}: {error}") from error
     if decoded != frames:
         raise RecordingError(f"{path} decodes to {decoded} frames, expected {frames}")
-    return sums.statistic()
+    statistic = deep.statistic() if deep else sums.statistic()
+    if statistic is None:
+        raise RecordingError(f"{path}: there is no number in its pictures")
+    return statistic
 
 
-def picture_statistic(pictures: PictureSequence) -> Statistic:
-    """As `video_statistic`, of pictures [H, W, 3] that are stored one by one."""
-    sums = _Histogram()
-    for number in np.unique(
-        np.linspace(0, len(pictures) - 1, min(len(pictures), SAMPLED_PICTURES)).round().astype(int)
+def picture_statistic(pictures: StoredPictures) -> Statistic | None:
+    """As `video_statistic`, of pictures that are stored one by one; None where there is none of them.
+
+    Those that are missing do not count. Depth of 16 bits counts as shares of 65535, floats as they are.
+    """
+    there = [number for number in range(len(pictures)) if not pictures.is_missing(number)]
+    sums, deep = _Histogram(), _Deep()
+    for place in np.unique(
+        np.linspace(0, len(there) - 1, min(len(there), SAMPLED_PICTURES)).round().astype(int)
     ):
-        sums.add(pictures[int(number)][::2, ::2])
-    return sums.statistic()
+        depth = pictures.depth(there[place])
+        if depth is not None:
+            deep.add(depth[::2, ::2])
+        else:
+            sums.add(pictures[there[place]][::2, ::2])
+    return (deep.statistic() if deep else sums.statistic()) if there else None
+
+
+class _Deep:
+    """Depth pictures: figures of each, then of all together, so that they need not fit into memory."""
+
+    def __init__(self) -> None:
+        self._each: list[Statistic] = []
+        self._pictures = 0
+
+    def __bool__(self) -> bool:
+        return self._pictures > 0
+
+    def add(self, depth: NDArray[np.floating[Any]]) -> None:
+        """A picture [H, W] of shares of the full scale."""
+        self._pictures += 1
+        statistic = column_statistic(depth.reshape(-1))
+        if statistic is not None:
+            self._each.append(statistic)
+
+    def statistic(self) -> Statistic | None:
+        """The one channel three times, as LeRobot wants it; None where no number is known."""
+        if not self._each:
+            return None
+        together = _together(self._each)
+        return {
+            name: [self._pictures] if name == "count" else [[list(figure)]] * 3
+            for name, figure in together.items()
+        }
 
 
 class _Histogram:
@@ -110,7 +183,7 @@ def aggregate(episodes: Iterable[Mapping[str, Statistic]]) -> dict[str, Statisti
     """The statistics of all episodes together, each episode weighted by its count.
 
     Source: the parallel form of the variance (Chan, Golub, LeVeque 1979). Quantiles are the mean of those of the
-    episodes, as LeRobot makes them; there are none where an episode has none.
+    episodes, as LeRobot makes them; there are none where an episode has none. ValueError for a count not above 0.
     """
     collected: dict[str, list[Statistic]] = {}
     for statistics in episodes:
@@ -122,6 +195,8 @@ def aggregate(episodes: Iterable[Mapping[str, Statistic]]) -> dict[str, Statisti
 def _together(parts: list[Statistic]) -> Statistic:
     means, deviations = (np.array([part[name] for part in parts], np.float64) for name in ("mean", "std"))
     counts = np.array([part["count"][0] for part in parts], np.float64)
+    if not (counts > 0).all():
+        raise ValueError(f"counts are {counts.tolist()}, expected all above 0")
     weights = (counts / counts.sum()).reshape(-1, *[1] * (means.ndim - 1))
     mean = (weights * means).sum(axis=0)
     variance = (weights * (deviations**2 + (means - mean) ** 2)).sum(axis=0)

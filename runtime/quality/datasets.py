@@ -14,6 +14,7 @@ from robots import RobotError
 from runtime.core.errors import RecordingError
 from runtime.core.types import EEF_WIDTH, Float64
 from runtime.datasets import layout
+from runtime.datasets.features import picture_size
 from runtime.datasets.mapping import ColumnMapping, video_key
 from runtime.datasets.pictures import Stretch
 from runtime.datasets.reader import Dataset
@@ -89,13 +90,10 @@ class DatasetSource(Source):
         return {key.removeprefix(video_key("")): key for key in stored}
 
     def _size(self, key: str) -> tuple[int, int] | None:
-        feature = self._features[key]
-        shape, names = feature.get("shape"), feature.get("names")
-        if not (isinstance(shape, list | tuple) and len(shape) == 3):
+        try:
+            return picture_size(self._features[key])[:2]
+        except RecordingError:  # it is not said
             return None
-        if isinstance(names, list) and "height" in names and "width" in names:
-            return int(shape[names.index("height")]), int(shape[names.index("width")])
-        return int(shape[0]), int(shape[1])
 
     def blocks(self) -> Iterator[Block]:
         path = self._entry.data

@@ -13,9 +13,13 @@ _ERRORS = {"not_found": "404 Not Found", "no_login": "401 Unauthorized"}
 
 
 class MjpegServer(CameraServer):
-    """multipart/x-mixed-replace, one part per picture. The fault "html" answers with a page."""
+    """multipart/x-mixed-replace, one part per picture, described by `headers`, in which {length} is its own.
+
+    The fault "html" answers with a page, "png" with parts of another kind, "still" with one picture.
+    """
 
     scheme = "http"
+    headers: tuple[str, ...] = ("Content-Type: image/jpeg", "Content-Length: {length}")
 
     def _speak(self, client: socket.socket) -> None:
         request = b""
@@ -30,6 +34,9 @@ class MjpegServer(CameraServer):
             page = b"<html>log in</html>"
             head = f"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: {len(page)}\r\n\r\n"
             client.sendall(head.encode() + page)
+        elif self.fault == "still":
+            jpeg = simplejpeg.encode_jpeg(picture(0, *self.size), quality=90)
+            client.sendall(b"HTTP/1.1 200 OK\r\nContent-Type: image/jpeg\r\nConnection: close\r\n\r\n" + jpeg)
         else:
             head = "HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=eva\r\n\r\n"
             client.sendall(head.encode())
@@ -43,9 +50,11 @@ class MjpegServer(CameraServer):
                 client.recv(1)  # until it gives up
                 return
             jpeg = simplejpeg.encode_jpeg(picture(number, *self.size), quality=90)
-            if self.fault == "nonsense":
+            if self.fault in ("nonsense", "png"):
                 jpeg = bytes(reversed(jpeg))
-            part = f"--eva\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
+            told = ("Content-Type: image/png",) if self.fault == "png" else self.headers
+            lines = "".join(f"{line}\r\n" for line in ("--eva", *told, ""))
+            part = lines.format(length=len(jpeg)).encode()
             if self.fault == "torn":
                 client.sendall(part + jpeg[: len(jpeg) // 2])
                 return

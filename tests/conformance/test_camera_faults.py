@@ -6,6 +6,7 @@ import pytest
 
 from runtime.cameras.base import Condition
 from runtime.sim.camera_server import FAULTS
+from runtime.sim.mjpeg_server import MjpegServer
 from tests.runtime.cameras.movies import until
 from tests.runtime.cameras.watched import KINDS, both, live, looking, lost, watched
 
@@ -35,6 +36,9 @@ ON_OPENING = {
         "torn": "its stream ends before the first picture",
         "nonsense": "what it sent for 0.5 s cannot be decoded",
         "html": NO_MJPEG.format("text/html"),
+        "png": "what it sent for 0.5 s cannot be decoded: parts of type image/png, no JPEG",
+        "still": "it answers with one picture and ends, not multipart/x-mixed-replace: "
+        "take the address of its stream",
     },
 }
 WHILE_IT_PLAYS = {
@@ -73,6 +77,28 @@ def test_what_breaks_while_it_plays_is_lost_and_comes_back(kind: str, fault: str
         server.fault = ""
         until(lambda: live(camera))
         assert camera.newest().captured > kept.captured  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        ("Content-Type: image/jpg", "Content-Length: {length}"),
+        ("Content-Type: image/jpeg; charset=utf-8", "Content-Length: {length}"),
+        ("Content-Length: {length}",),
+        (),
+        ("Content-Type: image/jpeg", "Content-Length: 7"),
+        ("Content-Type: image/jpeg", "Content-Length: 9{length}"),
+        ("Content-Type: image/jpeg", "Content-Length: many"),
+    ],
+)
+def test_pictures_are_seen_whatever_their_parts_are_called(headers: tuple[str, ...]) -> None:
+    with watched("mjpeg") as (server, camera):
+        assert isinstance(server, MjpegServer)
+        server.headers = headers
+        server.hang_up()  # that of before, if it was quick
+        until(lambda: live(camera) and server.sent > 0)
+        until(lambda: camera.newest() is not None)
+        assert camera.newest().picture.shape == (120, 160, 3)  # type: ignore[union-attr]
 
 
 @both

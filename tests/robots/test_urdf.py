@@ -159,6 +159,19 @@ def test_joints_that_nothing_drives_are_held_where_they_are_drawn(tmp_path: Path
     assert (read.joint("j").kind, read.held) == ("fixed", ("j",))
 
 
+@pytest.mark.parametrize("kind", ["fixed", "floating", "planar"])
+def test_limits_of_joints_that_do_not_move_do_not_matter(tmp_path: Path, kind: str) -> None:
+    limit = '<limit lower="-inf" upper="inf" velocity="-"/>'
+    read = urdf.read(write(tmp_path, LINKS + JOINT.format(kind=kind, rest=limit))).joint("j")
+    assert (read.kind, read.lower, read.upper, read.velocity) == ("fixed", None, None, None)
+
+
+def test_a_byte_order_mark_says_more_than_the_declaration(tmp_path: Path) -> None:
+    body = '<?xml version="1.0" encoding="gb2312"?><robot name="r"><link name="\u4e2d"/></robot>'
+    (tmp_path / "r.urdf").write_bytes(body.encode("utf-8-sig"))
+    assert urdf.read(tmp_path / "r.urdf").root == "\u4e2d"
+
+
 @pytest.mark.parametrize("encoding", ["gb2312", "GBK", "shift_jis", "utf-8", "iso-8859-1", "UTF-16"])
 def test_any_encoding_that_python_knows_is_read(tmp_path: Path, encoding: str) -> None:
     comment = "\u00e9" if encoding == "iso-8859-1" else "\u4e2d"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -11,10 +12,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from asgiref.sync import async_to_sync
 from django.test import AsyncClient, Client
 from django.urls import reverse
+from PIL import Image
 
 from evaweb.binary_frames import decode
 from evaweb.datasets import stills
@@ -84,6 +88,20 @@ def test_pictures_in_a_column_are_sent_one_by_one(browser: Client, foreign: Fore
     assert answer["Content-Type"] in ("image/png", "image/jpeg")
     assert browser.get(f"{pictures['address']}?row=8").status_code == 404
     assert browser.get(f"{pictures['address']}?row=-1").status_code == 400
+
+
+def test_depth_of_16_bits_is_shown_in_shades(browser: Client, foreign: Foreign) -> None:
+    folder = foreign("cups", version="v2.1", videos=(), images=("cam",))
+    path, key = folder / "data/chunk-000/episode_000000.parquet", "observation.images.cam"
+    table, sink = pq.read_table(path), io.BytesIO()
+    Image.fromarray(np.repeat([[0, 1000, 2000]], 4, axis=0).astype(np.uint16)).save(sink, "PNG")
+    rows = pa.array([sink.getvalue()] * table.num_rows)  # as their bytes alone
+    pq.write_table(table.set_column(table.column_names.index(key), key, rows), path)
+    (pictures,) = config(browser.get(reverse("dataset-replay", args=["cups", 0])))["videos"]
+    answer = browser.get(f"{pictures['address']}?row=0")
+    assert (answer.status_code, answer["Content-Type"]) == (200, "image/jpeg")
+    shown = np.asarray(Image.open(io.BytesIO(answer.content)).convert("L")).mean(axis=0)
+    assert np.allclose(shown, [0, 128, 255], atol=12)
 
 
 def test_a_camera_with_a_slash_in_its_name_is_shown_as_any_other(browser: Client, foreign: Foreign) -> None:

@@ -1,0 +1,53 @@
+"""The splits of info.json: which episodes are for training, which for something else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from runtime.core.errors import RecordingError
+
+TRAIN = "train"  # where LeRobot, and we, put every episode of which nobody says anything else
+
+
+def episodes_of(name: str, value: Any) -> list[int]:
+    """Indices in a split: "0:40", "0:3,5:8,9" or a list of numbers; RecordingError names one that says none."""
+    try:
+        if isinstance(value, str):
+            return [index for part in value.split(",") if part.strip() for index in _range(part)]
+        return [index for one in value for index in _range(str(one))]
+    except (TypeError, ValueError):
+        raise RecordingError(
+            f"split {name!r} is {value!r:.80}, expected episodes such as '0:40' or '0:3,5:8'"
+        ) from None
+
+
+def written(splits: Mapping[str, Iterable[int]]) -> dict[str, str]:
+    """Splits as info.json has them: half-open ranges, several with commas between; none that is empty."""
+    return {name: text for name, indices in splits.items() if (text := _text(sorted(set(indices))))}
+
+
+def with_more(splits: Mapping[str, Any], first: int, end: int) -> dict[str, Any]:
+    """`splits` with the new episodes `first` to `end` (excluded) in the one for training; RecordingError."""
+    if first >= end:
+        return dict(splits)
+    known = episodes_of(TRAIN, splits.get(TRAIN, ""))
+    return {**splits, **written({TRAIN: [*known, *range(first, end)]})}
+
+
+def _range(part: str) -> Sequence[int]:
+    first, colon, end = part.strip().partition(":")
+    made = range(int(first), int(end)) if colon else [int(first)]
+    if int(first) < 0 or len(made) > 10_000_000:
+        raise ValueError(part)
+    return made
+
+
+def _text(indices: Sequence[int]) -> str:
+    runs: list[list[int]] = []
+    for index in indices:
+        if runs and runs[-1][1] == index:
+            runs[-1][1] = index + 1
+        else:
+            runs.append([index, index + 1])
+    return ",".join(f"{first}:{end}" for first, end in runs)
