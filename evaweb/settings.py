@@ -226,6 +226,8 @@ EVA_GATE_NAME = os.environ.get("EVA_GATE_NAME", "")
 EVA_RESERVE_BYTES = int(1e9 * environment.gigabytes("EVA_RESERVE_GB", 5.0))
 # How many of a bucket's objects are kept here as files [GB].
 EVA_CACHE_BYTES = int(1e9 * environment.gigabytes("EVA_CACHE_GB", 10.0))
+# What a page is held that it does not read [MiB]; beyond it is cut off.
+EVA_UNREAD_BYTES = int(2**20 * environment.mebibytes("EVA_UNREAD_MIB", 8.0))
 # How long a request waits for a station's answer [s]; after it the outcome is unknown.
 EVA_COMMAND_TIMEOUT_S = environment.seconds("EVA_COMMAND_TIMEOUT_S", 2.0)
 # Without a sign of life for so long a worker's job is taken from it [s].
