@@ -123,6 +123,7 @@ def test_a_turn_lasts_as_long_as_its_thread_whoever_hangs_up():
             await turn_of_the_loop(client.empty)
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
+        await turn_of_the_loop(lambda: len(begun) > 1)
         assert len(begun) == 2
         free.set()
         await turns(asked(), a_request(), _nowhere)
