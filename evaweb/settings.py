@@ -184,6 +184,7 @@ SECURE_REFERRER_POLICY = "same-origin"
 X_FRAME_OPTIONS = "DENY"
 AUTHENTICATION_BACKENDS = [
     "axes.backends.AxesStandaloneBackend",
+    "evaweb.lockout.ManyNames",
     "django.contrib.auth.backends.ModelBackend",
     "evaweb.administration.RoleBackend",
 ]
@@ -199,7 +200,7 @@ AXES_FAILURE_LIMIT = 5
 AXES_COOLOFF_TIME = timedelta(minutes=15)
 AXES_RESET_ON_SUCCESS = True
 AXES_RESET_COOL_OFF_ON_FAILURE_DURING_LOCKOUT = False
-AXES_CLIENT_IP_CALLABLE = "evaweb.callers.address_of"
+AXES_CLIENT_IP_CALLABLE = "evaweb.callers.lockable_of"
 AXES_LOCKOUT_CALLABLE = "evaweb.lockout.answer"
 AXES_SENSITIVE_PARAMETERS = ["username", "ip_address", "csrfmiddlewaretoken"]
 AXES_DISABLE_ACCESS_LOG = True  # evaweb.audit logs who comes and goes

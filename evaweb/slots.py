@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
+from evaweb.callers import SHARE, share_of
 from evaweb.headers import BARE
 from evaweb.lock_wait import hurried
 
@@ -47,6 +48,7 @@ class Slots:
             self._turns.release()
 
     async def _work(self, scope: dict[str, Any], client: _Client) -> None:
+        SHARE.set(share_of(scope))  # of this task alone, and of the threads that work for it
         if scope["method"] == "POST" and scope["path"].startswith(_COMMANDING):
             with hurried():
                 await self._application(scope, client.receive, client.send)

@@ -30,7 +30,7 @@ class Application:
 
 
 def asked(path="/", method="GET"):
-    return {"type": "http", "method": method, "path": path}
+    return {"type": "http", "method": method, "path": path, "headers": []}
 
 
 def a_request():
