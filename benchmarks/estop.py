@@ -43,6 +43,8 @@ ATTACKS = (
     "handshakes",
     "pages",
     "rest_clients",
+    "made_up_tokens",
+    "halts",
     "database_hangs",
 )
 WAYS = ("estop", "socket", "rest")  # a page, its websocket alone, REST at the process for stops

@@ -119,22 +119,23 @@ class Program:
 
     def ready(self) -> None:
         """Ask whether this way stands, as a page does that is opened."""
-        self._asked("GET", "")
+        self.ask("GET", "estop")
 
     def press(self, why: str, identity: str = "") -> Press:
         """Press and wait for the answer."""
         begun = time.monotonic()
         try:
-            said = self._asked("POST", json.dumps({"uuid": identity or str(uuid4()), "why": why}))
+            said = self.ask("POST", "estop", json.dumps({"uuid": identity or str(uuid4()), "why": why}))
         except (OSError, http.client.HTTPException, ValueError) as fault:
             return Press("", f"{type(fault).__name__}: {fault}", (time.monotonic() - begun) * 1000.0)
         took = time.monotonic() - begun
         answered = took <= PATIENCE_S
         return Press(said.get("status", "refused") if answered else "", str(said)[:200], took * 1000.0)
 
-    def _asked(self, method: str, body: str) -> dict[str, Any]:
+    def ask(self, method: str, what: str, body: str = "") -> dict[str, Any]:
+        """The answer to what is asked of `estop` or `commands`."""
         with closing(http.client.HTTPConnection(self._address, timeout=PATIENCE_S)) as connection:
-            connection.request(method, f"/api/v1/stations/{self._station}/estop", body, self._headers)
+            connection.request(method, f"/api/v1/stations/{self._station}/{what}", body, self._headers)
             found: dict[str, Any] = json.loads(connection.getresponse().read())
             return found
 

@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 _MOST = 1000  # addresses that are remembered
 _EVERY_S = 60.0
 _refused = Rarely(_EVERY_S, _MOST)
+_unverified = Rarely(10.0, 16)  # a crowd presses more often than a disk writes
 
 
 @receiver(user_logged_in)
@@ -60,6 +61,13 @@ def token_refused(address: str | None, why: str) -> None:
     before = _refused.due(where)
     if before is not None:
         log.warning("a token from %s %s%s", where, why, before)
+
+
+def estop_unverified(station: str, why: Exception) -> None:
+    """An e-stop was obeyed of nobody knows whom; once in 10 s per station, with how many there were."""
+    before = _unverified.due(station)
+    if before is not None:
+        log.error("an e-stop of %a is obeyed, of nobody knows whom: %s%s", station[:80], why, before)
 
 
 def _named(username: Any) -> str:

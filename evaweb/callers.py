@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextvars import ContextVar
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
 from typing import Any
 
@@ -10,6 +11,7 @@ from django.conf import settings
 from django.http import HttpRequest
 
 Address = IPv4Address | IPv6Address
+SHARE = ContextVar("SHARE", default="nowhere")  # `share_of` the request that is worked on
 _ONE_SUBSCRIBER = 64  # bits of an address of IPv6: whoever has one has all that begin with them
 
 
@@ -17,6 +19,14 @@ def address_of(request: HttpRequest) -> str | None:
     """The address of the caller, None where there is none, as over a socket of the file system."""
     named = request.META.get("HTTP_X_FORWARDED_FOR", "").split(",")
     found = _caller(request.META.get("REMOTE_ADDR"), named, settings.EVA_PROXIES)
+    return None if found is None else str(found)
+
+
+def lockable_of(request: HttpRequest) -> str | None:
+    """The address at which names are locked: of IPv6 the first of the network, all of which is one subscriber's."""
+    found = _parsed(address_of(request))
+    if isinstance(found, IPv6Address):
+        return str(ip_network((found, _ONE_SUBSCRIBER), strict=False).network_address)
     return None if found is None else str(found)
 
 

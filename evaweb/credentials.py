@@ -29,10 +29,12 @@ from django.db import connection
 
 from evaweb.lock_wait import hurried
 from evaweb.lookups import Crowded, Lookups
+from evaweb.rarely import Rarely
 from evaweb.roles import Role, role_of
 from runtime.core.sentences import Pattern
 
 log = logging.getLogger(__name__)
+_faults = Rarely(10.0, 8)
 SESSION, TOKEN = "session", "token"
 OF_ANY_AGE = {
     kind: f"{kind} of any age" for kind in (SESSION, TOKEN)
@@ -271,7 +273,9 @@ class Credentials:
                     if self.look(one, secret) is not None:
                         return self.recall(one, secret)
         except Exception as fault:  # whatever it is: the database has not said who this is
-            log.warning("a %s was not verified: %s", kind, fault)
+            before = _faults.due(kind)
+            if before is not None:
+                log.warning("a %s was not verified: %s%s", kind, fault, before)
             raise
         finally:
             connection.close()

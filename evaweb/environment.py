@@ -78,6 +78,11 @@ def seconds(name: str, default: float) -> float:
     return _number(name, default, sys.float_info.min, sys.float_info.max, "seconds above zero")
 
 
+def mebibytes(name: str, default: float) -> float:
+    """A size from one [MiB]."""
+    return _number(name, default, 1.0, 1e6, "mebibytes from 1 to 1000000")
+
+
 def gigabytes(name: str, default: float) -> float:
     """A size from zero [GB]."""
     return _number(name, default, 0.0, 1e6, "gigabytes from 0 to 1000000")

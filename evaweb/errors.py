@@ -14,6 +14,7 @@ class EvaError(Exception):
     """
 
     status = 400
+    retry_after_s: int | None = None  # when to try again [s]
 
 
 class NotAllowed(EvaError):

@@ -1,17 +1,20 @@
 """Passwords are hashed one after the other, behind everything else: however many log in at once, a stop is not later.
 
-A hash is half a second of a processor. A login that comes when too many wait is asked to try again.
+A hash is half a second of a processor. Each address has its turn, so that a crowd waits behind itself; where too many
+wait, a login of the crowd is asked to try again.
 """
 
 from __future__ import annotations
 
 import os
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 from django.contrib.auth.hashers import PBKDF2PasswordHasher
 
+from evaweb.callers import SHARE
 from evaweb.errors import EvaError
+from evaweb.lookups import Crowded, Lookups
 from runtime.core.sentences import fixed
 
 _TOO_MANY_PASSWORDS_BEING_CHECKED = fixed(
@@ -27,14 +30,14 @@ class Busy(EvaError):
     """Too many passwords are being checked."""
 
     status = 503
+    retry_after_s = 5
 
 
 def _give_way() -> None:
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # of this thread alone
 
 
-_thread = ThreadPoolExecutor(1, "passwords", initializer=_give_way)
-_places = threading.BoundedSemaphore(_MOST_WAITING)
+_turns: Lookups[str] = Lookups(1, _MOST_WAITING, "passwords", _give_way)
 
 
 class QueuedHasher(PBKDF2PasswordHasher):
@@ -42,10 +45,7 @@ class QueuedHasher(PBKDF2PasswordHasher):
 
     def encode(self, password: str, salt: str, iterations: int | None = None) -> str:
         """The hash; raises Busy."""
-        if not _places.acquire(blocking=False):
-            raise Busy(_TOO_MANY_PASSWORDS_BEING_CHECKED)
         try:
-            made: str = _thread.submit(super().encode, password, salt, iterations).result()
-            return made
-        finally:
-            _places.release()
+            return _turns.ask(SHARE.get(), partial(super().encode, password, salt, iterations)).result()
+        except Crowded:
+            raise Busy(_TOO_MANY_PASSWORDS_BEING_CHECKED) from None

@@ -25,8 +25,16 @@ _SORT_ALLOWED_EACH_ALSO_WITH = Pattern(
     "sort = {value!r:.80}; allowed: {known}, each also with - in front",
 )
 
+_CHARACTERS_ALLOWED = Pattern(
+    "web.lists.characters_allowed", "{name} has {count} characters; allowed: at most {most}"
+)
+_WORDS_ALLOWED = Pattern(
+    "web.lists.words_allowed", "{name} has {count} different words; allowed: at most {most}"
+)
+
 SEARCH, CHOICE, DAY, UNSEEN = "search", "choice", "day", "unseen"
-LONGEST = 200  # characters of words that are looked for; each word is a condition of the query
+LONGEST = 200  # characters of words that are looked for
+_MOST_WORDS = 16  # each is a condition of the query
 _AT_ONCE = 500  # rows of a file
 
 
@@ -82,6 +90,16 @@ class Chip:
     without: str
 
 
+def words_of(text: str, name: str = "words") -> list[str]:
+    """The words that are looked for, each once; EvaError where there are too many."""
+    if len(text) > LONGEST:
+        raise EvaError(_CHARACTERS_ALLOWED(name=name, count=len(text), most=LONGEST))
+    words = list(dict.fromkeys(text.split()))
+    if len(words) > _MOST_WORDS:
+        raise EvaError(_WORDS_ALLOWED(name=name, count=len(words), most=_MOST_WORDS))
+    return words
+
+
 class Listing:
     """A list as its address asks for it; where that asks for what there is not, `fault` says so and all is shown."""
 
@@ -104,8 +122,8 @@ class Listing:
         known = [key for key, _ in one.choices]
         if value and one.kind == CHOICE and one.strict and value not in known:
             raise EvaError(f"{one.name} = {value!r:.80}; allowed: {', '.join(known) or 'nothing yet'}")
-        if one.kind == SEARCH and len(value) > LONGEST:
-            raise EvaError(f"{one.name} has {len(value)} characters; allowed: at most {LONGEST}")
+        if one.kind == SEARCH:
+            words_of(value, one.name)
         return value
 
     def _sort(self, value: str) -> str:

@@ -1,17 +1,19 @@
-"""Answer for a name that is locked at its address, on the login pages of the lab and of administration."""
+"""Logins that are locked: a name at its address, and an address from which many names are guessed."""
 
 from __future__ import annotations
 
+from datetime import datetime
 from math import ceil
 from typing import Any
 
 from axes.models import AccessAttempt
 from django.conf import settings
+from django.core.exceptions import PermissionDenied
 from django.db.models import Max
 from django.http import HttpRequest, HttpResponse
 from django.utils import timezone
 
-from evaweb.callers import address_of
+from evaweb.callers import lockable_of
 from evaweb.refusals import told
 from runtime.core.sentences import Pattern
 
@@ -27,20 +29,55 @@ _LOCKED_FOR_A_MINUTE = Pattern(
 )
 
 
+_MANY_NAMES = Pattern(
+    "login.many_names",
+    "The password was wrong for {names} names from this computer. Try again in {minutes} min. "
+    "Anyone who is already logged in stays logged in.",
+)
+MOST_NAMES = 20  # whose password was wrong, of one address; each of them five times
+
+
+class ManyNames:
+    """Refuses logins from an address from which passwords of many names are guessed."""
+
+    def authenticate(self, request: HttpRequest | None, **given: Any) -> None:
+        """PermissionDenied where it is one; the middleware of axes answers by `answer`."""
+        if request is not None and _many_names_until(request) is not None:
+            request.axes_locked_out = True  # type: ignore[attr-defined]
+            raise PermissionDenied
+
+
 def answer(request: HttpRequest, *given: Any) -> HttpResponse:
     """429 with how long it lasts."""
-    seconds = _left(request)
+    until = _many_names_until(request)
+    seconds = _seconds_to(until or _name_until(request))
     minutes = ceil(seconds / 60)
-    sentence = _LOCKED if minutes > 1 else _LOCKED_FOR_A_MINUTE
-    said = sentence(times=settings.AXES_FAILURE_LIMIT, minutes=minutes)
+    if until is not None:
+        said = _MANY_NAMES(names=MOST_NAMES, minutes=minutes)
+    else:
+        sentence = _LOCKED if minutes > 1 else _LOCKED_FOR_A_MINUTE
+        said = sentence(times=settings.AXES_FAILURE_LIMIT, minutes=minutes)
     response = told(request, said, 429, "registration/locked.html")
     response["Retry-After"] = str(seconds)
     return response
 
 
-def _left(request: HttpRequest) -> int:
-    """Until the newest failure no longer counts [s]."""
+def _name_until(request: HttpRequest) -> datetime:
+    """When the newest failure of the name no longer counts."""
     username = (getattr(request, "axes_credentials", None) or {}).get("username")
-    attempts = AccessAttempt.objects.filter(username=username, ip_address=address_of(request))
-    newest = attempts.aggregate(at=Max("attempt_time"))["at"] or timezone.now()
-    return max(1, ceil((newest + settings.AXES_COOLOFF_TIME - timezone.now()).total_seconds()))
+    attempts = AccessAttempt.objects.filter(username=username, ip_address=lockable_of(request))
+    newest: datetime = attempts.aggregate(at=Max("attempt_time"))["at"] or timezone.now()
+    return newest + settings.AXES_COOLOFF_TIME
+
+
+def _many_names_until(request: HttpRequest) -> datetime | None:
+    """When the failures of fewer names will count that came from this address; None where that is so now."""
+    since = timezone.now() - settings.AXES_COOLOFF_TIME
+    attempts = AccessAttempt.objects.filter(ip_address=lockable_of(request), attempt_time__gt=since)
+    newest = attempts.values("username").annotate(at=Max("attempt_time")).order_by("-at")
+    last = newest.values_list("at", flat=True)[MOST_NAMES - 1 : MOST_NAMES]
+    return next((at + settings.AXES_COOLOFF_TIME for at in last), None)
+
+
+def _seconds_to(moment: datetime) -> int:
+    return max(1, ceil((moment - timezone.now()).total_seconds()))

@@ -24,15 +24,23 @@ class Crowded(Exception):
 class Lookups(Generic[T]):
     """Work in `threads`, the oldest of each share in turn; from any thread, and none of its callers waits.
 
+    Each thread does `begin` first.
+
     Where `most` wait, the newest of the share that has most of them gives way, or is not taken: it fails with Crowded.
     """
 
-    def __init__(self, threads: int, most: int = _MOST) -> None:
+    def __init__(
+        self,
+        threads: int,
+        most: int = _MOST,
+        name: str = "lookups",
+        begin: Callable[[], None] | None = None,
+    ) -> None:
         self._most = most
         self._lock = Lock()
         self._shares: OrderedDict[Hashable, deque[tuple[Callable[[], T], Future[T]]]] = OrderedDict()
         self._waiting = 0
-        self._threads = ThreadPoolExecutor(threads, "lookups")
+        self._threads = ThreadPoolExecutor(threads, name, initializer=begin)
 
     def ask(self, share: Hashable, work: Callable[[], T]) -> Future[T]:
         """Result of `work`, once it had its turn."""

@@ -10,7 +10,7 @@ from django.contrib.auth.forms import PasswordChangeForm
 from django.contrib.auth.views import PasswordChangeView
 from django.core.exceptions import ValidationError
 
-from evaweb.callers import address_of
+from evaweb.callers import lockable_of
 
 
 class OwnPasswordForm(PasswordChangeForm):
@@ -24,7 +24,7 @@ class OwnPasswordForm(PasswordChangeForm):
         name = self.user.get_username()
         if authenticate(self.request, username=name, password=given) != self.user:
             raise ValidationError(self.error_messages["password_incorrect"], code="password_incorrect")
-        reset(username=name, ip=address_of(self.request))  # as a login forgets those before it
+        reset(username=name, ip=lockable_of(self.request))  # as a login forgets those before it
         return given
 
 

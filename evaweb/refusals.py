@@ -79,7 +79,14 @@ class RefusalMiddleware(MiddlewareMixin):
             return told(request, TAKEN, 409, "refused.html")
         if not isinstance(exception, EvaError):
             return None
-        return told(request, str(exception), exception.status, "refused.html")
+        return retrying(told(request, str(exception), exception.status, "refused.html"), exception)
+
+
+def retrying(answer: HttpResponse, fault: EvaError) -> HttpResponse:
+    """The answer to `fault`, with when to try again where it says so."""
+    if fault.retry_after_s is not None:
+        answer["Retry-After"] = str(fault.retry_after_s)
+    return answer
 
 
 def nowhere(path: str) -> str:

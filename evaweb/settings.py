@@ -184,6 +184,7 @@ SECURE_REFERRER_POLICY = "same-origin"
 X_FRAME_OPTIONS = "DENY"
 AUTHENTICATION_BACKENDS = [
     "axes.backends.AxesStandaloneBackend",
+    "evaweb.lockout.ManyNames",
     "django.contrib.auth.backends.ModelBackend",
     "evaweb.administration.RoleBackend",
 ]
@@ -199,7 +200,7 @@ AXES_FAILURE_LIMIT = 5
 AXES_COOLOFF_TIME = timedelta(minutes=15)
 AXES_RESET_ON_SUCCESS = True
 AXES_RESET_COOL_OFF_ON_FAILURE_DURING_LOCKOUT = False
-AXES_CLIENT_IP_CALLABLE = "evaweb.callers.address_of"
+AXES_CLIENT_IP_CALLABLE = "evaweb.callers.lockable_of"
 AXES_LOCKOUT_CALLABLE = "evaweb.lockout.answer"
 AXES_SENSITIVE_PARAMETERS = ["username", "ip_address", "csrfmiddlewaretoken"]
 AXES_DISABLE_ACCESS_LOG = True  # evaweb.audit logs who comes and goes
@@ -226,6 +227,8 @@ EVA_GATE_NAME = os.environ.get("EVA_GATE_NAME", "")
 EVA_RESERVE_BYTES = int(1e9 * environment.gigabytes("EVA_RESERVE_GB", 5.0))
 # How many of a bucket's objects are kept here as files [GB].
 EVA_CACHE_BYTES = int(1e9 * environment.gigabytes("EVA_CACHE_GB", 10.0))
+# What a page is held that it does not read [MiB]; beyond it is cut off.
+EVA_UNREAD_BYTES = int(2**20 * environment.mebibytes("EVA_UNREAD_MIB", 8.0))
 # How long a request waits for a station's answer [s]; after it the outcome is unknown.
 EVA_COMMAND_TIMEOUT_S = environment.seconds("EVA_COMMAND_TIMEOUT_S", 2.0)
 # Without a sign of life for so long a worker's job is taken from it [s].

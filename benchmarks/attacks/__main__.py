@@ -11,7 +11,7 @@ import os
 import sys
 from pathlib import Path
 
-from benchmarks.attacks import bus, crowds, databases, frames, requests
+from benchmarks.attacks import bus, crowds, databases, frames, presses, requests
 from benchmarks.attacks.target import Target
 from robots.broken_pipe import unread_ends
 from runtime.sim.standin import ending
@@ -28,6 +28,8 @@ ATTACKS = {
     "handshakes": crowds.handshakes,
     "pages": crowds.pages,
     "rest_clients": crowds.rest_clients,
+    "made_up_tokens": presses.made_up_tokens,
+    "halts": presses.halts,
     "database_hangs": databases.hangs,
 }
 _NICE = 19
@@ -53,6 +55,7 @@ def _target(given: argparse.Namespace) -> Target:
     lab = json.loads(given.ready_file.read_text("utf-8"))
     return Target(
         url=lab["url"],
+        stops=lab["stops"],
         passwords=lab["passwords"],
         data=given.data,
         database=given.database,

@@ -61,7 +61,7 @@ async def _one(target: Target, number: int, opened: Counter[str], tried: asyncio
 
 def logins(target: Target) -> Counter[str]:
     """Ten at once, again and again, every second one with a password that is wrong."""
-    return _again_and_again(target, _LOGINS, _login)
+    return again_and_again(target, _LOGINS, _login)
 
 
 def _login(target: Target, number: int) -> str:
@@ -72,7 +72,7 @@ def _login(target: Target, number: int) -> str:
 
 def bodies(target: Target) -> Counter[str]:
     """Post 200 MB without saying who it is, four at a time."""
-    return _again_and_again(target, _BODIES, _body)
+    return again_and_again(target, _BODIES, _body)
 
 
 def _body(target: Target, number: int) -> str:
@@ -91,7 +91,7 @@ def _body(target: Target, number: int) -> str:
 def toml(target: Target) -> Counter[str]:
     """Import a file of one key, or one table, of twenty thousand parts, as an administrator."""
     visitor = target.visitor("admin")
-    return _again_and_again(target, 1, partial(_import, visitor))
+    return again_and_again(target, 1, partial(_import, visitor))
 
 
 def _import(visitor: Visitor, target: Target, number: int) -> str:
@@ -114,7 +114,7 @@ def _posted_file(visitor: Visitor, target: Target, path: str, text: str) -> int:
         return connection.getresponse().status
 
 
-def _again_and_again(target: Target, at_once: int, ask: Callable[[Target, int], str]) -> Counter[str]:
+def again_and_again(target: Target, at_once: int, ask: Callable[[Target, int], str]) -> Counter[str]:
     """Ask from so many threads, each again when it has its answer; how often which came."""
     done: Counter[str] = Counter()
 

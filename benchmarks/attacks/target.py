@@ -16,6 +16,7 @@ class Target:
     """A lab of `benchmarks.estop_lab`; `share` of the whole attack, so that a test can make a short one."""
 
     url: str
+    stops: str  # address of its process for stops
     passwords: Mapping[str, str]
     data: Path
     database: Path | None  # folder of a PostgreSQL server; None: the SQLite file in `data`

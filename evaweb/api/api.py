@@ -33,6 +33,7 @@ from evaweb.api.auth import NOT_LOGGED_IN, Bearer, Session
 from evaweb.api.questions import Bounded, only_known
 from evaweb.errors import EvaError, refusal
 from evaweb.races import TAKEN, was_taken
+from evaweb.refusals import retrying
 from evaweb.storage import refusal_of
 from runtime.core import bounded_documents as bounded
 
@@ -92,7 +93,7 @@ def openapi(request: HttpRequest) -> Any:
 
 @api.exception_handler(EvaError)
 def _refused(request: HttpRequest, fault: EvaError) -> HttpResponse:
-    return _failure(request, str(fault), fault.status)
+    return retrying(_failure(request, str(fault), fault.status), fault)
 
 
 @api.exception_handler(AuthenticationError)

@@ -195,7 +195,7 @@ async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -
         login = await _presser(scope)
     except (Unverifiable, Busy) as fault:  # no crowd refuses an e-stop
         unverified = str(fault)
-        log.error("an e-stop of %s is obeyed, of nobody knows whom: %s", station, fault)
+        audit.estop_unverified(station, fault)
     else:
         username, user = login.username, login.account
     uuid = given.uuid or uuid4()

@@ -355,7 +355,8 @@ def preferences(
 def planner(request: HttpRequest, asked: Query[Planned]) -> Any:
     """Trials and robot hours for a wanted difference, and what the trials there is time for would miss."""
     question = question_of({name: str(value) for name, value in asked.model_dump().items()})
-    return {"question": asked.model_dump(), **table_of(question)}
+    user: Any = request.auth  # type: ignore[attr-defined]
+    return {"question": asked.model_dump(), **table_of(question, user.pk)}
 
 
 def _seen(request: Any, name: str, version: int, only: Only) -> tuple[Plan, Chosen]:

@@ -1,11 +1,14 @@
-"""Websockets that say too much below the messages which consumers count: pings, and messages in endless parts.
+"""Websockets beyond what consumers count: pings, messages in endless parts, and clients that do not read.
 
-Browsers send neither of themselves.
+Browsers do none of that of themselves.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 from daphne.ws_protocol import WebSocketProtocol
+from django.conf import settings
 
 from evaweb.console.quota import Quota
 
@@ -15,7 +18,7 @@ _READ = 4096  # bytes of one socket in one turn of the loop; a message is longer
 
 
 class CountedSocket(WebSocketProtocol):  # type: ignore[misc]
-    """A websocket of daphne's that is cut off where it pings or divides without end."""
+    """A websocket of daphne's that is cut off where it pings or divides without end, or does not read."""
 
     def onConnect(self, request: object) -> object:
         self._quota, self._parts = Quota(), 0
@@ -41,6 +44,13 @@ class CountedSocket(WebSocketProtocol):  # type: ignore[misc]
         self._parts = 0
         super().onMessage(payload, isBinary)
 
+    def sendData(self, *given: Any, **named: Any) -> None:
+        """Whatever it is sent, which stays here until it is read."""
+        super().sendData(*given, **named)
+        most = settings.EVA_UNREAD_BYTES
+        if unsent(self.transport.transport) > most:
+            self._cut(f"more than {most} bytes were not read")
+
     def _allowed(self) -> bool:
         allowed = self._quota.take(PING)
         if not allowed:
@@ -50,3 +60,9 @@ class CountedSocket(WebSocketProtocol):  # type: ignore[misc]
     def _cut(self, why: str) -> None:
         self.wasNotCleanReason = why
         self.dropConnection(abort=True)
+
+
+def unsent(transport: Any) -> int:
+    """What a transport of Twisted's still holds because the other end does not read [bytes]; it counts for itself."""
+    held: int = len(transport.dataBuffer) - transport.offset + transport._tempDataLen
+    return held

@@ -16,6 +16,7 @@ from uuid import UUID
 
 from django.utils import timezone
 
+from evaweb import audit
 from evaweb.console.requests import EStop, Stop
 from evaweb.credentials import UNVERIFIED, Busy, Credential, Login, Unverifiable, credentials
 from evaweb.errors import reasoned
@@ -59,7 +60,7 @@ class Stopping:
         try:
             login = await credentials.presser(self._found, self._share)
         except (Unverifiable, Busy) as fault:  # no crowd refuses an e-stop
-            log.error("an e-stop of %s is obeyed, of nobody knows whom: %s", self._station, fault)
+            audit.estop_unverified(self._station, fault)
             self._press(request, None, at, str(fault))
         else:
             if login is not None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from evaweb.datasets.finding import Overview
 from evaweb.datasets.listing import RESULTS, VERDICTS
-from evaweb.lists import SEARCH, Column, Filter
+from evaweb.lists import SEARCH, Column, Filter, words_of
 
 COLUMNS = (
     Column("dataset", "Dataset", ("short",), lambda row: row.short),
@@ -36,7 +36,7 @@ def filters(found: Sequence[Overview]) -> list[Filter]:
 def fits(one: Overview, *, words: str, robot: str, version: str) -> bool:
     """True if the dataset is one of those that are meant; "" where it does not matter."""
     return (
-        all(word in one.name.casefold() for word in words.casefold().split())
+        all(word in one.name.casefold() for word in words_of(words.casefold()))
         and robot in ("", one.robot)
         and version in ("", one.version)
     )

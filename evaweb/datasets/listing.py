@@ -9,6 +9,7 @@ from uuid import UUID
 
 from evaweb.datasets.finding import opened
 from evaweb.episodes.models import Episode
+from evaweb.lists import words_of
 from runtime.datasets import layout
 from runtime.datasets.reader import Dataset
 from runtime.recording.files import RecordingError
@@ -41,15 +42,17 @@ class Row:
 
 
 def rows(name: str, *, words: str = "", success: str = "", result: str = "", verdict: str = "") -> list[Row]:
-    """The episodes of a dataset, narrowed to those whose task or uuid has all `words`, and so on; RecordingError.
+    """The episodes of a dataset, narrowed to those whose task or uuid has all `words`, and so on.
 
     `success` is one of SUCCESSES, `result` one of RESULTS, `verdict` one of VERDICTS; others choose nothing.
+    RecordingError; EvaError where there are too many words.
     """
+    wanted = words_of(words.lower())
     dataset = opened(name)
     told = told_of(dataset)
     known = _known([str(line.get("uuid")) for line in told.values()])
     found = [_row(dataset, listed, told.get(listed.index, {}), known) for listed in dataset.episodes]
-    return [row for row in found if _fits(row, words.lower().split(), success, result, verdict)]
+    return [row for row in found if _fits(row, wanted, success, result, verdict)]
 
 
 def told_of(dataset: Dataset) -> dict[int, Mapping[str, Any]]:

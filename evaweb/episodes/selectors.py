@@ -19,6 +19,7 @@ from evaweb.errors import NotFound
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.workers import waiting_for
+from evaweb.lists import words_of
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError, read_document
 from runtime.recording.layout import Layout
@@ -92,7 +93,7 @@ def episode_list(
 
     In the names of checkpoints only as far as `sight` does not hide them.
 
-    `quality` is a key of QUALITY, `review` one of REVIEW; others choose nothing.
+    `quality` is a key of QUALITY, `review` one of REVIEW; others choose nothing. EvaError: too many words.
     """
     newest = (F("started_at").desc(nulls_last=True), "-created_at")
     found = Episode.objects.select_related(*_WITH).prefetch_related("tags").order_by(*newest)
@@ -106,7 +107,7 @@ def episode_list(
         found = found.filter(tags__words=tag)
     found = found.filter(QUALITY.get(quality, _ALL)[1], REVIEW.get(review, _ALL)[1])
     seen = ~Q(checkpoint__in=sight.names) & ~Q(trial__checkpoint__in=sight.checkpoints)
-    for word in words.split():
+    for word in words_of(words):
         found = found.filter(
             Q(task__icontains=word)
             | (Q(checkpoint__icontains=word) & seen if not sight.clear else Q(checkpoint__icontains=word))

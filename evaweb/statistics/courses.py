@@ -85,6 +85,30 @@ def pairs_needed(rule: str, p_first: float, p_second: float, power: float, alpha
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """Of each design in the order of RULES: what a power needs, its course of so many pairs, its power by gain."""
+
+    needs: tuple[Course | None, ...]
+    chances: tuple[Course, ...]
+    powers: tuple[tuple[float, ...], ...]
+
+
+def outlook(
+    p_first: float, p_second: float, power: float, alpha: float, pairs: int, gains: tuple[float, ...]
+) -> Outlook:
+    """All designs at these rates, as far as 0 to 250 pairs go; `gains` are those over the first rate."""
+    needs = tuple(pairs_needed(rule, p_first, p_second, power, alpha) for rule in RULES)
+    if not pairs:
+        return Outlook(needs, (), ())
+    chances = tuple(course(rule, pairs, p_first, p_second, alpha) for rule in RULES)
+    better = [round(p_first + gain, 9) for gain in gains]
+    powers = tuple(
+        tuple(course(rule, pairs, p_first, rate, alpha).power for rule in RULES) for rate in better
+    )
+    return Outlook(needs, chances, powers)
+
+
 @lru_cache(maxsize=128)
 def _boundary(shape: str, pairs: int, alpha: float, margin: float | None, at: tuple[int, ...]) -> Boundary:
     return boundary(in_pairs(pairs, at or None), alpha=alpha, shape=shape, margin=margin)

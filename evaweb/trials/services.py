@@ -14,11 +14,12 @@ from django.db.models import Max
 
 from evaweb.episodes.selectors import unrecorded_because
 from evaweb.episodes.services import publish_asked
-from evaweb.errors import Conflict, EvaError, NotFound
+from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.journal import text
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require, role_of
 from evaweb.stations.commands import identity_of
 from evaweb.stations.models import Station
+from evaweb.stations.selectors import lease_open
 from evaweb.trials import failures, lifecycle
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import (
@@ -49,6 +50,11 @@ _SWITCHED_OFF = Pattern(
 _POSITION_OF_ANOTHER_SCENE = Pattern(
     "trials.services.position_of_another_scene",
     "position {position} is not one of scene {name}",
+)
+_OF_ANOTHER = Pattern(
+    "trials.services.of_another",
+    "trial {trial} is {operator}'s, and {user} does not have {station}; allowed: {operator}, who has {station}, "
+    "and administrators",
 )
 _SEED = Pattern("trials.services.seed", "seed = {seed}; allowed: 0 to {highest_seed}")
 _UNFINISHED = Pattern(
@@ -316,6 +322,8 @@ def trial_score(
         if first is not None and uuid is not None:
             raise Conflict(_UUID_OF_ANOTHER_SCORE(uuid=uuid, trial_id=first.trial_id))
         require_scorable(held, words["reason"])
+        if held.verdict is not None:
+            require_own(held, user)
         found = judged()
         failures.check_failure(
             held.scene,
@@ -341,6 +349,7 @@ def trial_abandon(*, user: User, trial: Trial, reason: str = "") -> Trial:
         why = f"{why} ({user.get_username()})"
         if (held.status, held.reason) == (TrialStatus.ABANDONED, why):
             return held  # asked for once more, because the answer was lost
+        require_own(held, user)
         lifecycle.apply(held, Move.ABANDON)
         held.reason = why
         held.save()
@@ -410,6 +419,16 @@ def require_scorable(trial: Trial, reason: str) -> None:
     unrecorded = "" if trial.status == TrialStatus.SCORED else unrecorded_because(episode=trial.episode)
     if unrecorded:
         raise Conflict(_NEVER_RAN(trial=trial.pk, unrecorded=unrecorded))
+
+
+def require_own(trial: Trial, user: User) -> None:
+    """NotAllowed where what another has done is to be undone, by who has no business at the station now."""
+    if user.pk == trial.operator_id or role_of(user) is Role.ADMIN:
+        return
+    lease = lease_open(station=trial.station)
+    if lease is None or lease.user_id != user.pk:
+        named = {"operator": trial.operator.get_username(), "user": user.get_username()}
+        raise NotAllowed(_OF_ANOTHER(trial=trial.pk, station=trial.station.name, **named))
 
 
 def _repeated(trial: Trial) -> bool:

@@ -14,6 +14,7 @@ from django.db import Error, connections
 from django.test import TransactionTestCase
 from pytest_django import DjangoDbBlocker
 
+from evaweb import computing
 from evaweb.errors import NotFound
 from evaweb.stations import commands, stops
 from evaweb.stations.models import Command, Station
@@ -45,6 +46,13 @@ def _noted_in_the_tests_own_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 def _estops_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """As long as EVA_COMMAND_TIMEOUT_S says: a press that a slow machine answers late is no press without answer."""
     monkeypatch.setattr(stops, "_ESTOP_S", PATIENCE_S)
+
+
+@pytest.fixture(autouse=True)
+def _computing_has_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody's budget is used up, and no slow machine is a refusal."""
+    here = computing.Questions(lambda work, *given: (work(*given), 0.0), patience_s=PATIENCE_S)
+    monkeypatch.setattr(computing, "questions", here)
 
 
 @pytest.fixture(autouse=True)

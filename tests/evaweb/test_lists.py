@@ -48,6 +48,7 @@ def test_a_head_sorts_turns_round_and_lets_go():
         ("sort=path", "sort = 'path'; allowed: name, size"),
         ("kind=c", "kind = 'c'; allowed: a, b"),
         (f"words={'a+' * 500}", "words has 999 characters; allowed: at most 200"),
+        ("words=a+b+c+d+e+f+g+h+i+j+k+l+m+n+o+p+q+q", "words has 17 different words; allowed: at most 16"),
     ],
 )
 def test_what_is_unknown_is_named_and_nothing_is_narrowed(query, said):

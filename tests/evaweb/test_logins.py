@@ -14,6 +14,7 @@ from django.utils import timezone
 
 from evaweb import audit
 from evaweb.api.tokens import token_create
+from evaweb.lockout import MOST_NAMES
 from evaweb.rarely import Rarely
 from tests.evaweb.trials import builders
 
@@ -54,6 +55,31 @@ def test_others_and_other_addresses_are_not_locked(ann):
     assert locked().status_code == 429
     assert login(password="ann", address="10.0.0.6").status_code == 302
     assert login("bob", "bob").status_code == 302
+
+
+def test_another_address_of_the_same_network_of_ipv6_is_no_other_one(ann):
+    for number in range(MOST):
+        answer = login(address=f"2001:db8:1:2::{number + 1:x}")
+    assert answer.status_code == 429
+    assert login(password="ann", address="2001:db8:1:2:ffff::9").status_code == 429
+    assert login(password="ann", address="2001:db8:1:3::1").status_code == 302
+
+
+def test_who_guesses_many_names_is_locked_for_all_at_that_address_until_they_are_fewer(ann):
+    for number in range(MOST_NAMES):
+        assert login(f"name{number}").status_code == 200
+    for name, password in (("ann", "ann"), ("another", WRONG)):
+        answer = login(name, password)
+        assert answer.status_code == 429
+        assert (
+            f"wrong for {MOST_NAMES} names from this computer. Try again in 15 min" in answer.content.decode()
+        )
+        assert 0 < int(answer["Retry-After"]) <= 900
+    assert not AccessAttempt.objects.filter(username__in=("ann", "another")).exists()  # it is not prolonged
+    assert login(password="ann", address="10.0.0.6").status_code == 302
+    first = AccessAttempt.objects.filter(username="name0")
+    first.update(attempt_time=timezone.now() - settings.AXES_COOLOFF_TIME)
+    assert login(password="ann").status_code == 302
 
 
 def test_the_lock_ends_by_itself_and_trying_does_not_prolong_it(ann):
@@ -151,4 +177,19 @@ def test_refused_tokens_are_logged_once_a_minute_for_an_address(monkeypatch, cap
     assert caplog.messages == [
         "a token from 10.0.0.5 is not known",
         "a token from 10.0.0.5 is not known (2 before it)",
+    ]
+
+
+def test_a_crowd_of_unverified_presses_is_a_line_in_ten_seconds_of_each_station(caplog, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(audit, "_unverified", Rarely(10.0, 16, clock=lambda: now[0]))
+    for _ in range(500):
+        audit.estop_unverified("bench-1", TimeoutError("no turn"))
+    audit.estop_unverified("bench-2", TimeoutError("no turn"))
+    now[0] = 11.0
+    audit.estop_unverified("bench-1", TimeoutError("no turn"))
+    assert [record.getMessage() for record in caplog.records] == [
+        "an e-stop of 'bench-1' is obeyed, of nobody knows whom: no turn",
+        "an e-stop of 'bench-2' is obeyed, of nobody knows whom: no turn",
+        "an e-stop of 'bench-1' is obeyed, of nobody knows whom: no turn (499 before it)",
     ]

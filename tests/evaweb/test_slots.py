@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 
 import pytest
+from asgiref.sync import ThreadSensitiveContext, sync_to_async
 
 from evaweb import lock_wait, slots
 from evaweb.slots import Slots
+from tests.processes import PATIENCE_S
 
 
 class Application:
@@ -27,7 +30,22 @@ class Application:
 
 
 def asked(path="/", method="GET"):
-    return {"type": "http", "method": method, "path": path}
+    return {"type": "http", "method": method, "path": path, "headers": []}
+
+
+def a_request():
+    """What daphne tells of a request: its body, and once it hangs up that it did."""
+    return queue_of({"type": "http.request", "body": b"", "more_body": False}).get
+
+
+def queue_of(*messages):
+    found = asyncio.Queue()
+    for message in messages:
+        found.put_nowait(message)
+    return found
+
+
+GONE = {"type": "http.disconnect"}
 
 
 def statuses(sent):
@@ -49,9 +67,8 @@ def test_so_many_are_worked_on_so_many_wait_and_the_others_are_told():
         async def send(message):
             sent.append(message)
 
-        tasks = [asyncio.create_task(turns(asked(), None, send)) for _ in range(9)]
-        while len(statuses(sent)) < 4:
-            await asyncio.sleep(0)
+        tasks = [asyncio.create_task(turns(asked(), a_request(), send)) for _ in range(9)]
+        await turn_of_the_loop(lambda: len(statuses(sent)) == 4)
         assert statuses(sent) == [503] * 4
         await turns(asked("/healthz"), None, send)
         assert statuses(sent)[4:] == [200]
@@ -64,19 +81,92 @@ def test_so_many_are_worked_on_so_many_wait_and_the_others_are_told():
 
 
 @pytest.mark.usefixtures("few")
-def test_one_that_goes_away_while_it_waits_gives_its_place_back():
+def test_one_that_hangs_up_while_it_waits_gives_its_place_back():
     async def scenario():
         application = Application()
         turns = Slots(application)
-        tasks = [asyncio.create_task(turns(asked(), None, _nowhere)) for _ in range(5)]
-        while application.at_once < 2:
-            await asyncio.sleep(0)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        clients = [queue_of() for _ in range(5)]
+        tasks = [asyncio.create_task(turns(asked(), client.get, _nowhere)) for client in clients]
+        await turn_of_the_loop(lambda: application.at_once == 2)
+        for client in clients:
+            client.put_nowait(GONE)
+        await turn_of_the_loop(lambda: len(turns._tasks) == 2)
         application.may_end.set()
-        await asyncio.gather(*(turns(asked(), None, _nowhere) for _ in range(5)))
-        assert turns._waiting == 0
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await asyncio.gather(*(turns(asked(), a_request(), _nowhere) for _ in range(5)))
+        assert (application.most, len(application.hurries)) == (2, 7)
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.usefixtures("few")
+def test_a_turn_lasts_as_long_as_its_thread_whoever_hangs_up():
+    """As daphne does it: it says that the client is gone, and ends what waits for the answer."""
+
+    async def scenario():
+        free, begun = threading.Event(), []
+
+        def view(scope, receive, send):
+            begun.append(scope)
+            assert free.wait(PATIENCE_S)
+
+        async def application(scope, receive, send):
+            async with ThreadSensitiveContext():
+                await django_like(sync_to_async(view)(scope, receive, send), receive)
+
+        turns = Slots(application)
+        for _ in range(4):
+            client = queue_of({"type": "http.request"})
+            task = asyncio.create_task(turns(asked(), client.get, _nowhere))
+            await turn_of_the_loop(client.empty)
+            client.put_nowait(GONE)
+            await turn_of_the_loop(client.empty)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+        await turn_of_the_loop(lambda: len(begun) > 1)
+        assert len(begun) == 2
+        free.set()
+        await turns(asked(), a_request(), _nowhere)
+        assert len(begun) == 3
+
+    asyncio.run(scenario())
+
+
+async def django_like(work, receive):
+    """Work that its handler leaves when the client hangs up."""
+    await receive()
+    found, gone = asyncio.ensure_future(work), asyncio.ensure_future(receive())
+    await asyncio.wait((found, gone), return_when=asyncio.FIRST_COMPLETED)
+    for one in (found, gone):
+        one.cancel()
+    await asyncio.gather(found, gone, return_exceptions=True)
+
+
+async def turn_of_the_loop(check):
+    deadline = asyncio.get_running_loop().time() + PATIENCE_S
+    while not check():
+        assert asyncio.get_running_loop().time() < deadline
+        await asyncio.sleep(0.001)
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
+def test_nothing_more_is_made_for_who_has_hung_up():
+    async def scenario():
+        client, made = queue_of({"type": "http.request"}), []
+
+        async def application(scope, receive, send):
+            await receive()
+            for number in range(5):
+                made.append(number)
+                await send({"type": "http.response.body", "more_body": True})
+                if number == 1:
+                    client.put_nowait(GONE)
+                    await turn_of_the_loop(client.empty)
+
+        with pytest.raises(asyncio.CancelledError):
+            await Slots(application)(asked(), client.get, _nowhere)
+        assert made == [0, 1, 2]
 
     asyncio.run(scenario())
 
@@ -95,7 +185,7 @@ def test_what_commands_does_not_wait_long_for_the_database():
             asked("/api/v1/stations/b"),
             asked("/x", "POST"),
         ):
-            await turns(scope, None, _nowhere)
+            await turns(scope, a_request(), _nowhere)
         assert application.hurries == [lock_wait.HURRY_S, None, None]
 
     asyncio.run(scenario())

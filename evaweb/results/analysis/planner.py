@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from evaweb import computing
 from evaweb.errors import EvaError
 from evaweb.plans.models import Comparing
 from evaweb.statistics.boundaries import MOST
-from evaweb.statistics.courses import Course, course, pairs_needed
+from evaweb.statistics.courses import Course, Outlook, outlook
 from evaweb.statistics.designs import RULES
 from evaweb.statistics.planning import detectable
 from runtime.core.sentences import Pattern
@@ -103,32 +104,36 @@ def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
     return question
 
 
-def table_of(q: Question) -> dict[str, Any]:
-    """What each design needs for the question, what the time there is for finds, and the gains that it finds."""
+def table_of(q: Question, person: Hashable) -> dict[str, Any]:
+    """What each design needs for the question, what the time there is for finds, and the gains that it finds.
+
+    Computed for `person`; Busy beyond what theirs may take.
+    """
     comparisons = COMPARISONS[Comparing(q.comparing)](q.checkpoints)
     alpha = q.alpha / comparisons
     affordable = int(q.hours * 3600 * q.stations / q.cycle_s / q.checkpoints)
     tried = min(affordable, MOST)
+    gains = tuple(gain for gain in _GAINS if q.rate + gain <= 1)
+    found: Outlook = computing.questions.ask(person, outlook, q.rate, q.better, q.power, alpha, tried, gains)
     return {
         "comparisons": comparisons,
         "alpha": alpha,
         "most": MOST,
-        "designs": [needed(q, rule, alpha, alone=comparisons == 1) for rule in RULES],
+        "designs": [
+            told(q, rule, need, alone=comparisons == 1) for rule, need in zip(RULES, found.needs, strict=True)
+        ],
         "affordable": affordable,
         "tried": tried,
-        "chances": [asdict(course(rule, tried, q.rate, q.better, alpha)) for rule in RULES] if tried else [],
-        "gains": [_curve(q, gain, tried, alpha) for gain in _GAINS if q.rate + gain <= 1] if tried else [],
+        "chances": [asdict(one) for one in found.chances],
+        "gains": [
+            {"gain": gain, "powers": list(powers)} for gain, powers in zip(gains, found.powers, strict=False)
+        ],
         "detectable": detectable(affordable, q.rate, q.power, alpha) if affordable else None,
     }
 
 
-def needed(q: Question, rule: str, alpha: float, *, alone: bool) -> dict[str, Any]:
-    """A design that has the power that is asked for: its trials at worst and on average, with hours at the robots."""
-    return told(q, rule, pairs_needed(rule, q.rate, q.better, q.power, alpha), alone=alone)
-
-
 def told(q: Question, rule: str, found: Course | None, *, alone: bool) -> dict[str, Any]:
-    """The same of a design that was found, None where none has the power."""
+    """A design that has the power: its trials at worst and on average, with hours at the robots; None: none has it."""
     if found is None:
         return {"rule": rule, "pairs": None}
     hour = q.checkpoints * q.cycle_s / 3600
@@ -140,12 +145,4 @@ def told(q: Question, rule: str, found: Course | None, *, alone: bool) -> dict[s
         "robot_hours": found.pairs * hour,
         "mean_hours": found.mean * hour if alone else None,
         "hours": found.pairs * hour / q.stations,
-    }
-
-
-def _curve(q: Question, gain: float, pairs: int, alpha: float) -> dict[str, Any]:
-    """Power of each design of so many pairs against a gain over the weaker rate."""
-    return {
-        "gain": gain,
-        "powers": [course(rule, pairs, q.rate, round(q.rate + gain, 9), alpha).power for rule in RULES],
     }

@@ -1,7 +1,7 @@
 """Power of a draft's design at assumed rates, computed beside the page: what there is so far, until all is there.
 
-One thread of each process computes, one number after the other. What nobody asks for any more is given up between two
-of them, and what was computed is known afterwards.
+One thread of each process of the web has it computed, one number after the other. What nobody asks for any more is
+given up between two of them, and what was computed is known afterwards.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from dataclasses import dataclass, field, replace
 from threading import Condition
 from typing import Any
 
-from evaweb.results.analysis.planner import Question, needed, told
+from evaweb import computing
+from evaweb.results.analysis.planner import Question, told
 from evaweb.statistics import score_courses
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.boundaries import MOST
-from evaweb.statistics.courses import Course, course
+from evaweb.statistics.courses import Course, course, pairs_needed
 from evaweb.statistics.designs import ANYTIME, RULES
 from evaweb.statistics.score_courses import Scores, score_course, score_pairs_needed
 
@@ -65,11 +66,11 @@ class Asked:
     def at(self, rule: str, pairs: int) -> Course:
         """Course of a design of so many pairs, its looks at the same shares of the trials."""
         if self.scores is not None:
-            return score_course(rule, pairs, self.scores, self.alpha)
+            return _computed(score_course, rule, pairs, self.scores, self.alpha)
         looks = self.looks if rule == self.rule else ()
         scaled = tuple(sorted({max(1, round(look * pairs / self.pairs)) for look in looks}))
         new, control = self.question.better, self.question.rate
-        return course(rule, pairs, new, control, self.alpha, self.margin, scaled)
+        return _computed(course, rule, pairs, new, control, self.alpha, self.margin, scaled)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +92,11 @@ class Figures:
         """The courses at the planned number of trials, by design."""
         found = ((rule, one) for rule, curve in self.curves.items() for one in curve)
         return {rule: one for rule, one in found if one.pairs == asked.pairs}
+
+
+def _computed(work: Callable[..., Any], *given: Any) -> Any:
+    """Beside the web; all drafts have one share, because they are computed one after the other."""
+    return computing.questions.compute("drafts", work, *given)
 
 
 _Step = Callable[[Figures], Figures]
@@ -120,10 +126,10 @@ def _need(asked: Asked, rule: str) -> _Step:
     def step(so_far: Figures) -> Figures:
         question = asked.question
         if asked.scores is None:
-            row = needed(question, rule, asked.alpha, alone=asked.alone)
+            found = _computed(pairs_needed, rule, question.rate, question.better, question.power, asked.alpha)
         else:
-            found = score_pairs_needed(rule, asked.scores, question.power, asked.alpha)
-            row = told(question, rule, found, alone=asked.alone)
+            found = _computed(score_pairs_needed, rule, asked.scores, question.power, asked.alpha)
+        row = told(question, rule, found, alone=asked.alone)
         return replace(so_far, needs={**so_far.needs, rule: row})
 
     return step

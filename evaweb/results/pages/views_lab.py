@@ -12,8 +12,9 @@ from django.views.decorators.http import require_GET
 from evaweb.blinding import Sight, sight_for
 from evaweb.errors import EvaError
 from evaweb.plans.models import Comparing, PlanState
+from evaweb.refusals import retrying
 from evaweb.results import selectors
-from evaweb.results.analysis.planner import question_of, table_of
+from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.ratings.unblinding import why_sealed
 from evaweb.roles import Role, role_of
 
@@ -38,13 +39,13 @@ def wall(request: HttpRequest) -> HttpResponse:
 @require_GET
 def planner(request: HttpRequest) -> HttpResponse:
     """Trials and robot hours for a wanted difference, and what cannot be detected."""
-    fault = None
+    fault = table = None
+    question = Question()
     try:
         question = question_of(request.GET)
-        table = table_of(question)
+        table = table_of(question, request.user.pk)
     except EvaError as error:
-        fault, question = error, question_of({})
-        table = table_of(question)
+        fault = error
     context = {"question": question, "table": table, "fault": fault, "comparing": Comparing.choices}
     carried = ("rate", "better", "alpha", "power", "cycle_s", "comparing")
     context |= {
@@ -52,7 +53,8 @@ def planner(request: HttpRequest) -> HttpResponse:
         "may_draft": role_of(request.user) is Role.ADMIN,
         "carried": urlencode({name: getattr(question, name) for name in carried}),
     }
-    return render(request, "results/planner.html", context, status=fault.status if fault else 200)
+    answer = render(request, "results/planner.html", context, status=fault.status if fault else 200)
+    return answer if fault is None else retrying(answer, fault)
 
 
 def _lab(request: HttpRequest) -> dict[str, Any]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
+from daphne.ws_protocol import WebSocketProtocol
+from twisted.internet.abstract import FileDescriptor
 
 from evaweb.console.quota import AT_ONCE, Quota
-from evaweb.console.sockets import _MOST_PARTS, PING, CountedSocket
+from evaweb.console.sockets import _MOST_PARTS, PING, CountedSocket, unsent
 from evaweb.console.turns import Turns
 
 
@@ -87,3 +89,35 @@ def test_a_message_in_endless_parts_ends_the_socket_and_many_messages_do_not(soc
     for _ in range(_MOST_PARTS + 1):
         socket.onMessageFrameBegin(0)
     assert socket.cut == [f"a message in more than {_MOST_PARTS} parts"]
+
+
+class Wire(FileDescriptor):
+    """A connection of Twisted's whose other end reads as much as the test says."""
+
+    def __init__(self):
+        super().__init__(SimpleNamespace(addWriter=lambda writer: None, removeWriter=lambda writer: None))
+        self.connected, self.takes = 1, 0
+
+    def writeSomeData(self, data):
+        return min(self.takes, len(data))
+
+
+def test_a_page_that_does_not_read_is_cut_off_and_one_that_does_is_not(socket, settings, monkeypatch):
+    settings.EVA_UNREAD_BYTES = 1000
+    monkeypatch.setattr(
+        WebSocketProtocol, "sendData", lambda self, data: self.transport.transport.write(data)
+    )
+    wire = Wire()
+    socket.transport = SimpleNamespace(transport=wire)
+    for _ in range(4):  # three times as much as may lie there
+        socket.sendData(b"x" * 750)
+        wire.takes = 500
+        wire.doWrite()
+        wire.doWrite()
+    assert (unsent(wire), socket.cut) == (0, [])
+    wire.takes = 0
+    socket.sendData(b"x" * 1000)
+    wire.doWrite()
+    assert (unsent(wire), socket.cut) == (1000, [])
+    socket.sendData(b"x")
+    assert socket.cut == ["more than 1000 bytes were not read"]

@@ -1,10 +1,12 @@
 import pytest
+from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.blinding_rules import look
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
+from evaweb.stations.models import Lease
 from evaweb.trials import corrections, services, voids
 from evaweb.trials.models import Milestone
 from evaweb.trials.record import JUDGEMENTS, file_of
@@ -107,3 +109,29 @@ def test_a_scene_that_changed_since_changes_no_score_whose_failure_is_corrected(
     *_, line = JUDGEMENTS.read(file_of(trial), pytest.fail)
     assert (line.uuid, line.score) == (after.uuid, before.score)
     assert [outcome.points for outcome in line.milestones] == [row.points for row in before.outcomes.all()]
+
+
+@pytest.mark.parametrize("what", ["score", "failure", "abandon"])
+def test_what_another_has_done_is_undone_by_who_has_the_station_now_and_administrators(bench, terms, what):
+    trial = bench.prepare() if what == "abandon" else bench.ended()
+    if what != "abandon":
+        score(bench, trial, **SAID)
+    undo = {
+        "score": lambda who: score(bench, trial, user=who, reason=f"{who} saw it"),
+        "failure": lambda who: corrected(bench, trial, user=who, failure="missed"),
+        "abandon": lambda who: services.trial_abandon(user=who, trial=trial),
+    }[what]
+    bob, alma = builders.user("bob"), builders.user("alma", "admin")
+    lease = Lease.objects.create(station=bench.station, user=bench.operator, holder="web:ann:p1", epoch=1)
+    for changed in ({}, {"user": bob, "ended_at": timezone.now()}):
+        Lease.objects.filter(pk=lease.pk).update(**changed)
+        with pytest.raises(
+            NotAllowed, match=rf"trial {trial.pk} is ann's, and bob does not have bench-1; allowed: ann"
+        ):
+            undo(bob)
+    Lease.objects.filter(pk=lease.pk).update(ended_at=None)
+    undo(bob)
+    trial.refresh_from_db()
+    assert "bob" in (trial.reason if what == "abandon" else trial.verdict.rater.get_username())
+    if what == "score":
+        assert undo(alma).rater == alma

@@ -1,0 +1,213 @@
+"""What computes long for pages: in one process beside the web, by a budget for each person, with its answers kept.
+
+Whoever asks waits in a thread of a request, of which the web has few: so few wait at once, and not long. Nothing that
+stops a robot, keeps a lease or shows a page waits for any of them.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future
+from functools import partial
+from math import ceil
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from evaweb.errors import EvaError
+from evaweb.lookups import Crowded, Lookups
+from runtime.core.sentences import Pattern, fixed
+
+log = logging.getLogger(__name__)
+AT_ONCE_S = 30.0  # of computing that a person may have asked for; a question of the planner takes up to 10 s
+REFILLED = 0.1  # seconds of it that are given back each second
+_PATIENCE_S = 20.0  # for which a request waits; what it asked for goes on, and is known when it comes again
+_MOST_WAITING = 8  # requests; the web works on 32 at once
+_MOST_ASKED = 32  # questions that wait for the process, of all persons together
+_KEPT = 512  # answers
+_AGAIN_S = 5
+_NICE = 19
+_ROOT = Path(__file__).parents[1]
+_UNDER_WAY = fixed(
+    "web.computing.under_way", "your question is being computed: ask it again in a few seconds"
+)
+_ONE_AT_A_TIME = fixed(
+    "web.computing.one_at_a_time",
+    "another question of yours is being computed; allowed: one at a time. Try again in a few seconds",
+)
+_SPENT = Pattern(
+    "web.computing.spent",
+    "your questions have taken {spent:.0f} s of computing; allowed: {at_once:g} s at once. Try again in {seconds:d} s",
+)
+_CROWDED = fixed("web.computing.crowded", "too many questions are being computed: try again in a few seconds")
+_LOST = fixed(
+    "web.computing.lost", "the process that computes has ended: try again; the log of the web says more"
+)
+
+
+class Busy(EvaError):
+    """It is not computed yet, or not for this person now; `retry_after_s` says when to ask again."""
+
+    status = 503
+
+    def __init__(self, sentence: str, retry_after_s: int = _AGAIN_S) -> None:
+        super().__init__(sentence)
+        self.retry_after_s = retry_after_s
+
+
+class Beside:
+    """The process that computes, started with its first question and again after it has ended; for one thread."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._wire: Connection[Any, Any] | None = None
+
+    def run(self, work: Callable[..., Any], *given: Any) -> tuple[Any, float]:
+        """What `work`, a function of a module, makes of these, and its processor time [s]; Busy, its errors."""
+        try:
+            if self._wire is None:
+                self._wire = self._start()
+            self._wire.send((work, given))
+            done, found, seconds = self._wire.recv()
+        except (EOFError, OSError) as error:
+            log.error("the process that computes has ended: %r", error)
+            self.end()
+            raise Busy(_LOST) from error
+        if not done:
+            raise found
+        return found, seconds
+
+    def _start(self) -> Connection[Any, Any]:
+        here, there = socket.socketpair()
+        with there:
+            command = [sys.executable, "-m", "evaweb.computing", str(there.fileno())]
+            self._process = subprocess.Popen(
+                command, pass_fds=[there.fileno()], stdin=subprocess.DEVNULL, cwd=_ROOT
+            )
+        return Connection(here.detach())
+
+    def end(self) -> None:
+        """It ends now; the next question starts another one."""
+        if self._wire is not None:
+            self._wire.close()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        self._wire = self._process = None
+
+
+class Questions:
+    """Questions that `run` answers, one after the other, the persons in turn; from any thread."""
+
+    def __init__(
+        self,
+        run: Callable[..., tuple[Any, float]],
+        clock: Callable[[], float] = time.monotonic,
+        patience_s: float = _PATIENCE_S,
+    ) -> None:
+        self._run, self._clock, self._patience_s = run, clock, patience_s
+        self._lock = threading.Lock()
+        self._turns: Lookups[Any] = Lookups(1, _MOST_ASKED)
+        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
+        self._asked: dict[
+            Hashable, tuple[Hashable, Future[Any]]
+        ] = {}  # by question: who asked first, and what comes
+        self._spent: dict[Hashable, tuple[float, float]] = {}  # by person: seconds, and when that was so
+        self._waiting = 0
+
+    def ask(self, person: Hashable, work: Callable[..., Any], *given: Any) -> Any:
+        """What `work` makes of these; Busy where it is not known in time, or beyond the person's budget; its errors."""
+        question = (work, given)
+        with self._lock:
+            if question in self._kept:
+                self._kept.move_to_end(question)
+                return self._kept[question]
+            if self._waiting >= _MOST_WAITING:
+                raise Busy(_CROWDED)
+            coming = self._asked[question][1] if question in self._asked else self._begun(person, question)
+            self._waiting += 1
+        try:
+            return coming.result(self._patience_s)
+        except TimeoutError:
+            raise Busy(_UNDER_WAY) from None
+        except Crowded:
+            raise Busy(_CROWDED) from None
+        finally:
+            with self._lock:
+                self._waiting -= 1
+
+    def compute(self, share: Hashable, work: Callable[..., Any], *given: Any) -> Any:
+        """The same in the turn of `share`, however long it takes: for a thread that is no request's."""
+        found, _ = self._turns.ask(share, partial(self._run, work, *given)).result()
+        return found
+
+    def _begun(self, person: Hashable, question: tuple[Callable[..., Any], tuple[Any, ...]]) -> Future[Any]:
+        if any(who == person for who, _ in list(self._asked.values())):
+            raise Busy(_ONE_AT_A_TIME)
+        spent = self._spent_by(person)
+        if spent >= AT_ONCE_S:
+            wait = ceil((spent - AT_ONCE_S) / REFILLED) + 1
+            raise Busy(_SPENT(spent=spent, at_once=AT_ONCE_S, seconds=wait), wait)
+        coming: Future[Any] = self._turns.ask(person, partial(self._answered, person, question))
+        if not coming.done():  # else there was no room for it
+            self._asked[question] = (person, coming)
+            coming.add_done_callback(lambda _: self._asked.pop(question, None))
+        return coming
+
+    def _answered(self, person: Hashable, question: tuple[Callable[..., Any], tuple[Any, ...]]) -> Any:
+        work, given = question
+        found, seconds = self._run(work, *given)
+        with self._lock:
+            self._spent[person] = (self._spent_by(person) + seconds, self._clock())
+            self._kept[question] = found
+            while len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        return found
+
+    def _spent_by(self, person: Hashable) -> float:
+        seconds, at = self._spent.get(person, (0.0, 0.0))
+        return max(0.0, seconds - REFILLED * (self._clock() - at))
+
+
+questions = Questions(Beside().run)
+
+
+def _main() -> None:
+    """Answer what comes over the socket that we were given, until whoever asks is gone."""
+    wire = Connection(int(sys.argv[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the web ends us
+    os.nice(_NICE)
+    threading.Thread(target=_end_with, args=(wire.fileno(),), daemon=True).start()
+    while True:
+        try:
+            work, given = wire.recv()
+        except (EOFError, ConnectionError):
+            return
+        began = time.process_time()
+        try:
+            done, found = True, work(*given)
+        except Exception as fault:  # it is raised where it was asked
+            done, found = False, fault
+        wire.send((done, found, time.process_time() - began))
+
+
+def _end_with(descriptor: int) -> None:
+    """Whoever asks is gone: nobody waits for what is being computed."""
+    gone = select.poll()
+    gone.register(descriptor, select.POLLRDHUP)
+    gone.poll()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    _main()
