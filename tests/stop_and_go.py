@@ -35,7 +35,9 @@ def main() -> int:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.wait(every)
                 break
-            stopped = everybody(root)
+            stopped = [
+                one for one in everybody(root) if not _stands(one)
+            ]  # what a test stopped stays stopped
             _tell(stopped, signal.SIGSTOP)
             time.sleep(seconds)
             _tell(stopped, signal.SIGCONT)
@@ -45,6 +47,12 @@ def main() -> int:
         if child.poll() is None:
             _tell(everybody(root), signal.SIGTERM)
             child.wait()
+
+
+def _stands(process: psutil.Process) -> bool:
+    with contextlib.suppress(psutil.Error):
+        return bool(process.status() == psutil.STATUS_STOPPED)
+    return True
 
 
 def _tell(processes: Sequence[psutil.Process], number: int) -> None:

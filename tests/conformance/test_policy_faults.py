@@ -47,14 +47,14 @@ WEBSOCKET: Faults = {
     "bad_array_dialect": (PolicyError, "MNP"),
     "object_array": (PolicyError, "refused"),
     "exception": (PolicyError, "CUDA out of memory"),
-    "late_reply:0.8": (PolicyTimeout, "the connection is dropped"),
+    "late_reply:4": (PolicyTimeout, "the connection is dropped"),
     "too_large": (PolicyError, "67108865 bytes exceeds limit of 67108864 bytes"),
 }
 GR00T: Faults = {
     "mute_on_connect": (PolicyLostError, "did not send an answer to get_modality_config within"),
     "mute_on_infer:0": (PolicyLostError, "did not send an answer to get_action within 0.4 s"),
     "mute_on_infer:1": (PolicyLostError, "did not send an answer to get_action within 0.4 s"),
-    "late_reply:0.8": (PolicyLostError, "the connection is dropped"),
+    "late_reply:4": (PolicyLostError, "the connection is dropped"),
     "close_mid_reply:0": (PolicyLostError, "closed the connection before an answer"),
     "close_mid_reply:1": (PolicyLostError, "closed the connection before an answer"),
     "wrong_dim": (PolicyError, "rows of 6 numbers; this robot needs 7"),
@@ -95,7 +95,7 @@ FAULTS: dict[str, Faults] = {
         "mute_on_connect": (PolicyLostError, "did not answer Ready within"),
         "mute_on_infer:0": (PolicyLostError, "did not answer GetActions within"),
         "mute_on_infer:1": (PolicyLostError, "did not answer GetActions within"),
-        "late_reply:0.8": (PolicyLostError, "the connection is dropped"),
+        "late_reply:4": (PolicyLostError, "the connection is dropped"),
         "close_mid_reply:0": (PolicyLostError, "closed the connection"),
         "close_mid_reply:1": (PolicyLostError, "closed the connection"),
         "wrong_dim": (PolicyError, "rows of 13 numbers; this robot needs 14"),
@@ -195,7 +195,7 @@ def test_one_batch_and_one_row_are_understood(name: str, fault: str, rows: int |
 def test_a_late_answer_is_never_paired_with_the_next_request(name: str) -> None:
     served = protocol(name)
     deadlines = {"first_inference_deadline": 10.0, "inference_deadline": 0.4}
-    with served.served(Fault("late_reply", "1.5"), **deadlines) as policy:
+    with served.served(Fault("late_reply", "4"), **deadlines) as policy:
         if not served.first:  # else its second request is the first for rows, which may take long
             assert served.begins_at(policy, 0.05)
             with pytest.raises(PolicyTimeout):

@@ -48,13 +48,13 @@ def waits(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Line and sentence of each wait that has a number of its own."""
     known: dict[str, float] = {}
     for statement in tree.body:
-        if isinstance(statement, ast.Assign) and (value := _number(statement.value, known)) is not None:
-            known |= {target.id: value for target in statement.targets if isinstance(target, ast.Name)}
+        if isinstance(statement, ast.Assign) and (number := _number(statement.value, known)) is not None:
+            known |= {target.id: number for target in statement.targets if isinstance(target, ast.Name)}
     for node in ast.walk(tree):
         if isinstance(node, ast.BinOp) and ast.unparse(node.left) == "time.monotonic()":
-            number = _number(node.right, known) or 0.0
-            if isinstance(node.op, ast.Add) and number > LONGEST_S:
-                yield node.lineno, f"a deadline of {number:g} s; allowed: PATIENCE_S"
+            added = _number(node.right, known) or 0.0
+            if isinstance(node.op, ast.Add) and added > LONGEST_S:
+                yield node.lineno, f"a deadline of {added:g} s; allowed: PATIENCE_S"
         if not isinstance(node, ast.Call):
             continue
         name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
@@ -68,12 +68,12 @@ def waits(tree: ast.Module) -> Iterator[tuple[int, str]]:
             place = table.get(name)
             given += [] if place is None else _unpacked(node.args)[: place + 1]
             for value in given:
-                number = _number(value, known) or 0.0
-                playwright = name == "wait_for" and number > 1000
-                if number > LONGEST_S * (1000.0 if playwright else unit):
+                waited = _number(value, known) or 0.0
+                playwright = name == "wait_for" and waited > 1000
+                if waited > LONGEST_S * (1000.0 if playwright else unit):
                     yield (
                         node.lineno,
-                        f"{name} waits {number:g}; allowed: {word}, a turn of {LONGEST_S:g} s",
+                        f"{name} waits {waited:g}; allowed: {word}, a turn of {LONGEST_S:g} s",
                     )
 
 

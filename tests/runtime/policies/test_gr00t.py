@@ -297,7 +297,7 @@ def test_a_model_that_sees_the_past_is_shown_it() -> None:
 
 def test_a_late_answer_is_never_taken_for_the_next_one() -> None:
     with (
-        served(Fault("late_reply", "0.5")) as (_, url),
+        served(Fault("late_reply", "4")) as (_, url),
         policy_at(url, inference_deadline=0.2, first_inference_deadline=20.0) as policy,
     ):
         policy.infer(observation(0.05))

@@ -230,8 +230,8 @@ def test_an_observation_that_was_lost_is_sent_again() -> None:
 
 def test_a_late_answer_is_never_taken_for_the_next_one() -> None:
     with (
-        served(Fault("late_reply", "0.5")) as (server, url),
-        policy_at(url, inference_deadline=0.2, first_inference_deadline=5.0) as policy,
+        served(Fault("late_reply", "4")) as (server, url),
+        policy_at(url, inference_deadline=0.2, first_inference_deadline=20.0) as policy,
     ):
         policy.infer(observation(0.05))
         with pytest.raises(

@@ -787,7 +787,7 @@ def test_the_later_deadline_holds_after_the_first_answer() -> None:
 
 def test_a_late_answer_is_never_paired_with_the_next_request() -> None:
     settings = {"first_inference_deadline": 10.0, "inference_deadline": 1.0}
-    with served(Fault("late_reply", "1.5")) as url, policy_at(url, **settings) as policy:
+    with served(Fault("late_reply", "4")) as url, policy_at(url, **settings) as policy:
         policy.connect()
         assert row_zero_starts_at(policy.infer(observation(0.05)), 0.05)
         with pytest.raises(PolicyTimeout):

@@ -25,7 +25,7 @@ EVERYWHERE = {
     "mute_on_connect": ("timeout", "protocol"),
     "mute_on_infer:0": ("timeout", "infer"),
     "mute_on_infer:1": ("timeout", "infer"),
-    "late_reply:0.8": ("timeout", "infer"),
+    "late_reply:4": ("timeout", "infer"),
     "close_mid_reply:0": ("server_error", "infer"),
     "close_mid_reply:1": ("server_error", "infer"),
     "wrong_dim": ("bad_shape", "shape"),
@@ -98,7 +98,7 @@ def faults_of(name: str) -> dict[str, tuple[str, str]]:
         found = {
             key.replace(":1", ":2").replace(":0", ":1"): what
             for key, what in found.items()
-            if key != "late_reply:0.8"
+            if key != "late_reply:4"
         }
     return found | OWN.get(name, {})
 

@@ -36,8 +36,7 @@ for k in range(10_000):
 """
 
 
-@pytest.mark.some(1)
-@pytest.mark.slow
+@pytest.mark.lab  # its second is a real one
 @pytest.mark.parametrize("rows", [76, 100])
 def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path: Path, rows: int) -> None:
     paths = [Path(runtime.__file__).parents[1], Path(__file__).parent]

@@ -14,7 +14,7 @@ from runtime.clients.channel.names import Names
 from runtime.clients.channel.server import ChannelServer
 from runtime.clients.client import StationClient
 from runtime.ipc.bus import CommandServer, Endpoints
-from runtime.ipc.messages import Ack
+from runtime.ipc.messages import Ack, Command
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.process import CommandService
 from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
@@ -42,7 +42,7 @@ class Bench:
         self._open: list[Script] = []
         self.door = ChannelServer(
             *(self.context, 0, Names("lab", scripts), self.silence_s),
-            lambda name: StationClient(self.folder, name),
+            lambda name: _Patient(self, name),
             lambda: self.now,
         )
         self.channel = self.door.endpoint
@@ -102,6 +102,23 @@ class Bench:
         self._guard.close()
         self.station.close()
         self.context.term()
+
+
+class _Patient(StationClient):
+    """Waits as long as all of the tests for a station that answers; as it would for one that does not."""
+
+    def __init__(self, bench: Bench, name: str) -> None:
+        super().__init__(bench.folder, name)
+        self._bench = bench
+
+    def _command(self, kind: str, timeout: float, *given: Any, **named: Any) -> Ack:
+        return super()._command(kind, self._patience(timeout), *given, **named)
+
+    def _send(self, command: Command, timeout: float) -> Ack:
+        return super()._send(command, self._patience(timeout))
+
+    def _patience(self, timeout: float) -> float:
+        return timeout if self._bench.frozen else PATIENCE_S
 
 
 class Script:

@@ -155,7 +155,7 @@ def test_a_request_that_the_server_cannot_read_is_answered_with_an_error_without
 def test_one_late_reply_is_a_lost_policy_and_the_next_request_is_answered_rightly(dialect: str) -> None:
     settings = {"first_inference_deadline": 10.0, "inference_deadline": 0.5}
     left = Conditioning(np.tile(HOME, (40, 1)), 5, 3, 40)
-    with talking(dialect, Fault("late_reply", "1"), **settings) as policy:
+    with talking(dialect, Fault("late_reply", "4"), **settings) as policy:
         policy.infer(seen(0))
         with pytest.raises(PolicyTimeout):
             policy.infer(seen(10, 0.1), left)

@@ -382,6 +382,11 @@ def test_what_is_no_master_is_named(answer: bytes, said: str) -> None:
         uri = f"http://127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(TransportError, match=f"no ROS master is to be reached at {uri}: {said}"):
             RospyProcess(Site(PYTHON, uri, "127.0.0.1"), "eva_test")
+        server.shutdown(
+            socket.SHUT_RDWR
+        )  # or it would wait on, and take who comes to the next one of this number
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive()
 
 
 @needs_ros1
