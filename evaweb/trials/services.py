@@ -36,7 +36,7 @@ from evaweb.trials.models import (
 from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, file_of
 from evaweb.trials.selectors import attempts_of, trial_open
 from evaweb.trials.station_events import run_changed
-from evaweb.trials.verdicts import LONGEST_NOTE, Verdict, verdict
+from evaweb.trials.verdicts import LONGEST_NOTE, Verdict, reached_in_truth, verdict
 from runtime.core.sentences import Pattern
 
 _PREPARED_AT_ONCE = Pattern(
@@ -62,6 +62,14 @@ _UNFINISHED = Pattern(
     "trial {trial} of {name} is {label}: {advice}, then prepare the next one",
 )
 _SOURCE = Pattern("trials.services.source", "source = {source!r}; allowed: {values}")
+_BENCH_SAYS_NOTHING = Pattern(
+    "trials.services.bench_says_nothing",
+    "source = truth: the bench of trial {trial} has said nothing of it; allowed: human",
+)
+_BENCH_SAYS_OTHERWISE = Pattern(
+    "trials.services.bench_says_otherwise",
+    "source = truth: {milestone!r} = {said}, the bench of trial {trial} says {truth}: say it as a person",
+)
 _UUID_OF_ANOTHER_SCORE = Pattern(
     "trials.services.uuid_of_another_score",
     "uuid {uuid} is that of another score (trial {trial_id}): give each its own",
@@ -325,6 +333,8 @@ def trial_score(
         if held.verdict is not None:
             require_own(held, user)
         found = judged()
+        if source == Score.Source.TRUTH:
+            _require_truth(held, found)
         failures.check_failure(
             held.scene,
             words,
@@ -373,6 +383,18 @@ def settled(trial: Trial, user: Any) -> None:
 def locked(trial: Trial) -> Trial:
     """The trial's row as it is now, kept from others until the transaction ends."""
     return Trial.objects.select_for_update().get(pk=trial.pk)
+
+
+def _require_truth(trial: Trial, found: Verdict) -> None:
+    """EvaError unless the bench of the trial says the same: nobody says more in its name."""
+    if trial.truth is None:
+        raise EvaError(_BENCH_SAYS_NOTHING(trial=trial.pk))
+    for milestone, reached, _ in found.reached:
+        truth = bool(reached_in_truth(trial.truth, milestone))
+        if reached != truth:
+            raise EvaError(
+                _BENCH_SAYS_OTHERWISE(milestone=milestone.text, said=reached, trial=trial.pk, truth=truth)
+            )
 
 
 def _says(score: Score, said: Mapping[str, Any], found: Verdict) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from evaweb.errors import EvaError
 from evaweb.trials.models import Milestone
@@ -98,6 +99,14 @@ def verdict(
         raise EvaError(_SUCCESS_CONTRADICTS_REQUIRED_MILESTONES_WHICH(success=success, implied=implied))
     final = bool(success if implied is None else implied)
     return Verdict(reached, _share(reached, final), final)
+
+
+def reached_in_truth(truth: Mapping[str, Any], milestone: Milestone) -> bool | None:
+    """Whether a simulated bench says that it was reached in time, None where it says nothing of it."""
+    known = truth.get("milestones", {}).get(milestone.truth)
+    at, limit = truth.get("reached", {}).get(milestone.truth), milestone.time_limit_s
+    late = at is not None and limit is not None and at > limit
+    return None if known is None else bool(known) and not late
 
 
 def _answers(milestones: Sequence[Milestone], ticks: Mapping[object, object]) -> dict[int, bool]:

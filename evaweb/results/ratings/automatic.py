@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from django.contrib.auth.models import User
 from django.db import transaction
@@ -31,6 +30,7 @@ from evaweb.roles import Role, require
 from evaweb.trials.models import Milestone, Trial, TrialStatus
 from evaweb.trials.record import file_of
 from evaweb.trials.services import checked
+from evaweb.trials.verdicts import reached_in_truth
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
 
@@ -211,16 +211,8 @@ def _case(trial: Trial, milestones: Sequence[Milestone], found: Found) -> Case:
         trial.scene.criterion,
         tuple(Step(row.text, row.time_limit_s) for row in milestones),
         stills_of(trial.episode) if found.pictures and trial.episode is not None else (),
-        () if found.pictures else tuple(_true(trial.truth or {}, row) for row in milestones),
+        () if found.pictures else tuple(reached_in_truth(trial.truth or {}, row) for row in milestones),
     )
-
-
-def _true(truth: dict[str, Any], milestone: Milestone) -> bool | None:
-    """Whether the bench says that it was reached in time, None where it says nothing of it."""
-    known = truth.get("milestones", {}).get(milestone.truth)
-    at, limit = truth.get("reached", {}).get(milestone.truth), milestone.time_limit_s
-    late = at is not None and limit is not None and at > limit
-    return None if known is None else bool(known) and not late
 
 
 @transaction.atomic

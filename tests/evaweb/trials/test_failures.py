@@ -10,7 +10,7 @@ from django.test import Client
 from evaweb.errors import EvaError
 from evaweb.trials import services, voids
 from evaweb.trials.failures import in_order, offered
-from evaweb.trials.models import FailureTerm, Score
+from evaweb.trials.models import FailureTerm, Milestone, Score, Trial
 from evaweb.trials.record import JUDGEMENTS
 from tests.evaweb.trials import builders
 
@@ -89,7 +89,10 @@ def test_a_scene_may_want_both_of_whoever_scores_and_of_no_bench(bench, terms):
         with pytest.raises(EvaError, match=f"{field} is missing: scene block-on-plate wants it"):
             score(bench, trial := bench.ended(), **given)
         voids.trial_void(user=bench.operator, trial=trial, reason="of this test")
-    assert score(bench, bench.ended(), source="truth").why == ""
+    said_by_bench = bench.ended()
+    Milestone.objects.filter(order=1).update(truth="held")
+    Trial.objects.filter(pk=said_by_bench.pk).update(truth={"milestones": {"held": True}})
+    assert score(bench, said_by_bench, source="truth").why == ""
     assert score(bench, bench.ended(), success=True).success is True
     FailureTerm.objects.all().delete()
     assert score(bench, bench.ended()).why == "", "a lab without words asks for none"

@@ -243,6 +243,26 @@ def test_without_any_milestone_the_score_is_the_success(bench):
     assert (found.success, found.score) == (True, 1.0)
 
 
+def test_in_the_name_of_a_bench_nobody_scores_anything_but_what_it_says(bench):
+    for order, name in ((1, "held"), (3, "on_plate")):
+        bench.scene.milestones.filter(order=order).update(truth=name)
+    trial = bench.ended()
+
+    def score(*reached):
+        return services.trial_score(
+            user=bench.operator, trial=trial, milestones=bench.ticks(*reached), source="truth"
+        )
+
+    with pytest.raises(EvaError, match=r"the bench of trial .* has said nothing of it"):
+        score(True, False, False)
+    Trial.objects.filter(pk=trial.pk).update(truth={"milestones": {"held": True, "on_plate": False}})
+    for ticks, said in (((True, False, True), "on the plate"), ((True, True, False), "lifted")):
+        with pytest.raises(EvaError, match=rf"'{said}' = True, the bench of trial .* says False"):
+            score(*ticks)
+    assert not trial.scores.exists()
+    assert (score(True, False, False).source, trial.scores.count()) == ("truth", 1)
+
+
 def test_a_success_that_contradicts_the_required_milestones_is_refused(bench):
     with pytest.raises(EvaError, match="contradicts the required milestones"):
         score(bench, bench.ended(), True, True, False, success=True)
