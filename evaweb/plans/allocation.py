@@ -14,7 +14,7 @@ from django.db.models import Case, Max, OuterRef, Subquery, When
 
 from evaweb.errors import Conflict, NotAllowed
 from evaweb.plans import commitment as blinding
-from evaweb.plans.blinding_rules import has_looked_at_a_version
+from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.canonical import digest
 from evaweb.plans.design import dropped_of, ended_because, findings_of, told_reason
 from evaweb.plans.documents import checkpoint_of, require_scene, units_of
@@ -147,7 +147,7 @@ def _check(plan: Plan, user: User, station: Station) -> None:
             if why
             else _NO_TRIAL_HANDED_OUT(plan=plan, state=plan.get_state_display())
         )
-    if plan.sealed and has_looked_at_a_version(plan, user):
+    if plan.sealed and has_looked_at_the_same(plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_WHICH(plan=plan))
     allowed = list(plan.stations.values_list("name", flat=True))
     if allowed and station.name not in allowed:

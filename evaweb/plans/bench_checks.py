@@ -17,7 +17,7 @@ from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.journal import text
 from evaweb.plans import pictures, regions
 from evaweb.plans.allocation import hand_out
-from evaweb.plans.blinding_rules import has_looked_at_a_version
+from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.documents import require_scene
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
 from evaweb.roles import Role, require
@@ -307,7 +307,7 @@ def _before(what: str, trial: Trial, user: Any) -> None:
     if what in ("run", "judged"):
         require_scene(handout.plan, trial.scene)
     judged = what in ("scored", "voided", "void answered")
-    if judged and handout.plan.sealed and has_looked_at_a_version(handout.plan, user):
+    if judged and handout.plan.sealed and has_looked_at_the_same(handout.plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_OPERATOR(plan=handout.plan))
 
 

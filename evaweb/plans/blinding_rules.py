@@ -19,6 +19,7 @@ from evaweb.blinding import EVERYTHING, Sight, declare, masked
 from evaweb.episodes.reconcile import concludes
 from evaweb.errors import NotAllowed
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState
+from evaweb.plans.selectors import plans_beside
 from evaweb.roles import Role, role_of
 from evaweb.trials.models import Checkpoint, Evaluation, Trial
 from evaweb.trials.selectors import UNFINISHED
@@ -50,9 +51,10 @@ def has_looked(plan: Plan, user: Any) -> bool:
     return Look.objects.filter(plan=plan, user=user).exists()
 
 
-def has_looked_at_a_version(plan: Plan, user: Any) -> bool:
-    """True if this user has seen what is, or was, sealed of the plan or of a version before or after it."""
-    return Look.objects.filter(plan__name=plan.name, user=user).exists()
+def has_looked_at_the_same(plan: Plan, user: Any) -> bool:
+    """True if this user has seen what is, or was, sealed of any version of the plan, or of the same checkpoints."""
+    beside = plans_beside(plan).values("pk")
+    return Look.objects.filter(Q(plan__name=plan.name) | Q(plan__in=beside), user=user).exists()
 
 
 def may_look(plan: Plan, user: Any) -> bool:

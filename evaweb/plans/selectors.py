@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from django.db.models import Q, QuerySet
+from django.db.models import Count, Q, QuerySet
 
 from evaweb.errors import NotFound
 from evaweb.plans.models import Handout, Plan, PlanState, Reference, Slot
@@ -41,6 +41,13 @@ def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
         known = ", ".join(sorted(set(plan_list(user=user).values_list("name", flat=True)))) or "none yet"
         raise NotFound(_NO_SUCH_PLAN(name=name, value=f" v{version}" if version else "", known=known))
     return found
+
+
+def plans_beside(plan: Plan) -> QuerySet[Plan]:
+    """Other plans, by another name, that were frozen with two of its checkpoints or more: they tell of the same."""
+    shared = Count("checkpoints", filter=Q(checkpoints__in=plan.checkpoints.values("pk")), distinct=True)
+    rows = Plan.objects.exclude(name=plan.name).exclude(state=PlanState.DRAFT)
+    return rows.annotate(shared=shared).filter(shared__gte=2).order_by("name", "version")
 
 
 def plans_open(*, station: Station) -> list[Plan]:

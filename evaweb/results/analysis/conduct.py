@@ -12,12 +12,13 @@ from datetime import datetime, timedelta
 from statistics import median
 from typing import Any
 
-from django.db.models import F
+from django.db.models import Count, F
 
 from evaweb.memo import Kept
 from evaweb.plans.bench_checks import HOLDS
 from evaweb.plans.design import Names, compared
 from evaweb.plans.models import Achieved, CameraCheck, Plan
+from evaweb.plans.selectors import plans_beside
 from evaweb.results.analysis.integrity import changes_of, with_changes
 from evaweb.statistics.many import holm
 from evaweb.statistics.permutation import sign_flips
@@ -83,6 +84,10 @@ def conduct_of(plan: Plan, runs: Sequence[Run], looks: Iterable[Look]) -> dict[s
     given_back = plan.events.filter(what="given back").order_by("pk")
     return {
         "looks": list(plan.looks.order_by("at").values("at", by_name=F("user__username"))),
+        "beside": [
+            {"plan": row.name, "version": row.version, "state": row.state, "trials": row.trials}
+            for row in plans_beside(plan).annotate(trials=Count("handouts", distinct=True))
+        ],
         "checkpoints": _checkpoints(plan, runs),
         "voids": _voids(plan, runs),
         "corrections": _corrections(plan, runs),

@@ -50,6 +50,11 @@ def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
     looks = [row["by_name"] for row in found["looks"]]
     if looks:
         yield f"Looked behind the blind before the reveal: {', '.join(looks)}"
+    if found["beside"]:
+        named = ", ".join(
+            f"{row['plan']} v{row['version']} ({_of(row['trials'], 'trial')})" for row in found["beside"]
+        )
+        yield f"Other plans are of checkpoints of this one, and may have told of them: {named}"
     late = Counter(row["changed"] for row in found["corrections"] if row["late"])
     if late[VERDICT]:
         yield f"{_of(late[VERDICT], 'score')} came after the reveal"

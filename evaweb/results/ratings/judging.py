@@ -16,7 +16,7 @@ from django.db.models import Exists, OuterRef, QuerySet
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.journal import text
-from evaweb.plans.blinding_rules import has_looked
+from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.models import Handout, Plan, PlanState
 from evaweb.plans.seeded_draws import Chance
 from evaweb.results.models import Preference, Rating
@@ -107,7 +107,7 @@ def to_rate(user: User) -> Offer[Handout]:
     """The next trial that this user may rate again, of those of which there are pictures."""
     mine: list[Handout] = []
     for plan in Plan.objects.filter(state__in=_STATES, second_rater_share__gt=0).order_by("pk"):
-        if has_looked(plan, user):
+        if has_looked_at_the_same(plan, user):
             continue
         open_ones = {handout.slot.index: handout for handout in _unrated(plan, user)}
         mine += [open_ones[index] for index in sample_of(plan) if index in open_ones]
@@ -123,7 +123,7 @@ def _rated_first(what: str, trial: Trial, user: User) -> None:
         return
     for plan in Plan.objects.filter(handouts__trial=trial, state__in=_STATES, second_rater_share__gt=0):
         handout = _unrated(plan, user).filter(trial=trial).first()
-        if handout is None or not handout.trial.episode.cameras or has_looked(plan, user):
+        if handout is None or not handout.trial.episode.cameras or has_looked_at_the_same(plan, user):
             continue  # nobody will ask this user
         if handout.slot.index in sample_of(plan):
             raise NotAllowed(_TRIAL_RATED_BY_SECOND_PERSON(trial=trial.pk))
@@ -186,7 +186,7 @@ def rate(
     before = Rating.objects.filter(trial=trial, rater=user).first()
     if before is not None:
         return _once_more(before, said, twice)
-    if has_looked(plan, user):
+    if has_looked_at_the_same(plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_SECOND(plan=plan))
     failures.check_failure(trial.scene, said, success=found.success)
     require_seen_on_video(handout)
@@ -199,7 +199,7 @@ def to_prefer(user: User, plans: Iterable[Plan] | None = None) -> Offer[Pair]:
     """The next two trials that this user has not compared, of those of which there are pictures."""
     fresh: list[Pair] = []
     for plan in plans if plans is not None else Plan.objects.filter(state__in=_STATES).order_by("pk"):
-        if not has_looked(plan, user):
+        if not has_looked_at_the_same(plan, user):
             judged = set(Preference.objects.filter(plan=plan, rater=user).values_list("first", "second"))
             fresh += _named(plan, [pair for pair in _pairs(plan) if pair not in judged])
     return _offered(fresh, lambda pair: (pair.first, pair.second))
@@ -247,7 +247,7 @@ def prefer(*, user: User, plan: Plan, first: str, second: str, outcome: str, why
     before = Preference.objects.filter(first=one.trial, second=other.trial, rater=user).first()
     if before is not None:
         return _once_more(before, said, twice)
-    if has_looked(plan, user):
+    if has_looked_at_the_same(plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_RATER(plan=plan))
     require_seen_on_video(one, other)
     row = Preference(plan=plan, first=one.trial, second=other.trial, rater=user, blind=plan.sealed, **said)

@@ -14,9 +14,10 @@ from evaweb.plans.documents import conditions_of, scene_of
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.schedule import schedule
 from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
+from evaweb.results.presentation.integrity import integrity_document
 from evaweb.stations.models import Station
 from evaweb.trials import services as trials
-from evaweb.trials.models import Milestone, Scene, Trial
+from evaweb.trials.models import Checkpoint, Milestone, Scene, Trial
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import unguarded
 
@@ -181,6 +182,29 @@ def test_what_a_broken_station_has_not_begun_is_given_to_others(bench, plan, own
     assert give_back(user=owner, plan=plan, station=bench.station, reason="its gripper broke") == 1
     handout = hand_out(user=bench.operator, station=other, plan=plan)
     assert (handout.slot.index, handout.trial.station) == (1, other)
+
+
+def test_who_has_looked_at_another_plan_of_the_same_checkpoints_runs_none_of_this_one(bench, draft, owner):
+    def twin(name, checkpoints):
+        made = Plan.objects.create(name=name, title=name, question="And?", owner=owner, repetitions=3)
+        made.checkpoints.set(checkpoints)
+        made.positions.set(bench.scene.positions.all())
+        return plan_freeze(user=owner, plan=made)
+
+    both = list(draft.checkpoints.all())
+    others = [
+        Checkpoint.objects.create(name=f"other-{n}", policy={"url": f"ws://127.0.0.1:{n}"}) for n in (1, 2)
+    ]
+    plan = plan_freeze(user=owner, plan=draft)
+    look(twin("elsewhere", [both[0], *others]), owner)
+    trial = hand_out(user=owner, station=bench.station, plan=plan).trial
+    done(bench, trial)
+    look(twin("again", both), alma := builders.user("alma", "admin"))
+    with pytest.raises(NotAllowed, match="you have seen results"):
+        hand_out(user=alma, station=bench.station, plan=plan)
+    record = integrity_document(plan)
+    assert [(row["plan"], row["version"], row["trials"]) for row in record["beside"]] == [("again", 1, 0)]
+    assert any("again v1 (0 trials)" in said for said in record["remarks"])
 
 
 def test_a_plan_for_some_stations_is_not_carried_out_on_others(bench, draft, owner):
