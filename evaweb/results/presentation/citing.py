@@ -276,7 +276,7 @@ def _looks(found: Design) -> str:
     if found.rule == FIXED:
         return "one test at the end"
     at = looks_at(found)
-    if found.rule == ANYTIME or (len(at) > 2 and at == list(range(at[0], at[-1] + 1))):
+    if found.rule == ANYTIME or at == list(range(1, found.blocks + 1)):
         return f"looked at after every {found.unit[:-1]}"
     return f"looked at after {', '.join(map(str, at))} {found.unit}"
 

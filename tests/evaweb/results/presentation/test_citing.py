@@ -11,9 +11,11 @@ from django.test import Client
 from evaweb.plans.design import at_the_reveal
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
-from evaweb.results.presentation.citing import citation
+from evaweb.results.presentation.citing import _looks, citation
 from evaweb.results.presentation.latex import escaped, foreign
 from evaweb.results.presentation.wording import p_words
+from evaweb.statistics.boundaries import boundary, in_pairs
+from evaweb.statistics.designs import Design
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Evaluation
 from tests.evaweb.trials import builders
@@ -260,3 +262,12 @@ def test_a_reveal_that_kept_its_pairs_alone_is_cited_by_them(revealed):
     rows = {row.checkpoint: row.cells for row in citation(revealed).rows}
     assert rows["pi0-new"][1:3] == ("8", "6")
     assert rows["pi0-new"][4] == "–"
+
+
+@pytest.mark.parametrize(
+    ("looks", "said"),
+    [(None, "after every pair"), ([18, 19, 20], "after 18, 19, 20 pairs"), ([10], "after 10, 20 pairs")],
+)
+def test_looks_that_were_named_are_cited_as_they_were_also_where_they_follow_each_other(looks, said):
+    design = Design("late", 20, 0.05, boundary=boundary(in_pairs(20, looks)))
+    assert _looks(design) == f"looked at {said}"
