@@ -74,6 +74,11 @@ _UUID_OF_ANOTHER_SCORE = Pattern(
     "trials.services.uuid_of_another_score",
     "uuid {uuid} is that of another score (trial {trial_id}): give each its own",
 )
+_SAID_BEFORE = Pattern(
+    "trials.services.said_before",
+    "you said just this of trial {trial} before, and it was corrected since: where it is not that message once more, "
+    "give another reason, or a uuid",
+)
 _SCORED_ALREADY = Pattern(
     "trials.services.scored_already",
     "trial {trial} has a score already: to correct it, give a reason; both stay in the record",
@@ -330,6 +335,8 @@ def trial_score(
         if first is not None and uuid is not None:
             raise Conflict(_UUID_OF_ANOTHER_SCORE(uuid=uuid, trial_id=first.trial_id))
         require_scorable(held, words["reason"])
+        if uuid is None:
+            _require_said_anew(held, said, judged())
         if held.verdict is not None:
             require_own(held, user)
         found = judged()
@@ -383,6 +390,13 @@ def settled(trial: Trial, user: Any) -> None:
 def locked(trial: Trial) -> Trial:
     """The trial's row as it is now, kept from others until the transaction ends."""
     return Trial.objects.select_for_update().get(pk=trial.pk)
+
+
+def _require_said_anew(trial: Trial, said: Mapping[str, Any], found: Verdict) -> None:
+    """Conflict where it may be an earlier score that comes late: it must not take the place of what corrected it."""
+    before = trial.scores.filter(rater=said["rater"]).prefetch_related("outcomes")
+    if any(_says(score, said, found) for score in before):
+        raise Conflict(_SAID_BEFORE(trial=trial.pk))
 
 
 def _require_truth(trial: Trial, found: Verdict) -> None:

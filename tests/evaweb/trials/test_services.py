@@ -320,6 +320,17 @@ def test_who_scores_once_more_because_the_answer_was_lost_gets_the_first_answer(
         assert score(bench, trial, True, True, True, **said) == first, "whatever came after it"
 
 
+def test_a_correction_that_comes_late_takes_no_newer_ones_place(bench):
+    trial = bench.scored(success=True)
+    score(bench, trial, True, True, False, reason="on the rim")
+    newer = score(bench, trial, True, True, True, reason="it fell off afterwards")
+    with pytest.raises(Conflict, match="you said just this of trial .* before, and it was corrected since"):
+        score(bench, trial, True, True, False, reason="on the rim")
+    trial.refresh_from_db()
+    assert trial.verdict == newer
+    assert score(bench, trial, True, True, False, reason="on the rim after all").success is False
+
+
 def test_the_uuid_of_a_score_says_the_same_for_ever(bench):
     trial, uuid = bench.ended(), uuid4()
     score(bench, trial, True, True, True, uuid=uuid)
