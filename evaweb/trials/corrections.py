@@ -15,7 +15,7 @@ from evaweb.stations.commands import identity_of
 from evaweb.trials import failures
 from evaweb.trials.failure_words import NOT_SAID, why_words
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
-from evaweb.trials.services import checked, counts_now, locked, require_own, require_scorable
+from evaweb.trials.services import checked, counts_now, locked, require_scorable
 from evaweb.trials.verdicts import LONGEST_NOTE
 from runtime.core.sentences import Pattern
 
@@ -76,7 +76,6 @@ def _reworded(user: User, held: Trial, seen: Score, words: Mapping[str, str], re
     for what in ("scored", "reworded"):
         checked(what, held, user)
     require_scorable(held, reason)
-    require_own(held, user)
     failures.check_failure(held.scene, words, success=seen.success, said=failures.said_of(seen))
     found = Score(
         trial=held,

@@ -335,11 +335,9 @@ def trial_score(
         if first is not None and uuid is not None:
             raise Conflict(_UUID_OF_ANOTHER_SCORE(uuid=uuid, trial_id=first.trial_id))
         require_scorable(held, words["reason"])
-        if uuid is None:
-            _require_said_anew(held, said, judged())
-        if held.verdict is not None:
-            require_own(held, user)
         found = judged()
+        if uuid is None:
+            _require_said_anew(held, said, found)
         if source == Score.Source.TRUTH:
             _require_truth(held, found)
         failures.check_failure(
@@ -351,6 +349,8 @@ def trial_score(
         )
         if held.status == TrialStatus.SCORED and _judges_alike(held.verdict, found):
             checked("reworded", held, user)
+        elif held.verdict is not None:
+            _require_own(held, user)
         score = Score(uuid=identity_of(uuid), trial=held, success=found.success, score=found.score, **said)
         counts_now(held, score, _outcomes(score, found), user)
     trial.refresh_from_db()
@@ -366,7 +366,7 @@ def trial_abandon(*, user: User, trial: Trial, reason: str = "") -> Trial:
         why = f"{why} ({user.get_username()})"
         if (held.status, held.reason) == (TrialStatus.ABANDONED, why):
             return held  # asked for once more, because the answer was lost
-        require_own(held, user)
+        _require_own(held, user)
         lifecycle.apply(held, Move.ABANDON)
         held.reason = why
         held.save()
@@ -457,7 +457,7 @@ def require_scorable(trial: Trial, reason: str) -> None:
         raise Conflict(_NEVER_RAN(trial=trial.pk, unrecorded=unrecorded))
 
 
-def require_own(trial: Trial, user: User) -> None:
+def _require_own(trial: Trial, user: User) -> None:
     """NotAllowed where what another has done is to be undone, by who has no business at the station now."""
     if user.pk == trial.operator_id or role_of(user) is Role.ADMIN:
         return
