@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TypeVar
 
-from evaweb.results.analysis.outcomes import Interruption, Outcome, Pair, by_checkpoint, paired
+from evaweb.results.analysis.outcomes import Interruption, Outcome, Pair, by_checkpoint, paired, unbroken
 from evaweb.statistics import strata
 from evaweb.statistics.base import LEVEL, Interval, StatisticsError
 from evaweb.statistics.bounded import Mean, bounded_mean
@@ -165,10 +165,13 @@ def analyse(
     in_pairs: bool = True,
     limits: Mapping[str, float] | None = None,
     checkpoints: Sequence[str] = (),
+    whole: bool = False,
 ) -> Analysis:
     """All of it; `planned` comparisons are made in their direction, others the better one first.
 
-    Without `in_pairs` blocks are no pairs: a block has trials of whichever checkpoint was drawn.
+    Without `in_pairs` blocks are no pairs: a block has trials of whichever checkpoint was drawn. `whole`: these are all
+    trials of a plan, its blocks numbered from 0. Evidence then ends before the first of them that lacks a trial, as the
+    plan's design does: who chooses what is made next could else choose what it says.
 
     `limits` [s] are those of the evaluation's scenes that have one: the smallest is the horizon of times to success;
     without any, the longest run.
@@ -193,6 +196,7 @@ def analyse(
             _share(alpha, couples, planned, (one, other)),
             timing,
             in_pairs,
+            whole,
         )
         for (one, other), test, p in zip(couples, tests, corrected, strict=True)
     )
@@ -322,9 +326,13 @@ def _comparison(
     alpha: float,
     timing: _Timing,
     in_pairs: bool,
+    whole: bool,
 ) -> Comparison:
     notes: list[str] = []
     pairs = paired(first, second) if in_pairs else []
+    told = unbroken(pairs) if whole else pairs
+    if len(told) < len(pairs):
+        notes.append(_later(len(pairs) - len(told)))
     counts = (*_counts(first), *_counts(second))
     return Comparison(
         one,
@@ -340,10 +348,10 @@ def _comparison(
         _said(notes, lambda: _stratified(first, second)),
         _within(first, second),
         *_by_scene(first, second),
-        success_evidence([(p.first.success, p.second.success) for p in pairs], alpha),
-        score_evidence([(p.first.score, p.second.score) for p in pairs], alpha),
-        confidence_sequence([float(p.first.success) - p.second.success for p in pairs], alpha),
-        confidence_sequence([p.first.score - p.second.score for p in pairs], alpha),
+        success_evidence([(p.first.success, p.second.success) for p in told], alpha),
+        score_evidence([(p.first.score, p.second.score) for p in told], alpha),
+        confidence_sequence([float(p.first.success) - p.second.success for p in told], alpha),
+        confidence_sequence([p.first.score - p.second.score for p in told], alpha),
         _sooner(pairs, timing),
         (*notes, *(_waiting(pairs, first, second) if in_pairs else [_RANDOM])),
     )
@@ -418,6 +426,11 @@ def _waiting(pairs: Sequence[Pair], first: Sequence[Outcome], second: Sequence[O
         return []
     waiting = "1 trial has" if left == 1 else f"{left} trials have"
     return [f"{waiting} no partner in the block yet, and no part in the evidence"]
+
+
+def _later(pairs: int) -> str:
+    come = "1 pair comes" if pairs == 1 else f"{pairs} pairs come"
+    return f"{come} after a block that lacks a trial, and no part in the evidence until it has it"
 
 
 def _imbalances(arms: dict[str, list[Outcome]]) -> list[str]:

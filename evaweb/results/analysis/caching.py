@@ -76,6 +76,7 @@ def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> 
             in_pairs=plan.allocation == Allocation.PAIRED,
             limits=limits_of(plan),
             checkpoints=[row["name"] for row in (plan.document or {}).get("checkpoints", ())],
+            whole=which == Chosen(),
         )
 
     return _analyses.get((plan.pk, plan.digest, which), now, make)

@@ -86,6 +86,11 @@ def paired(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[Pair]:
     return sorted(pairs, key=_place)
 
 
+def unbroken(pairs: Sequence[Pair]) -> list[Pair]:
+    """Pairs of a whole plan, in their order, up to the first of its blocks that lacks one."""
+    return [pair for place, pair in enumerate(pairs) if _place(pair) == place]
+
+
 def _place(pair: Pair) -> int:
     """Its place: the number of its block, which a plan's schedule gives; nobody's choice, whoever finishes first."""
     block = pair.first.block

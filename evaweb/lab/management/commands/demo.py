@@ -210,6 +210,7 @@ class Command(BaseCommand):
             outcomes_of_plan(plan),
             planned=[(f"{SKILLED}-by-script", f"{CLUMSY}-by-script")],
             in_pairs=options["order"] == Allocation.PAIRED,
+            whole=True,
         )
         said = headline(plan)
         result["headline"] = said.sentence if said else ""

@@ -273,6 +273,9 @@ def _comparison(
 ) -> dict[str, Any]:
     counts = (*_counts(first), *_counts(second))
     pairs = _pairs(first, second) if in_pairs else []
+    told = [
+        pair for place, pair in enumerate(pairs) if int(pair[0].block) == place
+    ]  # up to the first unmade block
     statistic, p = methods.barnard(*counts)
     only = (
         sum(a.success and not b.success for a, b in pairs),
@@ -299,19 +302,19 @@ def _comparison(
         "within": _within(first, second),
         "by_scene": _by_scene(first, second),
         "evidence": _evidence(
-            methods.success_bets([(b.success, a.success) for a, b in pairs]),
-            methods.success_bets([(a.success, b.success) for a, b in pairs]),
+            methods.success_bets([(b.success, a.success) for a, b in told]),
+            methods.success_bets([(a.success, b.success) for a, b in told]),
             alpha,
         ),
         "score_evidence": _evidence(
-            methods.score_bets([a.score - b.score for a, b in pairs]),
-            methods.score_bets([b.score - a.score for a, b in pairs]),
+            methods.score_bets([a.score - b.score for a, b in told]),
+            methods.score_bets([b.score - a.score for a, b in told]),
             alpha,
         ),
         "anytime": {
             "level": 1 - alpha,
-            "success": methods.anytime([a.success - b.success for a, b in pairs], alpha),
-            "score": methods.anytime([a.score - b.score for a, b in pairs], alpha),
+            "success": methods.anytime([a.success - b.success for a, b in told], alpha),
+            "score": methods.anytime([a.score - b.score for a, b in told], alpha),
         },
         "sooner": _sooner(pairs, timing),
     }

@@ -162,6 +162,18 @@ def test_a_block_that_is_not_complete_waits():
     assert any("1 trial has no partner" in note for note in compared.notes)
 
 
+def test_evidence_of_a_whole_plan_ends_before_the_first_block_that_lacks_a_trial():
+    """As its design does: what is made after it could else be chosen by what it says."""
+    outcomes = trials({"old": 0.5, "new": 0.5}, blocks=12)
+    waits = [one for one in outcomes if (one.block, one.checkpoint) != ("4", "old")]
+    compared = analyse(waits, whole=True).comparisons[0]
+    assert (compared.pairs, compared.evidence.pairs, compared.score_evidence.pairs) == (11, 4, 4)
+    assert any("7 pairs come after a block that lacks a trial" in note for note in compared.notes)
+    unmade = [one for one in outcomes if one.block != "4"]
+    assert analyse(unmade, whole=True).comparisons[0].evidence.pairs == 4
+    assert analyse(outcomes, whole=True).comparisons[0].evidence.pairs == 12
+
+
 def test_pairs_are_in_the_order_in_which_they_were_completed():
     def one(checkpoint, block, order):
         return Outcome(order, order, block, checkpoint, "cups", 1, True, 1.0)

@@ -20,7 +20,7 @@ from evaweb.statistics.sequential import score_evidence
 
 
 def outcomes(checkpoints, n, scenes, seed):
-    chance, found, block = random.Random(seed), [], 0
+    chance, found, block = random.Random(seed), [], -1
     while len(found) < n:
         scene, position, block = chance.randrange(scenes), chance.randint(1, 3), block + 1
         for name in chance.sample(range(checkpoints), checkpoints):
@@ -82,10 +82,12 @@ def as_rows(runs):
 )
 def test_both_ways_come_to_the_same(checkpoints, n, scenes, seed):
     runs = outcomes(checkpoints, n, scenes, seed)
+    if seed in (1, 3):  # one is to be repeated: what came later is no evidence yet
+        runs = [run for run in runs if (run.block, run.checkpoint) != ("6", "c0")]
     planned = {1: [], 4: [("c3", "c0"), ("c1", "c0")]}.get(checkpoints, [("c0", "c1")])
     broken = [Interruption(9000, "c0", "s0", 1, 12.5)]
     limits = {} if seed == 2 else {f"s{scene}": 25.0 + 10 * scene for scene in range(1, scenes)}
-    analysis = analyse(runs, broken, planned=planned, limits=limits)
+    analysis = analyse(runs, broken, planned=planned, limits=limits, whole=True)
     shown = json.loads(json.dumps(analysis_document(analysis)))
     rows = [*as_rows(runs), Trial(9000, "x", 0, "c0", "s0", 1, "interrupted", False, 0.0, 12.5, "", ())]
     plan = {
