@@ -16,7 +16,7 @@ from evaweb.errors import Conflict, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.canonical import digest
-from evaweb.plans.design import dropped_of, ended_because, findings_of, told_reason
+from evaweb.plans.design import dropped_of, ended_at_an_ask, ended_because, findings_of, told_reason
 from evaweb.plans.documents import checkpoint_of, require_scene, units_of
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.selectors import without_dropped
@@ -25,7 +25,7 @@ from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials import lifecycle
 from evaweb.trials.models import Trial, TrialStatus
-from evaweb.trials.services import trial_create
+from evaweb.trials.services import require_none_open, trial_create
 from evaweb.trials.voids import voids_lapse, voids_waiting
 from runtime.core.sentences import Pattern
 
@@ -86,6 +86,7 @@ def hand_out(*, user: User, station: Station, plan: Plan) -> Handout:
     """
     require(user, Role.OPERATOR)
     _check(plan, user, station)
+    require_none_open(station)  # before anything is said of the design: then there is one answer
     with transaction.atomic():  # kept also where no trial is handed out
         held = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
         voids_lapse(Trial.objects.filter(handout__plan=held), user=user)
@@ -155,11 +156,13 @@ def _check(plan: Plan, user: User, station: Station) -> None:
 
 
 def _check_goes_on(plan: Plan) -> None:
-    found = findings_of(plan)
-    if found is not None and found.ended == "boundary":
+    ended = ended_at_an_ask(plan)
+    if not ended and (found := findings_of(plan)) is not None and found.ended == "boundary":
+        ended = ended_because(plan, found)  # since this ask began
+    if ended:
         waits = voids_waiting(Trial.objects.filter(handout__plan=plan)).first()
         then = f"the void of trial {waits.trial_id} is answered" if waits else "its last trial is scored"
-        raise Conflict(_HAS_ENDED_CLOSED_ONCE(plan=plan, ended_because=ended_because(plan, found), then=then))
+        raise Conflict(_HAS_ENDED_CLOSED_ONCE(plan=plan, ended_because=ended, then=then))
 
 
 def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:

@@ -44,6 +44,7 @@ ENDED = {
     "boundary": "a boundary of its design was crossed",
     "full": "all pairs of its comparison are made",
 }
+ENDED_EVENT = "ended"  # of a plan: an ask for its next trial found that
 Names = tuple[str, str]
 
 
@@ -300,6 +301,12 @@ def ended_because(plan: Plan, found: Findings) -> str:
     """Reason why a design has ended, which tells nothing of any checkpoint."""
     planned = frozen(plan.document or {})
     return f"{ENDED[found.ended]}, after {found.at} {planned.unit if planned else 'pairs'}"
+
+
+def ended_at_an_ask(plan: Plan) -> str:
+    """Why the plan ended when a next trial was asked for, "" where no ask has found that."""
+    told = plan.events.filter(what=ENDED_EVENT).values_list("text", flat=True).first()
+    return told or ""
 
 
 def told_reason(plan: Plan, sealed: bool) -> str:

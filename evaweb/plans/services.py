@@ -20,7 +20,14 @@ from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans import reveals
 from evaweb.plans.canonical import difference, digest
-from evaweb.plans.design import at_the_reveal, dropped_of, ended_because, findings_of
+from evaweb.plans.design import (
+    ENDED_EVENT,
+    at_the_reveal,
+    dropped_of,
+    ended_at_an_ask,
+    ended_because,
+    findings_of,
+)
 from evaweb.plans.documents import UnevenError, document_of, units_of
 from evaweb.plans.draft_checks import covered, problems
 from evaweb.plans.drafting import Changed, Values, apply, digest_of, merged, values_of
@@ -334,17 +341,24 @@ def plan_reveal(*, user: User, plan: Plan) -> Plan:
 def plan_end(*, user: User, plan: Plan, asked: bool = False) -> None:
     """Close a running plan whose design has ended, as soon as none of its trials is unfinished and no void waits.
 
-    With trials left, it is closed where the next one is `asked` for: a score that was mistyped can be corrected until
-    then, and corrected to and fro it does not tell at once which trial is of which checkpoint.
+    With trials left, it ends where the next one is `asked` for: a score that was mistyped can be corrected until then,
+    and corrected to and fro it does not tell at once which trial is of which checkpoint. A boundary that an ask finds
+    crossed is kept, whatever is corrected later: else each ask would tell what a correction moved.
     The reason says that a boundary was crossed or that all pairs are made: never for which checkpoint.
     """
     held = _held(plan)
     found = findings_of(held) if held.state == PlanState.FROZEN else None
-    if found is None or not found.ended or _unfinished(held) or voids_waiting(_trials(held)).exists():
+    if found is None:
         return
-    over = found.ended == "boundary" or not remaining(held, dropped_of(held))
-    if not remaining(held) or (asked and over):
-        _close(held, user, ended_because(held, found))
+    ended = ended_at_an_ask(held)
+    if asked and not ended and found.ended == "boundary":
+        ended = ended_because(held, found)
+        _note(held, user, ENDED_EVENT, ended)
+    if not (ended or found.ended) or _unfinished(held) or voids_waiting(_trials(held)).exists():
+        return
+    over = bool(ended) or not remaining(held, dropped_of(held))
+    if not remaining(held) or (asked and over) or ended:
+        _close(held, user, ended or ended_because(held, found))
 
 
 def _looked_at(trial: Trial, user: User) -> None:

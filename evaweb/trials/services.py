@@ -244,14 +244,7 @@ def trial_create(
     require(user, Role.OPERATOR)
     _check_choice(station, scene, position, checkpoint, seed)
     Station.objects.select_for_update().get(pk=station.pk)  # one at a time
-    unfinished = trial_open(station)
-    if unfinished is not None:
-        status = TrialStatus(unfinished.status)
-        raise Conflict(
-            _UNFINISHED(
-                trial=unfinished.pk, name=station.name, label=status.label, advice=lifecycle.advice(status)
-            )
-        )
+    require_none_open(station)
     if seed is None and station.simulated:
         seed = seed_of(scene, position, number)
     return Trial.objects.create(
@@ -269,6 +262,18 @@ def trial_create(
         seed=seed,
         strategy=strategy,
     )
+
+
+def require_none_open(station: Station) -> None:
+    """Conflict where the station has a trial that is not finished, with what to do about it."""
+    unfinished = trial_open(station)
+    if unfinished is not None:
+        status = TrialStatus(unfinished.status)
+        raise Conflict(
+            _UNFINISHED(
+                trial=unfinished.pk, name=station.name, label=status.label, advice=lifecycle.advice(status)
+            )
+        )
 
 
 def _next_attempt(key: Mapping[str, Any]) -> tuple[int, int]:

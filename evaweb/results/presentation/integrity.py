@@ -56,6 +56,9 @@ def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
         )
         yield f"Other plans are of checkpoints of this one, and may have told of them: {named}"
     late = Counter(row["changed"] for row in found["corrections"] if row["late"])
+    early = sum(row["changed"] == VERDICT and not row["late"] for row in found["corrections"])
+    if early:
+        yield f"{_of(early, 'score')} corrected before the reveal"
     if late[VERDICT]:
         yield f"{_of(late[VERDICT], 'score')} came after the reveal"
     if late[CATEGORY]:

@@ -140,6 +140,49 @@ def test_while_its_last_trial_runs_no_other_is_handed_out(bench, early, other):
     assert early.state == PlanState.CLOSED
 
 
+def test_whatever_is_corrected_after_an_ask_has_found_its_end_the_next_ask_finds_the_same(
+    bench, early, other
+):
+    """Else who corrects a score to and fro, with a trial left prepared elsewhere, knows which checkpoint it was of."""
+    needed = next(
+        n for n in range(1, 21) if conclude(frozen(early.document), in_blocks([(1.0, 0.0)] * n)).ended
+    )
+    carry_out(bench, early, 2 * needed - 1)
+    late = handed(bench, early, other)
+    carry_out(bench, early, 1)
+    ended = f"has ended: a boundary of its design was crossed, after {needed} pairs"
+    with pytest.raises(Conflict, match=ended):
+        handed(bench, early)
+    for trial in [row.trial for row in early.handouts.order_by("number")][:4]:
+        won = trial.checkpoint.name == BETTER
+        scored(bench, trial, success=not won, reason="was it?")
+        with pytest.raises(Conflict, match=ended):
+            handed(bench, early)
+        scored(bench, trial, success=won, reason="it was not")
+    trials.trial_abandon(user=bench.operator, trial=late)
+    early.refresh_from_db()
+    assert (early.state, early.closed_because) == (PlanState.CLOSED, ended.removeprefix("has ended: "))
+    assert [event.what for event in early.events.all()].count("ended") == 1
+
+
+def test_while_its_station_has_a_trial_to_finish_an_ask_says_that_and_nothing_of_the_design(bench, early):
+    needed = next(
+        n for n in range(1, 21) if conclude(frozen(early.document), in_blocks([(1.0, 0.0)] * n)).ended
+    )
+    carry_out(bench, early, 2 * needed - 1)
+    last = handed(bench, early)
+    said = []
+    for won in (True, False):  # of a trial of before, whose block is made
+        first = early.handouts.order_by("number").first().trial
+        scored(bench, first, success=won, reason=f"{won}")
+        with pytest.raises(Conflict) as asked:
+            handed(bench, early)
+        said.append(str(asked.value))
+    assert said[0] == said[1]
+    assert f"trial {last.pk} of bench-1 is" in said[0]
+    assert not early.events.filter(what="ended").exists()
+
+
 def test_all_pairs_made_close_it_too(bench, draft, owner):
     plan = frozen_plan(draft, owner, stopping="late", repetitions=1)
     carry_out(bench, plan, 4)

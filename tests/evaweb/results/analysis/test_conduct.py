@@ -122,7 +122,9 @@ def test_corrections_are_told_before_and_after_the_reveal(bench, plan, owner, ma
         False,
     )
     assert (late["trial_id"], late["before"], late["success"], late["late"]) == (second.pk, False, True, True)
-    assert "1 score came after the reveal" in integrity_document(plan)["remarks"]
+    remarks = integrity_document(plan)["remarks"]
+    assert "1 score corrected before the reveal" in remarks
+    assert "1 score came after the reveal" in remarks
 
 
 def test_categories_and_notes_that_are_corrected_after_the_reveal_change_no_score(bench, plan, owner, make):
