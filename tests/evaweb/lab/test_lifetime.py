@@ -3,6 +3,7 @@ import signal
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -27,14 +28,21 @@ def test_a_taken_port_names_the_option_and_leaves_its_holder_alone():
 
 def test_a_port_that_stops_cannot_have_ends_a_lab_before_anything_starts(tmp_path, settings):
     settings.DATA_DIR = tmp_path
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
+    with _listening_above_a_free_one() as other:
         port = other.getsockname()[1]
         for ports in ((0, port), (port - 1, None)):
             with pytest.raises(LabError, match=rf":{port}: .* with --stop-port"), a_lab("127.0.0.1", *ports):
                 pass
     assert list(tmp_path.iterdir()) == []
+
+
+def _listening_above_a_free_one():
+    """Below the ports that are given out to whoever asks for any: another test would take the free one."""
+    for port in range(20_001 + os.getpid() % 5000, 32_000):
+        with suppress(OSError, LabError):
+            lifetime.require_free("127.0.0.1", port - 1)
+            return socket.create_server(("127.0.0.1", port))
+    raise AssertionError("no two ports are free")
 
 
 def test_a_free_port_stays_free_after_the_look():
