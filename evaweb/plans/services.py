@@ -350,11 +350,13 @@ def plan_end(*, user: User, plan: Plan, asked: bool = False) -> None:
     found = findings_of(held) if held.state == PlanState.FROZEN else None
     if found is None:
         return
-    ended = ended_at_an_ask(held)
-    if asked and not ended and found.ended == "boundary":
+    ended, waits = ended_at_an_ask(held), voids_waiting(_trials(held)).exists()
+    if (
+        asked and not ended and found.ended == "boundary" and not waits
+    ):  # a void that is refused puts its trial back
         ended = ended_because(held, found)
         _note(held, user, ENDED_EVENT, ended)
-    if not (ended or found.ended) or _unfinished(held) or voids_waiting(_trials(held)).exists():
+    if not (ended or found.ended) or waits or _unfinished(held):
         return
     over = bool(ended) or not remaining(held, dropped_of(held))
     if not remaining(held) or (asked and over) or ended:
