@@ -31,6 +31,8 @@ from evaweb.plans.references import packed, reference_tables, take_references
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
+from evaweb.trials.scene_reading import kept_positions
+from evaweb.trials.selectors import checkpoint_used
 from evaweb.trials.tables import check_milestones
 from runtime.core import bounded_documents as bounded
 from runtime.core.sentences import Pattern
@@ -57,7 +59,7 @@ _PLAN_DOES_NOT_EXIST = Pattern(
 )
 _HAS_TRIALS_ANOTHER_ONE_FILE = Pattern(
     "plans.exchange.has_trials_another_one_file",
-    "{what} has trials and is another one in the file ({shown}): give it another name",
+    "{what} is in use (trials or a frozen plan) and is another one in the file ({shown}): give it another name",
 )
 
 _Row = TypeVar("_Row", bound=models.Model)
@@ -206,7 +208,7 @@ def _take_scene(table: SceneTable) -> str:
         changes = difference(now, {**wanted, "position": positions, "milestone": milestones})
         if not changes:
             return f"scene {made.name}: the same"
-        if made.trials.exists() or Reference.objects.filter(position__scene=made).exists():
+        if kept_positions(made) or Reference.objects.filter(position__scene=made).exists():
             raise _refused(f"scene {made.name}", changes)
         made.positions.all().delete()
         made.milestones.all().delete()
@@ -232,7 +234,7 @@ def _take_checkpoint(table: CheckpointTable) -> str:
         changes = difference(_checkpoint_table(made), wanted)
         if not changes:
             return f"checkpoint {made.name}: the same"
-        if made.trials.exists():
+        if checkpoint_used(made):
             raise _refused(f"checkpoint {made.name}", changes)
     checkpoint = made or Checkpoint()
     parent = wanted.pop("parent")

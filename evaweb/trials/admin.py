@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from django import forms
 from django.contrib import admin, messages
 from django.core.exceptions import ValidationError
 from django.db import models
-from django.db.models import Count, QuerySet
+from django.db.models import Count, Q, QuerySet
 from django.forms.fields import InvalidJSONInput
 from django.http import HttpRequest
 from django.urls import reverse
 from django.utils.html import format_html
 
 from evaweb.administration import LabelledRows
+from evaweb.blinding import sight_for
 from evaweb.trials.models import (
     Checkpoint,
     Evaluation,
@@ -26,6 +28,7 @@ from evaweb.trials.models import (
     Score,
     Trial,
 )
+from evaweb.trials.selectors import checkpoint_used
 from evaweb.trials.tables import check_milestones
 from runtime.core import bounded_documents as bounded
 
@@ -273,23 +276,35 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
     autocomplete_fields = ("parent",)
 
     def get_queryset(self, request: HttpRequest) -> QuerySet[Checkpoint]:
-        """With the number of trials."""
-        return super().get_queryset(request).annotate(n_trials=Count("trials"))
+        """With the number of trials, which nobody is told from whom the checkpoint is hidden."""
+        shown = Q(trials__in=sight_for(request).open(Trial.objects.all()))
+        return super().get_queryset(request).annotate(n_trials=Count("trials", filter=shown))
 
     def get_readonly_fields(self, request: HttpRequest, obj: Checkpoint | None = None) -> tuple[str, ...]:
         """The name is in every manifest from the first trial on; those trials were of these weights."""
-        tried = bool(obj and obj.trials.exists())
-        return ("name", *(("digest",) if obj and obj.digest else ())) if tried else ()
+        used = obj is not None and checkpoint_used(obj)
+        return ("name", *(("digest",) if obj and obj.digest else ())) if used else ()
+
+    def has_delete_permission(self, request: HttpRequest, obj: Checkpoint | None = None) -> bool:
+        """Only of one on which nothing rests."""
+        return super().has_delete_permission(request, obj) and (obj is None or not checkpoint_used(obj))
+
+    def get_deleted_objects(self, objs: Iterable[Checkpoint], request: HttpRequest) -> Any:
+        """What would go with them; what rests on one that is used is not listed: it may be hidden."""
+        used = [checkpoint for checkpoint in objs if checkpoint_used(checkpoint)]
+        found = super().get_deleted_objects([one for one in objs if one not in used], request)
+        to_delete, counts, perms_needed, protected = found
+        kept = [f"Checkpoint {checkpoint}: trials, or a plan that was frozen, are of it" for checkpoint in used]
+        return to_delete, counts, perms_needed, [*protected, *kept]
 
     def save_model(self, request: HttpRequest, obj: Checkpoint, form: Any, change: bool) -> None:
-        """Say so where trials were made with another table."""
+        """Say so where trials may have been made with another table."""
         super().save_model(request, obj, form, change)
-        trials = obj.trials.count() if change and "policy" in form.changed_data else 0
-        if trials:
+        if change and "policy" in form.changed_data and checkpoint_used(obj):
             messages.warning(
                 request,
-                f"Checkpoint {obj} has {_trials(trials)} made with another policy table. If this is another policy and "
-                "not only another address, make another checkpoint: all would be counted together.",
+                f"Trials, or a plan that was frozen, are of checkpoint {obj} with another policy table. If this is "
+                "another policy and not only another address, make another checkpoint: all would be counted together.",
             )
 
     @admin.display(description="tags")
@@ -308,7 +323,7 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
 
     @admin.display(description="trials", ordering="n_trials")
     def trials_n(self, checkpoint: Checkpoint) -> int:
-        """Number of trials."""
+        """Number of trials; 0 of one that is hidden."""
         return checkpoint.n_trials  # type: ignore[attr-defined, no-any-return]
 
 

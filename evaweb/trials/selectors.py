@@ -101,6 +101,11 @@ def scene_list(*, all_of_them: bool = False) -> QuerySet[Scene]:
     return rows if all_of_them else rows.filter(active=True)
 
 
+def checkpoint_used(checkpoint: Checkpoint) -> bool:
+    """True if trials, or a plan that was frozen, are of it: alike for all of a plan, whichever was run so far."""
+    return bool(checkpoint.trials.exists() or checkpoint.plan_set.exclude(state="draft").exists())
+
+
 def checkpoint_list(
     *, all_of_them: bool = False, tag: str = "", sight: Sight = EVERYTHING
 ) -> QuerySet[Checkpoint]:

@@ -6,6 +6,7 @@ The secrets are such that no clock, port or identifier has them by chance.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import uuid as uuids
 
@@ -45,18 +46,31 @@ SECRETS = (
 _SILENT = Pattern("test.blind.silent", "{url} did not answer within {seconds:g} s")
 ERROR = _SILENT(url="ws://host-alder.example:64611", seconds=5)  # with arguments, which tell as much
 
+# What follows from the checkpoint, and what stands there where it is of the other one; lengths differ where they may.
+_THERE = {"alder": "birch", "birch": "alder", ":64611": ":64622", ":64622": ":64611"}
+_THERE |= {str(KEYS[0]): str(KEYS[1]), str(KEYS[1]): str(KEYS[0])}
+_THERE |= {str(FIGURE): "880808.8", str(FIGURE / 1e12): "0.25", LATENCY: "88080"}
+_THERE |= {f"{ROWS} rows": "131 rows", DIGEST: "beef" + DIGEST[:-4]}
+_HERE = re.compile("|".join(map(re.escape, sorted(_THERE, key=len, reverse=True))))
+
+
+def in_the_other_world(text: str) -> str:
+    """The text as it would be if the trial were of the other checkpoint; see tests.evaweb.two_worlds."""
+    return _HERE.sub(lambda found: _THERE[found[0]], text)
+
 
 class Lab:
     """One trial of a blind plan, stage by stage; `checkpoint` is the one that it is of."""
 
     def __init__(self, station, runtime, operator, folder, data):
-        self.station, self.runtime, self.operator, self._folder, self._data = (
+        self.station, self.runtime, self.operator, self._folder, self.data = (
             station,
             runtime,
             operator,
             folder,
             data,
         )
+        self.swapped = False  # see tests.evaweb.two_worlds
         self.owner = builders.user("olga")
         self.scene = builders.scene()
         policies = [
@@ -135,7 +149,8 @@ class Lab:
                 "last_run": {"reason": ERROR},
                 "something_new": ERROR,
             }
-            return said | {"sentences": within(said)}
+            said |= {"sentences": within(said)}
+            return json.loads(in_the_other_world(json.dumps(said))) if self.swapped else said
 
         return told
 
@@ -169,7 +184,7 @@ class Lab:
         self._record(self.trial)
 
     def _record(self, trial):
-        folder = self._data / "episodes" / self._folder.name
+        folder = self.data / "episodes" / self._folder.name
         shutil.copytree(self._folder, folder)
         for name in ("manifest.json", "outcome.json"):
             content = json.loads((folder / name).read_text())
@@ -185,7 +200,7 @@ class Lab:
                 json.dumps({"kind": "command", "text": f"stop by ann: failed, {ERROR}", "time": 1.0}) + "\n"
             )
         resealed(folder)
-        export(folder, self._data)
+        export(folder, self.data)
         self.episode = Episode.objects.create(
             uuid=folder.name,
             station=self.station,
@@ -214,7 +229,7 @@ class Lab:
             },
             started_at=timezone.now(),
         )
-        (self._data / "previews" / folder.name).mkdir(parents=True)
+        (self.data / "previews" / folder.name).mkdir(parents=True)
         Trial.objects.filter(pk=trial.pk).update(
             episode=self.episode, duration_s=0.8, ended_at=timezone.now()
         )

@@ -20,6 +20,7 @@ from evaweb.trials.models import Checkpoint
 from tests.evaweb.blind_lab import LATENCY, NAMES, SECRETS, Lab
 from tests.evaweb.crawling import QUERIES, crawled, leaks, told_apart, whispers
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
+from tests.evaweb.two_worlds import differences, read, swap
 from tests.evaweb.unguarded import unguarded
 
 pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow]
@@ -40,25 +41,48 @@ def lab(live, runtime, ann, recorded, settings):  # noqa: F811
 STAGES = ("before", "handed", "running", "failed", "scored", "closed")
 
 
-@pytest.mark.parametrize(
-    "looked_at", [("scored", "closed"), pytest.param(STAGES, marks=pytest.mark.exhaustive)]
-)
-def test_nothing_that_an_operator_can_reach_tells_before_the_reveal(lab, looked_at):
+def told_by(lab, user):
+    """Somebody's browser."""
     client = Client()
-    client.force_login(lab.operator)
-    bearer = Client(headers={"Authorization": f"Bearer {token_create(user=lab.operator, name='crawler')}"})
-    for stage in STAGES:
-        getattr(lab, stage, lambda: None)()
-        if stage not in looked_at:
-            continue
-        asked = {"queries": QUERIES if stage == "scored" else (), "posts": stage == "closed"}
-        assert list(leaks(lab, client, **asked)) == [], stage
-        if stage != "before":
-            assert whispers(lab, lab.operator) == [], stage
-        if stage == "failed":
-            assert list(leaks(lab, bearer)) == []
-        if stage == "closed":
-            assert list(told_apart(lab, client)) == []
+    client.force_login(user)
+    return client
+
+
+@pytest.mark.parametrize(
+    ("who", "looked_at"),
+    [
+        ("alma", "scored"),
+        *(
+            pytest.param(who, stage, marks=pytest.mark.exhaustive)
+            for who in ("alma", "vera", "owner", "operator")
+            for stage in STAGES[1:]
+            if (who, stage) != ("alma", "scored")
+        ),
+    ],
+)
+def test_in_two_worlds_that_differ_in_the_checkpoint_of_a_trial_alone_everything_reads_alike(
+    lab, alma, vera, who, looked_at
+):
+    user = {"alma": alma, "vera": vera}.get(who) or getattr(lab, who)
+    if who == "alma":
+        lab.operator = alma  # who runs the trials, and administers
+    for stage in STAGES[1 : STAGES.index(looked_at) + 1]:
+        getattr(lab, stage)()
+    client = told_by(lab, user)
+    asked = {"queries": QUERIES, "posts": looked_at == "closed"}
+    here = read(lab, client, who == "alma", **asked)
+    assert [(address, secret) for address, _, told in here for secret in SECRETS if secret in told and secret not in address] == []
+    swap(lab)
+    assert differences(here, read(lab, client, who == "alma", **asked)) == []
+
+
+def test_nothing_that_an_operator_can_reach_tells_before_the_reveal(lab):
+    client = told_by(lab, lab.operator)
+    for stage in STAGES[1:]:
+        getattr(lab, stage)()
+        assert whispers(lab, lab.operator) == [], stage
+    assert list(leaks(lab, client, posts=True)) == []
+    assert list(told_apart(lab, client)) == []
     by_name = [client.get(reverse("api:checkpoint", args=[name])).status_code for name in NAMES]
     assert by_name == [404, 404]
     assert client.get(reverse("api:trials"), {"checkpoint": NAMES[0]}).status_code == 404
@@ -70,6 +94,14 @@ def test_nothing_that_an_operator_can_reach_tells_before_the_reveal(lab, looked_
     assert shown["checkpoint"] == lab.trial.checkpoint.name
     assert shown["code"]
     assert LATENCY in whispers(lab, lab.operator)
+
+
+@pytest.mark.exhaustive
+def test_a_token_tells_what_a_login_tells(lab):
+    for stage in STAGES[1:5]:
+        getattr(lab, stage)()
+    bearer = Client(headers={"Authorization": f"Bearer {token_create(user=lab.operator, name='crawler')}"})
+    assert list(leaks(lab, bearer, QUERIES)) == []
 
 
 @pytest.mark.exhaustive

@@ -59,10 +59,10 @@ def test_what_trials_were_made_with_is_not_changed_by_a_file(bench, admin):
     assert imported(user=admin, text=text) == ["scene block-on-plate: changed"]
     assert list(bench.scene.milestones.values_list("points", flat=True)) == [1, 1, 3]
     bench.scored()
-    with pytest.raises(Conflict, match=r"has trials .*milestone\[2\]\.points: 3 -> 4"):
+    with pytest.raises(Conflict, match=r"is in use .*milestone\[2\]\.points: 3 -> 4"):
         imported(user=admin, text=text.replace("points = 3", "points = 4"))
     policy = exported(checkpoints=[bench.checkpoint]).replace("8000", "8009")
-    with pytest.raises(Conflict, match="checkpoint pi0-block has trials"):
+    with pytest.raises(Conflict, match="checkpoint pi0-block is in use"):
         imported(user=admin, text=policy)
 
 

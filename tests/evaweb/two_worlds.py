@@ -1,0 +1,142 @@
+"""The same lab in two worlds that differ in one thing: which of the two checkpoints its blind trial is of.
+
+Whatever reads differently in the two tells it. Clocks, tokens and identifiers that are drawn anew are left out.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from itertools import zip_longest
+from typing import Any
+
+from django.contrib import admin
+from django.core.files.uploadedfile import SimpleUploadedFile
+from django.db import models, transaction
+from django.test import Client
+from django.urls import reverse
+
+from evaweb.episodes.models import Episode
+from evaweb.jobs.models import Job
+from evaweb.plans.exchange import exported
+from evaweb.plans.models import Slot
+from evaweb.results.models import Judgement
+from evaweb.reviews.models import Tag
+from evaweb.stations.models import Command
+from evaweb.trials.models import Checkpoint, Scene, Trial
+from tests.evaweb.blind_lab import KEYS, NAMES, in_the_other_world
+from tests.evaweb.crawling import _read, everything
+from tests.evaweb.unguarded import unguarded
+
+OF_A_TRIAL = (Trial, Slot, Command, Episode, Job, Judgement, Tag)  # rows that say which checkpoint it is of
+NUMBER = 7  # of the trial, as its checkpoint counts them
+
+
+def swap(lab: Any) -> None:
+    """Bring the lab into the other world: rows, files, and what its station says."""
+    with unguarded("plans", "trials", "episodes", "results", "stations"):
+        for model in OF_A_TRIAL:
+            for row in model._default_manager.all():
+                _swap_row(row)
+        Trial.objects.filter(pk=lab.trial.pk).update(number=NUMBER)
+    for path in sorted(lab.data.rglob("*")):
+        if path.suffix in (".json", ".jsonl", ".txt", ".md", ".log") and path.is_file():
+            path.write_text(in_the_other_world(path.read_text()))
+    lab.swapped = not lab.swapped
+    for name in ("trial", "episode", "command"):
+        if getattr(lab, name) is not None:
+            getattr(lab, name).refresh_from_db()
+
+
+def _swap_row(row: models.Model) -> None:
+    changed = {}
+    for field in row._meta.concrete_fields:
+        value = getattr(row, field.attname)
+        if isinstance(field, models.ForeignKey):
+            if field.related_model is Checkpoint and value is not None:
+                changed[field.attname] = int(in_the_other_world(str(value)))
+        elif not field.primary_key and isinstance(value, (str, dict, list, float)):
+            there = json.loads(in_the_other_world(json.dumps(value)))
+            if there != value:
+                changed[field.attname] = there
+    if changed:
+        type(row)._default_manager.filter(pk=row.pk).update(**changed)
+
+
+def read(lab: Any, client: Client, administrator: bool, **asked: Any) -> list[tuple[str, int, str]]:
+    """(what was asked, status, answer) of all that somebody can read, without what is drawn anew."""
+    found = [*everything(lab, client, **asked)]
+    if administrator:
+        with transaction.atomic():
+            found += administration(lab, client)
+            transaction.set_rollback(True)
+    return [(_plain(asked), status, _plain(told)) for asked, status, told in found]
+
+
+def differences(one: list[tuple[str, int, str]], other: list[tuple[str, int, str]]) -> list[str]:
+    """What reads differently, each with the first lines that do."""
+    found = []
+    for (asked, *here), (_, *there) in zip_longest(one, other, fillvalue=("nothing", 0, "")):
+        if here != there:
+            lines = zip_longest(str(here[1]).splitlines(), str(there[1]).splitlines(), fillvalue="")
+            apart = next((pair for pair in lines if pair[0] != pair[1]), ())
+            found.append(f"{asked}: {here[0]}, {there[0]}: {' | '.join(line.strip() for line in apart)[:400]}")
+    return found
+
+
+def _plain(text: str) -> str:
+    """Without tokens, nonces, times, and identifiers that were drawn for the answer."""
+    return re.sub(
+        r"[\w-]{40,}|nonce[=-][^' >]*|\d\d:\d\d:\d\d\S*|[0-9a-f]{8}-[0-9a-f-]{27}|\d+ (ms|s) ago", "", text
+    )
+
+
+# --- the administration -------------------------------------------------------------------------------------
+
+
+def administration(lab: Any, client: Client) -> Any:
+    """(what was asked, status, answer) of every page of it, and of what can be sent to those of checkpoints.
+
+    Of each list every order, filter and date that the page offers, and a search for each name.
+    """
+    index = reverse("admin:index")
+    yield (index, *_asked(client, index))
+    for model in sorted(admin.site._registry, key=lambda model: model._meta.label):
+        place = f"admin:{model._meta.app_label}_{model._meta.model_name}"
+        listed = reverse(f"{place}_changelist")
+        status, told = _asked(client, listed)
+        yield listed, status, told
+        for query in sorted(set(re.findall(r'href="(\?[^"#]+)"', told))):
+            yield (listed + query, *_asked(client, listed + query.replace("&amp;", "&")))
+        for name in NAMES if model in (Checkpoint, Scene) else ():
+            yield (f"{listed}?q={name}", *_asked(client, f"{listed}?q={name}"))
+        yield (f"{place}_add", *_asked(client, reverse(f"{place}_add")))
+        for row in model._default_manager.order_by("pk")[:3]:
+            for page in ("change", "delete", "history"):
+                address = reverse(f"{place}_{page}", args=[row.pk])
+                yield (address, *_asked(client, address))
+    yield from _sent(client)
+
+
+def _asked(client: Client, address: str) -> tuple[int, str]:
+    return _read(client.get(address, headers={"Accept": "text/html"}))
+
+
+def _sent(client: Client) -> Any:
+    """What is said to changes of a checkpoint: in its form, by a file, and to its removal, alone and with the other."""
+    listed, wanted = reverse("admin:trials_checkpoint_changelist"), reverse("admin:plans_plan_import")
+    for row in Checkpoint.objects.filter(pk__in=KEYS).order_by("pk"):
+        form = {"name": row.name, "description": "another", "policy": '{"url": "ws://127.0.0.1:1"}', "tags": ""}
+        deleted = reverse("admin:trials_checkpoint_delete", args=[row.pk])
+        text = exported(checkpoints=[row]).replace('description = ""', 'description = "another"')
+        for address, content in (
+            (reverse("admin:trials_checkpoint_change", args=[row.pk]), form),
+            (deleted, {"post": "yes"}),
+            (listed, {"action": "delete_selected", "_selected_action": [row.pk]}),
+            (listed, {"action": "switch_off", "_selected_action": [row.pk]}),
+            (wanted, {"file": SimpleUploadedFile("lab.toml", text.encode())}),
+        ):
+            with transaction.atomic():
+                answer = client.post(address, content, follow=True, headers={"Accept": "text/html"})
+                yield (f"POST {address} {row.pk} {content.get('action', '')}", *_read(answer))
+                transaction.set_rollback(True)
