@@ -23,10 +23,16 @@ from evaweb.results.analysis.filters import Chosen, chosen
 from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.presentation.citing import citation
-from evaweb.results.presentation.headline import with_planned_letters
+from evaweb.results.presentation.headline import headline_document, with_planned_letters
 from evaweb.results.presentation.integrity import integrity_document
 from evaweb.results.ratings.unblinding import require_seen
-from evaweb.results.reports.document import analysis_document, arm_document, comparison_document
+from evaweb.results.reports.document import (
+    analysis_document,
+    arm_document,
+    comparison_document,
+    proportion_document,
+)
+from evaweb.results.reports.reporting import planned_document
 from evaweb.results.reports.tables import COLUMNS, outcome_page, outcome_pages
 from evaweb.results.selectors import plan_at_reveal, plan_get
 from evaweb.tabular_export import in_pages
@@ -191,7 +197,12 @@ class Planned(Schema):
     url_name="plan-results",
 )
 def results(request: HttpRequest, name: str, version: int, only: Query[Only]) -> Any:
-    """Of each checkpoint, of each pair, of raters, automatic judges and preferences; intervals are at 95 %."""
+    """Of each checkpoint, of each pair, of raters, automatic judges and preferences; intervals are at 95 %.
+
+    What the plan's design decided stands in `headline` and `planned`; all else describes. A comparison whose design has
+    not ended (`standing` is "open") has neither test nor evidence. Of a revealed plan the figures are of the scores at
+    the reveal; `corrected` has rates with those of now, where they differ.
+    """
     plan, which = _seen(request, name, version, only)
     analysis = with_planned_letters(plan, caching.analysis_of(plan, which))
     return {
@@ -199,7 +210,13 @@ def results(request: HttpRequest, name: str, version: int, only: Query[Only]) ->
         "version": plan.version,
         "digest": plan.digest,
         "only": {name: value for name, value in only.model_dump().items() if value},
+        "headline": headline_document(plan),
+        "planned": planned_document(plan),
         **analysis_document(analysis),
+        "corrected": {
+            name: proportion_document(found)
+            for name, found in caching.corrected_of(plan, which, caching.fingerprint(plan)).items()
+        },
         "notes": list(analysis.notes),
         "agreement": agreement_of(plan),
         "judges": judges_of(plan),

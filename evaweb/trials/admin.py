@@ -294,7 +294,9 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
         used = [checkpoint for checkpoint in objs if checkpoint_used(checkpoint)]
         found = super().get_deleted_objects([one for one in objs if one not in used], request)
         to_delete, counts, perms_needed, protected = found
-        kept = [f"Checkpoint {checkpoint}: trials, or a plan that was frozen, are of it" for checkpoint in used]
+        kept = [
+            f"Checkpoint {checkpoint}: trials, or a plan that was frozen, are of it" for checkpoint in used
+        ]
         return to_delete, counts, perms_needed, [*protected, *kept]
 
     def save_model(self, request: HttpRequest, obj: Checkpoint, form: Any, change: bool) -> None:

@@ -160,7 +160,12 @@ def _opened(body):
 
 def leaks(lab, client, queries=(), *, posts=False):
     """Where a secret can be read by somebody who has not said it, one after the other."""
-    for asked, _, told in everything(lab, client, queries, posts=posts):
+    yield from secrets_in(everything(lab, client, queries, posts=posts))
+
+
+def secrets_in(answers):
+    """Each secret that was told to somebody who had not said it: (what was asked, secret)."""
+    for asked, _, told in answers:
         yield from ((asked, secret) for secret in SECRETS if secret in told and secret not in asked)
 
 

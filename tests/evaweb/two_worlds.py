@@ -80,7 +80,9 @@ def differences(one: list[tuple[str, int, str]], other: list[tuple[str, int, str
         if here != there:
             lines = zip_longest(str(here[1]).splitlines(), str(there[1]).splitlines(), fillvalue="")
             apart = next((pair for pair in lines if pair[0] != pair[1]), ())
-            found.append(f"{asked}: {here[0]}, {there[0]}: {' | '.join(line.strip() for line in apart)[:400]}")
+            found.append(
+                f"{asked}: {here[0]}, {there[0]}: {' | '.join(line.strip() for line in apart)[:400]}"
+            )
     return found
 
 
@@ -126,7 +128,12 @@ def _sent(client: Client) -> Any:
     """What is said to changes of a checkpoint: in its form, by a file, and to its removal, alone and with the other."""
     listed, wanted = reverse("admin:trials_checkpoint_changelist"), reverse("admin:plans_plan_import")
     for row in Checkpoint.objects.filter(pk__in=KEYS).order_by("pk"):
-        form = {"name": row.name, "description": "another", "policy": '{"url": "ws://127.0.0.1:1"}', "tags": ""}
+        form = {
+            "name": row.name,
+            "description": "another",
+            "policy": '{"url": "ws://127.0.0.1:1"}',
+            "tags": "",
+        }
         deleted = reverse("admin:trials_checkpoint_delete", args=[row.pk])
         text = exported(checkpoints=[row]).replace('description = ""', 'description = "another"')
         for address, content in (

@@ -6,8 +6,9 @@ Methods are those of docs/evaluation.md. What cannot be computed is None with it
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from itertools import combinations
 from typing import TypeVar
 
@@ -101,8 +102,32 @@ class Within:
 
 
 @dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the design of a planned comparison says: whether it has ended, and with both told apart.
+
+    `apart` is None where it asks something else than whether they differ. `evidence`: the outcome whose e-process is
+    the design, "" of any other design.
+    """
+
+    ended: bool = False
+    apart: bool | None = None
+    evidence: str = ""
+
+
+class Standing(StrEnum):
+    """Who decides a comparison: nobody (it was not planned), its plan's design, or that some day."""
+
+    UNPLANNED = "not planned"
+    DECIDED = "decided"
+    OPEN = "open"
+
+
+@dataclass(frozen=True, slots=True)
 class Comparison:
     """Two checkpoints: the first minus the second.
+
+    `standing` says who decides: of a planned comparison its design alone, once that has ended. Of one that is open no
+    test, evidence or letter is there: what describes it stays. `alpha` is its share.
 
     `within` has the exact test within conditions, scenes, operators and stations, where there are several that tell
     something; `scenes` the difference in each scene, of several, and `interaction` the probability of their being as
@@ -116,10 +141,12 @@ class Comparison:
 
     first: str
     second: str
+    standing: Standing
+    alpha: float
     difference: Difference
-    test: ExactTest
-    corrected: float
-    better: float
+    test: ExactTest | None
+    corrected: float | None
+    better: float | None
     pairs: int
     paired: McNemar | None
     scored: Flips | None
@@ -128,8 +155,8 @@ class Comparison:
     within: dict[str, Within]
     scenes: dict[str, Difference]
     interaction: float | None
-    evidence: Evidence
-    score_evidence: Evidence
+    evidence: Evidence | None
+    score_evidence: Evidence | None
     anytime: Interval | None
     score_anytime: Interval | None
     sooner: Flips | None
@@ -161,13 +188,16 @@ def analyse(
     interruptions: Sequence[Interruption] = (),
     *,
     alpha: float = 0.05,
-    planned: Sequence[tuple[str, str]] = (),
+    planned: Mapping[tuple[str, str], Verdict] | None = None,
     in_pairs: bool = True,
     limits: Mapping[str, float] | None = None,
     checkpoints: Sequence[str] = (),
     whole: bool = False,
 ) -> Analysis:
     """All of it; `planned` comparisons are made in their direction, others the better one first.
+
+    Of planned ones the design has the word: letters tell apart what it did, and while it has not decided there are
+    none, nor is there anything else that could be taken for a decision.
 
     Without `in_pairs` blocks are no pairs: a block has trials of whichever checkpoint was drawn. `whole`: these are all
     trials of a plan, its blocks numbered from 0. Evidence then ends before the first of them that lacks a trial, as the
@@ -179,10 +209,11 @@ def analyse(
     `interruptions` count for how often a checkpoint needs an operator, and for nothing else. `checkpoints` are those of
     the evaluation, in the order in which they have their colours, whichever of them are chosen.
     """
+    by_design = planned or {}
     arms, timing = by_checkpoint(outcomes), _Timing.of(outcomes, limits or {})
     series = list(dict.fromkeys([*checkpoints, *sorted(arms)]))
     ranked = sorted(arms, key=lambda name: (-sum(o.success for o in arms[name]) / len(arms[name]), name))
-    couples = [_directed(couple, planned) for couple in combinations(ranked, 2)]
+    couples = [_directed(couple, by_design) for couple in combinations(ranked, 2)]
     tests = [_test(arms[one], arms[other]) for one, other in couples]
     corrected = holm([test.p for test in tests])
     comparisons = tuple(
@@ -193,14 +224,16 @@ def analyse(
             arms[other],
             test,
             p,
-            _share(alpha, couples, planned, (one, other)),
+            _share(alpha, couples, by_design, (one, other)),
+            by_design.get((one, other)),
             timing,
             in_pairs,
             whole,
         )
         for (one, other), test, p in zip(couples, tests, corrected, strict=True)
     )
-    apart = {frozenset((c.first, c.second)) for c in comparisons if c.corrected <= alpha}
+    apart = {frozenset((c.first, c.second)) for c in comparisons if _apart(c, by_design, alpha)}
+    told = all(by_design[c.first, c.second].apart is not None for c in comparisons if _is_planned(c))
     return Analysis(
         len(outcomes),
         tuple(
@@ -211,7 +244,7 @@ def analyse(
             for name in ranked
         ),
         comparisons,
-        letters(ranked, apart),
+        letters(ranked, apart) if told else {},
         alpha,
         tuple(_imbalances(arms)),
     )
@@ -245,14 +278,24 @@ class _Timing:
         return self.until if time is None else min(time, self.until)
 
 
-def _directed(couple: tuple[str, str], planned: Sequence[tuple[str, str]]) -> tuple[str, str]:
+def _is_planned(found: Comparison) -> bool:
+    return found.standing is not Standing.UNPLANNED
+
+
+def _apart(found: Comparison, by_design: Mapping[tuple[str, str], Verdict], alpha: float) -> bool:
+    if _is_planned(found):
+        return bool(by_design[found.first, found.second].apart)
+    return found.corrected is not None and found.corrected <= alpha
+
+
+def _directed(couple: tuple[str, str], planned: Iterable[tuple[str, str]]) -> tuple[str, str]:
     return next((pair for pair in planned if set(pair) == set(couple)), couple)
 
 
 def _share(
     alpha: float,
     couples: Sequence[tuple[str, str]],
-    planned: Sequence[tuple[str, str]],
+    planned: Collection[tuple[str, str]],
     couple: tuple[str, str],
 ) -> float:
     """Alpha of the evidence: planned comparisons share all of it, each of the others has an equal share of all."""
@@ -324,6 +367,7 @@ def _comparison(
     test: ExactTest,
     corrected: float,
     alpha: float,
+    verdict: Verdict | None,
     timing: _Timing,
     in_pairs: bool,
     whole: bool,
@@ -334,9 +378,11 @@ def _comparison(
     if len(told) < len(pairs):
         notes.append(_later(len(pairs) - len(told)))
     counts = (*_counts(first), *_counts(second))
-    return Comparison(
+    found = Comparison(
         one,
         other,
+        Standing.UNPLANNED if verdict is None else Standing.DECIDED if verdict.ended else Standing.OPEN,
+        alpha,
         newcombe(*counts),
         test,
         corrected,
@@ -354,6 +400,29 @@ def _comparison(
         confidence_sequence([p.first.score - p.second.score for p in told], alpha),
         _sooner(pairs, timing),
         (*notes, *(_waiting(pairs, first, second) if in_pairs else [_RANDOM])),
+    )
+    return found if verdict is None or verdict.ended else _described(found, verdict.evidence)
+
+
+def _described(found: Comparison, evidence: str) -> Comparison:
+    """What describes the trials of a comparison that is open, and of the evidence that by which its design decides."""
+    kept = {"": (None, None), "success": (found.evidence, None), "score": (None, found.score_evidence)}
+    own, own_score = kept[evidence]
+    return replace(
+        found,
+        test=None,
+        corrected=None,
+        better=None,
+        paired=None,
+        scored=None,
+        stratified=None,
+        within={},
+        interaction=None,
+        evidence=own,
+        score_evidence=own_score,
+        anytime=None,
+        score_anytime=None,
+        sooner=None,
     )
 
 

@@ -13,12 +13,14 @@ from typing import Any
 from django.db.models import Count, Max, Q, Sum
 
 from evaweb.memo import Kept, steady
-from evaweb.plans.design import compared, planned
+from evaweb.plans.design import compared, findings_of, frozen, planned
 from evaweb.plans.models import Allocation, Plan
-from evaweb.results.analysis.analysis import Analysis, analyse
+from evaweb.results.analysis.analysis import Analysis, Verdict, analyse
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.analysis.load_outcomes import interruptions_of_plan, outcomes_of_plan
-from evaweb.results.analysis.outcomes import Interruption, Outcome
+from evaweb.results.analysis.outcomes import Interruption, Outcome, by_checkpoint
+from evaweb.statistics.designs import ANYTIME
+from evaweb.statistics.proportions import Proportion, proportion
 from evaweb.trials.models import Scene, Trial, TrialStatus
 
 
@@ -31,6 +33,7 @@ class Runs:
 
 
 _runs: Kept[Runs] = Kept()
+_corrected: Kept[list[Outcome]] = Kept()
 _analyses: Kept[Analysis] = Kept()
 _pages: Kept[dict[str, Any]] = Kept()
 
@@ -62,6 +65,21 @@ def runs_of(plan: Plan, at: Hashable = None) -> Runs:
     )
 
 
+def corrected_of(plan: Plan, only: Chosen, at: Hashable) -> dict[str, Proportion]:
+    """Successes by checkpoint with the scores of now, where those of a revealed plan were corrected since."""
+    if not plan.at_reveal:
+        return {}
+    now = _corrected.get((plan.pk, plan.digest), at, lambda: outcomes_of_plan(plan, corrected=True))
+    found = {}
+    before = by_checkpoint(only.apply(runs_of(plan, at).outcomes))
+    for name, rows in by_checkpoint(only.apply(now)).items():
+        if [(o.trial, o.success, o.score) for o in rows] != [
+            (o.trial, o.success, o.score) for o in before.get(name, [])
+        ]:
+            found[name] = proportion(sum(o.success for o in rows), len(rows))
+    return found
+
+
 def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> Analysis:
     """Analysis of the plan's trials, or of those that are chosen."""
     now = at or fingerprint(plan)
@@ -72,7 +90,7 @@ def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> 
             which.apply(runs.outcomes),
             which.apply(runs.interruptions),
             alpha=plan.alpha,
-            planned=compared(plan.document or {}) or planned(plan),
+            planned=verdicts_of(plan),
             in_pairs=plan.allocation == Allocation.PAIRED,
             limits=limits_of(plan),
             checkpoints=[row["name"] for row in (plan.document or {}).get("checkpoints", ())],
@@ -80,6 +98,22 @@ def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> 
         )
 
     return _analyses.get((plan.pk, plan.digest, which), now, make)
+
+
+def verdicts_of(plan: Plan) -> dict[tuple[str, str], Verdict]:
+    """What its design says of each comparison of a plan; those of a draft are open."""
+    found, design = findings_of(plan), frozen(plan.document) if plan.document else None
+    if found is None or design is None:
+        return dict.fromkeys(planned(plan), Verdict())
+    own = design.outcome if design.rule == ANYTIME else ""
+    return {
+        names: Verdict(
+            bool(one.ended),
+            one.winner is not None if one.ended and design.margin is None else None,
+            own,
+        )
+        for names, one in zip(compared(plan.document or {}), found.each, strict=True)
+    }
 
 
 def limits_of(plan: Plan) -> dict[str, float]:
@@ -96,5 +130,6 @@ def page_of(plan: Plan, name: Hashable, at: Hashable, make: Callable[[], dict[st
 def forget() -> None:
     """Drop what is kept: the next callers wait for it to be made."""
     _runs.clear()
+    _corrected.clear()
     _analyses.clear()
     _pages.clear()

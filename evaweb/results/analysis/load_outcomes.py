@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
+from datetime import datetime
+from typing import Any
 
 from django.db.models import QuerySet
 
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.outcomes import Interruption, Outcome
-from evaweb.trials.models import MilestoneOutcome, Trial, TrialStatus
+from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
 
 # What an outcome calls it, and where a trial has it.
 _RUN = {
@@ -21,22 +23,24 @@ _RUN = {
     "station": "station__name",
     "operator": "operator__username",
 }
+_JUDGED = ("success", "score", "failure", "failure_phase")
 _FIELDS = _RUN | {
-    "success": "verdict__success",
-    "score": "verdict__score",
-    "failure": "verdict__failure",
-    "failure_phase": "verdict__failure_phase",
+    **{name: f"verdict__{name}" for name in _JUDGED},
     "smoothness": "episode__smoothness",
     "commanded": "episode__smoothness_commanded",
 }
 
 
-def outcomes_of_plan(plan: Plan) -> list[Outcome]:
-    """Those of a plan that count, in the order in which they were handed out."""
+def outcomes_of_plan(plan: Plan, *, corrected: bool = False) -> list[Outcome]:
+    """Those of a plan that count, in the order in which they were handed out.
+
+    Of a revealed plan as they were scored at the reveal; `corrected`: as they are scored now.
+    """
     trials = Trial.objects.filter(handout__plan=plan)
     blocks = dict(plan.handouts.values_list("trial_id", "slot__block"))
     order = dict(plan.handouts.values_list("trial_id", "number"))
-    return _outcomes(trials, {trial: str(block) for trial, block in blocks.items()}, order)
+    until = datetime.fromisoformat(plan.at_reveal["at"]) if plan.at_reveal and not corrected else None
+    return _outcomes(trials, {trial: str(block) for trial, block in blocks.items()}, order, until)
 
 
 def interruptions_of_plan(plan: Plan) -> list[Interruption]:
@@ -54,13 +58,23 @@ def outcomes_of(trials: QuerySet[Trial]) -> list[Outcome]:
     return _outcomes(trials, {}, {})
 
 
-def _outcomes(trials: QuerySet[Trial], blocks: dict[int, str], order: dict[int, int]) -> list[Outcome]:
+def _outcomes(
+    trials: QuerySet[Trial], blocks: dict[int, str], order: dict[int, int], until: datetime | None = None
+) -> list[Outcome]:
+    """`until`: by the newest of the scores that were given before, without trials that had none yet."""
     scored = trials.filter(status=TrialStatus.SCORED).order_by("started_at", "pk")
     rows = list(scored.values_list("verdict_id", "number", *_FIELDS.values()))
-    milestones = _milestones(trials)
+    earlier = {} if until is None else _scores_before(until, trials)
+    milestones = _milestones(trials, earlier)
     found = []
-    for at, (verdict, number, *told) in enumerate(rows):
+    for at, (newest, number, *told) in enumerate(rows):
         said = dict(zip(_FIELDS, told, strict=True))
+        verdict = newest
+        if until is not None:
+            if said["trial"] not in earlier:
+                continue
+            verdict, judged = earlier[said["trial"]]
+            said |= judged
         reached = milestones.get(verdict, [])
         found.append(
             Outcome(
@@ -74,10 +88,24 @@ def _outcomes(trials: QuerySet[Trial], blocks: dict[int, str], order: dict[int, 
     return sorted(found, key=lambda outcome: outcome.order)
 
 
-def _milestones(trials: QuerySet[Trial]) -> dict[int, list[tuple[str, bool]]]:
-    """Of each score that counts, its milestones in their order."""
-    counting = MilestoneOutcome.objects.filter(
-        score__in=trials.filter(status=TrialStatus.SCORED).values("verdict")
+def _scores_before(until: datetime, trials: QuerySet[Trial]) -> dict[int, tuple[int, dict[str, Any]]]:
+    """Of each trial the newest score that was given before then: its key, and what it says."""
+    given = Score.objects.filter(trial__in=trials, scored_at__lt=until).order_by("pk")
+    return {
+        trial: (key, dict(zip(_JUDGED, said, strict=True)))
+        for trial, key, *said in given.values_list("trial_id", "pk", *_JUDGED)
+    }
+
+
+def _milestones(
+    trials: QuerySet[Trial], earlier: dict[int, tuple[int, dict[str, Any]]]
+) -> dict[int, list[tuple[str, bool]]]:
+    """Of each score that counts its milestones in their order; where `earlier` ones count, of all scores."""
+    scored = trials.filter(status=TrialStatus.SCORED)
+    counting = (
+        MilestoneOutcome.objects.filter(score__trial__in=scored)
+        if earlier
+        else MilestoneOutcome.objects.filter(score__in=scored.values("verdict"))
     )
     found: dict[int, list[tuple[str, bool]]] = defaultdict(list)
     rows: Iterable[tuple[int, str, bool]] = counting.order_by("score_id", "order").values_list(

@@ -11,7 +11,7 @@ from evaweb.errors import EvaError
 from evaweb.plans.design import frozen
 from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.analysis import Analysis, Comparison
+from evaweb.results.analysis.analysis import Analysis, Comparison, Standing
 from evaweb.results.analysis.filters import Chosen, choices
 from evaweb.results.analysis.integrity import changes_of
 from evaweb.results.analysis.outcomes import by_checkpoint, paired
@@ -131,7 +131,8 @@ def _compared(plan: Plan, only: Chosen, first: str, second: str, at: Hashable) -
             if (drawn := _funnel(plan, replace(analysis, arms=arms), scene, only))
         ],
         "success_times": courses.success_times(arms),
-        "evidence": courses.evidence(
+        "evidence": found.evidence
+        and courses.evidence(
             found.evidence, found.first, found.second, drawn=(arms[0].series, arms[1].series)
         ),
         "paired": list(enumerate(paired(runs.get(found.first, []), runs.get(found.second, [])), 1)),
@@ -193,10 +194,15 @@ def _meter(analysis: Analysis, found: Comparison, design: Design) -> dict[str, A
     return {
         "found": found,
         "foreseen": design.blocks,
-        "meter": courses.evidence(found.evidence, *names, design.blocks, drawn),
-        "score_meter": courses.evidence(found.score_evidence, *names, design.blocks, drawn),
-        "words": evidence_words(found.evidence),
-        "score_words": evidence_words(found.score_evidence),
+        "by": [
+            (what, courses.evidence(evidence, *names, design.blocks, drawn), evidence_words(evidence))
+            for what, evidence in (
+                ("By success and failure", found.evidence),
+                ("By scores, partial credit included", found.score_evidence),
+            )
+            if evidence
+        ],
+        "open": found.standing is Standing.OPEN,
         "difference": anytime_words(found.anytime, found.pairs),
         "score_difference": anytime_words(found.score_anytime, found.pairs),
         "level": 100 * (1 - design.share),

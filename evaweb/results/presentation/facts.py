@@ -8,7 +8,7 @@ from typing import Any
 
 from evaweb.plans.design import compared
 from evaweb.plans.models import Plan, StoppingRule
-from evaweb.results.analysis.analysis import Analysis, Comparison
+from evaweb.results.analysis.analysis import Analysis, Comparison, Standing
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.presentation.addresses import compare_address
 from evaweb.results.presentation.drawings import rates
@@ -56,6 +56,7 @@ def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[
         "headline": planned,
         "names": f"{found.first} and {found.second}",
         "facts": [*_of_the_rates(plan, analysis, found), *_of_the_evidence(found), *_beyond(found)],
+        "standing": found.standing.name.lower(),
         "notes": found.notes,
         "reversed": bool(found.stratified and found.stratified.reversed),
         "missed": missed_words(analysis, found),
@@ -67,9 +68,10 @@ def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[
 def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator[Fact]:
     fixed = "n as planned" if plan.stopping == StoppingRule.NONE else "as if n had been fixed"
     yield Fact("How much better?", "Newcombe, 95 %", points(found.difference))
-    corrected = f", Holm {probability(found.corrected)}" if len(analysis.comparisons) > 1 else ""
-    chance = f"{p_words(found.test.p)}{corrected}"
-    yield Fact("Could it be chance?", f"Barnard, two-sided, {fixed}", chance)
+    if found.test and found.corrected is not None:
+        corrected = f", Holm {probability(found.corrected)}" if len(analysis.comparisons) > 1 else ""
+        chance = f"{p_words(found.test.p)}{corrected}"
+        yield Fact("Could it be chance?", f"Barnard, two-sided, {fixed}", chance)
     if found.paired:
         split = (
             f"only {found.first} {found.paired.first_only}, only {found.second} {found.paired.second_only}"
@@ -87,19 +89,23 @@ def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator
 
 
 def _of_the_evidence(found: Comparison) -> Iterator[Fact]:
-    yield Fact(
-        "May you stop?", f"e-process, alpha {found.evidence.alpha:.2g}", evidence_words(found.evidence)
-    )
-    yield Fact(
-        "With partial credit, at any time?",
-        "betting e-process on scores",
-        evidence_words(found.score_evidence),
-    )
+    if found.evidence:
+        yield Fact("May you stop?", f"e-process, alpha {found.alpha:.2g}", evidence_words(found.evidence))
+    if found.score_evidence:
+        yield Fact(
+            "With partial credit, at any time?",
+            "betting e-process on scores",
+            evidence_words(found.score_evidence),
+        )
     for question, interval in (
-        ("How much better, at any time?", found.anytime),
-        ("With partial credit, how much at any time?", found.score_anytime),
+        ()
+        if found.standing is Standing.OPEN
+        else (
+            ("How much better, at any time?", found.anytime),
+            ("With partial credit, how much at any time?", found.score_anytime),
+        )
     ):
-        how = f"confidence sequence, {100 * (1 - found.evidence.alpha):.3g} %"
+        how = f"confidence sequence, {100 * (1 - found.alpha):.3g} %"
         yield Fact(question, how, anytime_words(interval, found.pairs))
 
 
@@ -116,15 +122,17 @@ def _beyond(found: Comparison) -> Iterator[Fact]:
     if found.scenes:
         by_scene = "; ".join(f"{name} {points(difference)}" for name, difference in found.scenes.items())
         chance = "too many ways to count" if found.interaction is None else p_words(found.interaction)
-        yield Fact("Does it depend on the scene?", "interaction, Zelen, exact", f"{chance}: {by_scene}")
+        told = by_scene if found.standing is Standing.OPEN else f"{chance}: {by_scene}"
+        yield Fact("Does it depend on the scene?", "interaction, Zelen, exact", told)
     if found.sooner:
         ahead = found.first if found.sooner.value < 0 else found.second
         by = f"{abs(found.sooner.value):.1f} s"
         lead = f"{ahead} by {by}, failures counted in full" if found.sooner.value else "neither"
         how = "sign flips of times within pairs, exact"
         yield Fact("Sooner?", how, f"{lead}, {p_words(found.sooner.p)} of {found.sooner.pairs} pairs")
-    believed = f"{found.first} is better with probability {_chance(found.better)}"
-    yield Fact("What to believe?", "uniform priors", believed)
+    if found.better is not None:
+        believed = f"{found.first} is better with probability {_chance(found.better)}"
+        yield Fact("What to believe?", "uniform priors", believed)
 
 
 def missed_words(analysis: Analysis, found: Comparison | None = None) -> str:
@@ -133,7 +141,7 @@ def missed_words(analysis: Analysis, found: Comparison | None = None) -> str:
     n = min(arm.success.n for arm in arms)
     rate = min((arm.success.rate for arm in arms if arm.success.rate is not None), default=None)
     compared = analysis.comparisons if found is None else (found,)
-    return missed(n, rate, max((one.evidence.alpha for one in compared), default=analysis.alpha))
+    return missed(n, rate, max((one.alpha for one in compared), default=analysis.alpha))
 
 
 def _chance(p: float) -> str:

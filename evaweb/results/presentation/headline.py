@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 from evaweb.plans.design import (
     Names,
@@ -67,6 +68,12 @@ def headline(plan: Plan) -> Headline | None:
     )
 
 
+def headline_document(plan: Plan) -> dict[str, Any] | None:
+    """It in plain values; None where the plan has no comparison."""
+    said = headline(plan)
+    return None if said is None else {**asdict(said), "letters": dict(said.letters)}
+
+
 def alpha_words(found: Design) -> str:
     """Alpha, and how many comparisons share it."""
     share = f" shared by {len(found.comparisons)} comparisons" if len(found.comparisons) > 1 else ""
@@ -110,7 +117,8 @@ def letters_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[tupl
     names = compared(plan.document or {})
     arms = arms_of(names)
     said = findings(found, blocks)
-    if len(names) < 3 or len(names) != len(arms) * (len(arms) - 1) // 2 or not said.ended:
+    of_all = len(names) > 2 and len(names) == len(arms) * (len(arms) - 1) // 2
+    if not of_all or found.margin is not None or not said.ended:
         return ()
     rates = {name: _mean(blocks, number) for number, name in enumerate(arms)}
     ranked = sorted(arms, key=lambda name: (-rates[name], name))

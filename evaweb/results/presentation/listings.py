@@ -40,11 +40,13 @@ class Row:
 
 
 def arm_rows(plan: Plan, analysis: Analysis, only: Chosen) -> list[dict[str, Any]]:
-    """The table of checkpoints, best first."""
+    """The table of checkpoints, best first, each with what scores that were corrected after the reveal make of it."""
+    corrected = caching.corrected_of(plan, only, caching.fingerprint(plan))
     return [
         {
             "arm": arm,
-            "letters": analysis.letters[arm.checkpoint],
+            "corrected": corrected.get(arm.checkpoint),
+            "letters": analysis.letters.get(arm.checkpoint, ""),
             "address": trials_address(plan, only, checkpoint=arm.checkpoint),
             "successes": trials_address(plan, only, checkpoint=arm.checkpoint, success="yes"),
             "exact": ends(arm.exact) if arm.exact else "",

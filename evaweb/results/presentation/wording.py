@@ -38,7 +38,12 @@ def p_words(p: float) -> str:
 
 
 def verdict(found: Comparison, one: Proportion, other: Proportion, alpha: float) -> str:
-    """The comparison in one sentence, with its evidence; says only what the corrected exact test says."""
+    """The comparison in one sentence, with its evidence; says only what the corrected exact test says.
+
+    One that is planned is not decided here: ValueError.
+    """
+    if found.corrected is None:
+        raise ValueError(f"{found.first} and {found.second}: their design decides, which has not ended")
     difference = found.difference
     if found.corrected > alpha:
         counts = (

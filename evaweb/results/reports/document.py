@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from evaweb.results.analysis.analysis import Analysis, Arm, Comparison
+from evaweb.results.analysis.analysis import Analysis, Arm, Comparison, Standing
 from evaweb.statistics.base import Interval
 from evaweb.statistics.bounded import Mean
 from evaweb.statistics.difference import Difference
@@ -79,8 +79,10 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
     return {
         "first": found.first,
         "second": found.second,
+        "standing": found.standing.value,
         "difference": {"value": found.difference.value, "newcombe": _ends(found.difference.interval)},
-        "barnard": {"statistic": found.test.statistic, "p": found.test.p, "holm": found.corrected},
+        "barnard": found.test
+        and {"statistic": found.test.statistic, "p": found.test.p, "holm": found.corrected},
         "probability_better": found.better,
         "pairs": found.pairs,
         "mcnemar": found.paired
@@ -111,8 +113,10 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
         },
         "evidence": _evidence(found.evidence),
         "score_evidence": _evidence(found.score_evidence),
-        "anytime": {
-            "level": 1 - found.evidence.alpha,
+        "anytime": None
+        if found.standing is Standing.OPEN
+        else {
+            "level": 1 - found.alpha,
             "success": _ends(found.anytime),
             "score": _ends(found.score_anytime),
         },
@@ -183,7 +187,9 @@ def _time(arm: Arm) -> dict[str, Any] | None:
     }
 
 
-def _evidence(found: Evidence) -> dict[str, Any]:
+def _evidence(found: Evidence | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
     return {
         "pairs": found.pairs,
         "log_e_first": list(found.first),

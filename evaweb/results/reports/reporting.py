@@ -119,14 +119,14 @@ def numbers_of(plan: Plan, analysis: Analysis) -> dict[str, Any]:
     words = ("reason", "groups")
     return {
         **analysis_document(analysis),
-        "planned": _planned(plan),
+        "planned": planned_document(plan),
         "agreement": agreement_of(plan),
         "judges": judges_of(plan),
         "preferences": preferred and {name: value for name, value in preferred.items() if name not in words},
     }
 
 
-def _planned(plan: Plan) -> list[dict[str, Any]]:
+def planned_document(plan: Plan) -> list[dict[str, Any]]:
     """What the plan's design says of each of its comparisons."""
     found = findings_of(plan)
     if found is None:
@@ -202,7 +202,7 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
                 drawn=(order[found.first], order[found.second]),
             )
             for found in primaries
-            if found.pairs
+            if found.pairs and found.evidence
         ],
         "agreement": agreement_of(plan),
         "judges": judges_of(plan),

@@ -12,6 +12,7 @@ from django.db.models import QuerySet
 
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.filters import Chosen
+from evaweb.results.presentation.headline import headline
 from evaweb.trials.models import MilestoneOutcome, Trial
 from evaweb.trials.record import COLUMNS as RECORDED
 from evaweb.trials.record import HINTS, TrialRecord
@@ -49,8 +50,12 @@ _ALL = _OF_PLAN | {
     if column.table
 }
 _ORDER = dict.fromkeys((*_FIRST, *_ALL))
-COLUMNS: dict[str, Any] = {name: _ALL[name][0] for name in _ORDER}
-"""The columns of an export with their types; those of the score are empty where there is none."""
+COLUMNS: dict[str, Any] = {name: _ALL[name][0] for name in _ORDER} | {"headline": str}
+"""The columns of an export with their types; those of the score are empty where there is none.
+
+`headline`, the same in each row, is what the plan's design says of its comparison: a table that is taken elsewhere
+keeps it.
+"""
 _FIELDS = [_ALL[name][1] for name in _ORDER]
 _TEXTS = [name for name, hint in COLUMNS.items() if hint in (str, str | None)]
 PAGE = 1000
@@ -60,8 +65,8 @@ def outcome_pages(
     plan: Plan, which: Chosen | None = None, size: int = PAGE
 ) -> Iterator[list[dict[str, Any]]]:
     """All attempts that are meant, in the order in which they were handed out, a page at a time."""
-    rows, last = _attempts(plan, which), 0
-    while page := _rows(rows.filter(handout__number__gt=last)[:size]):
+    rows, last, said = _attempts(plan, which), 0, _headline(plan)
+    while page := _rows(said, rows.filter(handout__number__gt=last)[:size]):
         yield page
         last = page[-1]["order"]
 
@@ -73,7 +78,7 @@ def outcome_page(plan: Plan, which: Chosen | None, offset: int, limit: int) -> d
         "total": rows.count(),
         "limit": limit,
         "offset": offset,
-        "items": _rows(rows[offset : offset + limit]),
+        "items": _rows(_headline(plan), rows[offset : offset + limit]),
     }
 
 
@@ -89,9 +94,14 @@ def _attempts(plan: Plan, which: Chosen | None) -> QuerySet[Trial]:
     return rows.filter(**{name: value for name, value in wanted.items() if value}).order_by("handout__number")
 
 
-def _rows(attempts: QuerySet[Trial]) -> list[dict[str, Any]]:
+def _headline(plan: Plan) -> str:
+    said = headline(plan)
+    return said.sentence if said else ""
+
+
+def _rows(said: str, attempts: QuerySet[Trial]) -> list[dict[str, Any]]:
     rows = attempts.values_list(*_FIELDS)
-    found = [dict(zip(COLUMNS, row, strict=True)) for row in rows]
+    found = [dict(zip(_ORDER, row, strict=True)) | {"headline": said} for row in rows]
     reached = milestones_of([row["milestones"] for row in found if row["milestones"]])
     for row in found:
         row["milestones"] = json.dumps(reached.get(row["milestones"], []), ensure_ascii=False)

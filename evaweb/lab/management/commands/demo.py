@@ -27,8 +27,8 @@ from evaweb.lab.seed import Login
 from evaweb.lab.simulated import CLUMSY, POLICIES, SKILLED, benches_of, known_port, simulated_options
 from evaweb.lab.visitor import Visitor
 from evaweb.plans.models import Allocation, Plan, StoppingRule
-from evaweb.results.analysis.analysis import Analysis, analyse
-from evaweb.results.analysis.load_outcomes import outcomes_of_plan
+from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.caching import analysis_of
 from evaweb.results.presentation.headline import headline
 from evaweb.roles import Role
 from evaweb.trials.models import Checkpoint
@@ -206,12 +206,7 @@ class Command(BaseCommand):
         made = evaluate.carry_out(visitors[0], _STATION, name, count, self.stderr.write)
         result = evaluate.revealed(visitors[1], name, made)
         plan.refresh_from_db()
-        found = analyse(
-            outcomes_of_plan(plan),
-            planned=[(f"{SKILLED}-by-script", f"{CLUMSY}-by-script")],
-            in_pairs=options["order"] == Allocation.PAIRED,
-            whole=True,
-        )
+        found = analysis_of(plan)
         said = headline(plan)
         result["headline"] = said.sentence if said else ""
         result |= {"lockstep": True, "analysis": asdict(found), "wall_s": time.monotonic() - begun}

@@ -41,13 +41,14 @@ def main() -> int:
     wrong = [*faults(seal, plan, rows), *kept_faults(rows, scores, plan, seal["at_reveal"]), *_boundary(plan)]
     found = {}
     try:
-        trials = [_trial(row) for row in rows]
+        trials = [_trial(row) for row in _as_revealed(rows, scores, seal["at_reveal"])]
         wrong += scene_faults(plan, rows, scores, ratings)
         people = Counter(map(_of, preferred))
-        found = numbers(trials, plan)
+        said = planned(trials, plan, seal["at_reveal"])
+        found = numbers(trials, plan, said)
         found |= {
             "letters": planned_letters(trials, plan, seal["at_reveal"]) or found["letters"],
-            "planned": planned(trials, plan, seal["at_reveal"]),
+            "planned": said,
             "agreement": _agreement(rows, scores, ratings),
             "judges": _judges(rows, scores, judgements),
             "preferences": preferences(
@@ -91,6 +92,24 @@ def _rows(path: Path) -> Rows:
         if None in row or None in row.values():
             raise ValueError(f"{path.name}: row {number} has another number of cells than the head")
     return [{name: _text(value) for name, value in row.items()} for row in rows]
+
+
+def _as_revealed(rows: Rows, scores: Rows, at_reveal: dict[str, Any] | None) -> Rows:
+    """The trials as they were scored when the plan was revealed: what was corrected since makes no other figure."""
+    if not at_reveal:
+        return rows
+    then = datetime.fromisoformat(at_reveal["at"])
+    newest: dict[str, dict[str, str]] = {}
+    for score in scores:  # in the order in which they were given
+        if datetime.fromisoformat(score["scored_at"]) < then:
+            newest[score["trial"]] = score
+    told = ("success", "score", "milestones", "failure", "failure_phase")
+    return [
+        {**row, **{name: newest[row["trial"]][name] for name in told}}
+        if row["trial"] in newest
+        else {**row, "status": "ended" if row["status"] == "scored" else row["status"]}
+        for row in rows
+    ]
 
 
 def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None:

@@ -44,6 +44,7 @@ def planned_letters(
     if (
         len(names) < 3
         or 2 * len(names) != len(arms) * (len(arms) - 1)
+        or plan["stopping"].get("margin") is not None
         or any(one["at"] is None for one in said)
     ):
         return None

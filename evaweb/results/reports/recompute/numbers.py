@@ -79,8 +79,8 @@ class Timing:
 Trials = Sequence[Trial]
 
 
-def numbers(trials: Trials, plan: Mapping[str, Any]) -> dict[str, Any]:
-    """Every number there is."""
+def numbers(trials: Trials, plan: Mapping[str, Any], said: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Every number there is; `said` is what the plan's design says of each of its comparisons."""
     alpha = plan["stopping"]["alpha"]
     arms: dict[str, list[Trial]] = defaultdict(list)
     broken: dict[str, list[Trial]] = defaultdict(list)
@@ -111,13 +111,36 @@ def numbers(trials: Trials, plan: Mapping[str, Any]) -> dict[str, Any]:
     for comparison, p in zip(compared, methods.holm([c["barnard"]["p"] for c in compared]), strict=True):
         comparison["barnard"]["holm"] = p
     corrected = {frozenset((c["first"], c["second"])): c["barnard"]["holm"] for c in compared}
+    decided = {(one["first"], one["second"]): one for one in said}
+    for comparison in compared:
+        one = decided.get((comparison["first"], comparison["second"]))
+        comparison["standing"] = "not planned" if one is None else "open" if one["at"] is None else "decided"
+        if one is not None:  # its design tells apart, and no test beside it
+            corrected[frozenset((one["first"], one["second"]))] = 0.0 if one["winner"] is not None else 1.0
+        if comparison["standing"] == "open":
+            _describe(comparison, plan["stopping"])
+    told = plan["stopping"].get("margin") is None or not decided
+    told = told and all(c["standing"] != "open" for c in compared)
     return {
         "n": sum(len(arm) for arm in arms.values()),
         "alpha": alpha,
-        "letters": methods.letters(names, methods.separated(names, corrected, alpha)),
+        "letters": methods.letters(names, methods.separated(names, corrected, alpha)) if told else {},
         "arms": {name: _arm(arms[name], broken[name], timing) for name in names},
         "comparisons": compared,
     }
+
+
+def _describe(comparison: dict[str, Any], stopping: Mapping[str, Any]) -> None:
+    """Leave what describes the trials, and the evidence by which the design decides."""
+    own = {"success": "evidence", "score": "score_evidence"}[stopping.get("outcome") or "success"]
+    for name in (
+        *("barnard", "probability_better", "mcnemar", "scores", "over_scenes", "evidence"),
+        *("score_evidence", "anytime", "sooner"),
+    ):
+        if name != own or stopping["rule"] != "evidence":
+            comparison[name] = None
+    comparison["within"] = {}
+    comparison["by_scene"]["interaction_p"] = None
 
 
 def _rate(trials: Trials) -> float:

@@ -4,11 +4,12 @@ import sys
 import numpy as np
 import pytest
 
-from evaweb.results.analysis.analysis import analyse
+from evaweb.results.analysis.analysis import Standing, Verdict, analyse
 from evaweb.results.analysis.outcomes import Outcome, paired
 from evaweb.statistics.proportions import clopper_pearson
 
 LABELS = ("held", "lifted", "on the plate")
+DECIDED = Verdict(True, True)
 
 
 def trials(rates, blocks=40, scenes=("cups",), seed=3):
@@ -59,7 +60,7 @@ def test_the_better_one_comes_first_with_everything_that_is_said_of_it():
 
 
 def test_a_comparison_has_all_its_evidence():
-    found = analyse(trials({"old": 0.4, "new": 0.9}), planned=[("old", "new")])
+    found = analyse(trials({"old": 0.4, "new": 0.9}), planned={("old", "new"): DECIDED})
     compared = found.compared("new", "old")
     assert (compared.first, compared.second) == ("old", "new")
     assert compared.difference.value < 0
@@ -77,6 +78,35 @@ def test_a_comparison_has_all_its_evidence():
     assert compared.score_anytime.high < 0
 
 
+@pytest.mark.parametrize("evidence", ["", "success", "score"])
+def test_a_planned_comparison_whose_design_has_not_ended_is_described_and_nothing_of_it_decides(evidence):
+    found = analyse(
+        trials({"old": 0.4, "new": 0.9, "other": 0.1}), planned={("old", "new"): Verdict(evidence=evidence)}
+    )
+    of_it = found.compared("old", "new")
+    assert of_it.standing is Standing.OPEN
+    assert of_it.difference.interval.high < 0
+    for name in ("test", "corrected", "better", "paired", "scored", "anytime", "score_anytime", "sooner"):
+        assert getattr(of_it, name) is None, name
+    assert (of_it.evidence is None, of_it.score_evidence is None) == (
+        evidence != "success",
+        evidence != "score",
+    )
+    assert found.letters == {}
+    beside = found.compared("other", "new")
+    assert (beside.standing, beside.corrected < 0.001) == (Standing.UNPLANNED, True)
+
+
+def test_letters_tell_apart_what_the_design_did_and_nothing_else():
+    outcomes = trials({"old": 0.4, "new": 0.9})
+    for verdict, letters in (
+        (Verdict(True, False), {"new": "a", "old": "a"}),
+        (Verdict(True, True), {"new": "a", "old": "b"}),
+        (Verdict(True, None), {}),
+    ):
+        assert analyse(outcomes, planned={("old", "new"): verdict}).letters == letters
+
+
 def timed(name, rows):
     """Trials of one checkpoint, a block each, from (succeeded, seconds)."""
     return [
@@ -88,7 +118,7 @@ def test_nine_of_ten_are_sooner_than_five_of_ten_that_gave_up_early():
     """Failures of B ended after 2 s: taken for successes to come, B would be the sooner one with p = 0.0002."""
     first = timed("A", [(True, 20.0)] * 9 + [(False, 40.0)])
     second = timed("B", [(True, 10.0)] * 5 + [(False, 2.0)] * 5)
-    found = analyse(first + second, planned=[("A", "B")], limits={"cups": 40.0, "plates": 60.0})
+    found = analyse(first + second, planned={("A", "B"): DECIDED}, limits={"cups": 40.0, "plates": 60.0})
     assert found.arm("A").mean_time.value == pytest.approx(22.0)
     assert found.arm("B").mean_time.value == pytest.approx(25.0)
     sooner = found.comparisons[0].sooner
@@ -109,7 +139,7 @@ def test_one_horizon_for_all_is_the_smallest_limit_or_the_longest_run():
 
 def test_a_time_that_is_not_known_has_no_part_in_who_is_sooner():
     runs = timed("A", [(True, None), (True, 5.0)]) + timed("B", [(True, 9.0), (True, 9.0)])
-    found = analyse(runs, planned=[("A", "B")])
+    found = analyse(runs, planned={("A", "B"): DECIDED})
     assert (found.comparisons[0].sooner.pairs, found.comparisons[0].sooner.value) == (1, -4.0)
     assert analyse(timed("A", [(True, None)]) + timed("B", [(True, None)])).comparisons[0].sooner is None
 
@@ -123,7 +153,7 @@ def test_three_checkpoints_are_corrected_for_three_comparisons():
     assert found.letters["c"] == "b"
     assert {c.evidence.alpha for c in found.comparisons} == {0.05 / 3}
     assert {c.anytime.level for c in found.comparisons} == {1 - 0.05 / 3}
-    planned = analyse(trials({"a": 0.9, "b": 0.85, "c": 0.2}), planned=[("a", "c")])
+    planned = analyse(trials({"a": 0.9, "b": 0.85, "c": 0.2}), planned={("a", "c"): DECIDED})
     shares = {(c.first, c.second): c.evidence.alpha for c in planned.comparisons}
     assert shares == {("a", "b"): 0.05 / 3, ("a", "c"): 0.05, ("b", "c"): 0.05 / 3}
 

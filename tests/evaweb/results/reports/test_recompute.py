@@ -6,7 +6,7 @@ import random
 import pytest
 
 from evaweb.results.analysis.agreement import agreement, by_words
-from evaweb.results.analysis.analysis import analyse
+from evaweb.results.analysis.analysis import Verdict, analyse
 from evaweb.results.analysis.outcomes import Interruption, Outcome
 from evaweb.results.reports.document import analysis_document
 from evaweb.results.reports.recompute import judged, methods
@@ -85,17 +85,33 @@ def test_both_ways_come_to_the_same(checkpoints, n, scenes, seed):
     if seed in (1, 3):  # one is to be repeated: what came later is no evidence yet
         runs = [run for run in runs if (run.block, run.checkpoint) != ("6", "c0")]
     planned = {1: [], 4: [("c3", "c0"), ("c1", "c0")]}.get(checkpoints, [("c0", "c1")])
+    verdict = {2: Verdict(), 4: Verdict(evidence="score"), 5: Verdict()}.get(seed, Verdict(True, seed == 3))
+    said = [
+        {
+            "first": one,
+            "second": other,
+            "at": n if verdict.ended else None,
+            "winner": one if verdict.apart else None,
+        }
+        for one, other in planned
+    ]
     broken = [Interruption(9000, "c0", "s0", 1, 12.5)]
     limits = {} if seed == 2 else {f"s{scene}": 25.0 + 10 * scene for scene in range(1, scenes)}
-    analysis = analyse(runs, broken, planned=planned, limits=limits, whole=True)
+    analysis = analyse(runs, broken, planned=dict.fromkeys(planned, verdict), limits=limits, whole=True)
     shown = json.loads(json.dumps(analysis_document(analysis)))
     rows = [*as_rows(runs), Trial(9000, "x", 0, "c0", "s0", 1, "interrupted", False, 0.0, 12.5, "", ())]
     plan = {
-        "stopping": {"alpha": 0.05},
+        "stopping": {
+            "alpha": 0.05,
+            "rule": "evidence" if verdict.evidence else "none",
+            "outcome": verdict.evidence or "success",
+        },
         "comparisons": planned,
         "scenes": [{"name": f"s{scene}", "time_limit_s": limits.get(f"s{scene}")} for scene in range(scenes)],
     }
-    wrong = [(where, problem) for where, problem in differences(shown, numbers(rows, plan), "") if problem]
+    wrong = [
+        (where, problem) for where, problem in differences(shown, numbers(rows, plan, said), "") if problem
+    ]
     assert wrong == []
 
 
