@@ -16,21 +16,25 @@ Pages = Iterable[Iterable[Mapping[str, Any]]]
 
 
 def cell(value: object) -> str:
-    """A value as it stands in CSV: None is empty, times are ISO 8601, and no text is a formula.
+    """A value as it stands in CSV: as `plain` says, and no text is a formula.
 
     A text that a spreadsheet would take for a formula gets an apostrophe in front (OWASP, CSV injection), and so does
     one that looks as if it had got some: one apostrophe less is always what it was.
     """
+    text = plain(value)
+    is_text = not isinstance(value, int | float | datetime)  # a number below 0 is no formula
+    return f"'{text}" if is_text and text.lstrip("'").startswith(_FORMULA) else text
+
+
+def plain(value: object) -> str:
+    """A value in words: None is empty, times are ISO 8601."""
     if value is None:
         return ""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, datetime):
         return value.isoformat()
-    if isinstance(value, int | float):
-        return repr(value)
-    text = str(value)
-    return f"'{text}" if text.lstrip("'").startswith(_FORMULA) else text
+    return repr(value) if isinstance(value, int | float) else str(value)
 
 
 def csv_lines(columns: Sequence[str], pages: Pages) -> Iterator[str]:

@@ -22,6 +22,7 @@ from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import Chosen, chosen
 from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.models import Judgement, Preference, Rating
+from evaweb.results.presentation.caveats import caveats_of
 from evaweb.results.presentation.citing import citation
 from evaweb.results.presentation.headline import headline_document, with_planned_letters
 from evaweb.results.presentation.integrity import integrity_document
@@ -212,6 +213,7 @@ def results(request: HttpRequest, name: str, version: int, only: Query[Only]) ->
         "only": {name: value for name, value in only.model_dump().items() if value},
         "headline": headline_document(plan),
         "planned": planned_document(plan),
+        "caveats": caveats_of(plan),
         **analysis_document(analysis),
         "corrected": {
             name: proportion_document(found)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -315,15 +315,33 @@ def told_reason(plan: Plan, sealed: bool) -> str:
     return plan.closed_because if own or not sealed else ""
 
 
+_told_of: list[Callable[[Plan], dict[str, Any]]] = []
+
+
+def declare_kept(told: Callable[[Plan], dict[str, Any]]) -> None:
+    """`told` says what else is kept at a reveal."""
+    _told_of.append(told)
+
+
 def at_the_reveal(plan: Plan) -> dict[str, Any] | None:
-    """The blocks that count and the sums of each checkpoint, kept with their digest: what is corrected later makes no
-    other headline.
+    """What is kept with its digest: the blocks that count, the sums of each checkpoint, and what was declared.
+
+    What is corrected later makes no other headline.
     """
     if frozen(plan.document or {}) is None:
         return None
-    blocks = [[list(trial) for trial in block] for block in tried(plan).counted]
-    kept = {"blocks": blocks, "arms": _sums(plan)}
+    kept = counted_now(plan)
+    for told in _told_of:
+        kept |= told(plan)
     return {**kept, "digest": digest({"plan": plan.digest, **kept}), "at": timezone.now().isoformat()}
+
+
+def counted_now(plan: Plan) -> dict[str, Any]:
+    """The blocks that count, and the sums of each checkpoint."""
+    return {
+        "blocks": [[list(trial) for trial in block] for block in tried(plan).counted],
+        "arms": _sums(plan),
+    }
 
 
 def _sums(plan: Plan) -> list[dict[str, Any]]:

@@ -32,7 +32,7 @@ _SCENE_CHANGED_SINCE_FROZEN = Pattern(
 
 # 2 had no outcome, margin, looks or boundary; 3 one "comparison" at most, of paired blocks; 4 was scored by its scenes
 # as they were then.
-FORMAT = 5
+FORMAT = 6
 
 
 def document_of(plan: Plan, key: bytes) -> dict[str, Any]:

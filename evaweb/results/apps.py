@@ -15,5 +15,6 @@ class ResultsConfig(AppConfig):
             judging,  # noqa: F401  it declares what is asked before a failure is corrected
             restoring,  # noqa: F401  it declares itself to those that reconcile
         )
+        from evaweb.results.reports import sealing  # noqa: F401  it declares what a reveal keeps
 
         protect(self)

@@ -90,7 +90,7 @@ def _outcomes(
 
 def _scores_before(until: datetime, trials: QuerySet[Trial]) -> dict[int, tuple[int, dict[str, Any]]]:
     """Of each trial the newest score that was given before then: its key, and what it says."""
-    given = Score.objects.filter(trial__in=trials, scored_at__lt=until).order_by("pk")
+    given = Score.objects.filter(trial__in=trials, scored_at__lte=until).order_by("pk")
     return {
         trial: (key, dict(zip(_JUDGED, said, strict=True)))
         for trial, key, *said in given.values_list("trial_id", "pk", *_JUDGED)

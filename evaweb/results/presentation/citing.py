@@ -10,7 +10,15 @@ from typing import Any
 from django.urls import reverse
 
 from evaweb.errors import Conflict
-from evaweb.plans.design import arms_of, at_the_reveal, blocks_kept, compared, frozen, same_blocks
+from evaweb.plans.design import (
+    arms_of,
+    at_the_reveal,
+    blocks_kept,
+    compared,
+    counted_now,
+    frozen,
+    same_blocks,
+)
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.presentation.drawings import rates
 from evaweb.results.presentation.drawings.svg import Drawing, printable
@@ -135,6 +143,16 @@ class Citation:
         )
         return f"{said}{where}: {self.address}"
 
+    @property
+    def caveats(self) -> list[str]:
+        """Reasons for doubt as the reveal kept them; one from before it kept them has none."""
+        return list(self.kept.get("caveats", ()))
+
+    @property
+    def doubts(self) -> list[str]:
+        """The same as lines of text."""
+        return [f"Reason for doubt: {said}." for said in self.caveats]
+
     @cached_property
     def rows(self) -> list[Cited]:
         """The table, in the order of the frozen plan."""
@@ -161,16 +179,15 @@ class Citation:
     @property
     def corrected(self) -> bool:
         """Whether scores were corrected, or came, after the reveal."""
-        now = at_the_reveal(self.plan) or {}
-        return not same_blocks(blocks_kept(now), self.blocks) or now.get("arms") != self.kept.get(
-            "arms", now.get("arms")
-        )
+        now = counted_now(self.plan)
+        arms = self.kept.get("arms", now["arms"])
+        return not same_blocks(blocks_kept(now), self.blocks) or now["arms"] != arms
 
     @cached_property
     def text(self) -> dict[str, str]:
         """Sentence, table and figure as plain text."""
         return {
-            "sentence": f"{self.sentence}\n{self.design}\n{self.source}\n",
+            "sentence": "\n".join((self.sentence, self.design, *self.doubts, self.source)) + "\n",
             "table": _text_table([row.cells for row in self.rows]),
             "figure": _text_figure(self.known),
         }
@@ -179,7 +196,8 @@ class Citation:
     def latex(self) -> dict[str, str]:
         """The same as LaTeX that needs no package."""
         rows = [row.cells for row in self.rows]
-        sentence = "\n".join(escaped(line) for line in (self.sentence, self.design, self.source)) + "\n"
+        lines = (self.sentence, self.design, *self.doubts, self.source)
+        sentence = "\n".join(map(escaped, lines)) + "\n"
         return {"sentence": sentence, "table": _latex_table(rows), "figure": _latex_figure(self.known)}
 
     @cached_property
@@ -192,7 +210,7 @@ class Citation:
     @cached_property
     def svg(self) -> str:
         """Figure with sentence, design and source, black on white, needing nothing beside it."""
-        return printable(self.drawn, above=[self.sentence], below=[self.design, self.source])
+        return printable(self.drawn, above=[self.sentence], below=[self.design, *self.doubts, self.source])
 
     def whole(self, form: str) -> str:
         """All of it as a file: "txt", "tex" or "svg"."""
@@ -232,6 +250,7 @@ class Citation:
             },
             "blocks": self.blocks,
             "headline": self.sentence,
+            "caveats": self.caveats,
             "arms": [
                 {
                     "checkpoint": row.checkpoint,

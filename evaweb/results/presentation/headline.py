@@ -48,6 +48,27 @@ class Headline:
         """All of them."""
         return ". ".join(self.sentences)
 
+    @property
+    def caveats(self) -> tuple[str, ...]:
+        """What else it could be, a sentence each, without what came after the reveal."""
+        found = []
+        if self.at_first:
+            found.append(
+                "Some scored trials were voided, have a void pending, or had their score corrected before the reveal. "
+                f"With every first score and no voids: {self.at_first}"
+            )
+        if self.worst:
+            found.append(
+                "Some attempts were discarded without a score. If each had ended in the worst way for this result: "
+                f"{self.worst}"
+            )
+        if self.versions:
+            found.append(
+                "Each earlier version of the plan used its full alpha: read together, they err more often than alpha "
+                f"says. {'. '.join(self.versions)}"
+            )
+        return tuple(found)
+
 
 def headline(plan: Plan) -> Headline | None:
     """That of a frozen plan; None where it has no comparison."""
@@ -71,7 +92,7 @@ def headline(plan: Plan) -> Headline | None:
 def headline_document(plan: Plan) -> dict[str, Any] | None:
     """It in plain values; None where the plan has no comparison."""
     said = headline(plan)
-    return None if said is None else {**asdict(said), "letters": dict(said.letters)}
+    return said and {**asdict(said), "letters": dict(said.letters), "caveats": list(said.caveats)}
 
 
 def alpha_words(found: Design) -> str:

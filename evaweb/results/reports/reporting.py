@@ -30,10 +30,9 @@ from evaweb.results.presentation.integrity import delays_banner, integrity_docum
 from evaweb.results.reports import bench_photos as laid_out
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.document import analysis_document
-from evaweb.results.reports.tables import COLUMNS, milestones_of, outcome_pages
-from evaweb.tabular_export import csv_lines, in_pages
+from evaweb.results.reports.tables import COLUMNS, SCORE_COLUMNS, outcome_pages, score_pages
+from evaweb.tabular_export import csv_lines
 from evaweb.trials.failures import in_order
-from evaweb.trials.models import Score
 from runtime.core.sentences import Pattern
 
 _NOT_EMPTY_NAME_NEW_FOLDER = Pattern(
@@ -70,10 +69,6 @@ _PREFERENCES = (
     "at",
 )
 _JUDGEMENTS = ("trial", "judge", "version", "model", "milestones", "reason", "prompt", "pictures", "at")
-_SCORES = (
-    *("trial", "rater", "source", "success", "score", "milestones", "failure", "failure_phase", "note"),
-    *("reason", "scored_at"),
-)
 
 
 def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> Path:
@@ -94,7 +89,7 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     record = integrity_document(plan)
     _json(data / "integrity.json", record)
     _csv(data / "trials.csv", list(COLUMNS), outcome_pages(plan))
-    _csv(data / "scores.csv", _SCORES, _scores(plan))
+    _csv(data / "scores.csv", SCORE_COLUMNS, score_pages(plan))
     _csv(data / "ratings.csv", _RATINGS, _ratings(plan))
     _csv(data / "preferences.csv", _PREFERENCES, _preferences(plan))
     _csv(data / "judgements.csv", _JUDGEMENTS, _judgements(plan))
@@ -228,18 +223,6 @@ def _style(name: str) -> str:
     if not isinstance(found, str):
         raise EvaError(_STYLE_SHEET_NOT_WHERE_INSTALLED(name=name))
     return Path(found).read_text("utf-8")
-
-
-def _scores(plan: Plan) -> Iterator[list[dict[str, Any]]]:
-    rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
-    known = {"trial": "trial_id", "rater": "rater__username", "milestones": "pk"}
-    fields = [known.get(name, name) for name in _SCORES]
-    for page in in_pages(dict(zip(_SCORES, row, strict=True)) for row in rows.values_list(*fields)):
-        reached = milestones_of([row["milestones"] for row in page])
-        yield [
-            {**row, "milestones": json.dumps(reached.get(row["milestones"], []), ensure_ascii=False)}
-            for row in page
-        ]
 
 
 def _ratings(plan: Plan) -> Iterator[list[dict[str, Any]]]:

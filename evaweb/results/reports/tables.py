@@ -13,7 +13,8 @@ from django.db.models import QuerySet
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.presentation.headline import headline
-from evaweb.trials.models import MilestoneOutcome, Trial
+from evaweb.tabular_export import in_pages
+from evaweb.trials.models import MilestoneOutcome, Score, Trial
 from evaweb.trials.record import COLUMNS as RECORDED
 from evaweb.trials.record import HINTS, TrialRecord
 
@@ -58,6 +59,11 @@ keeps it.
 """
 _FIELDS = [_ALL[name][1] for name in _ORDER]
 _TEXTS = [name for name, hint in COLUMNS.items() if hint in (str, str | None)]
+SCORE_COLUMNS = (
+    *("trial", "rater", "source", "success", "score", "milestones", "failure", "failure_phase", "note"),
+    *("reason", "scored_at"),
+)
+"""The columns of every score."""
 PAGE = 1000
 
 
@@ -116,3 +122,16 @@ def milestones_of(scores: list[int]) -> dict[int, list[tuple[str, bool]]]:
     for score, text, reached in rows.values_list("score_id", "text", "reached"):
         found[score].append((text, reached))
     return found
+
+
+def score_pages(plan: Plan) -> Iterator[list[dict[str, Any]]]:
+    """Every score of the plan's trials in the order in which they were given, a page at a time."""
+    rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
+    known = {"trial": "trial_id", "rater": "rater__username", "milestones": "pk"}
+    fields = [known.get(name, name) for name in SCORE_COLUMNS]
+    for page in in_pages(dict(zip(SCORE_COLUMNS, row, strict=True)) for row in rows.values_list(*fields)):
+        reached = milestones_of([row["milestones"] for row in page])
+        yield [
+            {**row, "milestones": json.dumps(reached.get(row["milestones"], []), ensure_ascii=False)}
+            for row in page
+        ]

@@ -16,6 +16,7 @@ from typing import Any
 from .designs import error, kept_faults, planned, planned_letters, share_of
 from .judged import agreement, by_words, calibration, on_milestone, preferences, score_alpha
 from .numbers import Drawn, Trial, numbers
+from .record import changes, gaps
 from .scenes import scene_faults
 from .sealed import faults
 
@@ -38,7 +39,15 @@ def main() -> int:
     rows, scores, ratings, preferred, judgements = (
         _rows(data / f"{name}.csv") for name in ("trials", "scores", "ratings", "preferences", "judgements")
     )
-    wrong = [*faults(seal, plan, rows), *kept_faults(rows, scores, plan, seal["at_reveal"]), *_boundary(plan)]
+    record = json.loads((data / "integrity.json").read_text("utf-8"))
+    page = (data.parent / "index.html").read_text("utf-8")
+    wrong = [
+        *faults(seal, plan, rows),
+        *gaps(rows, scores, record),
+        *changes(rows, scores, seal, record, page),
+        *kept_faults(rows, scores, plan, seal["at_reveal"]),
+        *_boundary(plan),
+    ]
     found = {}
     try:
         trials = [_trial(row) for row in _as_revealed(rows, scores, seal["at_reveal"])]
@@ -70,6 +79,9 @@ def main() -> int:
     if len(wrong) > _SHOWN:
         print(f"and {len(wrong) - _SHOWN} others")
     kept = "with its key, schedule and codes" if seal["key"] else "by its digest"
+    print(
+        f"the lab committed itself to {seal['commitment']} when it froze the plan: hold it against what was published then"
+    )
     print(f"{seen} numbers from {len(rows)} trials, and the plan {kept}: {len(wrong)} do not come out")
     return 1 if wrong else 0
 
@@ -101,7 +113,7 @@ def _as_revealed(rows: Rows, scores: Rows, at_reveal: dict[str, Any] | None) -> 
     then = datetime.fromisoformat(at_reveal["at"])
     newest: dict[str, dict[str, str]] = {}
     for score in scores:  # in the order in which they were given
-        if datetime.fromisoformat(score["scored_at"]) < then:
+        if datetime.fromisoformat(score["scored_at"]) <= then:
             newest[score["trial"]] = score
     told = ("success", "score", "milestones", "failure", "failure_phase")
     return [

@@ -99,14 +99,23 @@ def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapp
         found.append(f"plan.json has the digest {digest(plan)}, the plan that was frozen {seal['digest']}")
     kept = seal["at_reveal"]
     said = (
-        {name: kept[name] for name in ("pairs", "blocks", "arms") if name in kept} if kept else {}
+        {
+            name: kept[name]
+            for name in ("pairs", "blocks", "arms", "headline", "caveats", "record")
+            if name in kept
+        }
+        if kept
+        else {}
     )  # as it was then
     if kept and digest({"plan": seal["digest"], **said}) != kept["digest"]:
         found.append(f"the pairs of the reveal have not the digest {kept['digest']}")
     if not seal["key"]:
         return found
-    version = plan.get("format", 1)  # from 3 on a reveal kept what counts, from 4 on blocks and sums
+    version = plan.get(
+        "format", 1
+    )  # from 3 on a reveal kept what counts, from 4 on blocks and sums, from 6 on words
     kinds = () if version < 3 else ("digest",) if version == 3 else ("digest", "blocks", "arms")
+    kinds += ("headline", "caveats", "record") if version >= 6 else ()
     wanted = kinds if arms_of(plan) else ()
     found += [f"the reveal kept no {name}" for name in wanted if name not in (kept or {})]
     key = bytes.fromhex(seal["key"])

@@ -1,0 +1,47 @@
+"""What a reveal keeps beside the blocks that count, so that a report shows it if something of it is changed later."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from evaweb.plans.canonical import digest
+from evaweb.plans.design import declare_kept
+from evaweb.plans.models import Plan
+from evaweb.results.presentation.caveats import caveats_of
+from evaweb.results.presentation.headline import headline
+from evaweb.results.reports.tables import SCORE_COLUMNS, outcome_pages, score_pages
+from evaweb.tabular_export import plain
+from evaweb.trials.models import TrialStatus
+
+# Of an attempt, by the names of the report's table; recompute/record.py has the same.
+ATTEMPT = (
+    *("trial", "uuid", "order", "code", "slot", "block", "checkpoint", "scene", "position", "repetition"),
+    *("attempt", "why_again", "station", "operator", "started_at", "ended_at"),
+)
+
+
+def kept_of(plan: Plan) -> dict[str, Any]:
+    """Headline and caveats in their words, and the digest of every attempt and every score with its reason and time."""
+    said = headline(plan)
+    return {
+        "headline": list(said.sentences) if said else [],
+        "caveats": caveats_of(plan),
+        "record": digest({"attempts": list(_attempts(plan)), "scores": list(_scores(plan))}),
+    }
+
+
+def _attempts(plan: Plan) -> Iterator[list[str]]:
+    """Voids with their reason: other reasons may come to be others when an attempt is scored later."""
+    for page in outcome_pages(plan):
+        for row in page:
+            voided = row["status"] == TrialStatus.VOIDED
+            yield [*(plain(row[name]) for name in ATTEMPT), row["reason"] if voided else ""]
+
+
+def _scores(plan: Plan) -> Iterator[list[str]]:
+    for page in score_pages(plan):
+        yield from ([plain(row[name]) for name in SCORE_COLUMNS] for row in page)
+
+
+declare_kept(kept_of)
