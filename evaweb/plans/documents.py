@@ -31,7 +31,7 @@ _SCENE_CHANGED_SINCE_FROZEN = Pattern(
 )
 
 # 2 had no outcome, margin, looks or boundary; 3 one "comparison" at most, of paired blocks; 4 was scored by its scenes
-# as they were then.
+# as they were then; reveals of 5 kept neither caveats nor the digest of the record.
 FORMAT = 6
 
 

@@ -79,9 +79,7 @@ def main() -> int:
     if len(wrong) > _SHOWN:
         print(f"and {len(wrong) - _SHOWN} others")
     kept = "with its key, schedule and codes" if seal["key"] else "by its digest"
-    print(
-        f"the lab committed itself to {seal['commitment']} when it froze the plan: hold it against what was published then"
-    )
+    print(f"frozen under the commitment {seal['commitment']}: hold it against what was published then")
     print(f"{seen} numbers from {len(rows)} trials, and the plan {kept}: {len(wrong)} do not come out")
     return 1 if wrong else 0
 

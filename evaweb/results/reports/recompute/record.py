@@ -39,7 +39,7 @@ def gaps(rows: Rows, scores: Rows, record: Mapping[str, Any]) -> list[str]:
         found += [
             f"trial {trial} has a correction without a reason" for score in told[1:] if not score["reason"]
         ]
-    told_of = {str(row["trial"]) for row in record.get("corrections", ())}
+    told_of = {str(row["trial_id"]) for row in record.get("corrections", ())}
     found += [
         f"integrity.json does not have the correction of trial {trial}"
         for trial, told in given.items()

@@ -11,6 +11,7 @@ from typing import Any
 from .designs import arms_of
 
 _IMBALANCE = 3  # trials by which one of two checkpoints in random order may be ahead at a condition
+_KEPT = ("pairs", "blocks", "arms", "headline", "caveats", "record")  # of a reveal, under its digest
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
 
 
@@ -98,15 +99,7 @@ def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapp
     if digest(plan) != seal["digest"]:
         found.append(f"plan.json has the digest {digest(plan)}, the plan that was frozen {seal['digest']}")
     kept = seal["at_reveal"]
-    said = (
-        {
-            name: kept[name]
-            for name in ("pairs", "blocks", "arms", "headline", "caveats", "record")
-            if name in kept
-        }
-        if kept
-        else {}
-    )  # as it was then
+    said = {name: kept[name] for name in _KEPT if name in kept} if kept else {}  # as it was then
     if kept and digest({"plan": seal["digest"], **said}) != kept["digest"]:
         found.append(f"the pairs of the reveal have not the digest {kept['digest']}")
     if not seal["key"]:
