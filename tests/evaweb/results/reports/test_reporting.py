@@ -21,7 +21,7 @@ from evaweb.results.ratings import judging
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.recompute.sealed import faults
 from evaweb.results.reports.reporting import seal_of, write_report
-from evaweb.trials import services
+from evaweb.trials import services, voids
 from evaweb.trials.corrections import trial_failure
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.plans.lab import jpeg
@@ -175,11 +175,14 @@ def test_a_trial_that_was_taken_out_or_of_another_checkpoint_is_found(report):
     assert "is not what the schedule foresaw" in recompute(report).stdout
 
 
+KEPT = ("blocks", "arms", "headline", "caveats", "record")
+
+
 def forged(report, change):
     """What the program says of a seal whose reveal was changed, with a digest that fits."""
     data = report / "data"
     seal, plan = (json.loads((data / name).read_text("utf-8")) for name in ("seal.json", "plan.json"))
-    held = {name: seal["at_reveal"][name] for name in ("blocks", "arms")}
+    held = {name: seal["at_reveal"][name] for name in KEPT}
     change(held)
     seal["at_reveal"] |= {**held, "digest": digest({"plan": digest(plan), **held})}
     (data / "seal.json").write_text(json.dumps(seal), "utf-8")
@@ -203,15 +206,117 @@ def test_sums_of_the_reveal_that_were_forged_with_their_digest_are_found(report)
     assert "sums of pi0-new" not in said
 
 
+def of_table(name, change):
+    """A tampering with the rows of a table."""
+
+    def tamper(report):
+        path = report / "data" / f"{name}.csv"
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        columns = list(rows[0])
+        change(rows)
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, columns)
+            writer.writeheader()
+            writer.writerows(rows)
+
+    return tamper
+
+
+def of_text(name, before, after):
+    """A tampering with a file as text."""
+
+    def tamper(report):
+        path = report / name
+        text = path.read_text("utf-8")
+        assert before in text
+        path.write_text(text.replace(before, after), "utf-8")
+
+    return tamper
+
+
+def no_key(report):
+    path = report / "data" / "seal.json"
+    path.write_text(json.dumps(json.loads(path.read_text("utf-8")) | {"key": ""}), "utf-8")
+
+
+@pytest.fixture
+def steered(plan, owner, bench, carry_out, tmp_path):
+    """The report of a plan with a trial that was voided by two operators and one that was corrected, then revealed."""
+    carry_out(plan, 12)
+
+    def steer():
+        first, other = (handout.trial for handout in plan.handouts.order_by("number")[:2])
+        asked = voids.trial_void(user=bench.operator, trial=first, reason="the plate had slipped")
+        voids.void_answer(user=builders.user("bob"), trial=asked, agree=True)
+        services.trial_score(
+            user=bench.operator,
+            trial=other,
+            milestones=bench.ticks(False, False, False),
+            reason="looked again",
+        )
+
+    played("steered", steer)
+    carry_out(plan, 5)
+    played("revealed", lambda: plan_reveal(user=owner, plan=plan))
+    played("of the steered", lambda: call_command("eval_report", "blocks", "--out", str(tmp_path / "report")))
+    return tmp_path / "report"
+
+
+RECORD = "not those of which the reveal kept the digest"
+TAMPERINGS = {
+    "a trial that was voided": (
+        of_table("trials", lambda rows: rows.remove(next(row for row in rows if row["status"] == "voided"))),
+        "lacks the trial handed out as number",
+    ),
+    "the newest trial": (of_table("trials", lambda rows: rows.pop()), RECORD),
+    "a first score": (
+        of_table(
+            "scores", lambda rows: rows.remove(next(row for row in rows if row["trial"] == rows[-1]["trial"]))
+        ),
+        "has a correction and no score before it",
+    ),
+    "the key": (no_key, "seal.json has no key"),
+    "the headline": (
+        of_text("index.html", "succeeded more often than", "failed as often as"),
+        "does not say: pi0",
+    ),
+    "a caveat": (of_text("index.html", "Attempts voided", "Attempts"), "does not say: Attempts voided"),
+    "integrity.json": (
+        lambda report: (report / "data" / "integrity.json").write_text("{}"),
+        "integrity.json says",
+    ),
+    "an operator": (of_table("trials", lambda rows: rows[0].update(operator="nobody")), RECORD),
+    "a time": (
+        of_table(
+            "trials", lambda rows: rows[0].update(started_at=rows[0]["started_at"].replace("20", "21", 1))
+        ),
+        RECORD,
+    ),
+    "a reason": (of_table("scores", lambda rows: rows[-1].update(reason="a better one")), RECORD),
+}
+
+
+@pytest.mark.some(3)
+@pytest.mark.parametrize("what", TAMPERINGS)
+def test_what_was_tampered_with_is_found(steered, what):
+    tamper, said = TAMPERINGS[what]
+    tamper(steered)
+    found = recompute(steered)
+    assert found.returncode == 1
+    assert said in found.stdout
+    assert "Traceback" not in found.stdout + found.stderr
+
+
 @pytest.mark.some(1)
-@pytest.mark.parametrize("gone", ["at_reveal", "blocks", "arms"])
+@pytest.mark.parametrize("gone", ["at_reveal", *KEPT])
 def test_a_reveal_that_was_taken_out_is_missed(report, gone):
     path = report / "data" / "seal.json"
     seal = json.loads(path.read_text("utf-8"))
     if gone == "at_reveal":
         seal["at_reveal"] = None
     else:
-        held = {name: seal["at_reveal"][name] for name in ("blocks", "arms") if name != gone}
+        held = {name: seal["at_reveal"][name] for name in KEPT if name != gone}
         plan = json.loads((report / "data" / "plan.json").read_text("utf-8"))
         seal["at_reveal"] = {
             **held,
