@@ -18,6 +18,7 @@ from evaweb.journal import text
 from evaweb.plans import pictures, regions
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.blinding_rules import has_looked_at_the_same
+from evaweb.plans.design import ended_at_an_ask
 from evaweb.plans.documents import require_scene
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
 from evaweb.roles import Role, require
@@ -57,6 +58,10 @@ _TRIAL_BENCH_LOOKED_AT_BEFORE = Pattern(
 _BENCH_NOT_AS_REFERENCE_SHOWS = Pattern(
     "plans.bench_checks.bench_not_as_reference_shows",
     "the bench is not as its reference shows: {low}, wanted {least:.2f}; lay it out again, or give a reason",
+)
+_ENDED_TRIAL_COUNTS = Pattern(
+    "plans.bench_checks.ended_trial_counts",
+    "{plan} has ended: trial {trial} could not be repeated, so it counts",
 )
 _REVEALED_WHAT_VOIDED_NOW_WOULD = Pattern(
     "plans.bench_checks.revealed_what_voided_now_would",
@@ -290,8 +295,14 @@ def _require_match(trial: Trial, seen: Sequence[Seen], why: str) -> None:
 
 
 def _before(what: str, trial: Trial, user: Any) -> None:
-    """Check trials of plans before they run, or are taken out of the count."""
-    handout = Handout.objects.select_related("plan").filter(trial=trial).first()
+    """Check trials of plans before they run, or are taken out of the count.
+
+    Within a transaction the plan is kept from others until its end: no reveal comes between the check and the act.
+    """
+    rows = Handout.objects.select_related("plan", "trial")
+    if transaction.get_connection().in_atomic_block:
+        rows = rows.select_for_update(of=("plan",))
+    handout = rows.filter(trial=trial).first()
     if handout is None:
         return
     if what == "run":
@@ -300,8 +311,11 @@ def _before(what: str, trial: Trial, user: Any) -> None:
             achieve(user=user, trial=trial, override=newest.override if newest else "")
     if what.startswith("void") and handout.plan.state == PlanState.REVEALED:
         raise EvaError(_REVEALED_WHAT_VOIDED_NOW_WOULD(plan=handout.plan))
-    if what == "voided" and handout.plan.state == PlanState.CLOSED and trial.status == TrialStatus.SCORED:
-        raise Conflict(_CLOSED_TRIAL_COULD_NOT_REPEATED(plan=handout.plan, trial=trial.pk))
+    if what == "voided" and handout.trial.status == TrialStatus.SCORED:
+        if handout.plan.state == PlanState.CLOSED:
+            raise Conflict(_CLOSED_TRIAL_COULD_NOT_REPEATED(plan=handout.plan, trial=trial.pk))
+        if ended_at_an_ask(handout.plan):
+            raise Conflict(_ENDED_TRIAL_COUNTS(plan=handout.plan, trial=trial.pk))
     if what == "void agreed" and handout.plan.state == PlanState.CLOSED and not _repeated(handout):
         raise Conflict(_CLOSED_TRIAL_NOT_REPEATED_SO(plan=handout.plan, trial=trial.pk))
     if what in ("run", "judged"):

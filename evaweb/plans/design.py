@@ -44,7 +44,8 @@ ENDED = {
     "boundary": "a boundary of its design was crossed",
     "full": "all pairs of its comparison are made",
 }
-ENDED_EVENT = "ended"  # of a plan: an ask for its next trial found that
+ENDED_EVENT = "ended"  # of a plan: an ask for its next trial found that, or its last trial
+_ENDS_NOTED = 6  # the format of plans from which every end that the server finds is such an event
 Names = tuple[str, str]
 
 
@@ -304,14 +305,20 @@ def ended_because(plan: Plan, found: Findings) -> str:
 
 
 def ended_at_an_ask(plan: Plan) -> str:
-    """Why the plan ended when a next trial was asked for, "" where no ask has found that."""
+    """Why the plan ended: found when a next trial was asked for, or at its last one; "" where neither was."""
     told = plan.events.filter(what=ENDED_EVENT).values_list("text", flat=True).first()
     return told or ""
 
 
 def told_reason(plan: Plan, sealed: bool) -> str:
-    """Why it was closed; of a plan that is `sealed` for the reader only what the server itself says."""
-    own = any(plan.closed_because.startswith(f"{words}, after ") for words in ENDED.values())
+    """Why it was closed; of a plan that is `sealed` for the reader only what the server itself says.
+
+    Since format 6 the server has noted that: a reason of the owner's that begins like it stays the owner's.
+    """
+    if (plan.document or {}).get("format", 1) < _ENDS_NOTED:
+        own = any(plan.closed_because.startswith(f"{words}, after ") for words in ENDED.values())
+    else:
+        own = plan.closed_because == ended_at_an_ask(plan)
     return plan.closed_because if own or not sealed else ""
 
 

@@ -360,7 +360,10 @@ def plan_end(*, user: User, plan: Plan, asked: bool = False) -> None:
         return
     over = bool(ended) or not remaining(held, dropped_of(held))
     if not remaining(held) or (asked and over) or ended:
-        _close(held, user, ended or ended_because(held, found))
+        why = ended or ended_because(held, found)
+        if not ended:
+            _note(held, user, ENDED_EVENT, why)
+        _close(held, user, why)
 
 
 def _looked_at(trial: Trial, user: User) -> None:

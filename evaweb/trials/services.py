@@ -326,8 +326,8 @@ def trial_score(
         **failures.stripped(failure_phase=failure_phase, failure=failure),
         "reason": text("reason", reason, LONGEST_NOTE),
     }
-    checked("scored", trial, user)
     with transaction.atomic():
+        checked("scored", trial, user)
         held = locked(trial)
         checked("judged", held, user)
         rows = list(held.scene.milestones.order_by("order"))

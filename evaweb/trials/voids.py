@@ -80,8 +80,8 @@ def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
     """
     require(user, Role.OPERATOR)
     why = reason_given(reason, "a trial is voided")
-    checked("voided", trial, user)
     with transaction.atomic():
+        checked("voided", trial, user)
         held = locked(trial)
         if _said_already(held, user, why):
             return held

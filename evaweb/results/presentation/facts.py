@@ -23,6 +23,9 @@ from evaweb.results.presentation.wording import (
     verdict,
 )
 
+# A small p may come of another spread around the same mean, too.
+_EXCHANGEABLE = "sign flips within pairs, exact: are both exchangeable?"
+
 
 @dataclass(frozen=True, slots=True)
 class Fact:
@@ -81,7 +84,7 @@ def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator
     if found.scored:
         gain = f"{100 * found.scored.value:+.0f} points".replace("-", "−")
         of_scores = f"{gain} of the score, {p_words(found.scored.p)} of {found.pairs} pairs"
-        yield Fact("With partial credit, n as planned?", "sign flips within pairs, exact", of_scores)
+        yield Fact("With partial credit, n as planned?", _EXCHANGEABLE, of_scores)
     if found.clustered:
         yield Fact(
             "Other initial conditions?", "conditions as a sample, Gaffke, 95 %", points(found.clustered)
@@ -128,8 +131,8 @@ def _beyond(found: Comparison) -> Iterator[Fact]:
         ahead = found.first if found.sooner.value < 0 else found.second
         by = f"{abs(found.sooner.value):.1f} s"
         lead = f"{ahead} by {by}, failures counted in full" if found.sooner.value else "neither"
-        how = "sign flips of times within pairs, exact"
-        yield Fact("Sooner?", how, f"{lead}, {p_words(found.sooner.p)} of {found.sooner.pairs} pairs")
+        of_times = f"{lead}, {p_words(found.sooner.p)} of {found.sooner.pairs} pairs"
+        yield Fact("Sooner?", _EXCHANGEABLE, of_times)
     if found.better is not None:
         believed = f"{found.first} is better with probability {_chance(found.better)}"
         yield Fact("What to believe?", "uniform priors", believed)

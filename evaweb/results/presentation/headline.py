@@ -20,9 +20,13 @@ from evaweb.plans.design import (
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.presentation.wording import p_words, points
-from evaweb.statistics.designs import SUCCESS, Block, Conclusion, Design, alone, conclude, findings
+from evaweb.statistics.designs import FIXED, SUCCESS, Block, Conclusion, Design, alone, conclude, findings
 from evaweb.statistics.difference import newcombe
 from evaweb.statistics.many import letters
+
+# From this format of plans on. Flipping signs within pairs tests whether two checkpoints can be exchanged: scores that
+# spread differently around one mean cannot, either.
+_DIFFER = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,8 +178,11 @@ def _sentence(
         why = ", when one of them was dropped" if one.dropped else ""
         return f"No significant difference between {first} and {second}: {counts}{why}"
     better, worse = (first, second) if one.winner == "first" else (second, first)
-    what = "succeeded more often" if found.outcome == SUCCESS else "reached higher scores"
-    return f"{better} {what} than {worse}: {counts}"
+    if found.outcome == SUCCESS:
+        return f"{better} succeeded more often than {worse}: {counts}"
+    if found.rule == FIXED and (plan.document or {}).get("format", 1) >= _DIFFER:
+        return f"Scores of {better} and {worse} differ: {counts}"
+    return f"{better} reached higher scores than {worse}: {counts}"
 
 
 def _counts(found: Design, one: Conclusion, ours: Sequence[float], theirs: Sequence[float]) -> str:
