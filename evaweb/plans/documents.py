@@ -33,6 +33,7 @@ _SCENE_CHANGED_SINCE_FROZEN = Pattern(
 # 2 had no outcome, margin, looks or boundary; 3 one "comparison" at most, of paired blocks; 4 was scored by its scenes
 # as they were then; reveals of 5 kept neither caveats nor the digest of the record.
 FORMAT = 6
+_DRAWN_BY_ITSELF = 6  # the order within a block, from this format on
 
 
 def document_of(plan: Plan, key: bytes) -> dict[str, Any]:
@@ -189,4 +190,5 @@ def _units(document: dict[str, Any], key: bytes) -> list[Unit]:
         repetitions=document["repetitions"],
         key=key,
         allocation=document.get("allocation", PAIRED),
+        latin=document.get("format", 1) < _DRAWN_BY_ITSELF,
     )

@@ -2,7 +2,8 @@
 
 Paired: every checkpoint is tried once in a block, one after the other, so that each comparison is made under the same
 condition at nearly the same time (Kress-Gazit et al. 2024). Rounds go through all conditions before any is repeated.
-Within each round of as many blocks as there are checkpoints, each checkpoint comes once at each place.
+The order within a block is drawn for each by itself: what ran before says nothing of it. (Plans of format 5 and before
+took rows of Latin squares, by which one recognised trial told of blocks to come.)
 
 Random: a block has two trials, each of one of two checkpoints by a fair coin, but where one is `IMBALANCE` trials ahead
 at that condition the other comes (the big stick design, Soares and Wu 1983): what was determines little of what comes.
@@ -82,12 +83,16 @@ def schedule(
     repetitions: int,
     key: bytes,
     allocation: str = PAIRED,
+    latin: bool = False,
 ) -> list[Unit]:
-    """All trials of a plan in the order in which they are handed out; the same for the same plan and key."""
+    """All trials of a plan in the order in which they are handed out; the same for the same plan and key.
+
+    `latin`: of a plan of format 5 or before.
+    """
     check_schedule(checkpoints, conditions, repetitions, allocation)
     units: list[Unit] = []
     block = 0
-    orders = _orders(list(checkpoints), Chance(key, "orders"))
+    orders = (_latin if latin else _orders)(list(checkpoints), Chance(key, "orders"))
     drawn = _Coins(list(checkpoints), Chance(key, "allocation"))
     for repetition in range(1, repetitions + 1):
         for condition in Chance(key, f"conditions/{repetition}").shuffled(list(conditions)):
@@ -127,6 +132,23 @@ def counts_of(units: Sequence[Unit], names: Sequence[str]) -> list[tuple[int, in
 
 
 def _orders(checkpoints: list[str], chance: Chance) -> Iterator[list[str]]:
+    """Orders of the checkpoints, block by block, each drawn by itself."""
+    while True:
+        yield chance.shuffled(checkpoints)
+
+
+def foretold(checkpoints: int, allocation: str) -> str:
+    """What an operator who recognises every checkpoint knows beforehand, whatever is hidden from them."""
+    share = checkpoints if allocation == PAIRED else 2 * IMBALANCE
+    which = (
+        "the last trial of each block"
+        if allocation == PAIRED
+        else "a trial where one is as far ahead as may be"
+    )
+    return f"1 of {share} trials: {which}"
+
+
+def _latin(checkpoints: list[str], chance: Chance) -> Iterator[list[str]]:
     """Orders of the checkpoints, block by block: rows of Latin squares, each drawn anew."""
     k = len(checkpoints)
     while True:

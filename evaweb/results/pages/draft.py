@@ -15,7 +15,7 @@ from evaweb.plans.design import planned
 from evaweb.plans.draft_checks import Remark, covered, problems, thoughts
 from evaweb.plans.drafting import HIDDEN, Values
 from evaweb.plans.models import Allocation, Comparing, Plan, PrimaryOutcome, Reference, StoppingRule
-from evaweb.plans.schedule import IMBALANCE, Condition, schedule
+from evaweb.plans.schedule import IMBALANCE, Condition, foretold, schedule
 from evaweb.plans.seeded_draws import KEY_BYTES
 from evaweb.results.analysis.planner import Question
 from evaweb.results.analysis.power import Asked, Figures
@@ -175,6 +175,7 @@ def _preview(plan: Plan, size: Size) -> dict[str, Any]:
         "paired": paired,
         "ahead": IMBALANCE,
         "per_position": plan.repetitions if paired else 2 * plan.repetitions,
+        "foretold": foretold(size.checkpoints, plan.allocation),
         "stations": stations,
         "per_station": size.each // stations if stations else None,
     }

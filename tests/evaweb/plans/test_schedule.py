@@ -1,5 +1,6 @@
 import json
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -99,10 +100,21 @@ def test_every_checkpoint_meets_every_condition_equally_often_in_blocks(k, n, re
 @given(st.integers(2, 5), st.binary(min_size=32, max_size=32))
 def test_in_as_many_blocks_as_checkpoints_each_comes_once_at_each_place(k, key):
     names = [f"policy {i}" for i in range(k)]
-    units = schedule(checkpoints=names, conditions=conditions(2 * k), repetitions=1, key=key)
+    units = schedule(
+        checkpoints=names, conditions=conditions(2 * k), repetitions=1, key=key, latin=True
+    )  # plans of format 5 and before
     for start in range(0, len(units), k * k):
         places = Counter((u.checkpoint, u.place) for u in units[start : start + k * k])
         assert set(places.values()) == {1}
+
+
+def test_what_ran_before_says_nothing_of_the_order_within_a_block():
+    """Of three checkpoints each order follows each as often as any, within four standard errors."""
+    units = schedule(checkpoints=["a", "b", "c"], conditions=conditions(40), repetitions=90, key=KEY)
+    orders = ["".join(u.checkpoint for u in units[i : i + 3]) for i in range(0, len(units), 3)]
+    follow = Counter(pairwise(orders))
+    assert len(follow) == 36
+    assert all(abs(count - 100) < 40 for count in follow.values())
 
 
 def test_the_same_key_gives_the_same_schedule_and_another_another():

@@ -70,7 +70,9 @@ def schedule(plan: Mapping[str, Any], key: bytes) -> list[list[Any]]:
                     units.append([len(units), block, names[at], scene, position, number])
                 block += 1
                 continue
-            if not orders:
+            if plan.get("format", 1) >= 6:
+                orders = [_shuffled(draws, names)]
+            elif not orders:
                 rows, columns = _shuffled(draws, names), _shuffled(draws, range(k))
                 orders = _shuffled(draws, [[rows[(i + c) % k] for c in columns] for i in range(k)])
             for checkpoint in orders.pop(0):
