@@ -63,8 +63,8 @@ ifeq ($(origin ARGS),command line)
 	$(PY) -m pytest $(ARGS)
 else
 	@gate=0; \
-	$(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not story and not lab and not exhaustive" || gate=$$?; \
-	$(PY) -m pytest -n 0 -m "story" && exit $$gate
+	$(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not story and not lab and not exhaustive" --durations=15 || gate=$$?; \
+	$(PY) -m pytest -n 0 -m "story" --durations=40 --durations-min=1 && exit $$gate
 endif
 
 labs: setup-dev ## every other whole lab, one after the other, and properties with random examples: before an issue is resolved

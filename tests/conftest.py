@@ -45,10 +45,13 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """A file that has none of the stories or labs that are asked for is not read."""
-    if config.option.markexpr not in ("story", "lab") or collection_path.suffix != ".py":
+    """A file that has none of the stories or labs that are asked for is not read, nor for the gate one of labs alone."""
+    wanted = config.option.markexpr
+    if collection_path.suffix != ".py" or not (wanted in ("story", "lab") or "not lab" in wanted):
         return None
     here = collection_path.relative_to(config.rootpath).as_posix()
+    if "not lab" in wanted:
+        return here.startswith(_LABS) or None
     return None if here.startswith(_LABS) or _ALONE.search(collection_path.read_text()) else True
 
 

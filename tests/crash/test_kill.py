@@ -43,7 +43,7 @@ def test_a_killed_process_is_restarted_and_nothing_moves_until_set_up_again(stat
     station.rest(kills=len(FAMILY))
     for process in FAMILY:
         if state == "recording":
-            station.running(2.0)  # set up after the one before was killed
+            station.running(1.3)  # set up after the one before was killed
         one_is_killed(station, process, state)
         if state == "idle" or process == FAMILY[-1]:
             station.ready()

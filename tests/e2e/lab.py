@@ -42,7 +42,7 @@ class Demo:
 
     def start(self):
         """Start it and wait until it is up; returns itself."""
-        if not self.data.exists():  # tests/e2e/test_once.py begins without a database
+        if not self.data.exists():
             migrated.copy(self.data)
         ready = self.folder / "ready.json"
         ready.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ from contextlib import closing, contextmanager
 
 import pytest
 
+from tests import migrated
 from tests.e2e.conftest import SETS
 from tests.e2e.lab import ROOT, environment
 from tests.processes import PATIENCE_S, eventually
@@ -26,7 +27,9 @@ JOIN episodes_episode AS episode ON episode.uuid = trial.episode_id WHERE trial.
 
 def run(folder, *options):
     """Run the command to its end; what it wrote as its result, and how it ended."""
-    out = folder / "out.json"
+    out, data = folder / "out.json", folder / "data"
+    if not data.exists():
+        migrated.copy(data)
     done = subprocess.run(
         [*MANAGE, "--json", str(out), "--port", "0", *options],
         cwd=ROOT,
@@ -130,7 +133,6 @@ def test_its_score_is_on_the_disk_before_any_database(first, folder):
     assert [milestone["reached"] for milestone in score["milestones"]] == [True] * 4
 
 
-@pytest.mark.story
 def test_a_taken_port_is_named_and_its_holder_lives(folder):
     with socket.create_server(("127.0.0.1", 0)) as holder:
         port = holder.getsockname()[1]

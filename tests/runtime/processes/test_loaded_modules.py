@@ -87,7 +87,7 @@ def story(tmp_path_factory):
     return folder / "station", states
 
 
-@pytest.mark.story
+@pytest.mark.lab
 @pytest.mark.slow
 def test_a_station_starts_runs_and_stops_where_modules_of_other_kinds_are_broken(story):
     _, states = story
@@ -98,7 +98,7 @@ def test_a_station_starts_runs_and_stops_where_modules_of_other_kinds_are_broken
     ]
 
 
-@pytest.mark.story
+@pytest.mark.lab
 @pytest.mark.slow
 @pytest.mark.parametrize("process", PROGRAMS)
 def test_each_process_loads_what_its_list_has(story, process):
@@ -112,7 +112,7 @@ def test_each_process_loads_what_its_list_has(story, process):
     assert roots >= BASE
 
 
-@pytest.mark.story
+@pytest.mark.lab
 @pytest.mark.slow
 def test_control_loads_its_transport_and_no_policy_leader_camera_or_solver(story):
     modules = set(loaded(story[0], "control"))
@@ -121,7 +121,7 @@ def test_control_loads_its_transport_and_no_policy_leader_camera_or_solver(story
     assert kinds & modules == {"runtime.transports.zmq"}
 
 
-@pytest.mark.story
+@pytest.mark.lab
 @pytest.mark.slow
 def test_no_process_loads_a_kind_that_the_deployment_does_not_name(story):
     for process in PROGRAMS:
