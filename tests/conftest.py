@@ -45,7 +45,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """A file that has none of the stories or labs that are asked for is not read, nor for the gate one of labs alone."""
+    """A file that has none of what is asked for is not read."""
     wanted = config.option.markexpr
     if collection_path.suffix != ".py" or not (wanted in ("story", "lab") or "not lab" in wanted):
         return None

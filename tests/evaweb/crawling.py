@@ -181,7 +181,7 @@ def orders(lab):
     order = {"kind": "setup", "page": "p1", "uuid": str(lab.command.pk), "trial": lab.trial.pk}
     yield reverse("api:commands", args=[lab.station.name]), order
     yield reverse("api:commands", args=[lab.station.name]), {**order, "uuid": str(uuids.uuid4())}
-    pk = lab.trial.checkpoint_id
+    pk = KEYS[0]
     yield (
         reverse("api:prepare", args=[lab.station.name]),
         {"scene": lab.scene.name, "position": 1, "checkpoint": pk},

@@ -6,6 +6,7 @@ Whatever reads differently in the two tells it. Clocks, tokens and identifiers t
 from __future__ import annotations
 
 import json
+import os
 import re
 from itertools import zip_longest
 from typing import Any
@@ -16,17 +17,18 @@ from django.db import models, transaction
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.episodes.models import Episode
+from evaweb.episodes.models import Episode, Tag
 from evaweb.jobs.models import Job
 from evaweb.plans.exchange import exported
 from evaweb.plans.models import Slot
 from evaweb.results.models import Judgement
-from evaweb.reviews.models import Tag
 from evaweb.stations.models import Command
 from evaweb.trials.models import Checkpoint, Scene, Trial
+from runtime.recording.export import export
 from tests.evaweb.blind_lab import KEYS, NAMES, in_the_other_world
 from tests.evaweb.crawling import _read, everything
 from tests.evaweb.unguarded import unguarded
+from tests.runtime.recording.samples import resealed
 
 OF_A_TRIAL = (Trial, Slot, Command, Episode, Job, Judgement, Tag)  # rows that say which checkpoint it is of
 
@@ -39,7 +41,12 @@ def swap(lab: Any) -> None:
                 _swap_row(row)
     for path in sorted(lab.data.rglob("*")):
         if path.suffix in (".json", ".jsonl", ".txt", ".md", ".log") and path.is_file():
+            before = path.stat()
             path.write_text(in_the_other_world(path.read_text()))
+            os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    for folder in (lab.data / "episodes").iterdir():
+        resealed(folder)
+        export(folder, lab.data)
     lab.swapped = not lab.swapped
     for name in ("trial", "episode", "command"):
         if getattr(lab, name) is not None:
@@ -61,12 +68,14 @@ def _swap_row(row: models.Model) -> None:
         type(row)._default_manager.filter(pk=row.pk).update(**changed)
 
 
-def read(lab: Any, client: Client, administrator: bool, **asked: Any) -> list[tuple[str, int, str]]:
+def read(
+    lab: Any, client: Client, *, administers: bool, every: bool, **asked: Any
+) -> list[tuple[str, int, str]]:
     """(what was asked, status, answer) of all that somebody can read, without what is drawn anew."""
     found = [*everything(lab, client, **asked)]
-    if administrator:
+    if administers:
         with transaction.atomic():
-            found += administration(lab, client)
+            found += administration(client, every)
             transaction.set_rollback(True)
     return [(_plain(asked), status, _plain(told)) for asked, status, told in found]
 
@@ -85,19 +94,23 @@ def differences(one: list[tuple[str, int, str]], other: list[tuple[str, int, str
 
 
 def _plain(text: str) -> str:
-    """Without tokens, nonces, times, and identifiers that were drawn for the answer."""
+    """Without what is drawn or measured for the answer; bytes of a dataset tell less of a name than of its pictures."""
     return re.sub(
-        r"[\w-]{40,}|nonce[=-][^' >]*|\d\d:\d\d:\d\d\S*|[0-9a-f]{8}-[0-9a-f-]{27}|\d+ (ms|s) ago", "", text
+        r"[\w-]{40,}|nonce[=-][^' >]*|\d\d:\d\d:\d\d\S*|[0-9a-f]{8}-[0-9a-f-]{27}|\d+ (ms|s) ago"
+        r'|"(clock|sequence|size)": [\d.]+|[\d.]+ of [\d.]+ GB|\d+ (MB/s|ms)\b',
+        "",
+        text,
     )
 
 
 # --- the administration -------------------------------------------------------------------------------------
 
 
-def administration(lab: Any, client: Client) -> Any:
+def administration(client: Client, every: bool) -> Any:
     """(what was asked, status, answer) of every page of it, and of what can be sent to those of checkpoints.
 
-    Of each list every order, filter and date that the page offers, and a search for each name.
+    Of each list every order, filter and date that the page offers, and a search for each name; without `every` of
+    checkpoints alone, and of others the list and one of its rows.
     """
     index = reverse("admin:index")
     yield (index, *_asked(client, index))
@@ -106,13 +119,16 @@ def administration(lab: Any, client: Client) -> Any:
         listed = reverse(f"{place}_changelist")
         status, told = _asked(client, listed)
         yield listed, status, told
-        for query in sorted(set(re.findall(r'href="(\?[^"#]+)"', told))):
+        whole = every or model is Checkpoint
+        offered = set(re.findall(r'href="(\?[^"#]+)"', told)) if whole else set()
+        for query in sorted(offered):
             yield (listed + query, *_asked(client, listed + query.replace("&amp;", "&")))
         for name in NAMES if model in (Checkpoint, Scene) else ():
             yield (f"{listed}?q={name}", *_asked(client, f"{listed}?q={name}"))
-        yield (f"{place}_add", *_asked(client, reverse(f"{place}_add")))
-        for row in model._default_manager.order_by("pk")[:3]:
-            for page in ("change", "delete", "history"):
+        if whole:
+            yield (reverse(f"{place}_add"), *_asked(client, reverse(f"{place}_add")))
+        for row in model._default_manager.order_by("pk")[: 3 if whole else 1]:
+            for page in ("change", "delete", "history") if whole else ("change",):
                 address = reverse(f"{place}_{page}", args=[row.pk])
                 yield (address, *_asked(client, address))
     yield from _sent(client)
