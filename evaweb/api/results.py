@@ -216,8 +216,7 @@ def results(request: HttpRequest, name: str, version: int, only: Query[Only]) ->
         "caveats": caveats_of(plan),
         **analysis_document(analysis),
         "corrected": {
-            name: proportion_document(found)
-            for name, found in caching.corrected_of(plan, which, caching.fingerprint(plan)).items()
+            name: proportion_document(found) for name, found in caching.corrected_of(plan, which).items()
         },
         "notes": list(analysis.notes),
         "agreement": agreement_of(plan),

@@ -65,10 +65,11 @@ def runs_of(plan: Plan, at: Hashable = None) -> Runs:
     )
 
 
-def corrected_of(plan: Plan, only: Chosen, at: Hashable) -> dict[str, Proportion]:
+def corrected_of(plan: Plan, only: Chosen) -> dict[str, Proportion]:
     """Successes by checkpoint with the scores of now, where those of a revealed plan were corrected since."""
     if not plan.at_reveal:
         return {}
+    at = fingerprint(plan)
     now = _corrected.get((plan.pk, plan.digest), at, lambda: outcomes_of_plan(plan, corrected=True))
     found = {}
     before = by_checkpoint(only.apply(runs_of(plan, at).outcomes))

@@ -11,6 +11,7 @@ from django.db.models import QuerySet
 
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.outcomes import Interruption, Outcome
+from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
 
 # What an outcome calls it, and where a trial has it.
@@ -34,7 +35,8 @@ _FIELDS = _RUN | {
 def outcomes_of_plan(plan: Plan, *, corrected: bool = False) -> list[Outcome]:
     """Those of a plan that count, in the order in which they were handed out.
 
-    Of a revealed plan as they were scored at the reveal; `corrected`: as they are scored now.
+    Of a revealed plan as they were judged at the reveal; `corrected`: as they are now. Why a trial failed is what is
+    said of it now: no figure of a comparison has it.
     """
     trials = Trial.objects.filter(handout__plan=plan)
     blocks = dict(plan.handouts.values_list("trial_id", "slot__block"))
@@ -74,7 +76,8 @@ def _outcomes(
             if said["trial"] not in earlier:
                 continue
             verdict, judged = earlier[said["trial"]]
-            said |= judged
+            same = said["success"] == judged["success"]  # then why it failed may be said better by now
+            said |= {name: value for name, value in judged.items() if not (same and name in FIELDS)}
         reached = milestones.get(verdict, [])
         found.append(
             Outcome(

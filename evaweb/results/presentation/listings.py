@@ -41,7 +41,7 @@ class Row:
 
 def arm_rows(plan: Plan, analysis: Analysis, only: Chosen) -> list[dict[str, Any]]:
     """The table of checkpoints, best first, each with what scores that were corrected after the reveal make of it."""
-    corrected = caching.corrected_of(plan, only, caching.fingerprint(plan))
+    corrected = caching.corrected_of(plan, only)
     return [
         {
             "arm": arm,

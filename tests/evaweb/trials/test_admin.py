@@ -152,7 +152,7 @@ def test_a_change_of_a_tried_policy_is_warned_about(admin, bench):
     bench.scored()
     form = {"policy": '{"url": "ws://127.0.0.1:9000"}', "active": "on"}
     answer = admin.post(f"/admin/trials/checkpoint/{bench.checkpoint.pk}/change/", form, follow=True)
-    assert "Checkpoint pi0-block has 1 trial made with another policy table" in answer.content.decode()
+    assert "are of checkpoint pi0-block with another policy table" in answer.content.decode()
     bench.checkpoint.refresh_from_db()
     assert (bench.checkpoint.name, bench.checkpoint.policy) == ("pi0-block", {"url": "ws://127.0.0.1:9000"})
 
@@ -179,10 +179,16 @@ def test_what_happened_is_neither_made_nor_changed_nor_deleted(admin, bench, whe
 
 def test_what_was_tried_is_not_deleted(admin, bench):
     bench.scored()
-    for kind, row in (("scene", bench.scene), ("checkpoint", bench.checkpoint)):
-        answer = admin.post(f"/admin/trials/{kind}/{row.pk}/delete/", {"post": "yes"})
-        assert type(row).objects.filter(pk=row.pk).exists()
-        assert f"Cannot delete {kind}" in answer.content.decode()
+    chosen = {"action": "delete_selected", "_selected_action": [bench.checkpoint.pk]}
+    for address, form, said in (
+        (f"scene/{bench.scene.pk}/delete/", {}, "Cannot delete scene"),
+        (f"checkpoint/{bench.checkpoint.pk}/delete/", {}, "Not allowed"),
+        ("checkpoint/", chosen, "Checkpoint pi0-block: trials, or a plan that was frozen, are of it"),
+    ):
+        answer = admin.post(f"/admin/trials/{address}", {**form, "post": "yes"})
+        assert said in answer.content.decode()
+    bench.scene.refresh_from_db()
+    bench.checkpoint.refresh_from_db()
 
 
 def test_every_field_of_the_scene_form_has_a_label(admin, bench):

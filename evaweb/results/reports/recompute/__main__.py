@@ -113,13 +113,17 @@ def _as_revealed(rows: Rows, scores: Rows, at_reveal: dict[str, Any] | None) -> 
     for score in scores:  # in the order in which they were given
         if datetime.fromisoformat(score["scored_at"]) <= then:
             newest[score["trial"]] = score
-    told = ("success", "score", "milestones", "failure", "failure_phase")
-    return [
-        {**row, **{name: newest[row["trial"]][name] for name in told}}
-        if row["trial"] in newest
-        else {**row, "status": "ended" if row["status"] == "scored" else row["status"]}
-        for row in rows
-    ]
+    return [_as_judged(row, newest.get(row["trial"])) for row in rows]
+
+
+def _as_judged(row: dict[str, str], score: dict[str, str] | None) -> dict[str, str]:
+    """The trial by that score; why it failed is what is said of it now, where it failed by both."""
+    if score is None:
+        return {**row, "status": "ended" if row["status"] == "scored" else row["status"]}
+    names = ["success", "score", "milestones"]
+    if row["success"] != score["success"]:
+        names += ["failure", "failure_phase"]
+    return {**row, **{name: score[name] for name in names}}
 
 
 def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None:

@@ -78,7 +78,7 @@ def changes(
 
 
 def _unsaid(kept: Mapping[str, Any], page: str) -> Iterator[str]:
-    for sentence in (*kept["headline"], *kept["caveats"]):
+    for sentence in (*kept.get("headline", ()), *kept.get("caveats", ())):
         if sentence not in page:
             yield sentence
 
