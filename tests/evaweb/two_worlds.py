@@ -79,7 +79,9 @@ def read(
             found += administration(client, every)
             transaction.set_rollback(True)
     return [
-        (_plain(asked), status, _plain(told)) for asked, status, told in found if not asked.startswith(MEASURED)
+        (_plain(asked), status, _plain(told))
+        for asked, status, told in found
+        if not asked.startswith(MEASURED)
     ]
 
 
@@ -100,7 +102,7 @@ def _plain(text: str) -> str:
     """Without what is drawn or measured for the answer; bytes of a dataset tell less of a name than of its pictures."""
     return re.sub(
         r"[\w-]{40,}|nonce[=-][^' >]*|\d\d:\d\d:\d\d\S*|[0-9a-f]{8}-[0-9a-f-]{27}|\d+ (ms|s) ago"
-        r'|"(clock|sequence|size)": [\d.]+,
+        r'|"(clock|sequence|size)": [\d.]+',
         "",
         text,
     )
