@@ -270,13 +270,18 @@ def same_blocks(one: Sequence[Block], other: Sequence[Block]) -> bool:
     return [sorted(block) for block in one] == [sorted(block) for block in other]
 
 
+def blocks_that_count(plan: Plan) -> list[Block]:
+    """Of a revealed plan those of its reveal, else those there are now."""
+    kept = kept_blocks(plan)
+    return tried(plan).counted if kept is None else kept
+
+
 def findings_of(plan: Plan) -> Findings | None:
     """What the frozen design says: of a revealed plan as it stood at the reveal, else of the trials there are now."""
     found = frozen(plan.document) if plan.document else None
     if found is None:
         return None
-    kept = kept_blocks(plan)
-    return findings(found, tried(plan).counted if kept is None else kept)
+    return findings(found, blocks_that_count(plan))
 
 
 def dropped_of(plan: Plan) -> dict[str, int]:

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 from evaweb.statistics.base import StatisticsError, check_alpha
 from evaweb.statistics.boundaries import MOST, SHAPES, Boundary, Look, boundary, in_pairs
-from evaweb.statistics.difference import barnard
+from evaweb.statistics.difference import Difference, barnard
 from evaweb.statistics.permutation import sign_flips
 from evaweb.statistics.sequential import score_evidence, success_evidence
+from evaweb.statistics.stagewise import stagewise
 
 FIXED, ANYTIME = "none", "evidence"  # as plans have named them since there are plans
 RULES = (FIXED, ANYTIME, *SHAPES)
@@ -270,6 +271,21 @@ def conclude(found: Design, blocks: Sequence[Block], pair: tuple[int, int] = (0,
     p, lead = _scored(given) if found.outcome == SCORE else _succeeded(given)
     winner = _ahead(lead, 0) if p <= found.share * (1 + _TIE) else None
     return Conclusion(full, full, winner, p, found.blocks)
+
+
+def estimated(
+    found: Design, blocks: Sequence[Block], pair: tuple[int, int], one: Conclusion
+) -> Difference | None:
+    """The difference of rates that a comparison ended with, whatever stopped it; None where its rule does not stop it
+    early, or it asks about a margin, was dropped, or goes on.
+    """
+    if found.boundary is None or found.margin is not None or one.at is None or one.dropped:
+        return None
+    given = list(_made(found, blocks[: one.at], pair))
+    (first, n), (second, m) = (_sum(given, side) for side in (0, 1))
+    if (n, m) not in [(look.first, look.second) for look in found.boundary.looks]:
+        return None
+    return stagewise(found.boundary, first, n, second, m)
 
 
 Sides = tuple[list[float], list[float]]  # outcomes of the first and of the second arm in one block

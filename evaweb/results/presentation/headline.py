@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -20,7 +20,17 @@ from evaweb.plans.design import (
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.presentation.wording import p_words, points
-from evaweb.statistics.designs import FIXED, SUCCESS, Block, Conclusion, Design, alone, conclude, findings
+from evaweb.statistics.designs import (
+    FIXED,
+    SUCCESS,
+    Block,
+    Conclusion,
+    Design,
+    alone,
+    conclude,
+    estimated,
+    findings,
+)
 from evaweb.statistics.difference import newcombe
 from evaweb.statistics.many import letters
 
@@ -35,8 +45,8 @@ class Headline:
 
     `corrected`: with the scores that were corrected after the reveal. `at_first`: as trials were first scored, had none
     been voided. `worst`: of differences, had each attempt that was thrown away unscored been against them. Each is
-    empty where it is made of the same blocks. `letters`, where all checkpoints were compared with each other: two
-    share one if they were not told apart.
+    empty where it is made of the same blocks. `estimates`: of comparisons that stopped early, how much they differ.
+    `letters`, where all checkpoints were compared with each other: two share one if they were not told apart.
     """
 
     sentences: tuple[str, ...]
@@ -44,6 +54,7 @@ class Headline:
     corrected: str = ""
     at_first: str = ""
     worst: str = ""
+    estimates: tuple[str, ...] = ()
     versions: tuple[str, ...] = ()
     letters: tuple[tuple[str, str], ...] = ()
 
@@ -55,7 +66,7 @@ class Headline:
     @property
     def caveats(self) -> tuple[str, ...]:
         """What else it could be, a sentence each, without what came after the reveal."""
-        found = []
+        found = [*self.estimates]
         if self.at_first:
             found.append(
                 "Some scored trials were voided, have a void pending, or had their score corrected before the reveal. "
@@ -88,6 +99,7 @@ def headline(plan: Plan) -> Headline | None:
         _other(plan, found, now.counted, at_reveal),
         _other(plan, found, now.at_first, at_reveal),
         ". ".join(told.sentence for told in in_the_worst_case(plan, found, at_reveal, now)),
+        tuple(_estimates(plan, found, at_reveal)),
         _versions(plan),
         letters_of(plan, found, at_reveal),
     )
@@ -201,6 +213,21 @@ def _counts(found: Design, one: Conclusion, ours: Sequence[float], theirs: Seque
 def _other(plan: Plan, found: Design, blocks: Sequence[Block], at_reveal: Sequence[Block]) -> str:
     """What it would be of these; empty where they are the same."""
     return "" if same_blocks(blocks, at_reveal) else sentence_of(plan, found, blocks)
+
+
+def _estimates(plan: Plan, found: Design, blocks: Sequence[Block]) -> Iterator[str]:
+    """Of each comparison that a boundary stopped: the raw difference is on average too large."""
+    each = zip(compared(plan.document or {}), found.comparisons, findings(found, blocks).each, strict=True)
+    for (first, second), pair, one in each:
+        said = estimated(found, blocks, pair, one) if one.ended == "boundary" and one.winner else None
+        if said is None:
+            continue
+        if one.winner == "second":
+            first, second, said = second, first, said.reversed
+        yield (
+            f"{first} is ahead of {second} by {points(said)}, corrected for stopping early (median unbiased); the raw "
+            "difference is on average too large"
+        )
 
 
 @dataclass(frozen=True, slots=True)

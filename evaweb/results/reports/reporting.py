@@ -15,7 +15,7 @@ from django.template.loader import render_to_string
 from django.utils import timezone
 
 from evaweb.errors import EvaError
-from evaweb.plans.design import compared, findings_of
+from evaweb.plans.design import blocks_that_count, compared, frozen
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
@@ -31,6 +31,8 @@ from evaweb.results.reports import bench_photos as laid_out
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.document import analysis_document
 from evaweb.results.reports.tables import COLUMNS, SCORE_COLUMNS, outcome_pages, score_pages
+from evaweb.statistics.designs import estimated, findings
+from evaweb.statistics.difference import Difference
 from evaweb.tabular_export import csv_lines
 from evaweb.trials.failures import in_order
 from runtime.core.sentences import Pattern
@@ -123,9 +125,10 @@ def numbers_of(plan: Plan, analysis: Analysis) -> dict[str, Any]:
 
 def planned_document(plan: Plan) -> list[dict[str, Any]]:
     """What the plan's design says of each of its comparisons."""
-    found = findings_of(plan)
+    found = frozen(plan.document) if plan.document else None
     if found is None:
         return []
+    blocks = blocks_that_count(plan)
     return [
         {
             "first": names[0],
@@ -134,9 +137,16 @@ def planned_document(plan: Plan) -> list[dict[str, Any]]:
             "at": one.at,
             "winner": {"first": names[0], "second": names[1], None: None}[one.winner],
             "p": one.p,
+            "estimate": _estimate(estimated(found, blocks, pair, one)),
         }
-        for names, one in zip(compared(plan.document or {}), found.each, strict=True)
+        for names, pair, one in zip(
+            compared(plan.document or {}), found.comparisons, findings(found, blocks).each, strict=True
+        )
     ]
+
+
+def _estimate(found: Difference | None) -> list[float] | None:
+    return None if found is None else [found.value, found.interval.low, found.interval.high]
 
 
 def seal_of(plan: Plan) -> dict[str, Any]:

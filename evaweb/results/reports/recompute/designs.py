@@ -15,6 +15,8 @@ from . import methods
 Pair = tuple[float, float]
 Block = Sequence[tuple[int, float]]  # arm and outcome of each of its trials that count
 _TIE = 1e-9  # relative: a p that is alpha in other last bits
+_EDGE = 1e-9  # of rates and differences, nearer to whose ends none is taken
+_HALVED = 60
 
 
 class Row(Protocol):
@@ -197,7 +199,7 @@ def conclusions(blocks: Sequence[Block], plan: Mapping[str, Any]) -> list[dict[s
         } - spared
         for n in left:
             if n not in found and worse & {*sides[n]}:
-                found[n] = {"blocks": at, "at": at, "winner": None, "p": None}
+                found[n] = {"blocks": at, "at": at, "winner": None, "p": None, "estimate": None}
         still = {arm for n, pair in enumerate(sides) if n not in found for arm in pair}
         dropped |= {arm: at for arm in range(len(arms)) if arm not in still and arm not in dropped}
     return [
@@ -217,6 +219,7 @@ def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[i
     foreseen, alpha, margin = _foreseen(plan), share_of(plan), said.get("margin")
     given = _made(blocks, said.get("counts"), sides)
     at, winner, p = len(given) if len(given) == foreseen else None, None, None
+    found = None
     if said.get("boundary"):
         looks = {(look[0], look[1]): look for look in said["boundary"]}
         for number in range(1, len(given) + 1):
@@ -226,6 +229,9 @@ def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[i
             if side is not None:
                 at, winner = number, side
                 break
+        if at is not None and margin is None:
+            (first, n), (second, m) = (_sum(given[:at], side) for side in (0, 1))
+            found = estimate(said["boundary"], int(first), n, int(second), m)
     elif said["rule"] == "evidence":
         at, winner = _evidence([(one[0], other[0]) for one, other in given], said, alpha, at)
     elif at is not None:
@@ -235,7 +241,7 @@ def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[i
         else:
             p = methods.barnard(int(first), n, int(second), m)[1] if n and m else 1.0
         winner = int(first * m <= second * n) if p <= alpha * (1 + _TIE) else None
-    return {"blocks": len(given), "at": at, "winner": winner, "p": p}
+    return {"blocks": len(given), "at": at, "winner": winner, "p": p, "estimate": found and list(found)}
 
 
 def _made(
@@ -342,10 +348,18 @@ def _degree(a: int, n: int, b: int, m: int, margin: float | None) -> tuple[int, 
     return lead * abs(lead) * n * m, (a * (n - a) * m**3 + b * (m - b) * n**3) * scale**2
 
 
-def _stopped(
+Tables = dict[tuple[int, int], int]  # successes of both arms, with the orders that come to them
+
+
+def _stopped(boundary: Sequence[Sequence[int]], margin: float | None) -> Iterator[tuple[int, int, Tables]]:
+    """Each look's trials, and the tables that stop there."""
+    yield from ((n, m, gone) for n, m, gone, _ in _walked(boundary, margin))
+
+
+def _walked(
     boundary: Sequence[Sequence[int]], margin: float | None
-) -> Iterator[tuple[int, int, dict[tuple[int, int], int]]]:
-    """Each look's trials, and the tables (successes of both arms) that stop there with the orders that come to them."""
+) -> Iterator[tuple[int, int, Tables, Tables]]:
+    """Each look's trials, the tables that stop there, and those that go on."""
     alive, n, m = {(0, 0): 1}, 0, 0
     for look in boundary:
         for arm in (0,) * (look[0] - n) + (1,) * (look[1] - m):
@@ -358,7 +372,7 @@ def _stopped(
         gone = [
             (a, b) for a, b in alive if least and _reaches((a, n, b, m), (least[0], n, least[1], m), margin)
         ]
-        yield n, m, {table: alive.pop(table) for table in gone}
+        yield n, m, {table: alive.pop(table) for table in gone}, alive
 
 
 def _mixed(share: Sequence[float], p: float) -> float:
@@ -421,3 +435,72 @@ def _evidence(
         if max(worth) >= wanted:
             return number, worth.index(max(worth))
     return full, None
+
+
+def estimate(
+    boundary: Sequence[Sequence[int]], first: int, n: int, second: int, m: int
+) -> tuple[float, float, float] | None:
+    """Difference of rates, median unbiased, with its 95 % interval, where a design ended: outcomes by stages."""
+    beyond: list[tuple[float, ...]] = []
+    same: list[tuple[float, ...]] = []
+    looks = [(look[0], look[1]) for look in boundary]
+    if (n, m) not in looks:
+        return None
+    side = _side(boundary[looks.index((n, m))], first, second, None)
+    mirrored = side == 1
+    observed = first * m - second * n
+    for at_n, at_m, stopped, left in _walked(boundary, None):
+        last = (at_n, at_m) == (n, m)
+        for tables, stops in ((stopped, True), (left, False)):
+            if not stops and not last:
+                continue
+            for (a, b), ways in tables.items():
+                lead = a * at_m - b * at_n
+                row = (a, at_n - a, b, at_m - b, math.log(ways))
+                for_it = lead < 0 if mirrored else lead > 0
+                farther = lead < observed if mirrored else lead > observed
+                if last and (side is None) != stops and lead == observed and (side is None or for_it):
+                    same.append(row)
+                elif (stops and for_it and (not last or side is None or farther)) or (
+                    last and side is None and not stops and farther
+                ):
+                    beyond.append(row)
+        if last:
+            break
+
+    def chances(difference: float) -> tuple[float, float]:
+        p, q = _likeliest(difference, first, n, second, m)
+        logs = (math.log(p), math.log(1 - p), math.log(q), math.log(1 - q))
+        outside, alike = (
+            math.fsum(
+                math.exp(row[4] + sum(x * log for x, log in zip(row, logs, strict=False))) for row in rows
+            )
+            for rows in (beyond, same)
+        )
+        return (1 - outside - alike if mirrored else outside), alike
+
+    found = []
+    for wanted, share in ((0.5, 0.5), (0.025, 1.0), (0.975, 0.0)):
+        low, high = -1.0 + _EDGE, 1.0 - _EDGE
+        for _ in range(_HALVED):
+            middle = (low + high) / 2
+            more, alike = chances(middle)
+            low, high = (middle, high) if more + share * alike < wanted else (low, middle)
+        found.append((low + high) / 2)
+    return found[0], found[1], found[2]
+
+
+def _likeliest(difference: float, first: int, n: int, second: int, m: int) -> tuple[float, float]:
+    """The rates with this difference under which the successes are likeliest."""
+    low, high = max(0.0, -difference) + _EDGE / 4, min(1.0, 1.0 - difference) - _EDGE / 4
+    for _ in range(_HALVED):
+        q = (low + high) / 2
+        p = q + difference
+        slope = first / p - (n - first) / (1 - p) + second / q - (m - second) / (1 - q)
+        low, high = (q, high) if slope > 0 else (low, q)
+    q = (low + high) / 2
+    return _inside(q + difference), _inside(q)
+
+
+def _inside(rate: float) -> float:
+    return min(max(rate, _EDGE / 8), math.nextafter(1.0, 0.0) - _EDGE / 8)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from evaweb.results.reports.recompute import designs as offline
-from evaweb.statistics.designs import design, findings, in_blocks, table
+from evaweb.statistics.designs import design, estimated, findings, in_blocks, table
 
 RULES = [
     ("none", "success", None),
@@ -35,6 +35,9 @@ def same_end(found, blocks):
         winner = {"first": "abc"[sides[0]], "second": "abc"[sides[1]], None: None}[one.winner]
         assert (other["blocks"], other["at"], other["winner"]) == (one.blocks, one.at, winner)
         assert other["p"] == (one.p and pytest.approx(one.p, rel=1e-6))
+        said = estimated(found, blocks, sides, one)
+        ends = said and [said.value, said.interval.low, said.interval.high]
+        assert other["estimate"] == (ends and pytest.approx(ends, abs=1e-9))
 
 
 @pytest.mark.parametrize(("rule", "outcome", "margin"), RULES)

@@ -1,0 +1,140 @@
+"""How much two arms differ, where a design may stop early: an estimate that is as often too large as too small.
+
+A design that stops where the difference is large overestimates it. Outcomes are ordered by the stage at which they come
+(Armitage 1957; Tsiatis, Rosner and Mehta 1984): a stop for the first arm says more for it the earlier it comes, one for
+the second the later; at the end, and of tables at one look, the larger difference says more. The estimate is the
+difference of rates under which what was observed lies in the middle of that order; the interval's ends are those under
+which no more than half of what is left lies as far out. The other rate is the likeliest one for each difference.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+from evaweb.statistics.base import LEVEL, Interval, StatisticsError
+from evaweb.statistics.boundaries import Boundary, _grown
+from evaweb.statistics.difference import Difference
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+_EDGE = 1e-9  # of rates and of differences, nearer to whose ends none is taken
+_HALVED = 60
+
+
+@lru_cache(maxsize=256)
+def stagewise(found: Boundary, first: int, n: int, second: int, m: int, level: float = LEVEL) -> Difference:
+    """The first arm's rate less the second's, where a design without a margin ended with these successes of trials.
+
+    StatisticsError where it did not end there.
+    """
+    look = next((i for i, at in enumerate(found.looks) if (at.first, at.second) == (n, m)), None)
+    if found.margin is not None or look is None:
+        raise StatisticsError(f"no look of this design is after {n} and {m} trials")
+    if found.winner(look, first, second) is None and look < len(found.looks) - 1:
+        raise StatisticsError(f"the design goes on after {first}/{n} and {second}/{m}")
+    order = _ordered(found, look, first, second)
+    tail = (1 - level) / 2
+
+    def at(wanted: float, more: Callable[[float, float], float]) -> float:
+        """The difference under which `more`, of the probabilities of more and of the same, is just what is wanted."""
+        low, high = -1.0 + _EDGE, 1.0 - _EDGE
+        for _ in range(_HALVED):
+            middle = (low + high) / 2
+            if more(*order.probabilities(*_likeliest(middle, first, n, second, m))) < wanted:
+                low = middle
+            else:
+                high = middle
+        return (low + high) / 2
+
+    value = at(0.5, lambda more, same: more + same / 2)
+    low = at(tail, lambda more, same: more + same)
+    high = at(1 - tail, lambda more, same: more)
+    return Difference(value, Interval(low, high, level))
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    """Tables that say more (or, `mirrored`, less) for the first arm than what was observed, and those that say as much.
+
+    Each has successes and failures of both arms, and the logarithm of its probability at rates of a half: float64
+    [tables, 5].
+    """
+
+    beyond: NDArray[np.float64]
+    same: NDArray[np.float64]
+    mirrored: bool
+
+    def probabilities(self, p_first: float, p_second: float) -> tuple[float, float]:
+        """Of what says more for the first arm, and of what says the same, at these rates."""
+        beyond, same = (_mass(tables, p_first, p_second) for tables in (self.beyond, self.same))
+        return (1 - beyond - same if self.mirrored else beyond), same
+
+
+def _ordered(found: Boundary, look: int, first: int, second: int) -> _Order:
+    import numpy as np
+
+    winner = found.winner(look, first, second)
+    mirrored = winner == "second"
+    alive, before = np.ones((1, 1)), (0, 0)
+    beyond: list[NDArray[np.float64]] = []
+    for number, (at, region) in enumerate(zip(found.looks, found.regions, strict=True)):
+        alive = _grown(alive, at.first - before[0], at.second - before[1], (0.5, 0.5))
+        before = (at.first, at.second)
+        a, b = np.indices(alive.shape)
+        lead = a * at.second - b * at.first
+        stops = region & ((lead < 0) if mirrored else (lead > 0))
+        if number < look:
+            beyond.append(_tables(np.where(stops, alive, 0.0)))
+            alive = np.where(region, 0.0, alive)
+            continue
+        observed = first * at.second - second * at.first
+        among = stops if winner else ~region
+        ahead = among & ((lead < observed) if mirrored else (lead > observed))
+        if winner is None:  # whatever stops for the first at the end says more than what does not stop
+            ahead |= stops
+        beyond.append(_tables(np.where(ahead, alive, 0.0)))
+        return _Order(
+            np.concatenate(beyond), _tables(np.where(among & (lead == observed), alive, 0.0)), mirrored
+        )
+    raise StatisticsError("a design needs at least one look")
+
+
+def _tables(mass: NDArray[np.float64]) -> NDArray[np.float64]:
+    import numpy as np
+
+    a, b = np.nonzero(mass)
+    n, m = mass.shape[0] - 1, mass.shape[1] - 1
+    return np.column_stack([a, n - a, b, m - b, np.log(mass[a, b])]).astype(float)
+
+
+def _mass(tables: NDArray[np.float64], p_first: float, p_second: float) -> float:
+    import numpy as np
+
+    rates = np.log([2 * p_first, 2 * (1 - p_first), 2 * p_second, 2 * (1 - p_second)])
+    return float(np.exp(tables[:, :4] @ rates + tables[:, 4]).sum())
+
+
+def _likeliest(difference: float, first: int, n: int, second: int, m: int) -> tuple[float, float]:
+    """The rates with this difference under which the successes are likeliest: where the likelihood's slope is 0."""
+    low, high = max(0.0, -difference) + _EDGE / 4, min(1.0, 1.0 - difference) - _EDGE / 4
+    for _ in range(_HALVED):
+        q = (low + high) / 2
+        p = q + difference
+        slope = first / p - (n - first) / (1 - p) + second / q - (m - second) / (1 - q)
+        if slope > 0:
+            low = q
+        else:
+            high = q
+    q = (low + high) / 2
+    return _inside(q + difference), _inside(q)
+
+
+def _inside(rate: float) -> float:
+    return min(max(rate, _EDGE / 8), math.nextafter(1.0, 0.0) - _EDGE / 8)
