@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import datetime
+
 from django.conf import settings
 from django.core.validators import MaxValueValidator, MinValueValidator
 from django.db import models
@@ -223,6 +225,11 @@ class Plan(models.Model):
 
     def __str__(self) -> str:
         return f"{self.title} v{self.version}"
+
+    @property
+    def kept_at(self) -> datetime | None:
+        """When what counts was kept: at the reveal, of a plan that is not blind at its close; None before."""
+        return datetime.fromisoformat(self.at_reveal["at"]) if self.at_reveal else self.revealed_at
 
     @property
     def sealed(self) -> bool:

@@ -7,12 +7,14 @@ DATA/reveals/UUID.jsonl, named by the first half of the plan's digest. The first
 from __future__ import annotations
 
 import logging
+from datetime import datetime
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
+from django.contrib.auth.models import User
 from pydantic import Field
 
-from evaweb.journal import From, Journal, Line, Moment, Person
+from evaweb.journal import Journal, Line, Moment, Person
 from evaweb.plans.models import Plan
 
 log = logging.getLogger(__name__)
@@ -26,8 +28,8 @@ class RevealLine(Line):
     version: Annotated[int, Field(ge=1, lt=2**31)]
     digest: str
     at_reveal: dict[str, Any] | None
-    by: Annotated[Person, From("revealed_by__username")]
-    at: Annotated[Moment, From("revealed_at")]
+    by: Person
+    at: Moment
 
 
 REVEALS: Journal[RevealLine] = Journal("reveals", RevealLine)
@@ -39,12 +41,14 @@ def kept(plan: Plan) -> RevealLine | None:
     return next((line for line in lines if line.digest == plan.digest), None)
 
 
-def keep(plan: Plan) -> None:
-    """Write down a reveal that is about to be saved, and complete its `at_reveal`. Raises NotKept."""
-    if plan.at_reveal is not None and plan.revealed_by is not None:
-        by, key = plan.revealed_by.get_username(), bytes(plan.key or b"").hex()
+def keep(plan: Plan, user: User, at: datetime) -> None:
+    """Write down a reveal, or the close of a plan that is not blind, that is about to be saved, and complete its
+    `at_reveal`. Raises NotKept."""
+    by = user.get_username()
+    if plan.at_reveal is not None:
+        key = bytes(plan.key or b"").hex()
         plan.at_reveal = {**plan.at_reveal, "by": by, "commitment": plan.commitment, "key": key}
-    REVEALS.append(_file(plan), RevealLine.written(plan))
+    REVEALS.append(_file(plan), RevealLine.written(plan, by=by, at=at.isoformat()))
 
 
 def _file(plan: Plan) -> UUID:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from contextlib import suppress
+from datetime import datetime
 from typing import Any
 
 from django.contrib.admin.models import ADDITION, CHANGE, LogEntry
@@ -321,16 +322,14 @@ def plan_reveal(*, user: User, plan: Plan) -> Plan:
     if _slots(held) != [unit.row for unit in units]:
         raise EvaError(_RENAMED_SINCE_FROZEN(held=held))
     voids_lapse(_trials(held), user=user, now=True)
-    before = reveals.kept(held)
-    held.at_reveal = before.at_reveal if before else at_the_reveal(held)
     held.state, held.revealed_at, held.revealed_by = PlanState.REVEALED, timezone.now(), user
+    before = _keep_result(held, user, held.revealed_at)
+    what = "reveal" if held.blind else "close"
     again = (
-        f"; what counts is that of the reveal of {before.at:%Y-%m-%d %H:%M} UTC by {before.by}"
+        f"; what counts is that of the {what} of {before.at:%Y-%m-%d %H:%M} UTC by {before.by}"
         if before
         else ""
     )
-    if before is None:
-        reveals.keep(held)
     held.save()
     _note(held, user, "revealed", f"key {bytes(held.key or b'').hex()}; commitment verified{again}")
     plan.refresh_from_db()
@@ -401,8 +400,20 @@ def _close(plan: Plan, user: User, why: str) -> None:
             )
         )
     plan.state, plan.closed_at, plan.closed_because = PlanState.CLOSED, timezone.now(), why
+    if not plan.blind:  # everybody has seen it: no reveal is needed, and none may ever come
+        _keep_result(plan, user, plan.closed_at)
     plan.save()
     _note(plan, user, "closed", why)
+
+
+def _keep_result(plan: Plan, user: User, at: datetime) -> reveals.RevealLine | None:
+    """What counts is kept from now on, on the disk too; as it was kept before, where it was: that is returned."""
+    before = reveals.kept(plan)
+    if plan.at_reveal is None:
+        plan.at_reveal = before.at_reveal if before else at_the_reveal(plan)
+    if before is None:
+        reveals.keep(plan, user, at)
+    return before
 
 
 def _check(plan: Plan, user: User) -> None:

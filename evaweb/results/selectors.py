@@ -112,7 +112,7 @@ class Question:
 
 def plan_at_reveal(digest: str) -> Plan:
     """The plan whose reveal has this digest; NotFound where none has."""
-    found = Plan.objects.filter(state=PlanState.REVEALED, at_reveal__digest=digest).first()
+    found = Plan.objects.filter(at_reveal__digest=digest).first()
     if found is None:
         raise NotFound(_NO_REVEAL_HAS_DIGEST_STANDS(digest=digest))
     return found

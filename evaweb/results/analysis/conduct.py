@@ -253,7 +253,7 @@ def _corrections(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
     scores = Score.objects.filter(trial__handout__plan=plan)
     for row in with_changes(scores, why=F("reason"), at=F("scored_at"), by_name=F("rater__username")):
         earlier, run = row["earlier"], known[row["trial_id"]]
-        late = bool(plan.revealed_at and row["at"] >= plan.revealed_at)
+        late = bool(plan.kept_at and row["at"] > plan.kept_at)
         if earlier is None and not late:
             continue
         told = {name: row[name] for name in ("trial_id", "success", "score", "at", "by_name", "changed")}

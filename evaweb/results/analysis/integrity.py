@@ -71,7 +71,7 @@ def changes_of(plan: Plan) -> list[Changes]:
         row = found[score["name"]]
         row.to_success += success and not earlier["success"]
         row.to_failure += earlier["success"] and not success
-        row.late += score["changed"] == VERDICT and bool(plan.revealed_at and score["at"] >= plan.revealed_at)
+        row.late += score["changed"] == VERDICT and bool(plan.kept_at and score["at"] > plan.kept_at)
     return list(found.values())
 
 

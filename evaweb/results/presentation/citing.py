@@ -139,7 +139,9 @@ class Citation:
         document = self.plan.document or {}
         said = f"EVA Web, plan {document['name']} v{document['version']}, plan digest {self.plan.digest}"
         where = (
-            f", as revealed {self.kept['at'][:10]}, digest {self.digest}" if self.digest else ", not revealed"
+            f", as {'revealed' if self.plan.blind else 'closed'} {self.kept['at'][:10]}, digest {self.digest}"
+            if self.digest
+            else ", not revealed"
         )
         return f"{said}{where}: {self.address}"
 

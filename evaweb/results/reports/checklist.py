@@ -122,7 +122,7 @@ def _complete(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
 
 def _voids(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
     voided = trials.filter(status=TrialStatus.VOIDED)
-    late = voided.filter(voided_at__gte=plan.revealed_at).count() if plan.revealed_at else 0
+    late = voided.filter(voided_at__gte=plan.kept_at).count() if plan.kept_at else 0
     words = f"{voided.count()} voided, each with a reason, {late} of them after the reveal"
     return Item("No trial left out after unblinding", _yes(late == 0), words)
 
@@ -131,7 +131,7 @@ def _corrections(plan: Plan) -> Item:
     scores = Score.objects.filter(trial__evaluation=plan.evaluation_id)
     rows = with_changes(scores, why=F("reason"), at=F("scored_at"))
     corrected = sum(bool(row["why"]) for row in rows if row["changed"] == VERDICT)
-    late = Counter(row["changed"] for row in rows if plan.revealed_at and row["at"] >= plan.revealed_at)
+    late = Counter(row["changed"] for row in rows if plan.kept_at and row["at"] > plan.kept_at)
     categories = sum(row["changed"] == CATEGORY for row in rows)
     words = (
         f"{corrected} corrections, each a row of its own with author and reason, {late[VERDICT]} scores after the "

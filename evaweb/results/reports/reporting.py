@@ -151,7 +151,7 @@ def _estimate(found: Difference | None) -> list[float] | None:
 
 def seal_of(plan: Plan) -> dict[str, Any]:
     """Digest and commitment, and the key once it was revealed."""
-    shown = plan.state == PlanState.REVEALED
+    shown = plan.state == PlanState.REVEALED or plan.at_reveal is not None
     return {
         "digest": plan.digest,
         "commitment": plan.commitment,

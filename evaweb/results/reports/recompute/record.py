@@ -60,7 +60,7 @@ def changes(
     kept = seal["at_reveal"]
     if not kept:
         return []
-    found = [] if seal["key"] else ["the plan was revealed, and seal.json has no key"]
+    found = [] if seal["key"] else ["what counts was kept, and seal.json has no key"]
     if "record" not in kept:  # plans of format 5 and before
         return found
     then = datetime.fromisoformat(kept["at"])
