@@ -45,6 +45,7 @@ ENDED = {
     "full": "all pairs of its comparison are made",
 }
 ENDED_EVENT = "ended"  # of a plan: an ask for its next trial found that, or its last trial
+_SINCE_HOLM = 6  # the format of plans from which several comparisons with one test are decided step by step
 _ENDS_NOTED = 6  # the format of plans from which every end that the server finds is such an event
 Names = tuple[str, str]
 
@@ -81,7 +82,7 @@ def drafted(plan: Plan, counts: Sequence[tuple[int, int]] | None = None) -> Desi
     if said is None:
         return None
     try:
-        return design(**said, counts=counts)
+        return design(**said, counts=counts, holm=True)
     except StatisticsError as error:
         raise EvaError(str(error)) from None
 
@@ -137,6 +138,7 @@ def frozen(document: Mapping[str, Any]) -> Design | None:
         _by_number(comparisons),
         said["drops"],
         tuple((first, second) for first, second in said["counts"]) if said["counts"] else None,
+        document.get("format", 1) >= _SINCE_HOLM,
     )
 
 

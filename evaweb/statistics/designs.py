@@ -2,7 +2,8 @@
 
 Nothing but the design decides on planned comparisons. Blocks are taken in the order in which they were scheduled; what
 comes after the end belongs to the record, not to the decision. A paired block has one trial of each arm; of two arms in
-random order a block has two trials of whichever was drawn. Several comparisons share alpha equally (Bonferroni).
+random order a block has two trials of whichever was drawn. Several comparisons share alpha equally (Bonferroni), those of
+one test at the end step by step (Holm 1979).
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class Design:
     whether the first's success rate is lower than the second's by less than that. `outcome` is "success" or "score".
     `comparisons` are pairs of arms, each at its share of `alpha`; `drops`: an arm that one of them found worse, or that
     is in none that is open, is tried no more. `counts` [blocks, 2]: trials of both arms after each block, where they
-    are not one of each.
+    are not one of each. `holm`: of several comparisons with one test at the end the one that is farthest apart is
+    decided at its share, each next one at its share among those that are left, up to the first that is not.
     """
 
     rule: str
@@ -48,6 +50,7 @@ class Design:
     comparisons: tuple[tuple[int, int], ...] = ((0, 1),)
     drops: bool = False
     counts: tuple[tuple[int, int], ...] | None = None
+    holm: bool = False
 
     @property
     def share(self) -> float:
@@ -112,6 +115,7 @@ def design(
     comparisons: Sequence[tuple[int, int]] = ((0, 1),),
     drops: bool = False,
     counts: Sequence[tuple[int, int]] | None = None,
+    holm: bool = False,
 ) -> Design:
     """A design with its boundary, which is computed now; `looks` are blocks, none: after every one.
 
@@ -140,6 +144,7 @@ def design(
         tuple(comparisons),
         drops,
         tuple(counts) if counts is not None else None,
+        holm,
     )
     return replace(found, boundary=_bounded(found, looks)) if exact else found
 
@@ -215,7 +220,8 @@ def findings(found: Design, blocks: Sequence[Block]) -> Findings:
     """
     given = blocks[: found.blocks]
     if not found.drops:
-        return Findings(tuple(conclude(found, given, pair) for pair in found.comparisons), {})
+        each = [conclude(found, given, pair) for pair in found.comparisons]
+        return Findings(tuple(_stepped(found, given, each) if found.holm else each), {})
     decided: dict[int, Conclusion] = {}
     dropped: dict[int, int] = {}
     arms = sorted({arm for pair in found.comparisons for arm in pair})
@@ -240,6 +246,20 @@ def findings(found: Design, blocks: Sequence[Block]) -> Findings:
         still = {arm for n, pair in enumerate(found.comparisons) if n not in decided for arm in pair}
         dropped |= {arm: first for arm in arms if arm not in still and arm not in dropped}
     return Findings(tuple(decided[n] for n in range(len(found.comparisons))), dropped)
+
+
+def _stepped(found: Design, blocks: Sequence[Block], each: list[Conclusion]) -> list[Conclusion]:
+    """By Holm's procedure, where all of them have their test."""
+    tests = {number: one.p for number, one in enumerate(each) if one.p is not None}
+    if len(tests) < len(each):
+        return each
+    decided = list(each)
+    for done, number in enumerate(sorted(tests, key=lambda number: tests[number])):
+        left = replace(found, alpha=found.alpha * len(each) / (len(each) - done))
+        decided[number] = conclude(left, blocks, found.comparisons[number])
+        if decided[number].winner is None:
+            break
+    return decided
 
 
 def _whole(blocks: Sequence[Block], arms: Sequence[int], dropped: dict[int, int]) -> list[Block]:

@@ -113,8 +113,9 @@ def headline_document(plan: Plan) -> dict[str, Any] | None:
 
 def alpha_words(found: Design) -> str:
     """Alpha, and how many comparisons share it."""
-    share = f" shared by {len(found.comparisons)} comparisons" if len(found.comparisons) > 1 else ""
-    return f"alpha {found.alpha:g}{share}"
+    several = len(found.comparisons)
+    how = "Holm over" if found.holm and found.rule == FIXED and found.margin is None else "shared by"
+    return f"alpha {found.alpha:g}" + (f", {how} {several} comparisons" if several > 1 else "")
 
 
 def with_planned_letters(plan: Plan, analysis: Analysis) -> Analysis:

@@ -174,6 +174,8 @@ def conclusions(blocks: Sequence[Block], plan: Mapping[str, Any]) -> list[dict[s
     found: dict[int, dict[str, Any]] = {}
     if not plan["stopping"].get("drops"):
         found = {n: _conclusion(given, plan, pair) for n, pair in enumerate(sides)}
+        if plan.get("format", 1) >= 6 and all(said["p"] is not None for said in found.values()):
+            _step_by_step(found, given, plan, sides)
     dropped: dict[int, int] = {}
     # With a margin none is found worse; a control, which all comparisons have, stays whatever was found.
     margin = plan["stopping"].get("margin") is not None
@@ -211,6 +213,26 @@ def conclusions(blocks: Sequence[Block], plan: Mapping[str, Any]) -> list[dict[s
         }
         for n, (first, second) in enumerate(names)
     ]
+
+
+def _step_by_step(
+    found: dict[int, dict[str, Any]],
+    given: Sequence[Block],
+    plan: Mapping[str, Any],
+    sides: Sequence[tuple[int, int]],
+) -> None:
+    """Holm: the smallest p at alpha over all comparisons, the next at alpha over those that are left, and so on."""
+    ranked = sorted(found, key=lambda n: found[n]["p"])
+    for left, n in zip(range(len(ranked), 0, -1), ranked, strict=True):
+        if found[n]["p"] > plan["stopping"]["alpha"] / left * (1 + _TIE):
+            break
+        first, second = (_side_mean(given, plan, side) for side in sides[n])
+        found[n]["winner"] = int(first <= second)
+
+
+def _side_mean(given: Sequence[Block], plan: Mapping[str, Any], arm: int) -> float:
+    values = [value for block in given for number, value in block if number == arm]
+    return math.fsum(values) / len(values)
 
 
 def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[int, int]) -> dict[str, Any]:

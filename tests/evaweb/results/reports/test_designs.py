@@ -25,7 +25,8 @@ def plan_of(found):
     said |= {"drops": found.drops, "counts": found.counts}
     scenes = [{"name": "s", "positions": [{"number": 1}]}]
     compared = [["abc"[first], "abc"[second]] for first, second in found.comparisons]
-    return {"stopping": said, "comparisons": compared, "scenes": scenes, "repetitions": found.blocks}
+    whole = {"stopping": said, "comparisons": compared, "scenes": scenes, "repetitions": found.blocks}
+    return whole | {"format": 6 if found.holm else 5}
 
 
 def same_end(found, blocks):
@@ -70,6 +71,21 @@ def test_it_comes_to_the_same_ends_of_several_comparisons(rule, margin, drops, c
             ]
             del blocks[chance.randrange(15, 24)][chance.randrange(3)]
             same_end(found, blocks)
+
+
+@pytest.mark.parametrize("outcome", ["success", "score"])
+def test_it_comes_to_the_same_ends_of_several_comparisons_step_by_step(outcome):
+    found = design(
+        rule="none", blocks=20, alpha=0.05, outcome=outcome, comparisons=((0, 1), (0, 2), (1, 2)), holm=True
+    )
+    chance = random.Random(13)
+    for rates in ((0.5, 0.5, 0.5), (0.1, 0.9, 0.5), (0.9, 0.55, 0.2), (0.9, 0.5, 0.45)):
+        for _ in range(3):
+            blocks = [
+                [(arm, float(chance.random() < rate)) for arm, rate in enumerate(rates)] for _ in range(20)
+            ]
+            same_end(found, blocks)
+            same_end(found, blocks[:12])
 
 
 @pytest.mark.parametrize(("rule", "margin"), [("none", None), ("none", 0.3), ("late", None), ("early", 0.3)])
