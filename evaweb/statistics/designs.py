@@ -2,8 +2,8 @@
 
 Nothing but the design decides on planned comparisons. Blocks are taken in the order in which they were scheduled; what
 comes after the end belongs to the record, not to the decision. A paired block has one trial of each arm; of two arms in
-random order a block has two trials of whichever was drawn. Several comparisons share alpha equally (Bonferroni), those of
-one test at the end step by step (Holm 1979).
+random order a block has two trials of whichever was drawn. Several comparisons share alpha equally (Bonferroni); those
+with one test at the end share it step by step (Holm 1979).
 """
 
 from __future__ import annotations

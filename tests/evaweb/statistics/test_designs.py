@@ -179,27 +179,14 @@ def test_each_of_several_comparisons_has_its_share_of_alpha(rule):
 
 
 def test_several_comparisons_with_one_test_are_decided_step_by_step():
-    """Successes of 20: 16, 8, 8. p of 16 against 8 is .011, at most alpha over three; of 8 against 8 it is 1."""
-    counts = (16, 8, 8)
-    blocks = [[(arm, float(at < counts[arm])) for arm in range(3)] for at in range(20)]
-    pairs = ((0, 1), (0, 2), (1, 2))
-    share, stepped = (
-        design(rule=FIXED, blocks=20, alpha=alpha, comparisons=pairs, holm=holm)
-        for alpha, holm in ((0.03, False), (0.03, True))
-    )
-    p = [one.p for one in findings(share, blocks).each]
-    assert p[0] == p[1] > share.share
-    assert [one.winner for one in findings(share, blocks).each] == [None] * 3
-    assert [one.winner for one in findings(stepped, blocks).each] == [
-        None
-    ] * 3  # the first step is at its share too
-    wider = design(rule=FIXED, blocks=20, alpha=3.0 * p[0], comparisons=pairs, holm=True)
-    assert [one.winner for one in findings(wider, blocks).each] == ["first", "first", None]
-    blocks[15][1] = (1, 1.0)  # 9 of 20: farther than alpha over three, within alpha over two
-    found = findings(wider, blocks).each
-    assert wider.share < found[0].p <= wider.alpha / 2
-    assert [one.winner for one in found] == ["first", "first", None]
-    assert all(one.winner is None for one in findings(wider, blocks[:-1]).each)
+    counts = (16, 9, 8)  # successes of 20
+    rows = [[at < count for count in counts] for at in range(20)]
+    equal, stepped = (made("none", comparisons=ALL_OF_THREE, holm=holm) for holm in (False, True))
+    said = findings(equal, blocks_of_three(rows)).each
+    assert said[1].p <= 0.05 / 3 < said[0].p <= 0.05 / 2
+    assert [one.winner for one in said] == [None, "first", None]
+    assert [one.winner for one in findings(stepped, blocks_of_three(rows)).each] == ["first", "first", None]
+    assert findings(stepped, blocks_of_three(rows[:-1])) == findings(equal, blocks_of_three(rows[:-1]))
 
 
 def test_a_checkpoint_that_was_found_worse_is_dropped_and_the_others_go_on():
