@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import operator
+import sys
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import product
@@ -23,6 +24,7 @@ from evaweb.statistics.boundaries import MOST, Boundary, Look, extremeness
 from evaweb.statistics.courses import course
 from evaweb.statistics.designs import ANYTIME, FIXED, SCORE, conclude, design, findings, in_blocks
 from evaweb.statistics.difference import barnard
+from evaweb.statistics.stagewise import stagewise
 
 SECONDS = coverage.SECONDS
 SIZES = (50, 100)  # pairs
@@ -86,18 +88,26 @@ STEP = {((0.5, 0.7), 50): (0.464, 50), ((0.5, 0.8), 50): (0.838, 29), ((0.5, 0.7
 
 
 def measure(seconds: float, long: bool = False) -> Report:
-    """`type1.DESIGN.N`, `power.` and `median_pairs.DESIGN.P0.P1.N`, `drift.DESIGN.N`, and those of `coverage`; `long`
-    has designs of 250 pairs too.
+    """`type1.DESIGN.N`, `power.`, `median_pairs.` and `bias.WHAT.DESIGN.P0.P1.N`, `drift.DESIGN.N`, and those of
+    `coverage`; `long` has designs of 250 pairs too.
     """
     rows: Courses = []
     figures = [
-        *errors((*SIZES, MOST) if long else SIZES, rows),
-        *families(rows),
-        *powers(rows),
-        *drifts(rows),
+        *_told(errors((*SIZES, MOST) if long else SIZES, rows)),
+        *_told(families(rows)),
+        *_told(powers(rows)),
+        *_told(estimates(rows)),
+        *_told(drifts(rows)),
     ]
     covered = coverage.measure(seconds)
     return Report("designs", [*figures, *covered.figures], [*rows, *covered.rows])
+
+
+def _told(figures: Iterator[Figure]) -> Iterator[Figure]:
+    """Each as it comes, on standard error: all of them take minutes."""
+    for figure in figures:
+        print(f"{figure.name} {figure.value:.4g}", file=sys.stderr, flush=True)
+        yield figure
 
 
 def errors(sizes: Sequence[int], rows: Courses) -> Iterator[Figure]:
@@ -137,6 +147,43 @@ def powers(rows: Courses) -> Iterator[Figure]:
             yield Figure(f"median_pairs.{at}", found.median, "", soon)
     for rates, n in DIFFERENT:
         yield Figure(f"power.scipy_barnard.{rates[0]}.{rates[1]}.{n}", _of_scipy(rates, n), "")
+
+
+def estimates(rows: Courses) -> Iterator[Figure]:
+    """How far the difference is off on average, raw and corrected for stopping early, and how often the interval of the
+    latter holds: weighed over every table at which the design ends.
+    """
+    for name in ("late", "early"):
+        exact = boundary_of(DESIGNS[name], SIZES[0])
+        assert exact is not None
+        for rates in ((0.5, 0.5), (0.5, 0.7), (0.5, 0.8)):
+            truth, at = rates[0] - rates[1], f"{name}.{rates[0]}.{rates[1]}.{SIZES[0]}"
+            raw = corrected = held = 0.0
+            for (a, n, b, m), mass in _ends(exact, rates):
+                found = stagewise(exact, a, n, b, m)
+                raw += mass * (a / n - b / m)
+                corrected += mass * found.value
+                held += mass * (found.interval.low <= truth <= found.interval.high)
+            rows.append({"estimate": at, "raw": raw, "corrected": corrected, "held": held})
+            yield Figure(f"bias.raw.{at}", raw - truth, "")
+            yield Figure(f"bias.corrected.{at}", corrected - truth, "")
+            yield Figure(f"coverage.corrected.{at}", held, "", ">= 0.94")
+
+
+def _ends(exact: Boundary, rates: Rates) -> Iterator[tuple[tuple[int, int, int, int], float]]:
+    """Every table at which the design ends (successes and trials of both arms) with its probability."""
+    pairs = exact.looks[-1].first
+    alive = np.zeros((pairs + 1, pairs + 1))
+    alive[0, 0] = 1.0
+    looks = {look.first: region for look, region in zip(exact.looks, exact.regions, strict=True)}
+    for pair in range(1, pairs + 1):
+        for axis, rate in enumerate(rates):
+            alive = alive * (1 - rate) + np.roll(alive * rate, 1, axis=axis)
+        there = alive[: pair + 1, : pair + 1]
+        ending = there > 0 if pair == pairs else looks[pair] & (there > 0)
+        for a, b in np.argwhere(ending):
+            yield (int(a), pair, int(b), pair), float(there[a, b])
+        there[ending] = 0.0
 
 
 def drifts(rows: Courses) -> Iterator[Figure]:
@@ -188,7 +235,7 @@ def families(rows: Courses) -> Iterator[Figure]:
         ("all_of_three_early", "early", False),
         ("all_of_three_early_dropped", "early", True),
     ):
-        planned = design(rule=rule, blocks=SIZES[0], alpha=ALPHA, comparisons=three, drops=drops)
+        planned = design(rule=rule, blocks=SIZES[0], alpha=ALPHA, comparisons=three, drops=drops, holm=True)
         worst = 0.0
         for rate in _SOME_RATES:
             won = np.random.default_rng(7).random((_RUNS, SIZES[0], 3)) < rate
