@@ -46,6 +46,9 @@ _FROZEN = (
     "second",
     "second_rater_share",
     "match_gate",
+    "on_estop",
+    "on_interruption",
+    "on_timeout",
 )
 
 
@@ -136,6 +139,7 @@ class PlanAdmin(admin.ModelAdmin):
                     ("outcome", "margin", "look_after"),
                     "second_rater_share",
                     "match_gate",
+                    ("on_estop", "on_interruption", "on_timeout"),
                 )
             },
         ),

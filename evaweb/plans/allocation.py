@@ -16,6 +16,7 @@ from evaweb.errors import Conflict, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.canonical import digest
+from evaweb.plans.counting import require_scored_first
 from evaweb.plans.design import dropped_of, ended_at_an_ask, ended_because, findings_of, told_reason
 from evaweb.plans.documents import checkpoint_of, require_scene, units_of
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
@@ -100,6 +101,7 @@ def _handed_out(user: User, station: Station, plan: Plan) -> Handout:
     _check(held, user, station)
     _check_goes_on(held)
     slot, before = _next(held, station)
+    require_scored_first(held, before)
     _check_unchanged(held, slot)
     if slot.station_id is None:
         held.slots.filter(block=slot.block).update(station=station)

@@ -15,7 +15,10 @@ class PlansConfig(AppConfig):
         # They declare what is hidden from whom, what is asked before a trial of a plan runs, and what ends a plan.
         from evaweb.plans import bench_checks as bench  # noqa: F401
         from evaweb.plans import blinding_rules as sight  # noqa: F401
-        from evaweb.plans import services  # noqa: F401
+        from evaweb.plans import (
+            counting,  # noqa: F401
+            services,  # noqa: F401
+        )
         from evaweb.plans import setup_padding as pacing  # noqa: F401
 
         protect(self)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from evaweb.errors import Conflict, EvaError
+from evaweb.plans.counting import ENDS
 from evaweb.plans.design import drafted, planned
 from evaweb.plans.models import Allocation, Plan
 from evaweb.plans.schedule import PAIRED, Condition, Unit, counts_of, schedule
@@ -59,6 +60,7 @@ def document_of(plan: Plan, key: bytes) -> dict[str, Any]:
         "comparisons": [list(pair) for pair in planned(plan)],
         "second_rater_share": plan.second_rater_share,
         "match_gate": plan.match_gate,
+        "counts_as": {name: getattr(plan, name) for name in ENDS},
     }
     return {**document, "stopping": _design(plan, document, key)}
 

@@ -84,6 +84,9 @@ class _Draft(forms.Form):
     blind = _of("blind")
     second_rater_share = forms.FloatField(min_value=0, max_value=100)
     match_gate = _of("match_gate")
+    on_estop = _of("on_estop")
+    on_interruption = _of("on_interruption")
+    on_timeout = _of("on_timeout")
 
     def clean_question(self) -> str:
         """Lines end as they do in files of plans, whatever a browser makes of them."""

@@ -20,6 +20,7 @@ HIDDEN = "hidden"  # stands for a checkpoint that the person is not told
 _PLAIN = (
     *("title", "question", "comparing", "stopping", "repetitions", "alpha", "look_after", "drop_arms"),
     *("allocation", "outcome", "margin", "blind", "second_rater_share", "match_gate"),
+    *("on_estop", "on_interruption", "on_timeout"),
 )
 _SETS = ("positions", "stations")
 Values = dict[str, Any]

@@ -157,6 +157,7 @@ def _plan_table(plan: Plan) -> dict[str, Any]:
         "comparison": [row.name for row in (plan.first, plan.second) if row],
         "second_rater_share": plan.second_rater_share,
         "match_gate": plan.match_gate,
+        **{name: getattr(plan, name) for name in ("on_estop", "on_interruption", "on_timeout")},
     }
 
 

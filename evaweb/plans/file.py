@@ -93,6 +93,9 @@ class PlanTable(Table):
     comparison: list[str] = Field(default=[], max_length=2)
     second_rater_share: float = 0.0
     match_gate: float | None = None
+    on_estop: str = "judged"
+    on_interruption: str = "judged"
+    on_timeout: str = "judged"
 
 
 class ReferenceTable(Table):

@@ -55,6 +55,21 @@ class Comparing(models.TextChoices):
     ALL = "all", "all checkpoints with each other"
 
 
+class CountsAs(models.TextChoices):
+    """What a run counts as that did not end by itself."""
+
+    JUDGED = "judged", "judged: the operator scores it, or has it repeated"
+    FAILURE = "failure", "a failure of its checkpoint"
+    REPEATED = "repeated", "repeated: it does not count"
+
+
+class TimeCountsAs(models.TextChoices):
+    """The same of a run that its time limit ended, which is whole."""
+
+    JUDGED = "judged", "judged: by what was reached"
+    FAILURE = "failure", "a failure of its checkpoint"
+
+
 class Plan(models.Model):
     """One version of an evaluation: while a draft it is edited, frozen it is a document that nobody changes.
 
@@ -147,6 +162,28 @@ class Plan(models.Model):
         "Empty: it is measured, and stops nothing.",
     )
 
+    on_estop = models.CharField(
+        "an e-stop counts as",
+        max_length=8,
+        choices=CountsAs,
+        default=CountsAs.JUDGED,
+        help_text="Of a run that the e-stop ended.",
+    )
+    on_interruption = models.CharField(
+        "another interruption counts as",
+        max_length=8,
+        choices=CountsAs,
+        default=CountsAs.JUDGED,
+        help_text="Of a run that was broken off by anything else: a fault, a lost policy, a station that ended.",
+    )
+    on_timeout = models.CharField(
+        "a time-out counts as",
+        max_length=8,
+        choices=TimeCountsAs,
+        default=TimeCountsAs.JUDGED,
+        help_text="Of a run that its time limit ended.",
+    )
+
     evaluation = models.OneToOneField(
         Evaluation, null=True, blank=True, editable=False, on_delete=models.PROTECT, related_name="plan"
     )
@@ -199,6 +236,7 @@ class Plan(models.Model):
                 "first",
                 "second",
             ),
+            *("on_estop", "on_interruption", "on_timeout"),
             *("second_rater_share", "match_gate", "evaluation", "document", "digest", "commitment", "key"),
             "frozen_at",
         ),

@@ -120,6 +120,9 @@ _COPIED = (
     "alpha",
     "second_rater_share",
     "match_gate",
+    "on_estop",
+    "on_interruption",
+    "on_timeout",
 )
 
 

@@ -124,6 +124,7 @@ def declare_check(check: Check) -> None:
     """`check` is asked before a trial is "run", "scored", "voided" or the like, with the trial and the user.
 
     And of "judged" while the trial is locked, whenever its scene says what is success: scored, corrected, rated again.
+    And of "judged success" or "judged failure" once it is known what a score says.
     Before a correction that leaves success and milestones as they were it is asked of "scored", then of "reworded".
 
     It raises EvaError.
@@ -341,6 +342,7 @@ def trial_score(
             raise Conflict(_UUID_OF_ANOTHER_SCORE(uuid=uuid, trial_id=first.trial_id))
         require_scorable(held, words["reason"])
         found = judged()
+        checked(f"judged {'success' if found.success else 'failure'}", held, user)
         if uuid is None:
             _require_said_anew(held, said, found)
         if source == Score.Source.TRUTH:

@@ -11,6 +11,7 @@ from typing import Any
 from django.contrib.auth.models import User
 
 from evaweb.blinding import Sight
+from evaweb.plans.counting import ENDS
 from evaweb.plans.design import planned
 from evaweb.plans.draft_checks import Remark, covered, problems, thoughts
 from evaweb.plans.drafting import HIDDEN, Values
@@ -209,7 +210,13 @@ def choices_page(plan: Plan, sight: Sight, values: Values) -> dict[str, Any]:
             (Comparing.ALL, "All checkpoints with each other"),
         ),
         "outcomes": PrimaryOutcome.choices,
+        "ends": [_end(name, values[name]) for name in ENDS],
     }
+
+
+def _end(name: str, value: str) -> tuple[str, str, Any, str]:
+    field: Any = Plan._meta.get_field(name)
+    return name, field.verbose_name, field.choices, value
 
 
 def told(name: str, value: Any, sight: Sight) -> str:

@@ -50,6 +50,7 @@ _FAULTY = (  # fields whose faults the page has a place for
         "look_after",
     ),
     *("second_rater_share", "match_gate"),
+    *("on_estop", "on_interruption", "on_timeout"),
 )
 _CARRIED = ("rate", "better", "power", "cycle_s")  # of the planner's question: assumptions, no part of a plan
 

@@ -10,6 +10,7 @@ from typing import Any
 from django.urls import reverse
 
 from evaweb.errors import Conflict
+from evaweb.plans.counting import ENDS
 from evaweb.plans.design import (
     arms_of,
     at_the_reveal,
@@ -130,7 +131,7 @@ class Citation:
         order = "" if found.counts is None else ", checkpoints in random order"
         return (
             f"Design: {rule_words(self.plan)}, {_looks(found)}, {found.blocks} {found.unit} foreseen{order}, "
-            f"{alpha_words(found)}; asks {asks}, by {outcome}{drops}; {blind}."
+            f"{alpha_words(found)}; asks {asks}, by {outcome}{drops}; {blind}{_declared(document)}."
         )
 
     @cached_property
@@ -285,6 +286,13 @@ def citation(plan: Plan) -> Citation:
         raise Conflict(_RESULT_CITED_ONCE_PLAN_CLOSED(plan=plan, state=plan.get_state_display()))
     kept = plan.at_reveal or at_the_reveal(plan) or {}
     return Citation(plan, found, kept, plan.at_reveal["digest"] if plan.at_reveal else "")
+
+
+def _declared(document: Mapping[str, Any]) -> str:
+    """What runs count as that did not end by themselves, where the plan left that to nobody."""
+    counts = {"failure": "a failure", "repeated": "no trial, and is repeated"}
+    said = document.get("counts_as", {})
+    return "".join(f"; {ENDS[name]} makes {counts[said[name]]}" for name in ENDS if said.get(name) in counts)
 
 
 def _question(found: Design, first: str, second: str) -> str:

@@ -1,0 +1,67 @@
+"""What a run that did not end by itself counts as, by the plan: declared before the first trial, and held here."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from evaweb.episodes.models import EpisodeStatus
+from evaweb.errors import Conflict
+from evaweb.plans.models import CountsAs, Handout, Plan
+from evaweb.trials.models import Trial, TrialStatus
+from evaweb.trials.services import declare_check
+from runtime.core.sentences import Pattern
+
+_REPEATED = Pattern(
+    "plans.counting.repeated",
+    "trial {trial} was ended by {what}: by {plan} it is repeated, and not scored",
+)
+_FAILURE = Pattern(
+    "plans.counting.failure",
+    "trial {trial} was ended by {what}: by {plan} that is a failure, whatever was reached",
+)
+_SCORE_IT_FIRST = Pattern(
+    "plans.counting.score_it_first",
+    "trial {trial} was ended by {what}: by {plan} that is a failure; score it before the next one",
+)
+
+ENDS = {"on_estop": "the e-stop", "on_interruption": "an interruption", "on_timeout": "its time limit"}
+_ESTOP = re.compile(r"\be-stop\b")
+_TIMEOUT = re.compile(r"the run's [\d.e+]+ s are over")
+
+
+def ended_by(trial: Trial) -> str:
+    """Which of `ENDS` ended its run; "" where it ended by itself, or was stopped by the operator."""
+    broken = trial.status == TrialStatus.INTERRUPTED or (
+        trial.episode is not None
+        and trial.episode.status in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED)
+    )
+    if broken:
+        return "on_estop" if _ESTOP.search(trial.reason) else "on_interruption"
+    return "on_timeout" if _TIMEOUT.search(trial.reason) else ""
+
+
+def require_scored_first(plan: Plan, before: Trial | None) -> None:
+    """Conflict where the attempt before is a failure by the plan, and nobody has said so yet."""
+    if before is None or before.status != TrialStatus.INTERRUPTED:
+        return
+    end = ended_by(before)
+    if getattr(plan, end) == CountsAs.FAILURE:
+        raise Conflict(_SCORE_IT_FIRST(trial=before.pk, what=ENDS[end], plan=plan))
+
+
+def _judged(what: str, trial: Trial, user: Any) -> None:
+    if what not in ("judged success", "judged failure"):
+        return
+    handout = Handout.objects.select_related("plan").filter(trial=trial).first()
+    end = ended_by(trial)
+    if handout is None or not end:
+        return
+    counts, said = getattr(handout.plan, end), {"trial": trial.pk, "what": ENDS[end], "plan": handout.plan}
+    if counts == CountsAs.REPEATED:
+        raise Conflict(_REPEATED(**said))
+    if counts == CountsAs.FAILURE and what == "judged success":
+        raise Conflict(_FAILURE(**said))
+
+
+declare_check(_judged)

@@ -1,0 +1,92 @@
+"""What a run that did not end by itself counts as is the plan's to say, and nobody's afterwards."""
+
+from __future__ import annotations
+
+import pytest
+
+from evaweb.errors import Conflict
+from evaweb.plans.allocation import hand_out
+from evaweb.plans.exchange import exported, imported
+from evaweb.plans.models import CountsAs, Plan
+from evaweb.plans.services import plan_amend, plan_freeze
+from evaweb.trials import services
+from evaweb.trials.models import Trial
+from tests.evaweb.trials import builders
+
+ESTOP, FAULT, TIME = "the e-stop was pressed by ann", "the policy server was lost", "the run's 60 s are over"
+
+
+@pytest.fixture
+def declared(draft, owner):
+    """A frozen plan with that declared."""
+
+    def declare(**counts):
+        Plan.objects.filter(pk=draft.pk).update(**counts)
+        return plan_freeze(user=owner, plan=Plan.objects.get(pk=draft.pk))
+
+    return declare
+
+
+def ended(bench, plan, reason, status="interrupted"):
+    """The next trial, as a run leaves it that ended so."""
+    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    builders.over(trial, 10.0, status="finished" if status == "ended" else "interrupted")
+    Trial.objects.filter(pk=trial.pk).update(status=status, reason=reason)
+    return Trial.objects.get(pk=trial.pk)
+
+
+def scored(bench, trial, success, **said):
+    ticks = bench.ticks(True, success, success)
+    return services.trial_score(user=bench.operator, trial=trial, milestones=ticks, **said)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason", "status"),
+    [
+        ("on_estop", ESTOP, "interrupted"),
+        ("on_interruption", FAULT, "interrupted"),
+        ("on_timeout", TIME, "ended"),
+    ],
+)
+def test_what_is_a_failure_by_the_plan_is_scored_as_one_and_stays_one(bench, declared, name, reason, status):
+    plan = declared(**{name: CountsAs.FAILURE})
+    trial = ended(bench, plan, reason, status)
+    with pytest.raises(Conflict, match="by Blocks v1 that is a failure, whatever was reached"):
+        scored(bench, trial, True)
+    if status == "interrupted":
+        with pytest.raises(Conflict, match="score it before the next one"):
+            hand_out(user=bench.operator, station=bench.station, plan=plan)
+    assert scored(bench, trial, False).success is False
+    with pytest.raises(Conflict, match="that is a failure"):
+        scored(bench, Trial.objects.get(pk=trial.pk), True, reason="it had it after all")
+    assert hand_out(user=bench.operator, station=bench.station, plan=plan).trial.attempt == 1
+
+
+@pytest.mark.parametrize(("name", "reason"), [("on_estop", ESTOP), ("on_interruption", FAULT)])
+def test_what_is_repeated_by_the_plan_is_not_scored(bench, declared, name, reason):
+    plan = declared(**{name: CountsAs.REPEATED})
+    trial = ended(bench, plan, reason)
+    for success in (True, False):
+        with pytest.raises(Conflict, match="by Blocks v1 it is repeated, and not scored"):
+            scored(bench, trial, success)
+    assert hand_out(user=bench.operator, station=bench.station, plan=plan).trial.attempt == 2
+
+
+def test_what_the_plan_says_of_one_end_is_said_of_no_other(bench, declared):
+    plan = declared(on_estop=CountsAs.REPEATED, on_timeout="failure")
+    assert scored(bench, ended(bench, plan, FAULT), True).success is True
+    assert scored(bench, ended(bench, plan, "stopped by the operator", "ended"), True).success is True
+
+
+def test_it_is_frozen_amended_and_exported_with_the_plan(bench, declared, owner):
+    plan = declared(on_estop=CountsAs.FAILURE)
+    assert plan.document["counts_as"] == {
+        "on_estop": "failure",
+        "on_interruption": "judged",
+        "on_timeout": "judged",
+    }
+    text = exported(plans=[plan])
+    assert 'on_estop = "failure"' in text
+    assert plan_amend(user=owner, plan=plan, reason="more").on_estop == "failure"
+    with pytest.raises(Conflict):
+        imported(user=owner, text=text, pictures={})
