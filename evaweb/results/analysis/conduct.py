@@ -12,6 +12,7 @@ from datetime import datetime, timedelta
 from statistics import median
 from typing import Any
 
+from django.contrib.admin.models import CHANGE, LogEntry
 from django.db.models import Count, F
 
 from evaweb.memo import Kept
@@ -22,7 +23,7 @@ from evaweb.plans.selectors import plans_beside
 from evaweb.results.analysis.integrity import changes_of, with_changes
 from evaweb.statistics.many import holm
 from evaweb.statistics.permutation import sign_flips
-from evaweb.trials.models import Score, TrialStatus, VoidRequest
+from evaweb.trials.models import Scene, Score, TrialStatus, VoidRequest
 
 DELAYS = {
     "wait": "from hand-out to run",
@@ -92,6 +93,7 @@ def conduct_of(plan: Plan, runs: Sequence[Run], looks: Iterable[Look]) -> dict[s
         "voids": _voids(plan, runs),
         "corrections": _corrections(plan, runs),
         "amendments": _amendments(plan),
+        "edits": _edits(plan),
         "deviations": _deviations(runs, list(given_back.values("at", "text", by_name=F("by__username")))),
         "operators": balance(runs, "operator"),
         "stations": balance(runs, "station"),
@@ -283,6 +285,35 @@ def _amendments(plan: Plan) -> list[dict[str, Any]]:
     if later is not None:
         found.insert(0, {"version": later.version, "amends": plan.version, "because": later.amended_because})
     return found
+
+
+def _edits(plan: Plan) -> list[dict[str, Any]]:
+    """Changes of the plan's scenes and checkpoints from when it was frozen to when what counts was kept, as the
+    administration and the scene editor have logged them, also those that were taken back.
+    """
+    called = {
+        ("scene", str(pk)): name
+        for pk, name in Scene.objects.filter(positions__plan=plan).distinct().values_list("pk", "name")
+    } | {("checkpoint", str(pk)): name for pk, name in plan.checkpoints.values_list("pk", "name")}
+    rows = LogEntry.objects.filter(
+        content_type__app_label="trials",
+        content_type__model__in=("scene", "checkpoint"),
+        object_id__in=[pk for _, pk in called],
+        action_time__gte=plan.frozen_at,
+        action_flag=CHANGE,
+    ).select_related("user", "content_type")
+    if plan.kept_at:
+        rows = rows.filter(action_time__lte=plan.kept_at)
+    return [
+        {
+            "what": f"{kind} {name}",
+            "at": row.action_time,
+            "by_name": row.user.get_username(),
+            "text": row.get_change_message(),
+        }
+        for row in rows.order_by("action_time")
+        if (kind := row.content_type.model) and (name := called.get((kind, row.object_id)))
+    ]
 
 
 def _deviations(runs: Sequence[Run], given_back: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -69,6 +69,10 @@ def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
         if any(row[what] for row in rows):
             counts = ", ".join(f"{row['checkpoint']} {row[what]} of {row['attempts']}" for row in rows)
             yield f"Attempts {words}: {counts}"
+    edits = Counter(row["what"] for row in found["edits"])
+    if edits:
+        named = ", ".join(f"{what} ({number})" for what, number in sorted(edits.items()))
+        yield f"Edited after the plan was frozen, taken back or not: {named}"
     yield from _departures(found)
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 
 import pytest
+from django.contrib.admin.models import CHANGE, LogEntry
 from django.db import connection
 from django.test import Client
 from django.test.utils import CaptureQueriesContext
@@ -342,3 +343,23 @@ def test_what_ran_below_the_least_match_is_told_by_its_worst_region_when_last_lo
 def test_without_a_least_match_no_trial_is_told_to_be_below_it(plan, make):
     make()
     assert integrity_document(plan)["bench"] == {"gate": None, "low": [], "unmatched": [], "references": []}
+
+
+def test_scenes_and_checkpoints_that_were_edited_meanwhile_are_told_also_where_it_was_taken_back(
+    plan, bench, owner, carry_out
+):
+    def edited(row, text):
+        LogEntry.objects.log_actions(owner.pk, [row], CHANGE, text, single_object=True)
+
+    carry_out(plan, 2)
+    edited(bench.scene, "criterion")
+    edited(bench.scene, "taken back")
+    edited(bench.checkpoint, "policy")
+    record = integrity_document(plan)
+    assert [(row["what"], row["by_name"], row["text"]) for row in record["edits"]] == [
+        ("scene block-on-plate", "olga", "criterion"),
+        ("scene block-on-plate", "olga", "taken back"),
+        ("checkpoint pi0-block", "olga", "policy"),
+    ]
+    said = "Edited after the plan was frozen, taken back or not: checkpoint pi0-block (1), scene block-on-plate (2)"
+    assert said in record["remarks"]
