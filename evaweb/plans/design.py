@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
-from django.db.models import OuterRef, Subquery
+from django.db.models import Count, Max, OuterRef, Subquery
 from django.utils import timezone
 
 from evaweb.errors import EvaError
@@ -32,7 +32,7 @@ from evaweb.statistics.designs import (
     of_table,
 )
 from evaweb.trials.lifecycle import JUDGED
-from evaweb.trials.models import Score, TrialStatus
+from evaweb.trials.models import Score, Trial, TrialStatus
 from runtime.core.sentences import Pattern
 
 _LOOKS_ALLOWED_LIST_RISING_NUMBERS = Pattern(
@@ -348,6 +348,13 @@ def at_the_reveal(plan: Plan) -> dict[str, Any] | None:
     for told in _told_of:
         kept |= told(plan)
     return {**kept, "digest": digest({"plan": plan.digest, **kept}), "at": timezone.now().isoformat()}
+
+
+def recorded_so_far(plan: Plan) -> Hashable:
+    """Another value whenever anything was tried, scored, corrected or voided since."""
+    trials = Trial.objects.filter(evaluation=plan.evaluation_id)
+    found = trials.aggregate(n=Count("pk"), changed=Max("changed_at"), scores=Count("scores", distinct=True))
+    return tuple(found.values())
 
 
 def counted_now(plan: Plan) -> dict[str, Any]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Hashable, Mapping
 from contextlib import suppress
-from datetime import datetime
+from functools import partial
 from typing import Any
 
 from django.contrib.admin.models import ADDITION, CHANGE, LogEntry
@@ -28,6 +28,7 @@ from evaweb.plans.design import (
     ended_at_an_ask,
     ended_because,
     findings_of,
+    recorded_so_far,
 )
 from evaweb.plans.documents import UnevenError, document_of, units_of
 from evaweb.plans.draft_checks import covered, problems
@@ -312,9 +313,21 @@ def plan_close(*, user: User, plan: Plan, reason: str) -> Plan:
     return plan
 
 
-@transaction.atomic
 def plan_reveal(*, user: User, plan: Plan) -> Plan:
     """Say which checkpoint was which, once and for all, and with it the key of the commitment."""
+    fresh = Plan.objects.select_related("owner").get(pk=plan.pk)
+    _require_owner(fresh, user)
+    ready = None
+    if fresh.state == PlanState.CLOSED and fresh.at_reveal is None and reveals.kept(fresh) is None:
+        ready = (
+            recorded_so_far(fresh),
+            at_the_reveal(fresh),
+        )  # it may take seconds: before anything is locked
+    return _revealed(user, plan, ready)
+
+
+@transaction.atomic
+def _revealed(user: User, plan: Plan, ready: tuple[Hashable, dict[str, Any] | None] | None) -> Plan:
     held = _held(plan)
     _require_owner(held, user)
     if held.state != PlanState.CLOSED:
@@ -326,7 +339,14 @@ def plan_reveal(*, user: User, plan: Plan) -> Plan:
         raise EvaError(_RENAMED_SINCE_FROZEN(held=held))
     voids_lapse(_trials(held), user=user, now=True)
     held.state, held.revealed_at, held.revealed_by = PlanState.REVEALED, timezone.now(), user
-    before = _keep_result(held, user, held.revealed_at)
+    before = reveals.kept(held)
+    if held.at_reveal is None:
+        as_ready = ready is not None and ready[0] == recorded_so_far(held)
+        held.at_reveal = (
+            before.at_reveal if before else ready[1] if ready and as_ready else at_the_reveal(held)
+        )
+    if before is None:
+        reveals.keep(held, user, held.revealed_at)
     what = "reveal" if held.blind else "close"
     again = (
         f"; what counts is that of the {what} of {before.at:%Y-%m-%d %H:%M} UTC by {before.by}"
@@ -403,20 +423,31 @@ def _close(plan: Plan, user: User, why: str) -> None:
             )
         )
     plan.state, plan.closed_at, plan.closed_because = PlanState.CLOSED, timezone.now(), why
-    if not plan.blind:  # everybody has seen it: no reveal is needed, and none may ever come
-        _keep_result(plan, user, plan.closed_at)
     plan.save()
     _note(plan, user, "closed", why)
+    if not plan.blind:  # everybody has seen it: no reveal is needed, and none may ever come
+        transaction.on_commit(partial(_keep_at_close, plan, user), robust=True)
 
 
-def _keep_result(plan: Plan, user: User, at: datetime) -> reveals.RevealLine | None:
-    """What counts is kept from now on, on the disk too; as it was kept before, where it was: that is returned."""
-    before = reveals.kept(plan)
-    if plan.at_reveal is None:
-        plan.at_reveal = before.at_reveal if before else at_the_reveal(plan)
-    if before is None:
-        reveals.keep(plan, user, at)
-    return before
+def _keep_at_close(plan: Plan, user: User) -> None:
+    """Keep what counts of a plan that is not blind; worked out before anything is locked, which may take seconds."""
+    while True:
+        fresh = Plan.objects.get(pk=plan.pk)
+        at, found = recorded_so_far(fresh), at_the_reveal(fresh)
+        if found is None:
+            return
+        with transaction.atomic():
+            held = _held(plan)
+            if held.at_reveal is not None or held.state != PlanState.CLOSED or held.closed_at is None:
+                return
+            if recorded_so_far(held) != at:
+                continue  # somebody has corrected a score meanwhile
+            before = reveals.kept(held)
+            held.at_reveal = before.at_reveal if before else found
+            if before is None:
+                reveals.keep(held, user, held.closed_at)
+            held.save()
+            return
 
 
 def _check(plan: Plan, user: User) -> None:

@@ -248,6 +248,28 @@ def test_what_is_corrected_after_the_reveal_makes_no_other_headline(bench, early
         Plan.objects.filter(pk=early.pk).update(at_reveal=None)
 
 
+def test_what_counts_of_a_plan_that_is_not_blind_is_kept_at_its_close(
+    bench, draft, owner, django_capture_on_commit_callbacks
+):
+    plan = frozen_plan(draft, owner, blind=False, repetitions=2)
+    with django_capture_on_commit_callbacks(execute=True):
+        carry_out(bench, plan, 8)
+    plan.refresh_from_db()
+    kept, said = plan.at_reveal, headline(plan)
+    assert (plan.state, kept["by"], kept["headline"]) == (
+        "closed",
+        bench.operator.username,
+        list(said.sentences),
+    )
+    trial = next(handout.trial for handout in plan.handouts.all() if handout.trial.checkpoint.name == BETTER)
+    scored(bench, trial, success=False, reason="looked again")
+    assert headline(plan).sentence == said.sentence
+    assert "3/4 against 0/4" in headline(plan).corrected
+    plan = plan_reveal(user=owner, plan=plan)
+    assert plan.at_reveal == kept
+    assert "what counts is that of the close of" in plan.events.get(what="revealed").text
+
+
 def test_a_user_who_has_looked_changes_no_score_before_the_reveal(bench, early, owner):
     carry_out(bench, early, 4)
     trial = early.handouts.first().trial
