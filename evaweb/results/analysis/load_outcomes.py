@@ -104,11 +104,10 @@ def _milestones(
     trials: QuerySet[Trial], earlier: dict[int, tuple[int, dict[str, Any]]]
 ) -> dict[int, list[tuple[str, bool]]]:
     """Of each score that counts its milestones in their order; where `earlier` ones count, of all scores."""
-    scored = trials.filter(status=TrialStatus.SCORED)
     counting = (
-        MilestoneOutcome.objects.filter(score__trial__in=scored)
+        MilestoneOutcome.objects.filter(score__trial__in=trials)
         if earlier
-        else MilestoneOutcome.objects.filter(score__in=scored.values("verdict"))
+        else MilestoneOutcome.objects.filter(score__in=trials.exclude(verdict=None).values("verdict"))
     )
     found: dict[int, list[tuple[str, bool]]] = defaultdict(list)
     rows: Iterable[tuple[int, str, bool]] = counting.order_by("score_id", "order").values_list(

@@ -33,7 +33,8 @@ class Bench:
     ) -> None:
         self.context: zmq.Context[Any] = zmq.Context()
         self.now = 0.0
-        self.lock, self._ended, self.frozen = threading.Lock(), threading.Event(), False
+        self.lock, self.frozen = threading.Lock(), False
+        self._heard_out, self._ended = threading.Event(), threading.Event()
         self.station = Station(stubbed(folder, lease={"ttl_s": 60.0}, **settings))
         self.folder = self.station.spec.deployment.station_dir
         self._service = CommandService(self.station.coordinator, self.context)
@@ -70,7 +71,7 @@ class Bench:
                 )
 
     def _listen(self) -> None:
-        while not self._ended.is_set():
+        while not self._heard_out.is_set():
             self.door.serve(0.01)
         self.door.close()
 
@@ -93,8 +94,13 @@ class Bench:
         return held.until if held else 0.0
 
     def close(self) -> None:
+        """The door first: what it has asked of the station is answered by one that still ticks."""
+        self.frozen = False
+        self._heard_out.set()
+        *station, door = self.threads
+        door.join(PATIENCE_S)
         self._ended.set()
-        for thread in self.threads:
+        for thread in station:
             thread.join(PATIENCE_S)
         for script in self._open:
             script.close()
