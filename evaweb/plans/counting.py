@@ -57,11 +57,11 @@ def _judged(what: str, trial: Trial, user: Any) -> None:
     end = ended_by(trial)
     if handout is None or not end:
         return
-    counts, said = getattr(handout.plan, end), {"trial": trial.pk, "what": ENDS[end], "plan": handout.plan}
+    counts = getattr(handout.plan, end)
     if counts == CountsAs.REPEATED:
-        raise Conflict(_REPEATED(**said))
+        raise Conflict(_REPEATED(trial=trial.pk, what=ENDS[end], plan=handout.plan))
     if counts == CountsAs.FAILURE and what == "judged success":
-        raise Conflict(_FAILURE(**said))
+        raise Conflict(_FAILURE(trial=trial.pk, what=ENDS[end], plan=handout.plan))
 
 
 declare_check(_judged)

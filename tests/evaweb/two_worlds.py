@@ -73,11 +73,11 @@ def read(
     lab: Any, client: Client, *, administers: bool, every: bool, **asked: Any
 ) -> list[tuple[str, int, str]]:
     """(what was asked, status, answer) of all that somebody can read, without what is drawn anew."""
-    found = [*everything(lab, client, **asked)]
-    if administers:
-        with transaction.atomic():
+    with transaction.atomic():  # what is sent leaves nothing to the other world
+        found = [*everything(lab, client, **asked)]
+        if administers:
             found += administration(client, every)
-            transaction.set_rollback(True)
+        transaction.set_rollback(True)
     return [
         (_plain(asked), status, _plain(told))
         for asked, status, told in found
@@ -102,7 +102,7 @@ def _plain(text: str) -> str:
     """Without what is drawn or measured for the answer; bytes of a dataset tell less of a name than of its pictures."""
     return re.sub(
         r"[\w-]{40,}|nonce[=-][^' >]*|\d\d:\d\d:\d\d\S*|[0-9a-f]{8}-[0-9a-f-]{27}|\d+ (ms|s) ago"
-        r'|"(clock|sequence|size)": [\d.]+',
+        r'|"(clock|sequence|size)": [\d.]+|Content-Length: \d+',
         "",
         text,
     )

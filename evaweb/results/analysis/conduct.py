@@ -14,6 +14,7 @@ from typing import Any
 
 from django.contrib.admin.models import CHANGE, LogEntry
 from django.db.models import Count, F
+from django.utils import timezone
 
 from evaweb.memo import Kept
 from evaweb.plans.bench_checks import HOLDS
@@ -291,28 +292,30 @@ def _edits(plan: Plan) -> list[dict[str, Any]]:
     """Changes of the plan's scenes and checkpoints from when it was frozen to when what counts was kept, as the
     administration and the scene editor have logged them, also those that were taken back.
     """
-    called = {
-        ("scene", str(pk)): name
-        for pk, name in Scene.objects.filter(positions__plan=plan).distinct().values_list("pk", "name")
-    } | {("checkpoint", str(pk)): name for pk, name in plan.checkpoints.values_list("pk", "name")}
+    if plan.frozen_at is None:
+        return []
     rows = LogEntry.objects.filter(
         content_type__app_label="trials",
         content_type__model__in=("scene", "checkpoint"),
-        object_id__in=[pk for _, pk in called],
-        action_time__gte=plan.frozen_at,
         action_flag=CHANGE,
-    ).select_related("user", "content_type")
-    if plan.kept_at:
-        rows = rows.filter(action_time__lte=plan.kept_at)
+        action_time__gte=plan.frozen_at,
+        action_time__lte=plan.kept_at or timezone.now(),
+    )
+    found = list(rows.select_related("user", "content_type").order_by("action_time"))
+    if not found:
+        return []
+    scenes = Scene.objects.filter(positions__plan=plan).distinct()
+    called = {("scene", str(pk)): name for pk, name in scenes.values_list("pk", "name")}
+    called |= {("checkpoint", str(pk)): name for pk, name in plan.checkpoints.values_list("pk", "name")}
     return [
         {
-            "what": f"{kind} {name}",
+            "what": f"{row.content_type.model} {name}",
             "at": row.action_time,
             "by_name": row.user.get_username(),
             "text": row.get_change_message(),
         }
-        for row in rows.order_by("action_time")
-        if (kind := row.content_type.model) and (name := called.get((kind, row.object_id)))
+        for row in found
+        if (name := called.get((row.content_type.model, row.object_id)))
     ]
 
 

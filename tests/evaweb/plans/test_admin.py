@@ -5,6 +5,7 @@ from django.core.management import CommandError, call_command
 from django.forms import JSONField
 from django.urls import reverse
 
+from evaweb.plans.counting import ENDS
 from evaweb.plans.exchange import exported
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_freeze
@@ -36,6 +37,7 @@ def form_of(plan, **changed):
         "outcome": "success",
         "alpha": "0.05",
         "second_rater_share": "0",
+        **dict.fromkeys(ENDS, "judged"),
         "events-TOTAL_FORMS": 0,
         "events-INITIAL_FORMS": 0,
         **changed,

@@ -7,6 +7,7 @@ from threading import Event
 import pytest
 from django.urls import reverse
 
+from evaweb.plans.counting import ENDS
 from evaweb.plans.models import Plan, PlanState
 from evaweb.plans.services import plan_amend
 from evaweb.results.analysis import power
@@ -65,7 +66,7 @@ def shown(client, plan):
         "repetitions": was["repetitions"], "second_rater_share": 100 * was["second_rater_share"],
         "checkpoints": was["checkpoints"], "positions": was["positions"], "control": was["control"],
         "challenger": was["challenger"], "blind": "on" if was["blind"] else "", "comparing": was["comparing"],
-        "stopping": was["stopping"],
+        "stopping": was["stopping"], **{name: was[name] for name in ENDS},
     }  # fmt: skip
     return was, {name: value for name, value in form.items() if value != ""}
 
