@@ -24,6 +24,7 @@ class CheckpointOut(Schema):
     description: str
     digest: str
     parent: str | None
+    recipe: str
     tags: list[str]
     active: bool
     created_at: datetime

@@ -161,13 +161,13 @@ def _differences(frozen: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
 
 
 def checkpoint_of(checkpoint: Checkpoint) -> dict[str, Any]:
-    """A checkpoint: how it is reached, and its weights where they have a digest."""
-    weights = {"digest": checkpoint.digest} if checkpoint.digest else {}
+    """A checkpoint: how it is reached, its weights where they have a digest, and its recipe where it has one."""
+    named = {"digest": checkpoint.digest, "recipe": checkpoint.recipe}
     return {
         "name": checkpoint.name,
         "description": checkpoint.description,
         "policy": checkpoint.policy,
-        **weights,
+        **{name: value for name, value in named.items() if value},
     }
 
 

@@ -60,6 +60,7 @@ class CheckpointTable(Table):
     policy: dict[str, Any] = {}
     digest: str = ""
     parent: str | None = None
+    recipe: str = ""
     tags: list[str] = []
 
 

@@ -244,7 +244,7 @@ class CheckpointForm(forms.ModelForm):
 
     class Meta:
         model = Checkpoint
-        fields = ("name", "description", "digest", "parent", "tags", "policy", "active")
+        fields = ("name", "description", "digest", "parent", "recipe", "tags", "policy", "active")
 
     tags = forms.CharField(required=False, help_text="Words, with commas between them: to find it by.")
 
@@ -272,7 +272,7 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
     formfield_overrides = _SHORT
     list_display = ("name", "tagged", "active", "reached_at", "trials_n", "created_at")
     list_filter = ("active",)
-    search_fields = ("name", "description", "digest", "tags")
+    search_fields = ("name", "description", "digest", "recipe", "tags")
     autocomplete_fields = ("parent",)
 
     def get_queryset(self, request: HttpRequest) -> QuerySet[Checkpoint]:

@@ -194,6 +194,13 @@ class Checkpoint(models.Model):
         verbose_name="trained on from",
         help_text="The checkpoint that training went on from.",
     )
+    recipe = models.CharField(
+        max_length=120,
+        blank=True,
+        validators=[check_name],
+        help_text="What it is a training run of: the same data and settings, another seed. Frozen with a plan, whose "
+        "results sum up the runs of a recipe.",
+    )
     tags = models.JSONField(default=list, blank=True, validators=[check_tags], help_text="To find it by.")
     policy = models.JSONField(
         default=dict,

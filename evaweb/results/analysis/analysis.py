@@ -6,7 +6,7 @@ Methods are those of docs/evaluation.md. What cannot be computed is None with it
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import combinations
@@ -164,8 +164,20 @@ class Comparison:
 
 
 @dataclass(frozen=True, slots=True)
+class Recipe:
+    """Training runs of one recipe: the success rate of each, and their mean with the interval over runs, not trials.
+
+    Fewer than three runs have no interval: what is between them is what another training would be, too.
+    """
+
+    name: str
+    rates: dict[str, float]
+    mean: Average
+
+
+@dataclass(frozen=True, slots=True)
 class Analysis:
-    """The evaluation: its arms, best first, all comparisons, and letters that sum those up."""
+    """The evaluation: its arms, best first, all comparisons, letters that sum those up, and recipes of several runs."""
 
     n: int
     arms: tuple[Arm, ...]
@@ -173,6 +185,7 @@ class Analysis:
     letters: dict[str, str]
     alpha: float
     notes: tuple[str, ...]
+    recipes: tuple[Recipe, ...] = ()
 
     def arm(self, checkpoint: str) -> Arm:
         """That of a checkpoint."""
@@ -193,6 +206,7 @@ def analyse(
     limits: Mapping[str, float] | None = None,
     checkpoints: Sequence[str] = (),
     whole: bool = False,
+    recipes: Mapping[str, str] | None = None,
 ) -> Analysis:
     """All of it; `planned` comparisons are made in their direction, others the better one first.
 
@@ -205,6 +219,8 @@ def analyse(
 
     `limits` [s] are those of the evaluation's scenes that have one: the smallest is the horizon of times to success;
     without any, the longest run.
+
+    `recipes`: of checkpoints, what each is a training run of.
 
     `interruptions` count for how often a checkpoint needs an operator, and for nothing else. `checkpoints` are those of
     the evaluation, in the order in which they have their colours, whichever of them are chosen.
@@ -247,7 +263,24 @@ def analyse(
         letters(ranked, apart) if told else {},
         alpha,
         tuple(_imbalances(arms)),
+        tuple(_recipes(arms, recipes or {})),
     )
+
+
+_FEWEST_RUNS = 3  # of a recipe, for an interval of what another run of it would do
+
+
+def _recipes(arms: Mapping[str, Sequence[Outcome]], recipes: Mapping[str, str]) -> Iterator[Recipe]:
+    """Those of which several runs were tried."""
+    runs: dict[str, dict[str, float]] = defaultdict(dict)
+    for name in sorted(arms):
+        if recipes.get(name):
+            successes, n = _counts(arms[name])
+            runs[recipes[name]][name] = successes / n
+    for recipe, rates in sorted(runs.items()):
+        mean = average(list(rates.values()))
+        if len(rates) > 1 and mean is not None:
+            yield Recipe(recipe, rates, mean if len(rates) >= _FEWEST_RUNS else replace(mean, interval=None))
 
 
 @dataclass(frozen=True, slots=True)

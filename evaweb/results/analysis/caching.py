@@ -96,6 +96,11 @@ def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> 
             limits=limits_of(plan),
             checkpoints=[row["name"] for row in (plan.document or {}).get("checkpoints", ())],
             whole=which == Chosen(),
+            recipes={
+                row["name"]: row["recipe"]
+                for row in (plan.document or {}).get("checkpoints", ())
+                if row.get("recipe")
+            },
         )
 
     return _analyses.get((plan.pk, plan.digest, which), now, make)

@@ -27,7 +27,12 @@ def analysis_document(analysis: Analysis) -> dict[str, Any]:
         "letters": dict(analysis.letters),
         "arms": {arm.checkpoint: arm_document(arm) for arm in analysis.arms},
         "comparisons": [comparison_document(comparison) for comparison in analysis.comparisons],
+        "recipes": {found.name: {"rates": found.rates, **_run(found.mean)} for found in analysis.recipes},
     }
+
+
+def _run(mean: Average) -> dict[str, Any]:
+    return {"runs": mean.n, "mean": mean.value, "student": _ends(mean.interval)}
 
 
 def arm_document(arm: Arm) -> dict[str, Any]:

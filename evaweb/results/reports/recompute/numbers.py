@@ -127,7 +127,23 @@ def numbers(trials: Trials, plan: Mapping[str, Any], said: Sequence[Mapping[str,
         "letters": methods.letters(names, methods.separated(names, corrected, alpha)) if told else {},
         "arms": {name: _arm(arms[name], broken[name], timing) for name in names},
         "comparisons": compared,
+        "recipes": _recipes(arms, plan),
     }
+
+
+def _recipes(arms: Mapping[str, Trials], plan: Mapping[str, Any]) -> dict[str, Any]:
+    """Of each recipe of which several runs were tried the mean of their rates; of three or more with its interval."""
+    runs: dict[str, dict[str, float]] = defaultdict(dict)
+    for row in plan.get("checkpoints", ()):
+        if row.get("recipe") and row["name"] in arms:
+            runs[row["recipe"]][row["name"]] = _rate(arms[row["name"]])
+    found = {}
+    for recipe, rates in runs.items():
+        said = student(list(rates.values())) if len(rates) > 1 else None
+        if said is not None:
+            ends = said["student"] if len(rates) > 2 else None
+            found[recipe] = {"rates": rates, "runs": said["n"], "mean": said["mean"], "student": ends}
+    return found
 
 
 def _describe(comparison: dict[str, Any], stopping: Mapping[str, Any]) -> None:

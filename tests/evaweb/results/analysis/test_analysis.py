@@ -97,6 +97,16 @@ def test_a_planned_comparison_whose_design_has_not_ended_is_described_and_nothin
     assert (beside.standing, beside.corrected < 0.001) == (Standing.UNPLANNED, True)
 
 
+def test_runs_of_a_recipe_are_summed_up_by_runs_and_of_three_with_an_interval():
+    rates = {"a1": 0.9, "a2": 0.7, "a3": 0.8, "b1": 0.4, "b2": 0.5, "c1": 0.2}
+    recipes = {name: name[0] for name in rates} | {"c1": ""}
+    found = {one.name: one for one in analyse(trials(rates), recipes=recipes).recipes}
+    assert list(found) == ["a", "b"]
+    assert found["a"].mean.value == pytest.approx(sum(found["a"].rates.values()) / 3)
+    assert (found["a"].mean.n, found["a"].mean.interval.low < found["a"].mean.value) == (3, True)
+    assert (found["b"].mean.n, found["b"].mean.interval) == (2, None)
+
+
 def test_letters_tell_apart_what_the_design_did_and_nothing_else():
     outcomes = trials({"old": 0.4, "new": 0.9})
     for verdict, letters in (

@@ -95,9 +95,12 @@ def test_both_ways_come_to_the_same(checkpoints, n, scenes, seed):
         }
         for one, other in planned
     ]
+    recipes = {"c0": "a recipe", "c1": "a recipe", "c2": "a recipe" if checkpoints == 3 else "another"}
     broken = [Interruption(9000, "c0", "s0", 1, 12.5)]
     limits = {} if seed == 2 else {f"s{scene}": 25.0 + 10 * scene for scene in range(1, scenes)}
-    analysis = analyse(runs, broken, planned=dict.fromkeys(planned, verdict), limits=limits, whole=True)
+    analysis = analyse(
+        runs, broken, planned=dict.fromkeys(planned, verdict), limits=limits, whole=True, recipes=recipes
+    )
     shown = json.loads(json.dumps(analysis_document(analysis)))
     rows = [*as_rows(runs), Trial(9000, "x", 0, "c0", "s0", 1, "interrupted", False, 0.0, 12.5, "", ())]
     plan = {
@@ -107,6 +110,7 @@ def test_both_ways_come_to_the_same(checkpoints, n, scenes, seed):
             "outcome": verdict.evidence or "success",
         },
         "comparisons": planned,
+        "checkpoints": [{"name": name, "recipe": recipe} for name, recipe in recipes.items()],
         "scenes": [{"name": f"s{scene}", "time_limit_s": limits.get(f"s{scene}")} for scene in range(scenes)],
     }
     wrong = [
