@@ -6,13 +6,17 @@ Source of the anchors: STEP (Snyder et al. 2025), a near-optimal sequential test
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import operator
 import sys
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from functools import lru_cache, partial
 from itertools import product
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +31,7 @@ from evaweb.statistics.difference import barnard
 from evaweb.statistics.stagewise import stagewise
 
 SECONDS = coverage.SECONDS
+ROOT = Path(__file__).parents[1]
 SIZES = (50, 100)  # pairs
 ALPHA, LOOSE = 0.05, 0.1
 MARGIN = 0.2
@@ -89,44 +94,67 @@ STEP = {((0.5, 0.7), 50): (0.464, 50), ((0.5, 0.8), 50): (0.838, 29), ((0.5, 0.7
 
 def measure(seconds: float, long: bool = False) -> Report:
     """`type1.DESIGN.N`, `power.`, `median_pairs.` and `bias.WHAT.DESIGN.P0.P1.N`, `drift.DESIGN.N`, and those of
-    `coverage`; `long` has designs of 250 pairs too.
+    `coverage`; `long` has designs of 250 pairs too, and goes on where one before it was ended.
     """
     rows: Courses = []
-    figures = [
-        *_told(errors((*SIZES, MOST) if long else SIZES, rows)),
-        *_told(families(rows)),
-        *_told(powers(rows)),
-        *_told(estimates(rows)),
-        *_told(drifts(rows)),
-    ]
+    kept = Kept() if long else None
+    figures: list[Figure] = []
+    for name, part in _parts((*SIZES, MOST) if long else SIZES):
+        for figure in kept.once(name, part, rows) if kept else part(rows):
+            print(
+                f"{figure.name} {figure.value:.4g}", file=sys.stderr, flush=True
+            )  # all of them take minutes
+            figures.append(figure)
     covered = coverage.measure(seconds)
     return Report("designs", [*figures, *covered.figures], [*rows, *covered.rows])
 
 
-def _told(figures: Iterator[Figure]) -> Iterator[Figure]:
-    """Each as it comes, on standard error: all of them take minutes."""
-    for figure in figures:
-        print(f"{figure.name} {figure.value:.4g}", file=sys.stderr, flush=True)
-        yield figure
+Part = Callable[[Courses], Iterator[Figure]]
 
 
-def errors(sizes: Sequence[int], rows: Courses) -> Iterator[Figure]:
+def _parts(sizes: Sequence[int]) -> Iterator[tuple[str, Part]]:
+    looser = [(name, case, n) for name, (case, n) in DRIFTING.items() if name not in DESIGNS]
+    for name, case, n in [*((name, case, n) for n in sizes for name, case in DESIGNS.items()), *looser]:
+        yield f"type1.{name}.{n}", partial(error_of, name, case, n)
+    yield from (("families", families), ("powers", powers), ("estimates", estimates), ("drifts", drifts))
+
+
+class Kept:
+    """What is done of a long measurement, so that one that was ended goes on where it was; by what computes it."""
+
+    def __init__(self) -> None:
+        sources = [Path(__file__), *sorted((ROOT / "evaweb" / "statistics").glob("*.py"))]
+        made_of = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+        self._file = ROOT / "build" / "benchmarks" / f"designs-{made_of[:16]}.jsonl"
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        lines = self._file.read_text().splitlines() if self._file.exists() else []
+        self._done: dict[str, dict[str, Any]] = {part["name"]: part for part in map(json.loads, lines)}
+
+    def once(self, name: str, part: Part, rows: Courses) -> list[Figure]:
+        """Figures of a part, with its rows; as they were where it was made before."""
+        if name not in self._done:
+            own: Courses = []
+            figures = [asdict(figure) for figure in part(own)]
+            self._done[name] = {"name": name, "figures": figures, "rows": own}
+            with self._file.open("a") as file:
+                file.write(json.dumps(self._done[name]) + "\n")
+        rows += self._done[name]["rows"]
+        return [Figure(**figure) for figure in self._done[name]["figures"]]
+
+
+def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
     """The largest error over all common rates, with a bound between them; simulated ones may be above alpha by three
     standard errors.
     """
-    looser = [(name, case, n) for name, (case, n) in DRIFTING.items() if name not in DESIGNS]
-    for name, case, n in [*((name, case, n) for n in sizes for name, case in DESIGNS.items()), *looser]:
-        if exact := boundary_of(case, n):
-            largest, bound = exact.error()
-            rows.append({"type1": name, "pairs": n, "largest": largest, "bound": bound})
-            yield Figure(f"type1.{name}.{n}", bound, "", f"<= {case.alpha}")
-        else:
-            found = max(
-                (_found(case, (rate, rate), n) for rate in _some(case)), key=lambda found: found.power
-            )
-            rows.append({"type1": name, "pairs": n, "simulated": found.power, "error": found.error})
-            allowed = case.alpha + 3 * math.sqrt(case.alpha * (1 - case.alpha) / _runs(case))
-            yield Figure(f"type1.{name}.{n}", found.power, "", f"<= {allowed:.4f}")
+    if exact := boundary_of(case, n):
+        largest, bound = exact.error()
+        rows.append({"type1": name, "pairs": n, "largest": largest, "bound": bound})
+        yield Figure(f"type1.{name}.{n}", bound, "", f"<= {case.alpha}")
+    else:
+        found = max((_found(case, (rate, rate), n) for rate in _some(case)), key=lambda found: found.power)
+        rows.append({"type1": name, "pairs": n, "simulated": found.power, "error": found.error})
+        allowed = case.alpha + 3 * math.sqrt(case.alpha * (1 - case.alpha) / _runs(case))
+        yield Figure(f"type1.{name}.{n}", found.power, "", f"<= {allowed:.4f}")
 
 
 def powers(rows: Courses) -> Iterator[Figure]:
