@@ -15,6 +15,7 @@ from django.test import TransactionTestCase
 from pytest_django import DjangoDbBlocker
 
 from evaweb import computing
+from evaweb.computing import Busy
 from evaweb.errors import NotFound
 from evaweb.stations import commands, stops
 from evaweb.stations.models import Command, Station
@@ -135,6 +136,16 @@ def vera(db: None) -> User:
 def alma(db: None) -> User:
     """An administrator."""
     return person("alma", "admin")
+
+
+@pytest.fixture
+def nobody_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The planner's process is busy: no test that asks every address waits for what it computes."""
+
+    def busy(*asked: Any) -> None:
+        raise Busy("it computes for others")
+
+    monkeypatch.setattr("evaweb.computing.questions.ask", busy)
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from django.urls import reverse
 
 from evaweb.api.tokens import token_create
 from evaweb.blinding import sight_of
-from evaweb.computing import Busy
 from evaweb.plans.blinding_rules import look
 from evaweb.plans.models import Handout, Look, PlanEvent, Slot
 from evaweb.plans.services import plan_reveal
@@ -28,14 +27,9 @@ pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow]
 
 
 @pytest.fixture(autouse=True)
-def _data(settings, tmp_path, monkeypatch):
+def _data(settings, tmp_path, monkeypatch, nobody_computes):  # what is planned is of no trial
     settings.DATA_DIR = tmp_path
     monkeypatch.setattr("evaweb.jobs.doorbell.ring", lambda queue: True)
-    monkeypatch.setattr("evaweb.computing.questions.ask", _busy)  # what is planned is of no trial
-
-
-def _busy(*asked):
-    raise Busy("later")
 
 
 @pytest.fixture

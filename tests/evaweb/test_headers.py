@@ -38,7 +38,7 @@ def policy(answer):
     return {part[0]: part[1:] for part in parts}
 
 
-def test_every_address_answers_with_the_policy_and_no_cache_keeps_it(alma):
+def test_every_address_answers_with_the_policy_and_no_cache_keeps_it(alma, nobody_computes):
     client, stranger = Client(raise_request_exception=False), Client()
     client.force_login(alma)
     asked = [("admin", "/admin/"), ("nowhere", "/nowhere"), ("openapi", "/api/v1/openapi.json"), *addresses()]
