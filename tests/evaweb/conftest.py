@@ -142,7 +142,7 @@ def alma(db: None) -> User:
 def nobody_computes(monkeypatch: pytest.MonkeyPatch) -> None:
     """The planner's process is busy: no test that asks every address waits for what it computes."""
 
-    def busy(*asked: Any) -> None:
+    def busy(*asked: object) -> None:
         raise Busy("it computes for others")
 
     monkeypatch.setattr("evaweb.computing.questions.ask", busy)
