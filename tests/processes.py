@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,13 @@ def alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
         return False
+
+
+def joined(*threads: threading.Thread) -> None:
+    """Wait for their ends; one that does not come fails, else nobody sees the minute."""
+    for thread in threads:
+        thread.join(PATIENCE_S)
+        assert not thread.is_alive(), f"{thread.name} has not ended within {PATIENCE_S:g} s"
 
 
 def eventually(check: Callable[[], Found], what: str, patience: float = PATIENCE_S) -> Found:

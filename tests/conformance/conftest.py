@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from runtime.sim.ros_domain import free_domain
-from tests.processes import PATIENCE_S
+from tests.processes import joined
 from tests.runtime.ros_master import RosMaster, master
 
 
@@ -16,8 +16,7 @@ def no_thread_is_left() -> Iterator[None]:
     before = set(threading.enumerate())
     yield
     for thread in set(threading.enumerate()) - before:
-        thread.join(PATIENCE_S)
-        assert not thread.is_alive(), thread.name
+        joined(thread)
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from runtime.sim import arrays
 from runtime.sim.node import Node, parser, run
 from runtime.transports import zmq as link
 from runtime.transports.node_source import NodeSource
-from tests.processes import PATIENCE_S, eventually
+from tests.processes import eventually, joined
 
 ROBOT = robots.load("ur5e")
 HOME = ROBOT.poses["home"].astype(np.float32)
@@ -79,7 +79,7 @@ class Bench:
 
     def close(self) -> None:
         self._told.set()
-        self._thread.join(PATIENCE_S)
+        joined(self._thread)
         self.source.close()
         self.node.close()
         for socket in self._clients:

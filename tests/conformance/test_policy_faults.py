@@ -25,7 +25,7 @@ from runtime.core.types import Conditioning
 from runtime.sim import faults
 from runtime.sim.faults import Fault
 from tests.conformance.policies_served import PROTOCOLS, WEBSOCKETS, Served, protocol
-from tests.processes import PATIENCE_S, eventually
+from tests.processes import PATIENCE_S, eventually, joined
 from tests.runtime.policies.peers import seen, serving
 
 DEADLINE = 0.4  # s, where only a deadline ends the waiting; else what is wrong is noticed at once
@@ -237,7 +237,7 @@ def test_a_reset_while_an_answer_is_in_flight_leaves_both_right(name: str) -> No
         asking.start()
         with contextlib.suppress(PolicyLostError):
             policy.reset()
-        asking.join(PATIENCE_S)
+        joined(asking)
         assert found == [True]
         assert served.begins_at(policy, 0.2)
 
@@ -262,8 +262,7 @@ def test_closing_frees_whoever_waits_and_may_be_done_twice(name: str) -> None:
         waiting.join(0.1)
         policy.close()
         policy.close()
-        waiting.join(PATIENCE_S)
-        assert not waiting.is_alive()
+        joined(waiting)
         assert len(failed) == 1
         with pytest.raises(PolicyError, match="closed"):
             raise failed[0]

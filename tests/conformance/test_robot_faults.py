@@ -15,7 +15,7 @@ from runtime.core.errors import TransportError
 from runtime.core.types import Observation
 from runtime.transports.base import Source
 from tests.conformance.robots_played import TRANSPORTS, Played, mark_of, played
-from tests.processes import PATIENCE_S, eventually
+from tests.processes import PATIENCE_S, eventually, joined
 
 IDLE_FRAMES = 1000
 
@@ -206,7 +206,6 @@ def test_who_waits_is_let_go_when_it_is_closed_and_it_can_be_connected_again(rob
     waiting = threading.Thread(target=wait)
     waiting.start()
     robot.source.close()
-    waiting.join(PATIENCE_S)
-    assert not waiting.is_alive()
+    joined(waiting)
     robot.source.connect()
     seen(robot, 4)

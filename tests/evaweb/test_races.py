@@ -20,7 +20,7 @@ from evaweb.trials import scene_writing
 from evaweb.trials.models import Checkpoint, Scene
 from evaweb.trials.scene_writing import SceneRefused, scene_write
 from tests.evaweb.conftest import person
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, joined
 
 TAKEN_NAME = IntegrityError("UNIQUE constraint failed: trials_scene.name")
 
@@ -42,8 +42,7 @@ def at_once(*acts: Callable[[], Any]) -> list[Any]:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(PATIENCE_S)
-        assert not thread.is_alive()
+        joined(thread)
     return found
 
 

@@ -22,7 +22,7 @@ from runtime.recording.labels import Label, append
 from tests.evaweb.collect.conftest import Demonstrate, collecting
 from tests.evaweb.stand_in import StandIn
 from tests.evaweb.trials.builders import Wire
-from tests.processes import PATIENCE_S, eventually
+from tests.processes import eventually, joined
 
 pytestmark = pytest.mark.django_db
 NASTY, ESCAPED = "<script>alert(1)</script>", "&lt;script&gt;alert(1)&lt;/script&gt;"
@@ -151,4 +151,4 @@ def test_a_station_says_by_itself_that_it_collects_and_that_it_does_no_more(
         says(None)
     finally:
         scribe.end()
-        scribe._thread.join(PATIENCE_S)
+        joined(scribe._thread)

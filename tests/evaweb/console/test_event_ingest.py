@@ -14,7 +14,7 @@ from evaweb.console.feed import Feeds, History
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, Lease, Station
 from runtime.processes.coordinator.session.transitions import SessionEvent
-from tests.processes import PATIENCE_S, eventually
+from tests.processes import PATIENCE_S, eventually, joined
 
 
 class Services:
@@ -117,8 +117,7 @@ def scribe(live, runtime, transactional_db):
     made = Scribe(runtime.name, Feeds())
     yield made
     made.end()
-    made._thread.join(PATIENCE_S)
-    assert not made._thread.is_alive()
+    joined(made._thread)
 
 
 def until(reached):
@@ -204,7 +203,7 @@ def test_two_web_processes_write_the_same_and_nothing_twice_in_the_row(live, run
     until(lambda: Station.objects.get(pk=live.pk).last_event == 20)
     for one in both:
         one.end()
-        one._thread.join(PATIENCE_S)
+        joined(one._thread)
     numbers = [number for _, number, _ in services.trials]
     assert set(numbers) == set(range(1, 21))
 
@@ -217,7 +216,7 @@ def test_a_chronicle_finds_stations_that_are_added_later(runtime, services):
     runtime.say("state", "hello")
     services.wait(lambda: services.trials == [(runtime.boot, 1, "state")])
     made.end()
-    made._thread.join(PATIENCE_S)
+    joined(made._thread)
     for scribe in made._scribes.values():
-        scribe._thread.join(PATIENCE_S)
+        joined(scribe._thread)
     connection.close()

@@ -7,7 +7,7 @@ import threading
 from django.db import OperationalError
 
 from evaweb.jobs.heartbeat import Heartbeat, Lapse
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, joined
 
 
 def test_it_beats_until_the_block_is_left_also_after_an_error() -> None:
@@ -32,7 +32,7 @@ def test_it_beats_until_the_block_is_left_also_after_an_error() -> None:
 def test_it_stops_where_the_job_is_not_ours_any_more() -> None:
     beats: list[int] = []
     with Heartbeat(lambda: bool(beats.append(1)), 0.001) as heart:
-        heart._thread.join(PATIENCE_S)
+        joined(heart._thread)
         assert beats == [1]
 
 
@@ -49,8 +49,7 @@ def test_it_lapses_where_no_beat_arrives_and_only_then() -> None:
         pass
     assert not again.is_set()
     for timer in [one for one in threading.enumerate() if isinstance(one, threading.Timer)]:
-        timer.join(PATIENCE_S)
-        assert not timer.is_alive()
+        joined(timer)
 
 
 def test_it_lapses_at_once_where_the_job_is_anothers() -> None:

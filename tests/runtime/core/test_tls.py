@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from runtime.core.tls import allow_two_threads
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, joined
 from tests.runtime.policies.tls import self_signed
 
 _MIB = bytes(range(256)) * 4096
@@ -63,7 +63,7 @@ def ends(tmp_path: Path) -> Iterator[tuple[ssl.SSLSocket, ssl.SSLSocket]]:
     thread = threading.Thread(target=lambda: served.append(serving.wrap_socket(there, server_side=True)))
     thread.start()
     client = asking.wrap_socket(here, server_hostname="localhost")
-    thread.join(PATIENCE_S)
+    joined(thread)
     with client, served[0]:
         yield client, served[0]
 
@@ -87,7 +87,7 @@ def test_its_ssl_object_is_never_entered_twice_while_both_directions_are_full(
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(PATIENCE_S)
+        joined(thread)
     assert [taken[end] == _MIB for end in ends] == [True, True]
     assert [found.overlaps for found in watched] == [0, 0]
     assert min(found.calls for found in watched) > len(_MIB) // 16384  # a record holds no more
@@ -101,7 +101,7 @@ def test_a_write_goes_out_while_a_read_waits(ends: tuple[ssl.SSLSocket, ssl.SSLS
     client.sendall(b"asked")
     assert server.recv(16) == b"asked"
     server.sendall(b"answered")
-    reader.join(PATIENCE_S)
+    joined(reader)
     assert answers == [b"answered"]
 
 
@@ -143,6 +143,6 @@ def test_its_end_wakes_whoever_reads_and_whoever_writes(
     time.sleep(0.1)
     end(client)
     for thread in threads:
-        thread.join(PATIENCE_S)
+        joined(thread)
     assert sorted(ended) == ["read", "write"]
     assert got in ([b""], [])

@@ -17,7 +17,7 @@ from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
 from runtime.kinematics.loading import Loading
 from runtime.processes.coordinator.inference.worker import LockstepRunner, ThreadRunner
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, joined
 from tests.runtime.lockstep_station import Station, stubbed
 
 ROBOT = robots.load("ur5e")
@@ -85,7 +85,7 @@ def test_who_solves_waits_for_it_and_gets_what_the_backend_says() -> None:
     solving.start()
     assert found == []
     gate.set()
-    solving.join(PATIENCE_S)
+    joined(solving)
     assert np.array_equal(found[0], made().solve(targets, Q, 0.1, Q, 0).q)
     assert loading.prepare()
 

@@ -16,7 +16,7 @@ from runtime.policies import openpi
 from runtime.policies.health import require_healthy
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from tests.processes import PATIENCE_S
+from tests.processes import joined
 from tests.runtime.policies.peers import FRANKA, seen
 from tests.runtime.policies.tls import Certificate, encrypted, self_signed
 
@@ -170,7 +170,7 @@ def test_a_server_that_shakes_hands_by_tls_and_then_says_nothing_is_given_up(
             pytest.raises(PolicyLostError),
         ):
             policy.connect()
-        thread.join(PATIENCE_S)
+        joined(thread)
     kept[0].close()
 
 

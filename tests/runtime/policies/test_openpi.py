@@ -38,7 +38,7 @@ from runtime.sim.faults import NONE, TOO_LARGE, Fault
 from runtime.sim.in_poses import InPoses
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.script import Waving
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, joined
 
 ROBOT = robots.load("agilex_piper")
 CAMERAS = tuple(camera.key for camera in ROBOT.cameras)
@@ -872,8 +872,7 @@ def test_close_unblocks_an_inference_that_waits_in_another_thread() -> None:
         thread.start()
         assert asked.wait(PATIENCE_S)
         policy.close()
-        thread.join(PATIENCE_S)
-        assert not thread.is_alive()
+        joined(thread)
         policy.close()
     assert "closed from our side" in str(errors[0])
 
@@ -895,10 +894,7 @@ def test_close_does_not_wait_for_a_handshake_and_ends_it() -> None:
             assert thread.is_alive()
         closing = threading.Thread(target=policy.close)
         closing.start()
-        closing.join(PATIENCE_S)
-        thread.join(PATIENCE_S)
-        assert not closing.is_alive()
-        assert not thread.is_alive()
+        joined(closing, thread)
     assert "closed from our side" in str(errors[0])
 
 
@@ -938,8 +934,7 @@ def test_close_ends_the_search_for_a_host_that_does_not_answer() -> None:
         thread.join(0.2)
         assert thread.is_alive()
         policy.close()
-        thread.join(PATIENCE_S)
-        assert not thread.is_alive()
+        joined(thread)
     assert "closed from our side" in str(errors[0])
 
 
@@ -949,8 +944,7 @@ def test_close_returns_while_the_wire_is_in_use() -> None:
         with policy._lock:  # held by a call that cannot be woken, as by a host that does not answer
             closing = threading.Thread(target=policy.close)
             closing.start()
-            closing.join(PATIENCE_S)
-            assert not closing.is_alive()
+            joined(closing)
         policy.connect()
         assert row_zero_starts_at(policy.infer(observation(0.3)), 0.3)
 

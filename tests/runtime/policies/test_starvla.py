@@ -19,7 +19,7 @@ from runtime.policies import starvla
 from runtime.policies.starvla import Config, StarvlaPolicy
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.starvla_server import Star, StarvlaServer
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, joined
 from tests.runtime.policies.peers import FRANKA, PIPER, Handler, seen, serving
 
 VECTORS = Path(__file__).parents[1] / "vectors"
@@ -382,8 +382,7 @@ def test_pings_go_out_while_nobody_asks_until_it_is_closed() -> None:
         (thread,) = [thread for thread in threading.enumerate() if thread.name == "starvla-ping"]
         assert enough.wait(PATIENCE_S)
         policy.close()
-        thread.join(PATIENCE_S)
-        assert not thread.is_alive()
+        joined(thread)
     assert {message["type"] for message in pings} == {"ping"}
     assert len({message["request_id"] for message in pings}) == len(pings)
 

@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from runtime.policies.watchdog import Watchdog
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, joined
 
 SOON = 0.02
 LONG = 60.0
@@ -69,7 +69,7 @@ def test_it_is_one_thread_for_all_and_none_after_the_end(watched: Watched) -> No
             assert len(threads()) == 1
     thread = threads()[0]
     watched.dog.end()
-    thread.join(PATIENCE_S)
+    joined(thread)
     assert not threads()
     assert watched.cuts == 0
 

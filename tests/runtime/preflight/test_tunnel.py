@@ -13,7 +13,7 @@ from runtime.config.loader import server_of
 from runtime.policies.tunnel.process import free_port
 from runtime.preflight.course import Course
 from runtime.station.preflight_child import patience
-from tests.processes import PATIENCE_S
+from tests.processes import joined
 from tests.runtime.preflight.bench import WIRES, planned, served
 from tests.ssh import SshServer
 
@@ -40,8 +40,7 @@ def test_a_server_behind_a_tunnel_is_asked_and_the_tunnel_is_gone_afterwards(tmp
         closed = Course(planned(WIRES["openpi"], "ws://127.0.0.1:1", {"tunnel": server.settings()})).run(60.0)
         assert (closed.verdict, closed.stage) == ("port_closed", "connect"), closed.sentence
     for thread in set(threading.enumerate()) - before:
-        thread.join(PATIENCE_S)
-        assert not thread.is_alive(), thread.name
+        joined(thread)
 
 
 def test_the_same_address_behind_another_tunnel_is_another_server() -> None:

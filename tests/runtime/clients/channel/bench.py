@@ -17,7 +17,7 @@ from runtime.ipc.bus import CommandServer, Endpoints
 from runtime.ipc.messages import Ack, Command
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.process import CommandService
-from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
+from tests.processes import PATIENCE_MS, PATIENCE_S, eventually, joined
 from tests.runtime.lockstep_station import Station, stubbed
 
 _TICK_S = 0.003  # ten times as fast as life
@@ -98,10 +98,10 @@ class Bench:
         self.frozen = False
         self._heard_out.set()
         *station, door = self.threads
-        door.join(PATIENCE_S)
+        joined(door)
         self._ended.set()
         for thread in station:
-            thread.join(PATIENCE_S)
+            joined(thread)
         for script in self._open:
             script.close()
         self._service.close()

@@ -7,7 +7,7 @@ import pytest
 from runtime.clients.channel import lane as module
 from runtime.clients.channel.lane import Job, Lane
 from runtime.clients.channel.message import Message
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, joined
 
 
 class Clerk:
@@ -117,7 +117,7 @@ def test_a_lane_that_ends_answers_what_it_is_about_and_stops_alone_to_the_last(k
     while not world.lane._over.is_set():
         time.sleep(0.001)
     world.clerk.let_go.set()
-    ending.join(PATIENCE_S)
+    joined(ending)
     assert world.clerk.closed
     assert world.replies.qsize() == carried_out
 

@@ -33,7 +33,7 @@ from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.starvla_server import Star, StarvlaServer
 from runtime.station.checks import checked_spec
-from tests.processes import PATIENCE_S, alive, eventually
+from tests.processes import PATIENCE_S, alive, eventually, joined
 from tests.runtime.policies.peers import PIPER, seen
 from tests.runtime.policies.tls import encrypted, self_signed
 from tests.runtime.sim.tabletop_station import pick_and_place, served
@@ -336,8 +336,7 @@ def test_a_set_up_that_is_cancelled_does_not_wait_for_the_tunnel() -> None:
         eventually(lambda: policy._keeper is not None and policy._keeper._ssh is not None, "an ssh")
         pid = ssh_of(policy)
         policy.close()
-        waiting.join(PATIENCE_S)
-        assert not waiting.is_alive()
+        joined(waiting)
         assert "closed from our side" in told[0]
         eventually(lambda: not alive(pid), "the end of ssh")
 

@@ -13,7 +13,7 @@ import zmq
 
 from runtime.core.types import Observation
 from runtime.processes.media.background import NICE, LowPriorityWorker
-from tests.processes import PATIENCE_S, eventually
+from tests.processes import PATIENCE_S, eventually, joined
 
 
 def numbered(sequence: int) -> Observation:
@@ -104,7 +104,7 @@ def test_a_failure_is_that_of_the_next_call(wanting: Callable[..., Wanted]) -> N
 
     aside = LowPriorityWorker(wanting(work))
     aside(numbered(1))
-    aside._thread.join(PATIENCE_S)
+    joined(aside._thread)
     with pytest.raises(ValueError, match="no such picture"):
         aside(numbered(2))
     aside.close()

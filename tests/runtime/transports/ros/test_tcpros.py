@@ -25,7 +25,7 @@ from runtime.transports.ros.messages import JointState, MessageName, PoseStamped
 from runtime.transports.ros.middleware import COMMAND_QUALITY, SENSOR_QUALITY, Topic
 from runtime.transports.ros.rospy_process import RospyProcess, Site, require
 from runtime.transports.ros.tcpros import TcpRosMiddleware
-from tests.processes import PATIENCE_S, alive, eventually
+from tests.processes import PATIENCE_S, alive, eventually, joined
 from tests.runtime.ros_master import PYTHON, RosMaster, master, needs_ros1
 from tests.runtime.transports.ros.ros1_peer import Peer
 
@@ -385,8 +385,7 @@ def test_what_is_no_master_is_named(answer: bytes, said: str) -> None:
         server.shutdown(
             socket.SHUT_RDWR
         )  # or it would wait on, and take who comes to the next one of this number
-        thread.join(PATIENCE_S)
-        assert not thread.is_alive()
+        joined(thread)
 
 
 @needs_ros1
