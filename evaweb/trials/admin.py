@@ -277,8 +277,9 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
 
     def get_queryset(self, request: HttpRequest) -> QuerySet[Checkpoint]:
         """With the number of trials, which nobody is told from whom the checkpoint is hidden."""
-        shown = Q(trials__in=sight_for(request).open(Trial.objects.all()))
-        return super().get_queryset(request).annotate(n_trials=Count("trials", filter=shown))
+        hidden = sight_for(request).checkpoints
+        shown = Count("trials", filter=~Q(pk__in=hidden)) if hidden else Count("trials")
+        return super().get_queryset(request).annotate(n_trials=shown)
 
     def get_readonly_fields(self, request: HttpRequest, obj: Checkpoint | None = None) -> tuple[str, ...]:
         """The name is in every manifest from the first trial on; those trials were of these weights."""
