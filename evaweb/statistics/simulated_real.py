@@ -1,0 +1,105 @@
+"""Evaluations in simulation beside real ones of the same checkpoints.
+
+Whether simulation orders them as the robot does: Spearman's rank correlation (1904), and the mean maximum rank violation
+of SIMPLER (Li et al. 2024), the real difference that is lost where simulation orders two the other way round. What many
+simulated trials add to a few real ones: prediction-powered inference (Angelopoulos et al. 2023) with the weight of
+simulation that makes the interval narrowest (PPI++, 2023); without any correlation that weight is 0, and nothing is added.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+from evaweb.statistics.base import LEVEL, Interval, StatisticsError, check_level
+from evaweb.statistics.difference import Difference
+
+Pair = tuple[float, float]  # real and simulated outcome of the same checkpoint under the same condition
+_FEWEST = 8  # pairs of an arm, for an interval that stands on the normal approximation
+
+
+@dataclass(frozen=True, slots=True)
+class Powered:
+    """Real outcomes of one arm (0 to 1), each `paired` with a simulated one, and simulated ones `beside` them."""
+
+    paired: Sequence[Pair]
+    beside: Sequence[float]
+
+
+def rank_correlation(simulated: Sequence[float], real: Sequence[float]) -> float | None:
+    """Spearman's, ties sharing their ranks; None of fewer than two, or where one side is all the same."""
+    _check(simulated, real)
+    ours, theirs = _ranks(simulated), _ranks(real)
+    if len(ours) < 2:
+        return None
+    spread = _covariance(ours, ours) * _covariance(theirs, theirs)
+    return _covariance(ours, theirs) / math.sqrt(spread) if spread > 0 else None
+
+
+def rank_violation(simulated: Sequence[float], real: Sequence[float]) -> float:
+    """Mean over checkpoints of the largest real difference to another one that simulation orders the other way."""
+    _check(simulated, real)
+    numbers = range(len(real))
+    worst = [
+        max(
+            (
+                abs(real[i] - real[j])
+                for j in numbers
+                if (simulated[i] < simulated[j]) != (real[i] < real[j]) and real[i] != real[j]
+            ),
+            default=0.0,
+        )
+        for i in numbers
+    ]
+    return math.fsum(worst) / len(worst) if worst else 0.0
+
+
+def powered_difference(first: Powered, second: Powered, level: float = LEVEL) -> Difference | None:
+    """The first arm's real rate less the second's, with what simulation says of both; None of fewer than eight pairs
+    of either.
+    """
+    check_level(level)
+    if min(len(first.paired), len(second.paired)) < _FEWEST:
+        return None
+    (one, spread), (other, spread_of_other) = _powered(first), _powered(second)
+    half = NormalDist().inv_cdf(0.5 + level / 2) * math.sqrt(spread + spread_of_other)
+    value = one - other
+    return Difference(value, Interval(max(-1.0, value - half), min(1.0, value + half), level))
+
+
+def _powered(arm: Powered) -> tuple[float, float]:
+    """Mean, and its variance."""
+    real, matched = ([pair[side] for pair in arm.paired] for side in (0, 1))
+    n, beside = len(real), list(arm.beside)
+    if len(beside) < 2:
+        return math.fsum(real) / n, _covariance(real, real) / (n - 1) / n
+    whole = [*matched, *beside]
+    spread = _covariance(whole, whole) / (len(whole) - 1)
+    weight = 0.0
+    if spread > 0:
+        weight = _covariance(real, matched) / (n - 1) / (spread * (1 + n / len(beside)))
+        weight = min(max(weight, 0.0), 1.0)
+    left = [one - weight * other for one, other in arm.paired]
+    mean = math.fsum(left) / n + weight * math.fsum(beside) / len(beside)
+    variance = _covariance(left, left) / (n - 1) / n
+    return mean, variance + weight**2 * _covariance(beside, beside) / (len(beside) - 1) / len(beside)
+
+
+def _covariance(one: Sequence[float], other: Sequence[float]) -> float:
+    """Sum of products of what both are off their means."""
+    mean, of_other = math.fsum(one) / len(one), math.fsum(other) / len(other)
+    return math.fsum((a - mean) * (b - of_other) for a, b in zip(one, other, strict=True))
+
+
+def _ranks(values: Sequence[float]) -> list[float]:
+    return [
+        (sum(other < value for other in values) + sum(other <= value for other in values) + 1) / 2
+        for value in values
+    ]
+
+
+def _check(simulated: Sequence[float], real: Sequence[float]) -> None:
+    if len(simulated) != len(real):
+        raise StatisticsError(f"{len(simulated)} simulated rates and {len(real)} real ones; allowed: as many")
