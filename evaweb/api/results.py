@@ -21,12 +21,13 @@ from evaweb.results.analysis.agreement import agreement_of, judges_of, preferenc
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import Chosen, chosen
 from evaweb.results.analysis.planner import Question, question_of, table_of
+from evaweb.results.analysis.simulated import set_beside, simulated_plans
 from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.presentation.caveats import caveats_of
 from evaweb.results.presentation.citing import citation
 from evaweb.results.presentation.headline import headline_document, with_planned_letters
 from evaweb.results.presentation.integrity import integrity_document
-from evaweb.results.ratings.unblinding import require_seen
+from evaweb.results.ratings.unblinding import require_seen, why_sealed
 from evaweb.results.reports.document import (
     analysis_document,
     arm_document,
@@ -235,6 +236,42 @@ def integrity(request: HttpRequest, name: str, version: int) -> Any:
     """Looks, voids, corrections, amendments, deviations, delays, and what the headline would be under each doubt."""
     plan, _ = _seen(request, name, version, Only())
     return {"plan": plan.name, "version": plan.version, "digest": plan.digest, **integrity_document(plan)}
+
+
+@router.get(
+    _PLAN + "/simulated",
+    response={200: list[dict[str, Any]], **FAILURES},
+    summary="Simulated evaluations beside it",
+    url_name="plan-simulated",
+)
+def simulated(request: HttpRequest, name: str, version: int) -> Any:
+    """Of each plan of the same checkpoints on simulated benches: rates, rank correlation, mean maximum rank violation,
+    and differences with what simulation adds (null of fewer than eight matched trials)."""
+    plan, _ = _seen(request, name, version, Only())
+    user: Any = request.auth  # type: ignore[attr-defined]
+    found = (set_beside(plan, row) for row in simulated_plans(plan) if not why_sealed(row, user))
+    return [
+        {
+            "plan": one["plan"].name,
+            "version": one["plan"].version,
+            "checkpoints": {
+                checkpoint: {"real": proportion_document(real), "simulated": proportion_document(played)}
+                for checkpoint, real, played in one["rates"]
+            },
+            "rank_correlation": one["rank_correlation"],
+            "rank_violation": one["rank_violation"],
+            "differences": [
+                {
+                    "first": first,
+                    "second": second,
+                    "value": said and said.value,
+                    "interval": said and [said.interval.low, said.interval.high],
+                }
+                for first, second, said in one["differences"]
+            ],
+        }
+        for one in found
+    ]
 
 
 @router.get(

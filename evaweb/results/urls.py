@@ -24,6 +24,7 @@ urlpatterns = [
     path(_PLAN + "evidence/", views.evidence, name="result-evidence"),
     path(_PLAN + "report.zip", views.report, name="result-report"),
     path(_PLAN + "integrity/", views.integrity, name="result-integrity"),
+    path(_PLAN + "simulated/", views.simulated, name="result-simulated"),
     path(_PLAN + "cite/", views.cite, name="result-cite"),
     path(_FROZEN, views.frozen, name="result-frozen"),
     *(

@@ -1,9 +1,9 @@
 """Evaluations in simulation beside real ones of the same checkpoints.
 
-Whether simulation orders them as the robot does: Spearman's rank correlation (1904), and the mean maximum rank violation
-of SIMPLER (Li et al. 2024), the real difference that is lost where simulation orders two the other way round. What many
-simulated trials add to a few real ones: prediction-powered inference (Angelopoulos et al. 2023) with the weight of
-simulation that makes the interval narrowest (PPI++, 2023); without any correlation that weight is 0, and nothing is added.
+Whether simulation orders them as the robot does: Spearman's rank correlation (1904), and the mean maximum rank
+violation of SIMPLER (Li et al. 2024), the real difference that is lost where simulation orders two the other way round.
+What many simulated trials add to a few real ones: prediction-powered inference (Angelopoulos et al. 2023) with the
+weight of simulation that makes the interval narrowest (PPI++, 2023); where both have nothing in common it is 0.
 """
 
 from __future__ import annotations

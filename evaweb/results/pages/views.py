@@ -24,6 +24,7 @@ from evaweb.results import selectors
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
 from evaweb.results.analysis.filters import chosen
+from evaweb.results.analysis.simulated import is_simulated, set_beside, simulated_plans
 from evaweb.results.pages import pages
 from evaweb.results.presentation import listings
 from evaweb.results.presentation.citing import HEAD, Citation, citation
@@ -153,6 +154,22 @@ def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
         **_common(request, found),
     }
     return render(request, "results/conduct.html", context)
+
+
+@require_GET
+def simulated(request: HttpRequest, name: str, version: int) -> HttpResponse:
+    """Evaluations of its checkpoints on simulated benches, beside it."""
+    found = _found(name, version)
+    sealed = _sealed_page(request, found)
+    if sealed:
+        return sealed
+    others = [row for row in simulated_plans(found) if not why_sealed(row, request.user)]
+    context = {
+        "beside": [set_beside(found, row) for row in others],
+        "real": is_simulated(found),
+        **_common(request, found),
+    }
+    return render(request, "results/simulated.html", context)
 
 
 @require_GET

@@ -16,6 +16,7 @@ from evaweb.plans.models import Plan, PlanState, StoppingRule
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.analysis.outcomes import Outcome
 from evaweb.results.presentation import wording
+from evaweb.statistics.difference import Difference
 from evaweb.statistics.proportions import Proportion
 
 register = template.Library()
@@ -44,6 +45,12 @@ def design_words(rule: str) -> str:
 def rate_words(found: Proportion) -> str:
     """x/n, percent and interval."""
     return wording.rate_words(found)
+
+
+@register.filter
+def difference_words(found: Difference) -> str:
+    """Points with their interval."""
+    return wording.points(found)
 
 
 @register.filter

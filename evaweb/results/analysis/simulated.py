@@ -1,0 +1,84 @@
+"""Evaluations on simulated benches beside a real one of the same checkpoints."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from evaweb.plans.design import compared
+from evaweb.plans.models import Plan
+from evaweb.plans.selectors import plans_beside
+from evaweb.results.analysis.caching import runs_of
+from evaweb.results.analysis.outcomes import Outcome, by_checkpoint
+from evaweb.stations.models import Station
+from evaweb.statistics.proportions import Proportion, proportion
+from evaweb.statistics.simulated_real import Powered, powered_difference, rank_correlation, rank_violation
+
+
+def is_simulated(plan: Plan) -> bool | None:
+    """Whether all of its trials were made on simulated benches, or all on real ones (False); None of both, or none."""
+    kinds = set(plan.handouts.order_by().values_list("trial__station__simulated", flat=True).distinct())
+    return kinds.pop() if len(kinds) == 1 else None
+
+
+def simulated_plans(plan: Plan) -> list[Plan]:
+    """Plans of two of its checkpoints or more that were made on simulated benches, where this one is real."""
+    if is_simulated(plan) is not False:
+        return []
+    there = Station.objects.filter(simulated=True)
+    rows = plans_beside(plan).filter(handouts__trial__station__in=there).distinct()
+    return [row for row in rows.select_related("owner") if is_simulated(row)]
+
+
+def set_beside(real: Plan, simulated: Plan) -> dict[str, Any]:
+    """Rates of the checkpoints that both have, how far simulation orders them as the robot did, and the differences of
+    the real plan's comparisons with what simulation adds.
+
+    Trials are matched by checkpoint, scene and position, the first with the first.
+    """
+    ours, theirs = (by_checkpoint(runs_of(plan).outcomes) for plan in (real, simulated))
+    shared = sorted(set(ours) & set(theirs))
+    rates = [(name, _rate(ours[name]), _rate(theirs[name])) for name in shared]
+    of_real, of_simulated = (
+        [real.rate or 0.0 for _, real, _ in rates],
+        [found.rate or 0.0 for *_, found in rates],
+    )
+    return {
+        "plan": simulated,
+        "rates": rates,
+        "rank_correlation": rank_correlation(of_simulated, of_real),
+        "rank_violation": rank_violation(of_simulated, of_real),
+        "differences": [
+            (
+                first,
+                second,
+                powered_difference(
+                    _matched(ours[first], theirs[first]), _matched(ours[second], theirs[second])
+                ),
+            )
+            for first, second in compared(real.document or {})
+            if {first, second} <= set(shared)
+        ],
+    }
+
+
+def _rate(outcomes: Sequence[Outcome]) -> Proportion:
+    return proportion(sum(outcome.success for outcome in outcomes), len(outcomes))
+
+
+def _matched(real: Sequence[Outcome], simulated: Sequence[Outcome]) -> Powered:
+    left = _by_condition(simulated)
+    paired = []
+    for condition, rows in _by_condition(real).items():
+        there = left.get(condition, [])
+        paired += list(zip(rows, there, strict=False))
+        left[condition] = there[len(rows) :]
+    return Powered(paired, [value for rows in left.values() for value in rows])
+
+
+def _by_condition(outcomes: Iterable[Outcome]) -> dict[str, list[float]]:
+    found: dict[str, list[float]] = defaultdict(list)
+    for outcome in outcomes:
+        found[outcome.condition].append(float(outcome.success))
+    return found
