@@ -40,8 +40,8 @@ if _OWN:
 
 @pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are cores: a part of the tests' time is waiting, and each collects all of them."""
-    return (os.cpu_count() or 1) + 1
+    """Two more than there are cores: a part of the tests' time is waiting."""
+    return (os.cpu_count() or 1) + 2
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
