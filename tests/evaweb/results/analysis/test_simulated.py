@@ -20,6 +20,7 @@ PAGE = "/result/plans/blocks/1/simulated/"
 @pytest.fixture
 def played(revealed, bench, owner):
     """The same checkpoints on a simulated bench: 16 trials, closed; and the real plan, revealed."""
+    Station.objects.filter(pk=bench.station.pk).update(simulated=False)
     made = Plan.objects.create(
         name="played", title="Played", question="?", owner=owner, repetitions=4, blind=False
     )
