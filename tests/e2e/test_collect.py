@@ -6,7 +6,8 @@ from contextlib import suppress
 import pytest
 
 from tests.e2e.bench_page import BenchPage
-from tests.e2e.lab import STATION, TABLET
+from tests.e2e.conftest import LOCKSTEP
+from tests.e2e.lab import STATION, TABLET, Demo
 from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
@@ -33,8 +34,10 @@ CollectSession.objects.create(
 
 
 @pytest.fixture(scope="module")
-def demo(patient):
-    return patient
+def demo(tmp_path_factory):
+    lab = Demo(tmp_path_factory.mktemp("collect"), "--collect", *LOCKSTEP).start()
+    yield lab
+    assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
 
 
 class Collector(BenchPage):
