@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from functools import lru_cache, partial
-from itertools import product
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ from benchmarks.report import Figure, Report
 from evaweb.plans.schedule import RANDOM, Condition, Unit, counts_of, schedule
 from evaweb.statistics.boundaries import MOST, Boundary, Look, extremeness
 from evaweb.statistics.courses import course
-from evaweb.statistics.designs import ANYTIME, FIXED, SCORE, conclude, design, findings, in_blocks
+from evaweb.statistics.designs import ANYTIME, FIXED, SCORE, conclude, design, findings, in_blocks, unbeaten
 from evaweb.statistics.difference import barnard
 from evaweb.statistics.stagewise import stagewise
 
@@ -40,6 +40,7 @@ _SOME_RATES = (0.2, 0.5, 0.8)
 _RATES = tuple(round(0.05 * i, 2) for i in range(1, 20))  # at which simulated designs err
 _RUNS_OF_RATES, _SIMULATED = 4000, 0.003  # of `courses`, and what standard error that has at alpha .05
 _RUNS = 1000
+_CHOICES = ((0.5, 0.5, 0.5, 0.5), (0.5, 0.5, 0.5, 0.7), (0.5, 0.5, 0.5, 0.8))  # rates of four checkpoints
 _GRID, _ROUNDS = 15, 6  # of the search over drifts
 Rates = tuple[float, float]
 Courses = list[dict[str, object]]
@@ -116,7 +117,8 @@ def _parts(sizes: Sequence[int]) -> Iterator[tuple[str, Part]]:
     looser = [(name, case, n) for name, (case, n) in DRIFTING.items() if name not in DESIGNS]
     for name, case, n in [*((name, case, n) for n in sizes for name, case in DESIGNS.items()), *looser]:
         yield f"type1.{name}.{n}", partial(error_of, name, case, n)
-    yield from (("families", families), ("powers", powers), ("estimates", estimates), ("drifts", drifts))
+    yield from (("families", families), ("choices", choices), ("powers", powers))
+    yield from (("estimates", estimates), ("drifts", drifts))
 
 
 class Kept:
@@ -271,6 +273,44 @@ def families(rows: Courses) -> Iterator[Figure]:
             worst = max(worst, sum(any(one.winner for one in found.each) for found in ended) / _RUNS)
         rows.append({"family": name, "blocks": SIZES[0], "simulated": worst})
         yield Figure(f"type1.{name}.{SIZES[0]}", worst, "", f"<= {allowed:.4f}")
+
+
+def choices(rows: Courses) -> Iterator[Figure]:
+    """Of several checkpoints that are all compared, with those dropped that are found worse: how often one is called the
+    best that is not, how often the best one is, how often the choice by the highest rate among those that are left is
+    another than the best one, and the median number of trials. Of equal ones none is the best.
+    """
+    allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
+    for rates in _CHOICES:
+        arms, best = range(len(rates)), max(rates)
+        wanted = {arm for arm in arms if rates[arm] == best} if rates.count(best) == 1 else set()
+        for rule, drops in ((FIXED, False), ("early", True)):
+            pairs = tuple(combinations(arms, 2))
+            planned = design(
+                rule=rule, blocks=SIZES[0], alpha=ALPHA, comparisons=pairs, drops=drops, holm=True
+            )
+            won = np.random.default_rng(7).random((_RUNS, SIZES[0], len(rates))) < rates
+            called, chosen, trials = [], [], []
+            for run in won:
+                said = findings(planned, [tuple(enumerate(map(float, block))) for block in run])
+                left = unbeaten(planned, said)
+                made = {arm: said.dropped.get(arm, said.at or SIZES[0]) for arm in arms}
+                trials.append(sum(made.values()))
+                called.append(left[0] if len(left) == 1 else None)
+                chosen.append(max(left, key=lambda arm: run[: made[arm], arm].mean(), default=None))
+            wrong = sum(arm is not None and arm not in wanted for arm in called) / _RUNS
+            at = f"{rule}.{'.'.join(map(str, rates))}.{SIZES[0]}"
+            yield Figure(f"best.wrong.{at}", wrong, "", f"<= {allowed:.4f}")
+            yield Figure(f"best.trials.{at}", float(np.median(trials)), "")
+            row = {"best": at, "wrong": wrong, "trials": float(np.median(trials))}
+            if wanted:
+                row |= {
+                    "found": sum(arm in wanted for arm in called) / _RUNS,
+                    "chosen_wrong": sum(arm not in wanted for arm in chosen) / _RUNS,
+                }
+                yield Figure(f"best.found.{at}", float(row["found"]), "")
+                yield Figure(f"best.chosen_wrong.{at}", float(row["chosen_wrong"]), "")
+            rows.append(row)
 
 
 def _least(n: int, alpha: float) -> tuple[int, int] | None:

@@ -26,6 +26,8 @@ class CheckpointOut(Schema):
     parent: str | None
     recipe: str
     tags: list[str]
+    strategy: dict[str, Any] | None
+    anchor: bool
     active: bool
     created_at: datetime
 

@@ -52,7 +52,8 @@ Names = tuple[str, str]
 
 def planned(plan: Plan) -> list[Names]:
     """The comparisons of a draft, by names; none where it asks for none."""
-    names = list(plan.checkpoints.order_by("name").values_list("name", flat=True))
+    # An anchor is compared where it is named alone.
+    names = list(plan.checkpoints.filter(anchor=False).order_by("name").values_list("name", flat=True))
     if plan.comparing == Comparing.ALL:
         return list(combinations(names, 2))
     if plan.first is None:

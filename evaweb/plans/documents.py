@@ -161,8 +161,8 @@ def _differences(frozen: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
 
 
 def checkpoint_of(checkpoint: Checkpoint) -> dict[str, Any]:
-    """A checkpoint: how it is reached, its weights where they have a digest, and its recipe where it has one."""
-    named = {"digest": checkpoint.digest, "recipe": checkpoint.recipe}
+    """A checkpoint: how it is reached; weights' digest, recipe and strategy where it has them, and if it is an anchor."""
+    named = {name: getattr(checkpoint, name) for name in ("digest", "recipe", "strategy", "anchor")}
     return {
         "name": checkpoint.name,
         "description": checkpoint.description,

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from django.core.exceptions import ValidationError
+
 from evaweb.blinding import Sight
 from evaweb.errors import EvaError
 from evaweb.plans.design import check_drafted, planned
 from evaweb.plans.models import Allocation, Comparing, Plan, PrimaryOutcome, StoppingRule
 from evaweb.plans.schedule import Condition, check_schedule
 from evaweb.trials.models import Scene
+from evaweb.trials.tables import check_strategy
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,10 +33,24 @@ def problems(plan: Plan) -> Iterator[Remark]:
         yield Remark("arms", f"{plan} has no checkpoint: choose at least one")
     for off in plan.checkpoints.filter(active=False):
         yield Remark("arms", f"checkpoint {off} is switched off")
+    yield from _served(plan)
     compared = list(_comparisons(plan, chosen))
     yield from compared
     if chosen and plan.positions.exists() and not compared:
         yield from _designed(plan)
+
+
+def _served(plan: Plan) -> Iterator[Remark]:
+    """Strategies that stations would refuse, or of which two would be in force."""
+    try:
+        check_strategy(plan.strategy)
+    except ValidationError as error:  # of a draft from before it was checked
+        yield Remark("design", f"strategy: {'; '.join(error.messages)}")
+    own = [str(row) for row in plan.checkpoints.filter(strategy__isnull=False)]
+    if plan.strategy is not None and own:
+        yield Remark(
+            "arms", f"the plan has a strategy for all trials, and one of their own have: {', '.join(own)}"
+        )
 
 
 def covered(plan: Plan, sight: Sight) -> Callable[[str], str]:
@@ -70,7 +87,8 @@ def _comparisons(plan: Plan, chosen: set[int]) -> Iterator[Remark]:
             yield Remark("arms", "no control is chosen (first), with which each checkpoint is compared")
         elif len(named) != number or (number and plan.first is None):
             yield Remark("arms", f"comparisons of {plan.get_comparing_display()} name {words}")
-        if len(chosen) < 2:
+        others = plan.checkpoints.filter(anchor=True) if plan.comparing == Comparing.ALL else ()
+        if len(chosen - {row.pk for row in others}) < 2:
             yield Remark(
                 "arms", f"comparisons of {plan.get_comparing_display()} need two checkpoints or more"
             )

@@ -3,7 +3,7 @@
     [[scene]]       name, title, instruction, criterion, layout, time_limit_s, ordered, failure_required
     [[scene.position]]   number, label, description, bench
     [[scene.milestone]]  order, text, points, required, time_limit_s, truth
-    [[checkpoint]]  name, description, policy, digest, parent (a name), recipe, tags
+    [[checkpoint]]  name, description, policy, digest, parent (a name), recipe, tags, strategy, anchor
     [[plan]]        name, title, question, positions (scene and number each), checkpoints, repetitions, ...
     [[reference]]   which picture a camera's reference at a position is; see .references
 
@@ -125,6 +125,8 @@ def _checkpoint_table(checkpoint: Checkpoint) -> dict[str, Any]:
         "parent": parent,
         "recipe": checkpoint.recipe,
         "tags": checkpoint.tags,
+        "strategy": checkpoint.strategy,
+        "anchor": checkpoint.anchor,
     }
 
 

@@ -62,6 +62,8 @@ class CheckpointTable(Table):
     parent: str | None = None
     recipe: str = ""
     tags: list[str] = []
+    strategy: dict[str, Any] | None = None
+    anchor: bool = False
 
 
 class PlaceTable(Table):

@@ -13,6 +13,7 @@ from evaweb.append_only import AppendOnly
 from evaweb.names import check_name
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene, Trial
+from evaweb.trials.tables import check_strategy
 
 
 class PlanState(models.TextChoices):
@@ -99,7 +100,10 @@ class Plan(models.Model):
         Station, blank=True, help_text="Where it is carried out; none: anywhere."
     )
     strategy = models.JSONField(
-        null=True, blank=True, help_text="The [strategy] table for all trials; empty: as each station has it."
+        null=True,
+        blank=True,
+        validators=[check_strategy],
+        help_text="Keys of the [strategy] table for all trials; empty: as each checkpoint or station has it.",
     )
     blind = models.BooleanField(default=True, help_text="Operators are not told which checkpoint runs.")
     allocation = models.CharField(
@@ -130,7 +134,7 @@ class Plan(models.Model):
         max_length=7,
         choices=Comparing,
         default=Comparing.PAIR,
-        help_text="What the question is about. Several share alpha equally.",
+        help_text="What the question is about. Several share alpha.",
     )
     drop_arms = models.BooleanField(
         "drop checkpoints",

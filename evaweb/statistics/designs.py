@@ -248,6 +248,13 @@ def findings(found: Design, blocks: Sequence[Block]) -> Findings:
     return Findings(tuple(decided[n] for n in range(len(found.comparisons))), dropped)
 
 
+def unbeaten(found: Design, said: Findings) -> list[int]:
+    """The arms that no comparison found worse, of a design that has ended."""
+    pairs = zip(found.comparisons, said.each, strict=True)
+    beaten = {pair[one.winner == "first"] for pair, one in pairs if one.winner}
+    return [arm for arm in sorted({arm for pair in found.comparisons for arm in pair}) if arm not in beaten]
+
+
 def _stepped(found: Design, blocks: Sequence[Block], each: list[Conclusion]) -> list[Conclusion]:
     """By Holm's procedure, where all of them have their test."""
     tests = {number: one.p for number, one in enumerate(each) if one.p is not None}

@@ -90,12 +90,12 @@ def mantel_haenszel(tables: Sequence[Table]) -> Stratified:
     )
 
 
-def exact_within(tables: Sequence[Table]) -> float | None:
+def exact_within(tables: Sequence[Table], least: int = 2) -> float | None:
     """Two-sided probability, within strata, of the first's successes or any as improbable, were both arms equal in
-    each; None where fewer than two strata tell anything.
+    each; None where fewer than `least` strata tell anything.
     """
     telling = [table for table in tables if table.tells]
-    if len(telling) < 2:
+    if len(telling) < least:
         return None
     total = {0: 1}
     for table in telling:

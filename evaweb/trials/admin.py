@@ -242,9 +242,11 @@ class CheckpointForm(forms.ModelForm):
         "from that host. Never a key or a password here: a key is named by its path on the station's machine.",
     )
 
+    strategy = Table(required=False, help_text=Checkpoint._meta.get_field("strategy").help_text)
+
     class Meta:
         model = Checkpoint
-        fields = ("name", "description", "digest", "parent", "recipe", "tags", "policy", "active")
+        fields = ("name", "description", "digest", "parent", "recipe", "tags", "policy", "strategy", "anchor", "active")
 
     tags = forms.CharField(required=False, help_text="Words, with commas between them: to find it by.")
 
@@ -263,12 +265,17 @@ class CheckpointForm(forms.ModelForm):
         given = self.cleaned_data["policy"]
         return {} if given is None else given
 
+    def clean_strategy(self) -> Any:
+        """An empty field is no strategy of its own."""
+        return self.cleaned_data["strategy"] or None
+
 
 @admin.register(Checkpoint)
 class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
     """A trained policy."""
 
     form = CheckpointForm
+    save_as = True  # the same weights, served otherwise
     formfield_overrides = _SHORT
     list_display = ("name", "tagged", "active", "reached_at", "trials_n", "created_at")
     list_filter = ("active",)
@@ -303,11 +310,12 @@ class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
     def save_model(self, request: HttpRequest, obj: Checkpoint, form: Any, change: bool) -> None:
         """Say so where trials may have been made with another table."""
         super().save_model(request, obj, form, change)
-        if change and "policy" in form.changed_data and checkpoint_used(obj):
+        if change and {"policy", "strategy"} & {*form.changed_data} and checkpoint_used(obj):
             messages.warning(
                 request,
-                f"Trials, or a plan that was frozen, are of checkpoint {obj} with another policy table. If this is "
-                "another policy and not only another address, make another checkpoint: all would be counted together.",
+                f"Trials, or a plan that was frozen, are of checkpoint {obj} with another policy or strategy table. If "
+                "this is another policy and not only another address, make another checkpoint: all would be counted "
+                "together.",
             )
 
     @admin.display(description="tags")

@@ -16,7 +16,7 @@ from evaweb.episodes.models import Episode
 from evaweb.names import check_name
 from evaweb.stations.models import Station
 from evaweb.trials.failure_words import why_words
-from evaweb.trials.tables import check_bench, check_policy, check_tags, check_term
+from evaweb.trials.tables import check_bench, check_policy, check_strategy, check_tags, check_term
 
 
 class Scene(models.Model):
@@ -208,6 +208,18 @@ class Checkpoint(models.Model):
         validators=[check_policy],
         help_text='Keys of the deployment\'s [policy] table, e.g. {"url": "ws://127.0.0.1:8000"}.',
     )
+    strategy = models.JSONField(
+        null=True,
+        blank=True,
+        validators=[check_strategy],
+        help_text="Keys of the [strategy] table that its trials run with; empty: as plan or station have it. The same "
+        "weights served in several ways are a checkpoint each, with the same digest.",
+    )
+    anchor = models.BooleanField(
+        default=False,
+        help_text="Tried beside others in plan after plan, so that it shows when a bench or its scoring drifts: compared "
+        "with none but where a plan names it. Frozen with a plan.",
+    )
     active = models.BooleanField(default=True, help_text="Off: not offered to operators.")
     created_at = models.DateTimeField(auto_now_add=True)
 
@@ -216,6 +228,11 @@ class Checkpoint(models.Model):
 
     def __str__(self) -> str:
         return self.name
+
+    @property
+    def strategy_words(self) -> str:
+        """Its own strategy as one reads it; "" where it has none."""
+        return ", ".join(f"{key} {value}" for key, value in (self.strategy or {}).items())
 
     @property
     def lineage(self) -> list[Checkpoint]:

@@ -261,7 +261,7 @@ def trial_create(
         instruction=scene.instruction,
         time_limit_s=scene.time_limit_s,
         seed=seed,
-        strategy=strategy,
+        strategy=checkpoint.strategy if strategy is None else strategy,
     )
 
 

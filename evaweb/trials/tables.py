@@ -1,4 +1,4 @@
-"""Checks tables that an administrator writes as JSON: how a policy is reached, how a bench is laid out."""
+"""Checks tables that an administrator writes as JSON: how a policy is reached and asked, how a bench is laid out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pydantic
 from django.core.exceptions import ValidationError
 
 from evaweb.trials.failure_words import is_not_said
-from runtime.config.schema import policy_tables
+from runtime.config.schema import policy_tables, strategy_tables
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
 _PLACES = {"block": ("x", "y", "yaw in degrees"), "plate": ("x", "y")}
@@ -24,11 +24,20 @@ _OBJECT = ("x", "y", "yaw in degrees", "width", "depth")
 
 def check_policy(given: object) -> None:
     """ValidationError unless `given` fits on top of a deployment's [policy] table of some kind."""
+    _check_kinds(given, _kinds(), '{"url": "ws://127.0.0.1:8000"}')
+
+
+def check_strategy(given: object) -> None:
+    """ValidationError unless `given` is None, or fits on top of a deployment's [strategy] table of some kind."""
+    if given is not None:
+        _check_kinds(given, _strategies(), '{"kind": "rtc", "inference_rate": 5}')
+
+
+def _check_kinds(given: object, kinds: Mapping[str, type[pydantic.BaseModel]], example: str) -> None:
     if not isinstance(given, Mapping):
-        raise ValidationError(_sentence(given, 'a table such as {"url": "ws://127.0.0.1:8000"}'))
-    kinds = _kinds()
+        raise ValidationError(_sentence(given, f"a table such as {example}"))
     wanted = given.get("kind")
-    if wanted is not None and wanted not in kinds:
+    if wanted is not None and not (isinstance(wanted, str) and wanted in kinds):
         raise ValidationError(f"kind = {wanted!r}; allowed: {', '.join(kinds)}")
     problems = {kind: _problems(given, kinds[kind]) for kind in ([wanted] if wanted else kinds)}
     if all(problems.values()):
@@ -160,6 +169,11 @@ def _table(config: type[pydantic.BaseModel], way: tuple[str | int, ...]) -> type
 def _kinds() -> dict[str, type[pydantic.BaseModel]]:
     kinds = {config.model_fields["kind"].default: config for config in policy_tables()}
     return {kind: config for kind, config in kinds.items() if kind != "none"}  # no policy is no checkpoint
+
+
+@cache
+def _strategies() -> dict[str, type[pydantic.BaseModel]]:
+    return {config.model_fields["kind"].default: config for config in strategy_tables()}
 
 
 def _sentence(given: object, allowed: str, name: str = "") -> str:

@@ -63,6 +63,11 @@ def policy_tables() -> tuple[type[Settings], ...]:
     return parts(PolicyConfig)
 
 
+def strategy_tables() -> tuple[type[Settings], ...]:
+    """The same of a [strategy] table."""
+    return parts(StrategyConfig)
+
+
 class ControlSettings(Settings):
     """The control loop."""
 

@@ -65,8 +65,10 @@ def pytest_runtest_teardown(item, nextitem):
 
 @pytest.fixture(scope="session")
 def patient(tmp_path_factory):
-    """A lab with more people and a dead checkpoint, whose station's time waits for a slow machine."""
-    running["patient"] = lab = Demo(tmp_path_factory.mktemp("patient"), *LOCKSTEP).start().people()
+    """A lab with more people and a dead checkpoint, whose station collects too and waits for a slow machine."""
+    running["patient"] = lab = (
+        Demo(tmp_path_factory.mktemp("patient"), "--collect", *LOCKSTEP).start().people()
+    )
     return lab
 
 

@@ -6,8 +6,7 @@ from contextlib import suppress
 import pytest
 
 from tests.e2e.bench_page import BenchPage
-from tests.e2e.conftest import LOCKSTEP
-from tests.e2e.lab import STATION, TABLET, Demo
+from tests.e2e.lab import STATION, TABLET
 from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
@@ -34,10 +33,8 @@ CollectSession.objects.create(
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    lab = Demo(tmp_path_factory.mktemp("collect"), "--collect", *LOCKSTEP).start()
-    yield lab
-    assert lab.end() == 0, (lab.folder / "demo.log").read_text()[-2000:]
+def demo(patient):
+    return patient
 
 
 class Collector(BenchPage):
@@ -95,8 +92,8 @@ def ann(browser, demo):
     bench = Collector(browser, demo, "operator", TABLET)
     bench.page.add_init_script(_PAD)
     bench.open(f"/stations/{STATION}/collect/")
-    bench.reaches("IDLE")
-    bench.take()
+    bench.at_rest()
+    bench.take_again()
     yield bench
     assert [error for error in bench.errors if "409" not in error] == []  # what is refused is said so
     bench.close()
@@ -115,6 +112,7 @@ def collecting(ann):
     page.fill("#seed", "1")
     page.keyboard.press("Enter")
     ann.key("u")
+    eventually(lambda: ann.collect["set_up"], "the station is set up to collect")
     ann.reaches("READY")
     page.locator("#big:not([data-settling])").wait_for()
     return ann

@@ -21,6 +21,7 @@ from evaweb.plans.bench_checks import HOLDS
 from evaweb.plans.design import Names, compared
 from evaweb.plans.models import Achieved, CameraCheck, Plan
 from evaweb.plans.selectors import plans_beside
+from evaweb.results.analysis.drift import anchors_of
 from evaweb.results.analysis.integrity import changes_of, with_changes
 from evaweb.statistics.many import holm
 from evaweb.statistics.permutation import sign_flips
@@ -101,6 +102,7 @@ def conduct_of(plan: Plan, runs: Sequence[Run], looks: Iterable[Look]) -> dict[s
         "cameras": _cameras(plan, runs),
         "bench": _bench(plan, runs, looks),
         "delays": _compared(plan, runs),
+        "anchors": anchors_of(plan),
     }
 
 

@@ -26,10 +26,12 @@ from evaweb.statistics.designs import (
     Block,
     Conclusion,
     Design,
+    Findings,
     alone,
     conclude,
     estimated,
     findings,
+    unbeaten,
 )
 from evaweb.statistics.difference import newcombe
 from evaweb.statistics.many import letters
@@ -37,6 +39,7 @@ from evaweb.statistics.many import letters
 # From this format of plans on. Flipping signs within pairs tests whether two checkpoints can be exchanged: scores that
 # spread differently around one mean cannot, either.
 _DIFFER = 6
+_BEST = 6  # and which is the best of several is said
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +49,8 @@ class Headline:
     `corrected`: with the scores that were corrected after the reveal. `at_first`: as trials were first scored, had none
     been voided. `worst`: of differences, had each attempt that was thrown away unscored been against them. Each is
     empty where it is made of the same blocks. `estimates`: of comparisons that stopped early, how much they differ.
-    `letters`, where all checkpoints were compared with each other: two share one if they were not told apart.
+    `letters` and `best`, where all checkpoints were compared with each other: two share a letter if they were not told
+    apart, and which one is best if one is.
     """
 
     sentences: tuple[str, ...]
@@ -57,11 +61,17 @@ class Headline:
     estimates: tuple[str, ...] = ()
     versions: tuple[str, ...] = ()
     letters: tuple[tuple[str, str], ...] = ()
+    best: str = ""
+
+    @property
+    def said(self) -> tuple[str, ...]:
+        """Which is best, then each comparison."""
+        return (self.best, *self.sentences) if self.best else self.sentences
 
     @property
     def sentence(self) -> str:
         """All of them."""
-        return ". ".join(self.sentences)
+        return ". ".join(self.said)
 
     @property
     def caveats(self) -> tuple[str, ...]:
@@ -102,6 +112,7 @@ def headline(plan: Plan) -> Headline | None:
         tuple(_estimates(plan, found, at_reveal)),
         _versions(plan),
         letters_of(plan, found, at_reveal),
+        best_of(plan, found, at_reveal),
     )
 
 
@@ -136,8 +147,8 @@ def rule_words(plan: Plan) -> str:
 
 
 def sentence_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
-    """What the design says of these blocks: a sentence of each comparison."""
-    return ". ".join(sentences_of(plan, found, blocks))
+    """What the design says of these blocks: which is best, where that was asked, and a sentence of each comparison."""
+    return ". ".join(filter(None, (best_of(plan, found, blocks), *sentences_of(plan, found, blocks))))
 
 
 def sentences_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[str, ...]:
@@ -155,13 +166,43 @@ def letters_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[tupl
     names = compared(plan.document or {})
     arms = arms_of(names)
     said = findings(found, blocks)
-    of_all = len(names) > 2 and len(names) == len(arms) * (len(arms) - 1) // 2
-    if not of_all or found.margin is not None or not said.ended:
+    if not _ranks(found, arms, said):
         return ()
     rates = {name: _mean(blocks, number) for number, name in enumerate(arms)}
     ranked = sorted(arms, key=lambda name: (-rates[name], name))
     apart = {frozenset(name) for name, one in zip(names, said.each, strict=True) if one.winner}
     return tuple((name, letter) for name, letter in letters(ranked, apart).items())
+
+
+def _ranks(found: Design, arms: Sequence[str], said: Findings) -> bool:
+    """Whether it compared three or more with each other, and has ended."""
+    of_all = len(arms) > 2 and len(found.comparisons) == len(arms) * (len(arms) - 1) // 2
+    return of_all and found.margin is None and bool(said.ended)
+
+
+def best_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
+    """Which of three or more that were compared with each other is best, or which are left; empty where that was not
+    asked, is not decided yet, or the test says of scores alone that they differ.
+    """
+    document = plan.document or {}
+    arms, said = arms_of(compared(document)), findings(found, blocks)
+    differ = found.outcome != SUCCESS and found.rule == FIXED
+    if document.get("format", 1) < _BEST or differ or not _ranks(found, arms, said):
+        return ""
+    left = unbeaten(found, said)
+    if len(left) == 1:
+        return f"{arms[left[0]]} is the best of {len(arms)}"
+    if not left:
+        return f"No best of {len(arms)} was found: each was found worse than another"
+    means = {arm: _mean(blocks, arm) for arm in left}
+    highest = [arms[arm] for arm in left if means[arm] == max(means.values())]
+    of = "success rate" if found.outcome == SUCCESS else "mean score"
+    names = _listed([arms[arm] for arm in left])
+    return f"No single best of {len(arms)}: {names} were not told apart (highest {of}: {_listed(highest)})"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def _mean(blocks: Sequence[Block], arm: int) -> float:

@@ -12,6 +12,8 @@ from evaweb.results.analysis.integrity import CATEGORY, VERDICT
 from evaweb.results.presentation.wording import p_words
 from evaweb.results.presentation.would_be import would_be
 
+_RARE = 0.05  # probability at or below which an anchor is said to drift
+
 
 def integrity_document(plan: Plan) -> dict[str, Any]:
     """What the record says, what the headline would be under each doubt, and `remarks` that sum both up."""
@@ -96,6 +98,13 @@ def _departures(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"{_of(len(found['cameras']['unchecked']), 'trial')} without cameras confirmed in the 12 hours before"
 
     yield from _of_the_bench(found["bench"])
+    for row in found["anchors"]:
+        for name, since in (("against_earlier", "earlier plans"), ("within", "its first half")):
+            if row[name] is not None and row[name] <= _RARE:
+                yield (
+                    f"Anchor {row['checkpoint']} did not succeed as often as in {since} ({p_words(row[name])}): bench or "
+                    "scoring may have drifted"
+                )
 
 
 def _of_the_bench(bench: Mapping[str, Any]) -> Iterator[str]:

@@ -25,7 +25,7 @@ def kept_of(plan: Plan) -> dict[str, Any]:
     """Headline and caveats in their words, and the digest of every attempt and every score with its reason and time."""
     said = headline(plan)
     return {
-        "headline": list(said.sentences) if said else [],
+        "headline": list(said.said) if said else [],
         "caveats": caveats_of(plan),
         "record": digest({"attempts": list(_attempts(plan)), "scores": list(_scores(plan))}),
     }

@@ -1,7 +1,7 @@
 import pytest
 from django.core.exceptions import ValidationError
 
-from evaweb.trials.tables import check_bench, check_policy, simulated_bench
+from evaweb.trials.tables import check_bench, check_policy, check_strategy, simulated_bench
 
 KEY = "-----BEGIN OPENSSH PRIVATE KEY-----\nc2VjcmV0\n"
 
@@ -117,3 +117,24 @@ def test_a_simulated_bench_lays_what_is_its_own():
     laid = {"block": [0.1, 0.3, 45], "plate": [-0.1, 0.3]}
     assert simulated_bench({**laid, "objects": {"cup": [0, 0, 0, 0.1, 0.1]}}) == laid
     assert simulated_bench(None) is None
+
+
+@pytest.mark.parametrize("strategy", [None, {}, {"kind": "rtc", "inference_rate": 5}, {"blend_window": "all"}])
+def test_strategies_that_a_deployment_could_have_pass(strategy):
+    check_strategy(strategy)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "sentence"),
+    [
+        ({"kind": "asink"}, "kind = 'asink'; allowed: ensemble, naive, async, rtc, sync"),
+        ({"kind": ["rtc"]}, "kind = ['rtc']; allowed: ensemble, naive, async, rtc, sync"),
+        ({"inference_rate": 0}, "inference_rate = 0: Input should be greater than 0"),
+        ({"kind": "sync", "rate": 5}, "rate: unknown key for kind 'sync'"),
+        ("rtc", """'rtc'; allowed: a table such as {"kind": "rtc", "inference_rate": 5}"""),
+    ],
+)
+def test_other_strategies_are_refused_with_what_is_allowed(strategy, sentence):
+    with pytest.raises(ValidationError) as refused:
+        check_strategy(strategy)
+    assert sentence in refused.value.messages[0]
