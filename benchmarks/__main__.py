@@ -22,6 +22,7 @@ _BENCHMARKS = (
     "measures",
     "moving_target",
     "pages",
+    "partial_credit",
     "recording",
     "replay",
     "results",

@@ -11,7 +11,7 @@ import hmac
 from collections.abc import Sequence
 
 from evaweb.errors import EvaError
-from evaweb.plans.canonical import digest
+from evaweb.canonical import digest
 from evaweb.plans.schedule import Unit
 from evaweb.plans.seeded_draws import KEY_BYTES, Chance
 from runtime.core.sentences import Pattern

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from evaweb.blinding import EVERYTHING, Sight
-from evaweb.plans.canonical import digest
+from evaweb.canonical import digest
 from evaweb.plans.models import Comparing, Plan
 from evaweb.trials.models import Checkpoint
 

@@ -23,7 +23,7 @@ from django.db import models, transaction
 from pydantic import ValidationError
 
 from evaweb.errors import Conflict, EvaError
-from evaweb.plans.canonical import difference
+from evaweb.canonical import difference
 from evaweb.plans.documents import checkpoint_of, scene_of
 from evaweb.plans.file import CheckpointTable, File, PlaceTable, PlanTable, SceneTable
 from evaweb.plans.models import Comparing, Plan, PlanState, Reference

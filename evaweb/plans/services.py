@@ -20,7 +20,7 @@ from evaweb.blinding import sight_of
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans import reveals
-from evaweb.plans.canonical import difference, digest
+from evaweb.canonical import difference, digest
 from evaweb.plans.design import (
     ENDED_EVENT,
     at_the_reveal,

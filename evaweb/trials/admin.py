@@ -11,12 +11,14 @@ from django.core.exceptions import ValidationError
 from django.db import models
 from django.db.models import Count, Q, QuerySet
 from django.forms.fields import InvalidJSONInput
+from django.forms.models import model_to_dict
 from django.http import HttpRequest
 from django.urls import reverse
 from django.utils.html import format_html
 
 from evaweb.administration import LabelledRows
 from evaweb.blinding import sight_for
+from evaweb.canonical import difference
 from evaweb.trials.models import (
     Checkpoint,
     Evaluation,
@@ -28,6 +30,7 @@ from evaweb.trials.models import (
     Score,
     Trial,
 )
+from evaweb.trials.scene_reading import scene_table
 from evaweb.trials.selectors import checkpoint_used
 from evaweb.trials.tables import check_milestones
 from runtime.core import bounded_documents as bounded
@@ -116,6 +119,27 @@ class MilestoneInline(admin.TabularInline):
     fields = ("order", "text", "points", "required", "time_limit_s", "truth")
 
 
+class LogsValues(admin.ModelAdmin):
+    """What a change made of a row stands in its history with what was there before, also if it is taken back later."""
+
+    def table_of(self, row: Any) -> dict[str, Any]:
+        """The row in plain values."""
+        raise NotImplementedError
+
+    def save_model(self, request: HttpRequest, obj: Any, form: Any, change: bool) -> None:
+        """Keep for the log what is there before."""
+        if change:
+            before = type(obj)._default_manager.get(pk=obj.pk)
+            request._eva_before = self.table_of(before)  # type: ignore[attr-defined]
+        super().save_model(request, obj, form, change)
+
+    def construct_change_message(self, request: HttpRequest, form: Any, formsets: Any, add: bool = False) -> Any:
+        """Each value that is another one; once all of it, lines of other tables included, is saved."""
+        before = getattr(request, "_eva_before", None)
+        changes = [] if before is None else difference(before, self.table_of(form.instance))
+        return "; ".join(changes) or super().construct_change_message(request, form, formsets, add)
+
+
 class ActiveActions:
     """Switching on and off for whole selections."""
 
@@ -137,8 +161,12 @@ def _trials(n: int) -> str:
 
 
 @admin.register(Scene)
-class SceneAdmin(ActiveActions, admin.ModelAdmin):
+class SceneAdmin(ActiveActions, LogsValues):
     """A task on a bench, with its positions and milestones."""
+
+    def table_of(self, row: Scene) -> dict[str, Any]:
+        """As the scene editor has it."""
+        return scene_table(Scene.objects.get(pk=row.pk))
 
     list_display = ("title", "name", "active", "instruction", "positions_n", "milestones_n", "trials_n")
     list_filter = ("active",)
@@ -271,8 +299,12 @@ class CheckpointForm(forms.ModelForm):
 
 
 @admin.register(Checkpoint)
-class CheckpointAdmin(ActiveActions, admin.ModelAdmin):
+class CheckpointAdmin(ActiveActions, LogsValues):
     """A trained policy."""
+
+    def table_of(self, row: Checkpoint) -> dict[str, Any]:
+        """All that its form has."""
+        return model_to_dict(row, CheckpointForm.Meta.fields)
 
     form = CheckpointForm
     save_as = True  # the same weights, served otherwise

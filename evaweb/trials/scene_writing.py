@@ -17,6 +17,7 @@ from django.core.exceptions import ValidationError as Invalid
 from django.db import models, transaction
 from pydantic import ValidationError
 
+from evaweb.canonical import difference
 from evaweb.errors import Conflict, EvaError
 from evaweb.races import once_more
 from evaweb.roles import Role, require
@@ -290,8 +291,7 @@ def _name(row: models.Model, field: str) -> str:
 
 
 def _changed(before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> str:
-    names = [name for name, value in after.items() if before and before[name] != value]
-    return f"changed in the scene editor: {', '.join(names)}"
+    return f"changed in the scene editor: {'; '.join(difference(before or {}, after))}"
 
 
 def _remarks(scene: Scene, before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> list[str]:

@@ -23,6 +23,7 @@ FEWER = {
     "measures": {"measures._VARIANTS": ["", "fifo"]},
     "moving_target": {"moving_target.SEEDS": 1, "moving_target.DELAYS": [8]},
     "pages": {"pages.LOADS": 1},
+    "partial_credit": {"partial_credit.RUNS": 5, "partial_credit.PAIRS": 10},
     "start": {"start._STARTS": 1},
     "strategies": {
         "moving_target.SEEDS": 1,

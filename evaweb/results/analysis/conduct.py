@@ -93,6 +93,7 @@ def conduct_of(plan: Plan, runs: Sequence[Run], looks: Iterable[Look]) -> dict[s
         ],
         "checkpoints": _checkpoints(plan, runs),
         "voids": _voids(plan, runs),
+        "broken_off": _broken_off(runs),
         "corrections": _corrections(plan, runs),
         "amendments": _amendments(plan),
         "edits": _edits(plan),
@@ -246,6 +247,23 @@ def _voids(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
     return [
         {**row, "code": known[row["trial_id"]].code, "checkpoint": known[row["trial_id"]].checkpoint}
         for row in rows
+    ]
+
+
+def _broken_off(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Attempts that were interrupted and have no score, or that never ran, and why."""
+    return [
+        {
+            "trial_id": run.trial,
+            "code": run.code,
+            "checkpoint": run.checkpoint,
+            "by_name": run.operator,
+            "at": run.ended_at or run.handed_at,
+            "ran": run.status == TrialStatus.INTERRUPTED,
+            "reason": run.reason,
+        }
+        for run in runs
+        if run.status in (TrialStatus.INTERRUPTED, TrialStatus.ABANDONED)
     ]
 
 

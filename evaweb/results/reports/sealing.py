@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from evaweb.plans.canonical import digest
+from evaweb.canonical import digest
 from evaweb.plans.design import declare_kept
 from evaweb.plans.models import Plan
 from evaweb.results.presentation.caveats import caveats_of

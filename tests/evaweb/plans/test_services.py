@@ -8,7 +8,7 @@ from evaweb.episodes.reconcile import reconcile
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import give_back, hand_out, progress
 from evaweb.plans.blinding_rules import look, sealed_for
-from evaweb.plans.canonical import digest
+from evaweb.canonical import digest
 from evaweb.plans.commitment import commitment, schedule_digest
 from evaweb.plans.documents import conditions_of, scene_of
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState, Slot

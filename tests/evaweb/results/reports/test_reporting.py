@@ -11,7 +11,7 @@ from django.core.management import CommandError, call_command
 from evaweb.errors import Conflict
 from evaweb.plans import pictures
 from evaweb.plans.allocation import hand_out
-from evaweb.plans.canonical import digest
+from evaweb.canonical import digest
 from evaweb.plans.models import Achieved, Plan, Reference
 from evaweb.plans.services import plan_freeze, plan_reveal
 from evaweb.results.analysis.agreement import comparisons_of

@@ -16,15 +16,15 @@ from evaweb.errors import EvaError
 from runtime.core.sentences import Pattern
 
 _ALLOWED_FINITE_NUMBERS = Pattern(
-    "plans.canonical.allowed_finite_numbers",
+    "canonical.allowed_finite_numbers",
     "{where} = {value}; allowed: finite numbers",
 )
 _HAS_KEY_ALLOWED_TEXTS = Pattern(
-    "plans.canonical.has_key_allowed_texts",
+    "canonical.has_key_allowed_texts",
     "{where} has the key {key!r}; allowed: texts",
 )
 _ALLOWED_WHAT_JSON_HAS = Pattern(
-    "plans.canonical.allowed_what_json_has",
+    "canonical.allowed_what_json_has",
     "{where} is a {name}; allowed: what JSON has",
 )
 

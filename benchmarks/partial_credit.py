@@ -1,0 +1,79 @@
+"""How soon partial credit tells two policies apart: our e-process beside NSCORE's supermartingale, on the same pairs.
+
+NSCORE (Snyder et al.) is no part of the product, and pulls in cvxpy and matplotlib: it is asked in an environment of its
+own, which is made by hand, and left out where there is none.
+
+    python -m venv build/peers/nscore && build/peers/nscore/bin/python -m pip install nscore==0.1.2
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.report import Figure, Report
+from evaweb.statistics.sequential import ALPHA, score_evidence
+
+PEER = Path(__file__).parents[1] / "build" / "peers" / "nscore" / "bin" / "python"
+SECONDS = 0.0  # cases bound it
+RUNS, PAIRS, STEPS = 200, 100, 3  # steps: milestones of a trial, each reached by the checkpoint's chance
+CHANCES = ((0.5, 0.5), (0.5, 0.6), (0.5, 0.7), (0.5, 0.8))
+# Two one-sided tests at alpha/2 each, as ours are.
+_ASKED = """
+import json, sys
+import numpy as np
+from nscore.nsm import MirroredPartialCreditNsmTest
+from statistical_comparison_core import Decision, Hypothesis
+given = json.load(sys.stdin)
+found = []
+for run in given["runs"]:
+    test = MirroredPartialCreditNsmTest(Hypothesis.P0LessThanP1, given["alpha"] / 2, np.array(given["scores"]))
+    stop = None
+    for at, (one, other) in enumerate(run, start=1):
+        if test.step(one, other).decision is not Decision.FailToDecide:
+            stop = at
+            break
+    found.append(stop)
+print(json.dumps(found))
+"""
+
+
+def measure(seconds: float) -> Report:
+    """`found.WHO.P0.P1`, the share of runs that tell both apart (of equal ones: wrongly), and `pairs.WHO.P0.P1`, the
+    median number of pairs after which they do, those that never do counted as all; WHO is ours or nscore.
+    """
+    scores = [step / STEPS for step in range(STEPS + 1)]
+    figures: list[Figure] = []
+    rows: list[dict[str, object]] = []
+    for chances in CHANCES:
+        reached = np.random.default_rng(7).binomial(STEPS, chances, size=(RUNS, PAIRS, 2))
+        runs = [[[scores[one], scores[other]] for one, other in run] for run in reached.tolist()]
+        stops = {"ours": [score_evidence([(one, other) for one, other in run]).stop for run in runs]}
+        if PEER.exists():
+            stops["nscore"] = _asked({"runs": runs, "alpha": ALPHA, "scores": scores})
+        for who, found in stops.items():
+            figures += _figures(f"{who}.{chances[0]}.{chances[1]}", found, equal=chances[0] == chances[1])
+            rows.append({"who": who, "chances": chances, "stops": found})
+    if not PEER.exists():
+        print(f"{PEER} does not exist: NSCORE is left out (see {__file__})", file=sys.stderr)
+    return Report("partial_credit", figures, rows)
+
+
+def _asked(given: dict[str, object]) -> list[int | None]:
+    done = subprocess.run(
+        [str(PEER), "-c", _ASKED], input=json.dumps(given), capture_output=True, text=True, check=True
+    )
+    return list(json.loads(done.stdout))
+
+
+def _figures(of: str, stops: Sequence[int | None], equal: bool) -> Iterator[Figure]:
+    share = sum(stop is not None for stop in stops) / len(stops)
+    ours = equal and of.startswith("ours")
+    allowed = ALPHA + 3 * (ALPHA * (1 - ALPHA) / len(stops)) ** 0.5
+    yield Figure(f"found.{of}", share, "", f"<= {allowed:.4f}" if ours else "")
+    yield Figure(f"pairs.{of}", float(np.median([stop or PAIRS for stop in stops])), "")
