@@ -276,9 +276,9 @@ def families(rows: Courses) -> Iterator[Figure]:
 
 
 def choices(rows: Courses) -> Iterator[Figure]:
-    """Of several checkpoints that are all compared, with those dropped that are found worse: how often one is called the
-    best that is not, how often the best one is, how often the choice by the highest rate among those that are left is
-    another than the best one, and the median number of trials. Of equal ones none is the best.
+    """Of several checkpoints that are all compared, all trials made or those dropped that are found worse: how often
+    one is called the best that is not, how often the best one is, how often the choice by the highest rate among those
+    that are left is another than the best one, and the median number of trials. Of equal ones none is the best.
     """
     allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
     for rates in _CHOICES:

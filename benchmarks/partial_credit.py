@@ -1,7 +1,7 @@
 """How soon partial credit tells two policies apart: our e-process beside NSCORE's supermartingale, on the same pairs.
 
-NSCORE (Snyder et al.) is no part of the product, and pulls in cvxpy and matplotlib: it is asked in an environment of its
-own, which is made by hand, and left out where there is none.
+NSCORE (Snyder et al.) is no part of the product, and pulls in cvxpy and matplotlib: it is asked in an environment of
+its own, which is made by hand, and left out where there is none.
 
     python -m venv build/peers/nscore && build/peers/nscore/bin/python -m pip install nscore==0.1.2
 """

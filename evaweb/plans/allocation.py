@@ -12,10 +12,10 @@ from django.contrib.auth.models import User
 from django.db import transaction
 from django.db.models import Case, Max, OuterRef, Subquery, When
 
+from evaweb.canonical import digest
 from evaweb.errors import Conflict, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans.blinding_rules import has_looked_at_the_same
-from evaweb.canonical import digest
 from evaweb.plans.counting import require_scored_first
 from evaweb.plans.design import dropped_of, ended_at_an_ask, ended_because, findings_of, told_reason
 from evaweb.plans.documents import checkpoint_of, require_scene, units_of

@@ -16,8 +16,8 @@ from typing import Any
 from django.db.models import Count, Max, OuterRef, Subquery
 from django.utils import timezone
 
-from evaweb.errors import EvaError
 from evaweb.canonical import digest
+from evaweb.errors import EvaError
 from evaweb.plans.models import Allocation, Comparing, Plan
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.designs import (

@@ -161,7 +161,7 @@ def _differences(frozen: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
 
 
 def checkpoint_of(checkpoint: Checkpoint) -> dict[str, Any]:
-    """A checkpoint: how it is reached; weights' digest, recipe and strategy where it has them, and if it is an anchor."""
+    """A checkpoint: how it is reached; digest, recipe and strategy where it has them, and whether it is an anchor."""
     named = {name: getattr(checkpoint, name) for name in ("digest", "recipe", "strategy", "anchor")}
     return {
         "name": checkpoint.name,

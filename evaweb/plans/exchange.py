@@ -22,8 +22,8 @@ from django.core.exceptions import ValidationError as Invalid
 from django.db import models, transaction
 from pydantic import ValidationError
 
-from evaweb.errors import Conflict, EvaError
 from evaweb.canonical import difference
+from evaweb.errors import Conflict, EvaError
 from evaweb.plans.documents import checkpoint_of, scene_of
 from evaweb.plans.file import CheckpointTable, File, PlaceTable, PlanTable, SceneTable
 from evaweb.plans.models import Comparing, Plan, PlanState, Reference

@@ -17,10 +17,10 @@ from django.utils import timezone
 from django.utils.text import slugify
 
 from evaweb.blinding import sight_of
+from evaweb.canonical import difference, digest
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans import reveals
-from evaweb.canonical import difference, digest
 from evaweb.plans.design import (
     ENDED_EVENT,
     at_the_reveal,

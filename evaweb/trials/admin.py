@@ -133,7 +133,9 @@ class LogsValues(admin.ModelAdmin):
             request._eva_before = self.table_of(before)  # type: ignore[attr-defined]
         super().save_model(request, obj, form, change)
 
-    def construct_change_message(self, request: HttpRequest, form: Any, formsets: Any, add: bool = False) -> Any:
+    def construct_change_message(
+        self, request: HttpRequest, form: Any, formsets: Any, add: bool = False
+    ) -> Any:
         """Each value that is another one; once all of it, lines of other tables included, is saved."""
         before = getattr(request, "_eva_before", None)
         changes = [] if before is None else difference(before, self.table_of(form.instance))
@@ -274,7 +276,18 @@ class CheckpointForm(forms.ModelForm):
 
     class Meta:
         model = Checkpoint
-        fields = ("name", "description", "digest", "parent", "recipe", "tags", "policy", "strategy", "anchor", "active")
+        fields = (
+            "name",
+            "description",
+            "digest",
+            "parent",
+            "recipe",
+            "tags",
+            "policy",
+            "strategy",
+            "anchor",
+            "active",
+        )
 
     tags = forms.CharField(required=False, help_text="Words, with commas between them: to find it by.")
 

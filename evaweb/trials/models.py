@@ -217,8 +217,8 @@ class Checkpoint(models.Model):
     )
     anchor = models.BooleanField(
         default=False,
-        help_text="Tried beside others in plan after plan, so that it shows when a bench or its scoring drifts: compared "
-        "with none but where a plan names it. Frozen with a plan.",
+        help_text="Tried beside others in plan after plan, so that it shows when a bench or its scoring drifts: "
+        "compared with none but where a plan names it. Frozen with a plan.",
     )
     active = models.BooleanField(default=True, help_text="Off: not offered to operators.")
     created_at = models.DateTimeField(auto_now_add=True)

@@ -102,8 +102,8 @@ def _departures(found: Mapping[str, Any]) -> Iterator[str]:
         for name, since in (("against_earlier", "earlier plans"), ("within", "its first half")):
             if row[name] is not None and row[name] <= _RARE:
                 yield (
-                    f"Anchor {row['checkpoint']} did not succeed as often as in {since} ({p_words(row[name])}): bench or "
-                    "scoring may have drifted"
+                    f"Anchor {row['checkpoint']} did not succeed as often as in {since} ({p_words(row[name])}): bench "
+                    "or scoring may have drifted"
                 )
 
 

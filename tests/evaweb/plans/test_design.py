@@ -3,11 +3,11 @@
 import pytest
 from django.db import IntegrityError, transaction
 
+from evaweb.canonical import digest
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import services
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.blinding_rules import look
-from evaweb.canonical import digest
 from evaweb.plans.design import dropped_of, findings_of, frozen, tried
 from evaweb.plans.documents import UnevenError, document_of
 from evaweb.plans.models import Plan, PlanState

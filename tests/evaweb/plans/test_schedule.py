@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaweb.errors import EvaError
 from evaweb.canonical import canonical, difference, digest
+from evaweb.errors import EvaError
 from evaweb.plans.commitment import codes, commitment, verified
 from evaweb.plans.schedule import IMBALANCE, RANDOM, Condition, counts_of, schedule
 from evaweb.plans.seeded_draws import Chance, new_key

@@ -4,11 +4,11 @@ import pytest
 from django.db import IntegrityError, transaction
 
 from evaweb.blinding import HIDDEN, sight_of
+from evaweb.canonical import digest
 from evaweb.episodes.reconcile import reconcile
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import give_back, hand_out, progress
 from evaweb.plans.blinding_rules import look, sealed_for
-from evaweb.canonical import digest
 from evaweb.plans.commitment import commitment, schedule_digest
 from evaweb.plans.documents import conditions_of, scene_of
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState, Slot

@@ -70,7 +70,9 @@ def test_a_strategy_of_before_it_was_checked_is_found_at_the_freeze(draft):
     )
 
 
-def test_a_strategy_is_frozen_and_exported_and_an_edit_needs_another_plan(bench, draft, served, anchor, owner):
+def test_a_strategy_is_frozen_and_exported_and_an_edit_needs_another_plan(
+    bench, draft, served, anchor, owner
+):
     draft.checkpoints.add(served, anchor)
     plan = plan_freeze(user=owner, plan=draft)
     told = {row["name"]: row for row in plan.document["checkpoints"]}
@@ -78,7 +80,10 @@ def test_a_strategy_is_frozen_and_exported_and_an_edit_needs_another_plan(bench,
     assert {"strategy", "anchor"} & {*told["pi0-block"]} == set()
     text = exported(checkpoints=[served, anchor])
     admin = builders.user("adam", "admin")
-    assert imported(user=admin, text=text) == ["checkpoint act-anchor: the same", "checkpoint pi0-rtc: the same"]
+    assert imported(user=admin, text=text) == [
+        "checkpoint act-anchor: the same",
+        "checkpoint pi0-rtc: the same",
+    ]
     with pytest.raises(Conflict, match="checkpoint pi0-rtc is in use"):
         imported(user=admin, text=text.replace("5.0", "6.0"))
     Checkpoint.objects.filter(pk=served.pk).update(strategy=RTC | {"inference_rate": 6.0})

@@ -119,7 +119,9 @@ def test_a_simulated_bench_lays_what_is_its_own():
     assert simulated_bench(None) is None
 
 
-@pytest.mark.parametrize("strategy", [None, {}, {"kind": "rtc", "inference_rate": 5}, {"blend_window": "all"}])
+@pytest.mark.parametrize(
+    "strategy", [None, {}, {"kind": "rtc", "inference_rate": 5}, {"blend_window": "all"}]
+)
 def test_strategies_that_a_deployment_could_have_pass(strategy):
     check_strategy(strategy)
 

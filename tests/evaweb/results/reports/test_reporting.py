@@ -8,10 +8,10 @@ import sys
 import pytest
 from django.core.management import CommandError, call_command
 
+from evaweb.canonical import digest
 from evaweb.errors import Conflict
 from evaweb.plans import pictures
 from evaweb.plans.allocation import hand_out
-from evaweb.canonical import digest
 from evaweb.plans.models import Achieved, Plan, Reference
 from evaweb.plans.services import plan_freeze, plan_reveal
 from evaweb.results.analysis.agreement import comparisons_of
