@@ -19,6 +19,7 @@ from daphne.server import Server, twisted_loop  # first: it decides which reacto
 from twisted.internet import reactor, task
 
 from evaweb.console.arrivals import Arrivals, Entrance, Request
+from evaweb.console.reading import until_read
 from evaweb.console.sockets import CountedSocket
 from evaweb.lock_wait import for_pages
 
@@ -86,6 +87,12 @@ class _Server(Server):
     def __init__(self, entrance: Any, arrivals: Arrivals, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
         self._entrance, self._arrivals = entrance, arrivals
+
+    async def handle_reply(self, protocol: Any, message: Any) -> None:
+        """Hand a part of an answer on; done once its next piece may be made."""
+        await super().handle_reply(protocol, message)
+        if message["type"] == "http.response.body" and message.get("more_body"):
+            await until_read(protocol)
 
     def listen_success(self, port: Any) -> None:
         """Daphne makes its own factory and listens with it: ours stands before it from now on."""

@@ -357,7 +357,7 @@ def trial_score(
         if held.status == TrialStatus.SCORED and _judges_alike(held.verdict, found):
             checked("reworded", held, user)
         elif held.verdict is not None:
-            _require_own(held, user)
+            require_own(held, user)
         score = Score(uuid=identity_of(uuid), trial=held, success=found.success, score=found.score, **said)
         counts_now(held, score, _outcomes(score, found), user)
     trial.refresh_from_db()
@@ -373,7 +373,7 @@ def trial_abandon(*, user: User, trial: Trial, reason: str = "") -> Trial:
         why = f"{why} ({user.get_username()})"
         if (held.status, held.reason) == (TrialStatus.ABANDONED, why):
             return held  # asked for once more, because the answer was lost
-        _require_own(held, user)
+        require_own(held, user)
         lifecycle.apply(held, Move.ABANDON)
         held.reason = why
         held.save()
@@ -464,7 +464,7 @@ def require_scorable(trial: Trial, reason: str) -> None:
         raise Conflict(_NEVER_RAN(trial=trial.pk, unrecorded=unrecorded))
 
 
-def _require_own(trial: Trial, user: User) -> None:
+def require_own(trial: Trial, user: User) -> None:
     """NotAllowed where what another has done is to be undone, by who has no business at the station now."""
     if user.pk == trial.operator_id or role_of(user) is Role.ADMIN:
         return

@@ -13,7 +13,7 @@ from django.views.decorators.http import require_GET, require_POST
 
 from evaweb.blinding import Sight, sight_for
 from evaweb.episodes.selectors import stage_of
-from evaweb.errors import EvaError
+from evaweb.errors import EvaError, NotAllowed
 from evaweb.lists import DAY, Column, Filter, Listing
 from evaweb.roles import Role, role_of
 from evaweb.stations.selectors import station_list
@@ -128,6 +128,7 @@ def _trial_page(
         "milestones": [(milestone, _ticked(found, milestone.pk, typed)) for milestone in milestones],
         "implied": any(milestone.required for milestone in milestones),
         "may_score": operator and lifecycle.allows(found, Move.SCORE),
+        "words_alone": _words_alone(found, request.user) if found.verdict_id else "",
         "may_void": operator
         and lifecycle.allows(found, Move.VOID)
         and found.status != TrialStatus.VOID_ASKED,
@@ -146,6 +147,15 @@ def _trial_page(
         "uuid": uuid4(),  # of the score that may be sent from this page, and then be sent again
     }
     return render(request, "trials/trial.html", context, status=fault.status if fault else 200)
+
+
+def _words_alone(trial: Trial, user: Any) -> str:
+    """Why this user may correct words of its score and not its verdict; "" where they may do both."""
+    try:
+        services.require_own(trial, user)
+    except NotAllowed as refused:
+        return str(refused)
+    return ""
 
 
 def laid_out(trial: Trial) -> list[Any]:

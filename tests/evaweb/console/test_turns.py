@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +10,7 @@ from daphne.ws_protocol import WebSocketProtocol
 from twisted.internet.abstract import FileDescriptor
 
 from evaweb.console.quota import AT_ONCE, Quota
+from evaweb.console.reading import AHEAD, STALLED_S, until_read
 from evaweb.console.sockets import _MOST_PARTS, PING, CountedSocket, unsent
 from evaweb.console.turns import Turns
 
@@ -100,6 +102,55 @@ class Wire(FileDescriptor):
 
     def writeSomeData(self, data):
         return min(self.takes, len(data))
+
+
+class Reader:
+    """The other end of an answer, which reads `bytes_a_look` each time that we look; time stands else."""
+
+    def __init__(self, bytes_a_look):
+        self.now, self.aborted = 0.0, False
+        self.wire = Wire()
+        self.wire.takes = bytes_a_look
+        self.wire.abortConnection = lambda: setattr(self, "aborted", True)
+        self.request = SimpleNamespace(
+            channel=SimpleNamespace(transport=SimpleNamespace(transport=self.wire))
+        )
+
+    async def sleep(self, seconds):
+        self.now += seconds
+        self.wire.doWrite()
+
+    def wait(self):
+        asyncio.run(until_read(self.request, lambda: self.now, self.sleep))
+
+
+def test_the_next_piece_of_a_download_waits_until_the_one_before_is_read():
+    reader = Reader(bytes_a_look=1000)
+    reader.wire.write(b"x" * (AHEAD + 5000))
+    reader.wait()
+    assert unsent(reader.wire) == AHEAD
+    assert not reader.aborted
+    at_once = reader.now
+    reader.wait()
+    assert reader.now == at_once
+
+
+def test_a_download_that_nobody_reads_is_cut_off_and_a_slow_one_is_not():
+    slow, deaf = Reader(bytes_a_look=1), Reader(bytes_a_look=0)
+    for reader in (slow, deaf):
+        reader.wire.write(b"x" * (AHEAD + 2000))
+        reader.wait()
+    assert (slow.aborted, deaf.aborted) == (False, True)
+    assert slow.now > STALLED_S
+    assert deaf.now == pytest.approx(STALLED_S, abs=0.2)
+
+
+def test_nobody_waits_for_a_connection_that_is_gone():
+    reader = Reader(bytes_a_look=0)
+    reader.wire.write(b"x" * (AHEAD + 1))
+    reader.request.channel = None
+    reader.wait()
+    assert (reader.now, reader.aborted) == (0.0, False)
 
 
 def test_a_page_that_does_not_read_is_cut_off_and_one_that_does_is_not(socket, settings, monkeypatch):

@@ -232,6 +232,15 @@ def test_a_viewer_sees_no_forms_and_cannot_send_them(bench):
     assert Score.objects.count() == 1
 
 
+def test_who_may_not_change_the_verdict_of_anothers_trial_is_told_before_they_type(bench, browser):
+    trial = bench.scored()
+    said = "another verdict cannot"
+    assert said not in page(browser, f"/result/trials/{trial.pk}/")
+    other = Client()
+    other.force_login(builders.user("bob"))
+    assert said in page(other, f"/result/trials/{trial.pk}/")
+
+
 def test_a_running_trial_cannot_be_scored_on_the_page(bench, browser):
     trial = bench.prepare()
     Trial.objects.update(status="running")
