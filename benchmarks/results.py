@@ -109,6 +109,8 @@ def database_figures(row: dict[str, Any]) -> Iterator[Figure]:
         yield Figure(f"handing.{what}.{name}", handing[what], "", "== 0")
     yield Figure(f"handing.locked.{name}", handing["locked"], "")
     yield Figure(f"handing.p95_ms.{name}", handing["p95_ms"], "ms")
+    for what, value in row["planner"].items():
+        yield Figure(f"planner.{what}.{name}", value, "ms" if what.endswith("ms") else "")
 
 
 def rule_figures(runs: int) -> Iterator[Figure]:

@@ -22,6 +22,7 @@ from typing import Any
 from benchmarks.results_seed import Seeded, closed_episode, multiplied, seed
 
 ROUNDS = 120
+_QUESTIONS = 40  # to the planner, at once
 _MS = 1000.0
 
 
@@ -56,6 +57,7 @@ def main() -> None:
         "pages": pages(seeded, given.rounds),
         "exports": exports(seeded),
         "handing": handing(seeded),
+        "planner": planner(seeded),
     }
     given.out.write_text(json.dumps(found), "utf-8")
 
@@ -121,6 +123,38 @@ def _addresses(seeded: Seeded) -> dict[str, Callable[[Any], str]]:
         "export": lambda plan: api(plan, "outcomes"),
         "export_statistics": lambda plan: api(plan, "results"),
     }
+
+
+def planner(seeded: Seeded) -> dict[str, float]:
+    """A page of others while one viewer asks the planner so many different questions at once: p95 [ms] of the page, and
+    how many questions were answered, and refused with when to ask again.
+    """
+    from django.test import Client
+
+    person, other = Client(), Client()
+    person.force_login(seeded.viewer)
+    other.force_login(seeded.operators[0])
+    address, answers = "/result/plans/", []
+
+    def ask(number: int) -> None:
+        answers.append(person.get("/api/v1/planner", {"rate": 0.2 + number / 100}).status_code)
+
+    _ask(other, address)
+    asking = [threading.Thread(target=ask, args=(number,)) for number in range(_QUESTIONS)]
+    for thread in asking:
+        thread.start()
+    times = []
+    while any(thread.is_alive() for thread in asking) or len(times) < _QUESTIONS:
+        began = time.perf_counter()
+        _ask(other, address)
+        times.append((time.perf_counter() - began) * _MS)
+    for thread in asking:
+        thread.join()
+    answered = sum(status == 200 for status in answers)
+    refused = sum(status == 503 for status in answers)
+    if answered + refused < _QUESTIONS:
+        raise SystemExit(f"the planner answered {sorted(set(answers))}")
+    return {"page_p95_ms": _share(times, 0.95), "answered": float(answered), "refused": float(refused)}
 
 
 def exports(seeded: Seeded) -> dict[str, float]:
