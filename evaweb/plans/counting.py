@@ -32,13 +32,14 @@ _TIMEOUT = re.compile(r"the run's [\d.e+]+ s are over")
 
 def ended_by(trial: Trial) -> str:
     """Which of `ENDS` ended its run; "" where it ended by itself, or was stopped by the operator."""
-    broken = trial.status == TrialStatus.INTERRUPTED or (
-        trial.episode is not None
-        and trial.episode.status in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED)
-    )
-    if broken:
-        return "on_estop" if _ESTOP.search(trial.reason) else "on_interruption"
-    return "on_timeout" if _TIMEOUT.search(trial.reason) else ""
+    return end_of(trial.status, trial.reason, trial.episode and trial.episode.status)
+
+
+def end_of(status: str, reason: str, recording: str | None) -> str:
+    """The same of a trial's status and reason, and of the status of its episode, None without one."""
+    if status == TrialStatus.INTERRUPTED or recording in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED):
+        return "on_estop" if _ESTOP.search(reason) else "on_interruption"
+    return "on_timeout" if _TIMEOUT.search(reason) else ""
 
 
 def require_scored_first(plan: Plan, before: Trial | None) -> None:

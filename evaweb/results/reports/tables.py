@@ -10,11 +10,12 @@ from typing import Any, get_args
 
 from django.db.models import QuerySet
 
+from evaweb.plans.counting import end_of
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.presentation.headline import headline
 from evaweb.tabular_export import in_pages
-from evaweb.trials.models import MilestoneOutcome, Score, Trial
+from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
 from evaweb.trials.record import COLUMNS as RECORDED
 from evaweb.trials.record import HINTS, TrialRecord
 
@@ -51,9 +52,10 @@ _ALL = _OF_PLAN | {
     if column.table
 }
 _ORDER = dict.fromkeys((*_FIRST, *_ALL))
-COLUMNS: dict[str, Any] = {name: _ALL[name][0] for name in _ORDER} | {"headline": str}
+COLUMNS: dict[str, Any] = {name: _ALL[name][0] for name in _ORDER} | {"headline": str, "ended_by": str}
 """The columns of an export with their types; those of the score are empty where there is none.
 
+`ended_by`: estop, interruption or timeout, empty where a run ended by itself or by the operator, or was voided.
 `headline`, the same in each row, is what the plan's design says of its comparison: a table that is taken elsewhere
 keeps it.
 """
@@ -106,8 +108,12 @@ def _headline(plan: Plan) -> str:
 
 
 def _rows(said: str, attempts: QuerySet[Trial]) -> list[dict[str, Any]]:
-    rows = attempts.values_list(*_FIELDS)
-    found = [dict(zip(_ORDER, row, strict=True)) | {"headline": said} for row in rows]
+    found = []
+    for *row, recording in attempts.values_list(*_FIELDS, "episode__status"):
+        told = dict(zip(_ORDER, row, strict=True))
+        voided = told["status"] == TrialStatus.VOIDED  # its reason is a person's
+        end = "" if voided else end_of(told["status"], told["reason"], recording).removeprefix("on_")
+        found.append(told | {"headline": said, "ended_by": end})
     reached = milestones_of([row["milestones"] for row in found if row["milestones"]])
     for row in found:
         row["milestones"] = json.dumps(reached.get(row["milestones"], []), ensure_ascii=False)

@@ -9,7 +9,10 @@ from evaweb.plans.allocation import hand_out
 from evaweb.plans.exchange import exported, imported
 from evaweb.plans.models import CountsAs, Plan
 from evaweb.plans.services import plan_amend, plan_freeze
-from evaweb.trials import services
+from evaweb.results.reports.recompute.scenes import ending_faults
+from evaweb.results.reports.tables import outcome_pages
+from evaweb.tabular_export import plain
+from evaweb.trials import services, voids
 from evaweb.trials.models import Trial
 from tests.evaweb.trials import builders
 
@@ -93,3 +96,27 @@ def test_it_is_frozen_amended_and_exported_with_the_plan(bench, declared, owner)
     imported(user=builders.user("alma", "admin"), text=text)
     again.refresh_from_db()
     assert again.on_estop == "failure"
+
+
+def test_exports_say_what_ended_each_run_and_the_reports_program_holds_it_against_the_plan(bench, declared):
+    plan = declared(on_estop=CountsAs.REPEATED, on_timeout="failure")
+    ended(bench, plan, ESTOP)
+    scored(bench, ended(bench, plan, TIME, "ended"), False)
+    scored(bench, ended(bench, plan, "stopped by the operator", "ended"), True)
+    voids.trial_void(user=bench.operator, trial=ended(bench, plan, FAULT), reason="the e-stop box fell on it")
+    (page,) = outcome_pages(plan)
+    assert [row["ended_by"] for row in page] == ["estop", "timeout", "", ""]
+    rows = [{name: plain(value) for name, value in row.items()} for row in page]
+    assert ending_faults(plan.document, rows) == []
+    rows[0]["status"] = "scored"
+    rows[1]["success"] = "true"
+    assert ending_faults(plan.document, rows) == [
+        f"trial {rows[0]['trial']} counts, its end (estop) is repeated by the plan",
+        f"trial {rows[1]['trial']} is a success, its end (timeout) is a failure by the plan",
+    ]
+    rows[0]["status"] = "interrupted"
+    counts = {"on_estop": "failure", "on_timeout": "judged"}
+    assert ending_faults({"counts_as": counts}, rows) == [
+        f"trial {rows[0]['trial']} was repeated, its end (estop) is a failure by the plan"
+    ]
+    assert ending_faults({}, [{**row, "ended_by": ""} for row in rows]) == []

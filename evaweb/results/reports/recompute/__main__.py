@@ -17,7 +17,7 @@ from .designs import error, kept_faults, planned, planned_letters, share_of
 from .judged import agreement, by_words, calibration, on_milestone, preferences, score_alpha
 from .numbers import Drawn, Trial, numbers
 from .record import changes, gaps
-from .scenes import scene_faults
+from .scenes import ending_faults, scene_faults
 from .sealed import faults
 
 _SHOWN = 40
@@ -51,7 +51,7 @@ def main() -> int:
     found = {}
     try:
         trials = [_trial(row) for row in _as_revealed(rows, scores, seal["at_reveal"])]
-        wrong += scene_faults(plan, rows, scores, ratings)
+        wrong += [*scene_faults(plan, rows, scores, ratings), *ending_faults(plan, rows)]
         people = Counter(map(_of, preferred))
         said = planned(trials, plan, seal["at_reveal"])
         found = numbers(trials, plan, said)

@@ -1,4 +1,4 @@
-"""Scores held against the scenes of the plan: their milestones, which of them are required, and their points."""
+"""Scores held against the plan: milestones of its scenes, which are required, their points, and what ends count as."""
 
 from __future__ import annotations
 
@@ -25,6 +25,23 @@ def scene_faults(
         if said["trial"] in played
         for fault in _faults(said, scenes.get(played[said["trial"]], []))
     ]
+
+
+def ending_faults(plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """Runs that did not end by themselves and count as something else than the plan says."""
+    counts = plan.get("counts_as", {})
+    last = {row["slot"]: int(row["attempt"]) for row in sorted(rows, key=lambda row: int(row["attempt"]))}
+    found = []
+    for row in rows:
+        by = row.get("ended_by", "")
+        rule = counts.get(f"on_{by}", "judged")
+        if rule == "repeated" and row["status"] == "scored":
+            found.append(f"trial {row['trial']} counts, its end ({by}) is repeated by the plan")
+        if rule == "failure" and row["status"] == "scored" and row["success"] == "true":
+            found.append(f"trial {row['trial']} is a success, its end ({by}) is a failure by the plan")
+        if rule == "failure" and row["status"] == "interrupted" and int(row["attempt"]) < last[row["slot"]]:
+            found.append(f"trial {row['trial']} was repeated, its end ({by}) is a failure by the plan")
+    return found
 
 
 def _faults(said: Mapping[str, str], milestones: Sequence[Mapping[str, Any]]) -> Iterator[str]:
