@@ -14,10 +14,15 @@ from typing import Any
 
 from django.core.exceptions import ImproperlyConfigured
 
+from evaweb.blinding_reasons import uncovered
 from evaweb.errors import NotAllowed
 from runtime.core.sentences import fixed, identity, plain, shows
 
 HIDDEN = fixed("blinding.hidden", "hidden until the reveal")
+COVERED = fixed(
+    "blinding.covered",
+    "hidden until the reveal: look whether the robot stands safely, then resume, or stop and have the trial repeated",
+)
 
 # Sentences that no checkpoint has a part in. All others may name a server, a time or a number of rows.
 _HARMLESS = re.compile(
@@ -85,11 +90,16 @@ class Sight:
             return str(trial.reason)
         return self.told(trial.reason)
 
-    def told(self, text: str) -> str:
-        """A station's sentence as a user may read it from whom something is hidden; with its id if it is all shown."""
+    def told(self, text: str, covered: str = HIDDEN) -> str:
+        """A station's sentence as a user may read it from whom something is hidden; with its id if it is all shown.
+
+        `covered` stands for what may not be read.
+        """
+        shown = text
         if text and not _HARMLESS.fullmatch(text):
-            return HIDDEN
-        return text if shows(text, identity(text)["arguments"]) else plain(text)
+            said = uncovered(text)
+            shown = covered if said is None else said
+        return shown if shows(shown, identity(shown)["arguments"]) else plain(shown)
 
     def open(self, rows: Any, checkpoint: str = "checkpoint") -> Any:
         """The rows of a query that are of no hidden checkpoint; `checkpoint` leads to it."""

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from evaweb.blinding import Sight
-from runtime.core.sentences import shows, texts
+from evaweb.blinding import COVERED, Sight
+from runtime.core.sentences import Sentence, heard, identity, shows, texts
 
 # Of a snapshot: the robot, the bench, who commands; nothing of the policy, its times and its chunks.
 _SHOWN = (
@@ -64,7 +64,7 @@ _JUDGED = ("milestones", "success")  # of the bench's truth: people score before
 def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
     """A snapshot, in the same shape: what would tell is empty, and "veiled" says that it is."""
     shown = {key: snapshot[key] for key in _SHOWN if key in snapshot}
-    shown["reason"] = sight.told(str(snapshot.get("reason") or ""))
+    shown["reason"] = _reason(snapshot.get("reason"), (snapshot.get("sentences") or {}).get("reason"), sight)
     shown |= {key: empty for key, empty in _COVERED.items() if key in snapshot}
     if isinstance(snapshot.get("truth"), Mapping):
         shown["truth"] = {key: said for key, said in snapshot["truth"].items() if key not in _JUDGED}
@@ -81,7 +81,26 @@ def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
         shown["episode"] = {key: snapshot["episode"][key] for key in ("uuid",) if key in snapshot["episode"]}
     if isinstance(snapshot.get("sentences"), Mapping):
         shown["sentences"] = _sentences(snapshot, shown)
+        if isinstance(shown["reason"], Sentence):
+            shown["sentences"]["reason"] = identity(shown["reason"])
     return shown | {"veiled": True}
+
+
+def _reason(text: object, said: object, sight: Sight) -> str:
+    """Why the station is where it is, as it may be read; `said` has its id and arguments."""
+    return sight.told(
+        _sentence({"text": str(text or ""), **(said if isinstance(said, Mapping) else {})}), COVERED
+    )
+
+
+def _sentence(said: object) -> str:
+    """A sentence as it travelled; a plain text where it has no id, or none that is one."""
+    found = said if isinstance(said, Mapping) else {"text": str(said or "")}
+    text = str(found.get("text") or "")
+    try:
+        return heard(text, found.get("id") or "", found.get("arguments") or {})
+    except ValueError:
+        return text
 
 
 def _sentences(snapshot: Mapping[str, Any], shown: Mapping[str, Any]) -> dict[str, Any]:
@@ -120,12 +139,13 @@ def answer(data: Mapping[str, Any]) -> dict[str, Any]:
 def _event(row: Mapping[str, Any], sight: Sight) -> dict[str, Any] | None:
     kind, text = row.get("kind"), str(row.get("text") or "")
     kept = {key: row[key] for key in ("number", "time", "wall") if key in row}
+    reason = _sentence((row.get("arguments") or {}).get("reason"))
     if kind == "command":  # "stop by ann: accepted", "setup by ann: refused, the reason"
-        said, _, reason = text.partition(", ")
-        text = f"{said}, {sight.told(reason)}" if reason else said
+        said, _, rest = text.partition(", ")
+        text = f"{said}, {sight.told(reason if reason == rest else rest, COVERED)}" if rest else said
     elif kind == "state":  # "running -> holding: the reason"
-        moved, _, reason = text.partition(": ")
-        text = f"{moved}: {sight.told(reason)}" if reason else moved
+        moved, _, rest = text.partition(": ")
+        text = f"{moved}: {sight.told(reason if reason == rest else rest, COVERED)}" if rest else moved
     elif kind in ("episode_opened", "episode_closed"):
         text = str(kind).replace("_", " ")
     elif kind not in _EVENTS:

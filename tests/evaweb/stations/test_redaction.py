@@ -1,10 +1,15 @@
 """What a station says to users from whom the checkpoint is hidden."""
 
+import importlib
+import pkgutil
+
 import pytest
 
-from evaweb.blinding import EVERYTHING, HIDDEN
+import runtime
+from evaweb import blinding_reasons as reasons
+from evaweb.blinding import COVERED, EVERYTHING
 from evaweb.stations import redaction
-from runtime.core.sentences import Pattern, identity, plain, within
+from runtime.core.sentences import Pattern, identity, known, plain, within
 from runtime.processes.coordinator import operations
 
 LOST = Pattern("test.redaction.lost", "{url} did not answer")(url="ws://alder:8000")
@@ -12,6 +17,21 @@ STATE = Pattern("test.redaction.state", "running -> holding: {reason}")
 COMMAND = Pattern("test.redaction.command", "run by ann: refused, {reason}")
 STOPPED = Pattern("test.redaction.stopped", "stopped by the operator")()
 CAMERA = Pattern("test.redaction.camera", "camera {camera} is back")
+
+ESTOPPED = Pattern("health.estopped", "e-stop {pressed}: make safe, then release")
+PRESSED = Pattern("health.pressed_by", "by {who}: {why}")
+LOST_CAMERA = Pattern("cameras.not_live", "camera {camera} ({source}) is {condition}: {why}")
+LINK = Pattern("health.link_lost", "no observation for {seconds:.1f} s: {who}")
+ASK = Pattern("health.ask_for_node", "is the execution node running?")()
+REFUSED = Pattern("control.refused_in_a_row", "{count} actions refused in a row, the last one: {why}")
+JUMPS = Pattern("safety.jumps", "{joint} jumps {distance:.2f} rad, allowed {allowed:g}")
+OLD = Pattern("safety.joints_old", "joints are {seconds:.2f} s old, allowed {allowed:g}")
+MISSING = Pattern(
+    "control.joints_missing",
+    "{why}: the run stands, and goes on by itself where they are back before they are {seconds:g} s old",
+)
+STARVED = Pattern("control.starved", "no usable chunk for {seconds:.1f} s")
+TUNED = Pattern("operations.tuned_to", "strategy {strategy}, task {task!r}")
 
 TRUTH = {"reset": "a", "objects": {"block": [0.1, 0.2]}, "milestones": {"lifted": True}, "success": True}
 
@@ -52,8 +72,8 @@ def test_a_refusal_while_a_process_is_starting_keeps_the_id_by_which_pages_ask_a
 def test_of_a_snapshot_those_sentences_are_left_that_are_shown_whole():
     said = {"state": "holding", "reason": LOST, "guarded": {"run": STOPPED}, "last_run": {"reason": LOST}}
     shown = redaction.state({**said, "sentences": within(said)}, EVERYTHING)
-    assert shown["reason"] == HIDDEN
-    assert list(shown["sentences"]) == ["guarded.run"]
+    assert shown["reason"] == COVERED
+    assert shown["sentences"] == {"guarded.run": identity(STOPPED), "reason": identity(COVERED)}
     assert "alder" not in str(shown)
 
 
@@ -61,3 +81,65 @@ def test_of_a_snapshot_those_sentences_are_left_that_are_shown_whole():
 def test_an_event_that_says_how_it_went_is_none(kind, told):
     row = {"number": 1, "kind": kind, "text": "the simulated bench says: success", "data": {"success": True}}
     assert bool(redaction.events([row], EVERYTHING)) is told
+
+
+def holding(reason):
+    """The reason of a blind station, as somebody reads it from whom the checkpoint is hidden, and in its event."""
+    said = {"state": "holding", "reason": reason}
+    shown = redaction.state({**said, "sentences": within(said)}, EVERYTHING)
+    text = STATE(reason=reason)
+    row = {"number": 1, "kind": "state", "text": plain(text), "data": {}, **identity(text)}
+    (event,) = redaction.events([row], EVERYTHING)
+    assert event["text"] == f"running -> holding: {shown['reason']}"
+    return shown
+
+
+@pytest.mark.parametrize(
+    ("reason", "said"),
+    [
+        (
+            ESTOPPED(pressed=PRESSED(who="ann", why="it came too near")),
+            "e-stop by ann: it came too near: make safe, then release",
+        ),
+        (
+            LOST_CAMERA(camera="cam_high", source="usb", condition="absent", why="no such device"),
+            "camera cam_high (usb) is absent: no such device",
+        ),
+        (LINK(seconds=1.5, who=ASK), "no observation for 1.5 s: is the execution node running?"),
+        (
+            REFUSED(count=10, why=JUMPS(joint="left_2", distance=0.31, allowed=0.1)),
+            "actions were refused, the last one: an action would have jumped farther than allowed (safety.jump)",
+        ),
+        (REFUSED(count=10, why="numbers of somebody else"), "safety held the robot"),
+        (
+            MISSING(why=OLD(seconds=0.31, allowed=0.2), seconds=1.0),
+            "joints were too old (safety.joint_age_s): the run stands, and goes on by itself where they are back "
+            "before they are 1 s old",
+        ),
+        (STARVED(seconds=1.2), COVERED),
+        (TUNED(strategy="rtc", task="put it there"), COVERED),
+    ],
+)
+def test_what_tells_nothing_of_the_policy_is_said_and_what_may_is_covered(reason, said):
+    shown = holding(reason)
+    assert shown["reason"] == said
+    whole = shown["sentences"].get("reason", identity(""))
+    assert whole in (identity(shown["reason"]), identity(""))
+    assert "0.31" not in str(shown)
+
+
+def test_what_is_covered_by_its_id_is_no_other_sentence_that_is_shown():
+    """Each id of the table is a sentence of a station: one that was renamed would be covered without a word."""
+    for module in pkgutil.walk_packages(runtime.__path__, "runtime."):
+        if not module.name.startswith("runtime.sim") and not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    ids = {pattern.id for pattern in known()}
+    assert reasons._NOT | reasons._ALSO | {*reasons._LIMITS, *reasons._IN_A_ROW, reasons._BY_A_PERSON} <= ids
+    kinds = {id.partition(".")[0] for id in ids}
+    assert {*reasons._OF_THE_ROBOT, *reasons._OF_THE_STATION} <= kinds
+
+
+@pytest.mark.parametrize("kind", ["policy", "rtc", "tuning", "inbox", "preflight", "rights", "queries"])
+def test_of_the_policy_nothing_is_said(kind):
+    pattern = Pattern(f"{kind}.anything_at_all", "the server at alder has answered")
+    assert reasons.uncovered(pattern()) is None
