@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -98,6 +98,7 @@ def state_page(
         "cycle_s": cycle_s,
         "hours": size.total * cycle_s / 3600,
         "preview": _preview(plan, size) if not inway else None,
+        "summary": list(_summary(plan, size, said, cycle_s)) if not inway else (),
         "freezable": not inway and not faults and agreed,
     }
 
@@ -150,6 +151,27 @@ _FIELDS = {
 
 def _step_of(field: str) -> str:
     return next((step for step, fields in _FIELDS.items() if field in fields), "design")
+
+
+def _summary(plan: Plan, size: Size, said: Callable[[str], str], cycle_s: float) -> Iterator[tuple[str, str]]:
+    """What a freeze asks about, once more in short."""
+    names = plan.checkpoints.order_by("name").values_list("name", flat=True)
+    pairs = [f"{first} with {second}" for first, second in planned(plan)]
+    scenes = plan.positions.values("scene").distinct().count()
+    yield "Checkpoints", said(", ".join(names))
+    yield "Compared", said("; ".join(pairs)) or "nothing: no comparison is chosen"
+    yield "Positions", f"{size.positions} of {scenes} scene{'s' if scenes > 1 else ''}"
+    hours = size.total * cycle_s / 3600
+    yield "Trials", f"{size.each} of each checkpoint, {size.total} in all: {hours:.1f} robot hours"
+    if pairs:
+        drops = ", checkpoints found worse are dropped" if plan.drop_arms else ""
+        yield "Design", f"{design_words(plan.stopping)}, alpha {plan.alpha:g}{drops}"
+    yield (
+        "Blind",
+        "yes: these checkpoints leave everybody's lists and choices, yours too, until the reveal"
+        if plan.blind
+        else "no: everybody sees which checkpoint runs",
+    )
 
 
 def _preview(plan: Plan, size: Size) -> dict[str, Any]:

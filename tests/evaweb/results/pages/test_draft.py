@@ -178,6 +178,8 @@ def test_it_is_frozen_as_it_was_seen_and_by_its_owner(as_, alma, draft, bench, t
     client = as_(alma)
     text = filled(client, draft, bench, two)
     seen = re.search(r'name="seen" value="([0-9a-f]{64})"', text)[1]
+    assert "12 in all: " in text
+    assert "these checkpoints leave everybody" in text
     Plan.objects.filter(pk=draft.pk).update(repetitions=4)
     freeze = reverse("result-freeze", args=[draft.name, 1])
     late = client.post(freeze, {"seen": seen})
