@@ -300,17 +300,13 @@ def choices(rows: Courses) -> Iterator[Figure]:
                 chosen.append(max(left, key=lambda arm: run[: made[arm], arm].mean(), default=None))
             wrong = sum(arm is not None and arm not in wanted for arm in called) / _RUNS
             at = f"{rule}.{'.'.join(map(str, rates))}.{SIZES[0]}"
-            yield Figure(f"best.wrong.{at}", wrong, "", f"<= {allowed:.4f}")
-            yield Figure(f"best.trials.{at}", float(np.median(trials)), "")
-            row = {"best": at, "wrong": wrong, "trials": float(np.median(trials))}
+            said_of = {"wrong": wrong, "trials": float(np.median(trials))}
             if wanted:
-                row |= {
-                    "found": sum(arm in wanted for arm in called) / _RUNS,
-                    "chosen_wrong": sum(arm not in wanted for arm in chosen) / _RUNS,
-                }
-                yield Figure(f"best.found.{at}", float(row["found"]), "")
-                yield Figure(f"best.chosen_wrong.{at}", float(row["chosen_wrong"]), "")
-            rows.append(row)
+                said_of["found"] = sum(arm in wanted for arm in called) / _RUNS
+                said_of["chosen_wrong"] = sum(arm not in wanted for arm in chosen) / _RUNS
+            for what, value in said_of.items():
+                yield Figure(f"best.{what}.{at}", value, "", f"<= {allowed:.4f}" if what == "wrong" else "")
+            rows.append({"best": at, **said_of})
 
 
 def _least(n: int, alpha: float) -> tuple[int, int] | None:

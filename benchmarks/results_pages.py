@@ -143,7 +143,7 @@ def planner(seeded: Seeded) -> dict[str, float]:
     asking = [threading.Thread(target=ask, args=(number,)) for number in range(_QUESTIONS)]
     for thread in asking:
         thread.start()
-    times = []
+    times: list[float] = []
     while any(thread.is_alive() for thread in asking) or len(times) < _QUESTIONS:
         began = time.perf_counter()
         _ask(other, address)

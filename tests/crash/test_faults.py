@@ -66,7 +66,7 @@ def test_policy_server_mute_in_the_middle_of_a_run(served):
     lab, by = served
     lost = len(lab.events("policy_lost"))
     lab.running(0.5, **by("--fault", "mute_on_infer:20"))
-    assert_holds(lab, "no usable chunk for 1.", "1 s")
+    assert_holds(lab, "no usable chunk for ", "1 s")  # one loss is borne, the next is not
     assert len(lab.events("policy_lost")) > lost
 
 

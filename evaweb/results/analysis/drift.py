@@ -104,5 +104,6 @@ def _differ(before: Sequence[_Tried], since: Sequence[_Tried]) -> float | None:
     for condition in conditions:
         sides = [[each.success for each in rows if each.condition == condition] for rows in (before, since)]
         (one, n), (other, m) = ((sum(side), len(side)) for side in sides)
-        tables.append(Table(one, n, other, m))
+        if n and m:
+            tables.append(Table(one, n, other, m))
     return exact_within(tables, least=1)
