@@ -33,6 +33,7 @@ def test_figures_of_a_database_are_named_by_page_and_database():
             "locked": 0.0,
             "p95_ms": 5.0,
         },
+        "planner": {"page_p95_ms": 20.0, "answered": 3.0, "refused": 37.0},
     }
     found = {figure.name: figure for figure in results.database_figures(row)}
     assert found["page_p95_ms.dashboard.sqlite"].holds is False

@@ -240,7 +240,7 @@ MUTANTS = (
     Mutant(
         "blinding/reason-of-the-station",
         "evaweb/stations/redaction.py",
-        'sight.told(str(snapshot.get("reason") or ""))',
+        '_reason(snapshot.get("reason"), (snapshot.get("sentences") or {}).get("reason"), sight)',
         'str(snapshot.get("reason") or "")',
         _OF_REDACTION,
     ),

@@ -152,7 +152,7 @@ def test_a_change_of_a_tried_policy_is_warned_about(admin, bench):
     bench.scored()
     form = {"policy": '{"url": "ws://127.0.0.1:9000"}', "active": "on"}
     answer = admin.post(f"/admin/trials/checkpoint/{bench.checkpoint.pk}/change/", form, follow=True)
-    assert "are of checkpoint pi0-block with another policy table" in answer.content.decode()
+    assert "are of checkpoint pi0-block with another policy or strategy table" in answer.content.decode()
     bench.checkpoint.refresh_from_db()
     assert (bench.checkpoint.name, bench.checkpoint.policy) == ("pi0-block", {"url": "ws://127.0.0.1:9000"})
 
