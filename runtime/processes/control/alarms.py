@@ -23,6 +23,7 @@ _HELD_ELSEWHERE = Pattern(
 
 _RETURNED_AWAY = 0.1  # [rad] that an arm may be off after it was not seen, by sagging
 _AGREES_S = 1.0  # that a joint reads where it is told to be, before its readings lead its command again
+_NOISE = 0.02  # [rad] beyond a servo error that is set
 _THERE = 1e-6  # [rad]
 _LATELY_S = 1.0  # ago a command that moved went away from a joint that was blocked, and not the joint from it
 
@@ -95,7 +96,7 @@ class Displacement:
                 self._followed &= self._off
             if self.distance(robot, self.goal) <= _THERE:
                 self.goal = None
-        allowed = _RETURNED_AWAY if returned or self._meeting else self._settings.safety.following_error
+        allowed = self._sagged if returned or self._meeting else self._settings.safety.following_error
         away = self.goal is None and self._away(robot, measured, allowed)
         self._meeting = self._meeting and (away or self.goal is not None)
         if away:
@@ -103,7 +104,9 @@ class Displacement:
             self.follow(robot, where)
             if self._away(robot, where, allowed):
                 limits = self._settings.limits
-                self.goal = np.clip(self.trusted(robot, where), limits.lower, limits.upper)
+                goal = np.clip(self.trusted(robot, where), limits.lower, limits.upper)
+                # What hangs by its error alone stays: it would sink by it each time that another joint is led.
+                self.goal = np.where(np.abs(where - robot.commanded) > self._sagged, goal, robot.commanded)
                 self._led = Led(
                     robot.commanded,
                     measured,
@@ -113,6 +116,12 @@ class Displacement:
                 )
                 self.begins = True
         return None if self.goal is None or self._led is None else self._led.end(self.goal)
+
+    @property
+    def _sagged(self) -> float:
+        """How far an arm may be off by its servo error alone [rad]."""
+        steady = self._settings.safety.steady_error
+        return _RETURNED_AWAY if steady <= _RETURNED_AWAY else steady + _NOISE
 
     def distance(self, robot: RobotActuator, measured: Float64) -> float:
         """Distance of the farthest joint from its command [rad]."""
@@ -125,7 +134,7 @@ class Displacement:
     def follow(self, robot: RobotActuator, measured: Float64) -> None:
         """The command is about to be led to `measured` [D]: `doubt` names the joints for which it was before."""
         where = self.trusted(robot, measured)
-        away = self._angles & (np.abs(where - robot.commanded) > _RETURNED_AWAY)
+        away = self._angles & (np.abs(where - robot.commanded) > self._sagged)
         off = away & self._followed
         self._off |= off
         self._followed |= away
@@ -144,7 +153,7 @@ class Displacement:
             return ""
         led = self._distrusted | (self._meeting or self.goal is not None)
         away = np.abs(measured - robot.commanded)
-        far = self._angles & (away > np.where(led, _RETURNED_AWAY, self._settings.safety.following_error))
+        far = self._angles & (away > np.where(led, self._sagged, self._settings.safety.following_error))
         if not far.any():
             return ""
         worst = int(np.where(far, away, 0.0).argmax())
@@ -187,7 +196,7 @@ class Displacement:
         if not robot.engaged:
             self.forget()
             self.goal = None
-        apart = True if measured is None else np.abs(measured - robot.commanded) > _RETURNED_AWAY
+        apart = True if measured is None else np.abs(measured - robot.commanded) > self._sagged
         self._apart_at[apart & self._angles] = now
         agrees = now - self._apart_at >= _AGREES_S
         for joints in (self._followed, self._plausibility.leapt):

@@ -125,9 +125,11 @@ class EStopped(Behaviour):
     _FOLLOWS_S = 0.5
     _SLACK = 0.05  # [rad] beyond the distance to rest: what a command is ahead of a robot that follows it
 
-    def __init__(self, position: Float64 | None, rest: Float64) -> None:
+    def __init__(self, position: Float64 | None, rest: Float64, captured: float = float("-inf")) -> None:
+        """`captured`: the newest sample of the joints when it was pressed [s]."""
         self.position = position
         self.rest = rest
+        self.captured = captured
         self.kept: np.ndarray | None = None  # joints that keep their command, bool [D]; None until it is seen
         self._first: Float64 | None = None  # where it was seen first since it was pressed
         self._time = 0.0

@@ -55,6 +55,7 @@ _SAME = 0.02  # [rad] within which two joints have exchanged their values
 _LONGEST_DOUBT_S = 2.0
 _KEPT = 512  # samples: as many that agree are enough, however short their time at a high rate
 _QUIET_S = 1.0  # without a contradiction, after which the next one is a first one
+_GAP_S = 0.15  # between two samples, in which an arm that moves has gone somewhere else
 _EPSILON = 1e-6  # stamps are sums of floats
 
 
@@ -167,11 +168,15 @@ class Plausibility:
     def middle(self, joints: Float64) -> Float64:
         """The middle of the newest three believed samples, number by number: a spike among them does not count.
 
-        Angles that wrap are counted in the turn of `joints` [D].
+        Angles that wrap are counted in the turn of `joints` [D]. After a gap it is `joints` until there are three: those
+        from before it say where the arm was.
         """
-        newest = [] if self._chain is None else islice(reversed(self._chain.samples), _CONSISTENT)
+        newest = [] if self._chain is None else list(islice(reversed(self._chain.samples), _CONSISTENT))
+        gaps = [after.captured - before.captured for after, before in pairwise(newest)]
+        if len(newest) < _CONSISTENT or max(gaps) > _GAP_S:
+            return joints
         lately = [joints + difference(sample.joints, joints, self._wrapping) for sample in newest]
-        return np.asarray(np.median(lately, axis=0)) if lately else joints
+        return np.asarray(np.median(lately, axis=0))
 
     def speed(self) -> Float64:
         """Median velocity [D] between the newest believed samples that have to agree: a step among them is none."""

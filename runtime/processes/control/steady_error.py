@@ -42,14 +42,15 @@ class SteadyError:
         self._settings = settings
         self._samples: deque[_Sample] = deque()
         self._inherited = inherited
-        self.last: Float64 = np.zeros(len(settings.limits.names))  # of each joint, when it last stood [rad]
+        # Of each joint, when it last stood [rad]; NaN before it was seen to stand.
+        self.last: Float64 = np.full(len(settings.limits.names), np.nan)
         self._presses = np.zeros(len(self.last), bool)  # joints that did not follow their command, bool [D]
 
     def look(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
         """Take note of a tick; `measured` [D], None where the joints are not known."""
         if not robot.engaged:
             self._samples.clear()
-            self.last[:], self._presses[:] = 0.0, False
+            self.last[:], self._presses[:] = np.nan, False
             self._inherited = False
         elif measured is not None and not (self._samples and now - self._samples[-1].time < _EVERY_S):
             self._note(robot, measured, now)
@@ -70,8 +71,19 @@ class SteadyError:
         else:
             self._note(robot, measured, now)
             standing, error = self._standing(now)
+            # One that was not seen to stand yet, just after it was taken over, and whose command rests.
+            lately = [sample.commanded for sample in self._samples if now - sample.time <= _REST_S]
+            new = np.isnan(self.last) & (np.ptp(lately, axis=0) <= _STILL) & ~self._presses
+            now_off = self._error(robot, measured)
+            new &= self._settings.limits.places & (np.abs(now_off) <= self._settings.safety.steady_error)
+            error, standing = np.where(standing, error, now_off), standing | new
         self.last = np.where(standing, error, self.last)
         return standing
+
+    @property
+    def known(self) -> Float64:
+        """The error of each joint when it last stood [D]; 0 for one that was not seen to stand."""
+        return np.nan_to_num(self.last)
 
     def _note(self, robot: RobotActuator, measured: Float64, now: float) -> None:
         if self._samples and now - self._samples[-1].time > _UNSEEN_S:

@@ -66,6 +66,7 @@ _MOVED_AWAY = Pattern(
 )
 
 __all__ = ["Tick", "TickSettings"]
+_NOW_S = 0.05  # age of joints that say where the arm is now
 _QUIET_S = 1.0  # without an implausible measurement: the next one is told again
 
 
@@ -341,7 +342,8 @@ class Tick:
         if latched and stopped is None:
             # Before it was ever engaged nothing is known to send, until the robot has been measured.
             commanded = self._settings.limits.standing(self._actuator.commanded.copy())
-            stopped = EStopped(commanded if self._actuator.engaged else None, self._actuator.rest)
+            position = commanded if self._actuator.engaged else None
+            stopped = EStopped(position, self._actuator.rest, self._seen.joints_captured)
             self._actuator.rest_here()
             self._displacement.leave_off()
             # Or a gripper that is on its way to its lock would go on after the release.
@@ -353,8 +355,15 @@ class Tick:
             self._report.say("released", _RELEASED)
             return
         measured = None if stopped is None else self._measured(now)
-        if stopped is not None and measured is not None:
+        if stopped is not None and measured is not None and self._shows_it_now(stopped, now):
             self._stop_at(measured, stopped, now)
+
+    def _shows_it_now(self, stopped: EStopped, now: float) -> bool:
+        """False while the joints are those of before a gap in which the e-stop was pressed: the arm has gone on since,
+        and would be driven back to there.
+        """
+        seen = self._seen.joints_captured
+        return stopped.seen or not self._actuator.engaged or seen > stopped.captured or now - seen <= _NOW_S
 
     def _stop_at(self, measured: Float64, stopped: EStopped, now: float) -> None:
         """Send where the robot is: at once as far as it takes to come to rest, farther as fast as it moves."""
@@ -369,7 +378,7 @@ class Tick:
             measured = self._plausibility.middle(measured)
             if stopped.kept is None:
                 stopped.kept = self._steady.keeps(actuator, measured, now)
-            measured = np.where(stopped.kept, actuator.commanded, measured + self._steady.last)
+            measured = np.where(stopped.kept, actuator.commanded, measured + self._steady.known)
             if not stopped.seen:
                 self._displacement.follow(actuator, measured)
             measured = self._displacement.trusted(actuator, measured)
