@@ -43,6 +43,10 @@ class Mailbox:
         self._changed: set[str] = set()
         self._events_of = ""  # the boot that the page has events of
         self._events_after: int | None = None  # None: it has not asked for any
+        self._covered_up_to = (
+            0,
+            0,
+        )  # the last event that it was shown, or not, and the number of the last one shown
 
     @property
     def watched(self) -> frozenset[str]:
@@ -66,7 +70,7 @@ class Mailbox:
 
     def want_events(self, after: int, boot: str) -> None:
         """The page has the events of `boot` up to `after`, and wants what follows."""
-        self._events_after, self._events_of = after, boot
+        self._events_after, self._events_of, self._covered_up_to = after, boot, (0, 0)
 
     def credit(self) -> None:
         """The page has drawn a frame."""
@@ -93,17 +97,23 @@ class Mailbox:
         if self._events_after is None or not history.boot:
             return
         self._events_of = self._events_of or history.boot
-        if self._events_of != history.boot or self._events_after > history.newest:
-            self._events_of, self._events_after = history.boot, 0
+        beyond = not self.covers and self._events_after > history.newest  # as numbers of covered ones are
+        if self._events_of != history.boot or beyond:
+            self._events_of, self._events_after, self._covered_up_to = history.boot, 0, (0, 0)
         rows: Sequence[Any] = history.after(self._events_after)
+        covered: Sequence[Any] = ()
         if self.covers:
-            rows = veil.events(rows, self.sight)
+            heard, last = self._covered_up_to
+            covered = veil.events(history.after(heard), self.sight, last)
+            rows = [row for row in covered if row["number"] > self._events_after]
         for start in range(0, len(rows), EVENTS_AT_ONCE):
             some = rows[start : start + EVENTS_AT_ONCE]
             covered = {"covered": True} if self.covers else {}
             if not self._say({"type": "events", "boot": history.boot, "events": some, **covered}):
                 return
             self._events_after = some[-1]["number"]
+        last = covered[-1]["number"] if covered else self._covered_up_to[1]
+        self._covered_up_to = (history.newest, last) if self.covers else (0, 0)
 
     def _say(self, message: dict[str, object]) -> bool:
         """Send a text, unless the page has not been heard for many of them."""

@@ -6,6 +6,7 @@ import re
 from typing import Any
 
 from evaweb.episodes.models import EpisodeStatus
+from evaweb.episodes.selectors import unrecorded_because
 from evaweb.errors import Conflict
 from evaweb.plans.models import CountsAs, Handout, Plan
 from evaweb.trials.models import Trial, TrialStatus
@@ -46,19 +47,30 @@ def require_scored_first(plan: Plan, before: Trial | None) -> None:
     """Conflict where the attempt before is a failure by the plan, and nobody has said so yet."""
     if before is None or before.status != TrialStatus.INTERRUPTED:
         return
-    end = ended_by(before)
-    if getattr(plan, end) == CountsAs.FAILURE:
-        raise Conflict(_SCORE_IT_FIRST(trial=before.pk, what=ENDS[end], plan=plan))
+    if fails_by(plan, before):
+        raise Conflict(_SCORE_IT_FIRST(trial=before.pk, what=ENDS[ended_by(before)], plan=plan))
+
+
+def fails_by(plan: Plan, trial: Trial) -> bool:
+    """Whether it is a failure by the plan, whatever is said of it: not where nothing of its run was recorded, which
+    nobody could score.
+    """
+    counts = getattr(plan, ended_by(trial) or "on_nothing", CountsAs.JUDGED)
+    return counts == CountsAs.FAILURE and not unrecorded_because(episode=trial.episode)
 
 
 def _judged(what: str, trial: Trial, user: Any) -> None:
-    if what not in ("judged success", "judged failure"):
+    if what not in ("voided", "judged success", "judged failure"):
         return
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     end = ended_by(trial)
     if handout is None or not end:
         return
     counts = getattr(handout.plan, end)
+    if what == "voided":  # before it has a score one operator alone voids: it would be tried again instead
+        if trial.verdict_id is None and fails_by(handout.plan, trial):
+            raise Conflict(_SCORE_IT_FIRST(trial=trial.pk, what=ENDS[end], plan=handout.plan))
+        return
     if counts == CountsAs.REPEATED:
         raise Conflict(_REPEATED(trial=trial.pk, what=ENDS[end], plan=handout.plan))
     if counts == CountsAs.FAILURE and what == "judged success":

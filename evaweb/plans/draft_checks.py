@@ -9,8 +9,9 @@ from django.core.exceptions import ValidationError
 
 from evaweb.blinding import Sight
 from evaweb.errors import EvaError
+from evaweb.plans.counting import ENDS
 from evaweb.plans.design import check_drafted, planned
-from evaweb.plans.models import Allocation, Comparing, Plan, PrimaryOutcome, StoppingRule
+from evaweb.plans.models import Allocation, Comparing, CountsAs, Plan, PrimaryOutcome, StoppingRule
 from evaweb.plans.schedule import Condition, check_schedule
 from evaweb.trials.models import Scene
 from evaweb.trials.tables import check_strategy
@@ -97,6 +98,13 @@ def _comparisons(plan: Plan, chosen: set[int]) -> Iterator[Remark]:
     for row in named:
         if row.pk not in chosen:
             yield Remark("arms", f"the comparison is about {row}, which is not one of the plan's checkpoints")
+    failing = [words for name, words in ENDS.items() if getattr(plan, name) == CountsAs.FAILURE]
+    if plan.outcome == PrimaryOutcome.SCORE and failing:
+        yield Remark(
+            "design",
+            f"the comparison is about scores, and {', '.join(failing)} counts as a failure, which keeps its partial "
+            "credit; allowed: judged or repeated, or the comparison about success",
+        )
     if plan.comparing == Comparing.ALL and plan.margin is not None:
         yield Remark(
             "arms",

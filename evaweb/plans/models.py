@@ -228,6 +228,7 @@ class Plan(models.Model):
                 "title",
                 "question",
                 "repetitions",
+                "strategy",
                 "blind",
                 "allocation",
                 "stopping",

@@ -33,7 +33,6 @@ _SHOWN = (
     "estop",
     "run",
     "link",
-    "newest_event",
     "facts",
 )
 _COVERED: Mapping[str, Any] = {
@@ -50,6 +49,7 @@ _COVERED: Mapping[str, Any] = {
     "strategy": "",
     "tuning": {},
     "last_run": {},
+    "newest_event": 0,  # how many there were tells a checkpoint: so do gaps in their numbers
 }
 _CONTROL = ("rate", "engaged", "scheduling", "records_lost")
 _CONTROL_COVERED = {"step": 0, "behaviour": "", "remaining": 0, "ticks": 0, "missed": 0}
@@ -121,9 +121,17 @@ def _identity(row: Mapping[str, Any], text: str) -> dict[str, Any]:
     return {"id": row["id"], "arguments": arguments}
 
 
-def events(rows: Iterable[Mapping[str, Any]], sight: Sight) -> list[dict[str, Any]]:
-    """Events that name no policy; the others are left out, and with them when they were."""
-    return [shown for row in rows if (shown := _event(row, sight)) is not None]
+def events(rows: Iterable[Mapping[str, Any]], sight: Sight, last: int = 0) -> list[dict[str, Any]]:
+    """Events that name no policy; the others are left out, and with them when they were, and how many.
+
+    Numbers are made of their times [us], rising from the one before them, `last`: gaps would count what is left out.
+    """
+    found = []
+    for row in rows:
+        if (shown := _event(row, sight)) is not None:
+            last = max(int(1e6 * float(row.get("time") or 0.0)), last + 1)
+            found.append({**shown, "number": last})
+    return found
 
 
 def joints(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -138,7 +146,7 @@ def answer(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def _event(row: Mapping[str, Any], sight: Sight) -> dict[str, Any] | None:
     kind, text = row.get("kind"), str(row.get("text") or "")
-    kept = {key: row[key] for key in ("number", "time", "wall") if key in row}
+    kept = {key: row[key] for key in ("time", "wall") if key in row}
     reason = _sentence((row.get("arguments") or {}).get("reason"))
     if kind == "command":  # "stop by ann: accepted", "setup by ann: refused, the reason"
         said, _, rest = text.partition(", ")

@@ -18,6 +18,9 @@ from evaweb.statistics.difference import Difference
 
 Pair = tuple[float, float]  # real and simulated outcome of the same checkpoint under the same condition
 _FEWEST = 8  # pairs of an arm, for an interval that stands on the normal approximation
+_FEWEST_OF_EACH = (
+    5  # and of real successes, and of failures: of rates near 0 and 1 it would be far too narrow
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +61,13 @@ def rank_violation(simulated: Sequence[float], real: Sequence[float]) -> float:
 
 def powered_difference(first: Powered, second: Powered, level: float = LEVEL) -> Difference | None:
     """The first arm's real rate less the second's, with what simulation says of both; None of fewer than eight pairs
-    of either.
+    of either, or of fewer than five real successes or failures.
     """
     check_level(level)
-    if min(len(first.paired), len(second.paired)) < _FEWEST:
-        return None
+    for arm in (first, second):
+        won = math.fsum(real for real, _ in arm.paired)
+        if len(arm.paired) < _FEWEST or min(won, len(arm.paired) - won) < _FEWEST_OF_EACH:
+            return None
     (one, spread), (other, spread_of_other) = _powered(first), _powered(second)
     half = NormalDist().inv_cdf(0.5 + level / 2) * math.sqrt(spread + spread_of_other)
     value = one - other

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Any
+from urllib.parse import urlsplit
 
 from django import forms
 from django.contrib import admin, messages
@@ -142,6 +143,20 @@ class LogsValues(admin.ModelAdmin):
         return "; ".join(changes) or super().construct_change_message(request, form, formsets, add)
 
 
+def _readable(policy: Any) -> Any:
+    """A policy's table without what an address or a tunnel may have of a secret."""
+    if not isinstance(policy, dict):
+        return policy
+    url, tunnel = str(policy.get("url") or ""), policy.get("tunnel")
+    shown = {**policy}
+    if url:
+        parts = urlsplit(url)
+        shown["url"] = f"{parts.scheme}://{parts.hostname}:{parts.port}{parts.path}"
+    if isinstance(tunnel, dict):
+        shown["tunnel"] = {key: tunnel[key] for key in ("host", "port") if key in tunnel}
+    return shown
+
+
 class ActiveActions:
     """Switching on and off for whole selections."""
 
@@ -150,12 +165,19 @@ class ActiveActions:
     @admin.action(description="Switch on: offer to operators")
     def switch_on(self, request: HttpRequest, rows: QuerySet[Any]) -> None:
         """Operators can choose them."""
-        messages.success(request, f"{rows.update(active=True)} switched on")
+        self._switch(request, rows, active=True)
 
     @admin.action(description="Switch off: offer no longer")
     def switch_off(self, request: HttpRequest, rows: QuerySet[Any]) -> None:
         """Operators cannot choose them; what was tried stays."""
-        messages.success(request, f"{rows.update(active=False)} switched off")
+        self._switch(request, rows, active=False)
+
+    def _switch(self, request: HttpRequest, rows: QuerySet[Any], active: bool) -> None:
+        changed = list(rows.filter(active=not active))
+        rows.update(active=active)
+        for row in changed:
+            self.log_change(request, row, f"active: {str(not active).lower()} -> {str(active).lower()}")  # type: ignore[attr-defined]
+        messages.success(request, f"{len(changed)} switched {'on' if active else 'off'}")
 
 
 def _trials(n: int) -> str:
@@ -316,8 +338,9 @@ class CheckpointAdmin(ActiveActions, LogsValues):
     """A trained policy."""
 
     def table_of(self, row: Checkpoint) -> dict[str, Any]:
-        """All that its form has."""
-        return model_to_dict(row, CheckpointForm.Meta.fields)
+        """All that its form has; of an address what may be read by everybody who reads results."""
+        table = model_to_dict(row, CheckpointForm.Meta.fields)
+        return {**table, "policy": _readable(table["policy"])}
 
     form = CheckpointForm
     save_as = True  # the same weights, served otherwise

@@ -120,7 +120,8 @@ def checkpoint_command(
 
 
 def _policy_args(checkpoint: Checkpoint) -> dict[str, Any]:
-    return {"policy": checkpoint.policy, "checkpoint": {"id": checkpoint.pk, "name": checkpoint.name}}
+    args = {"policy": checkpoint.policy, "checkpoint": {"id": checkpoint.pk, "name": checkpoint.name}}
+    return args if checkpoint.strategy is None else {**args, "strategy": checkpoint.strategy}
 
 
 Least = Callable[[Trial], Mapping[str, float] | None]

@@ -6,6 +6,7 @@ score, a correction or a void changes it, and so does the name of a checkpoint o
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any
@@ -96,14 +97,21 @@ def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> 
             limits=limits_of(plan),
             checkpoints=[row["name"] for row in (plan.document or {}).get("checkpoints", ())],
             whole=which == Chosen(),
-            recipes={
-                row["name"]: row["recipe"]
-                for row in (plan.document or {}).get("checkpoints", ())
-                if row.get("recipe")
-            },
+            recipes=recipes_of(plan),
         )
 
     return _analyses.get((plan.pk, plan.digest, which), now, make)
+
+
+def recipes_of(plan: Plan) -> dict[str, str]:
+    """Of each training run of a recipe which one; the same weights served in several ways are no runs of it."""
+    rows = (plan.document or {}).get("checkpoints", ())
+    weights = Counter(row["digest"] for row in rows if row.get("digest"))
+    return {
+        row["name"]: row["recipe"]
+        for row in rows
+        if row.get("recipe") and not row.get("strategy") and weights[row.get("digest")] <= 1
+    }
 
 
 def verdicts_of(plan: Plan) -> dict[tuple[str, str], Verdict]:

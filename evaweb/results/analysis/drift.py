@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 from django.db.models import Q
 
-from evaweb.plans.models import Handout, Plan, PlanState
+from evaweb.plans.models import Plan, PlanState
+from evaweb.results.analysis.load_outcomes import outcomes_of_plan
 from evaweb.statistics.strata import Table, exact_within
-from evaweb.trials.models import TrialStatus
 
 
 class _Tried(NamedTuple):
@@ -24,15 +24,17 @@ def anchors_of(plan: Plan) -> list[dict[str, Any]]:
     differs from those before it, and its own second half from its first, by chance alone as much as they do.
 
     Each is within station, scene and position; None where nothing is to be compared. Earlier plans are those frozen
-    before it that are sealed for nobody, as far as they had the anchor and a scene as this one has them.
+    before it that were revealed or never blind, as far as they had the anchor and a scene as this one has them.
     """
     found = []
     for row in (plan.document or {}).get("checkpoints", ()):
         if row.get("anchor"):
-            own = _tried(row["name"], [plan])
-            before = _tried(row["name"], _earlier(plan, row))
-            alike = {other.pk: _same_scenes(plan, other) for other in {each.plan for each in before}}
-            before = [each for each in before if each.condition[1] in alike[each.plan.pk]]
+            own = _tried(row["name"], plan, {scene["name"] for scene in plan.document["scenes"]})
+            before = [
+                each
+                for other in _earlier(plan, row)
+                for each in _tried(row["name"], other, _same_scenes(plan, other))
+            ]
             half = len(own) // 2
             found.append(
                 {
@@ -46,17 +48,22 @@ def anchors_of(plan: Plan) -> list[dict[str, Any]]:
 
 
 def _earlier(plan: Plan, row: dict[str, Any]) -> list[Plan]:
+    """Those that had it, reached and asked in the same way, and are not blind any more."""
     told = Q(state=PlanState.REVEALED) | Q(blind=False, state=PlanState.CLOSED)
     rows = Plan.objects.filter(told, frozen_at__lt=plan.frozen_at).exclude(pk=plan.pk)
+    served = _served(plan, row)
     return [
         other
-        for other in rows
-        if any(_undescribed(row) == _undescribed(there) for there in (other.document or {})["checkpoints"])
+        for other in rows.order_by("frozen_at", "pk")
+        if any(_served(other, there) == served for there in (other.document or {})["checkpoints"])
     ]
 
 
-def _undescribed(row: dict[str, Any]) -> dict[str, Any]:
-    return {**row, "description": ""}
+def _served(plan: Plan, row: dict[str, Any]) -> dict[str, Any]:
+    """What its outcomes depend on: what it is called beside does not."""
+    kept = {name: row.get(name) for name in ("name", "policy", "digest", "strategy")}
+    document = plan.document or {}
+    return {**kept, "of_plan": document.get("strategy"), "counts_as": document.get("counts_as")}
 
 
 def _same_scenes(one: Plan, other: Plan) -> set[str]:
@@ -68,18 +75,12 @@ def _same_scenes(one: Plan, other: Plan) -> set[str]:
     return {name for name, scene in ours.items() if theirs.get(name) == scene}
 
 
-def _tried(name: str, plans: Sequence[Plan]) -> list[_Tried]:
-    """Trials that count, in the order in which they were handed out."""
-    if not plans:
-        return []
-    rows = Handout.objects.filter(
-        plan__in=plans, slot__checkpoint__name=name, trial__status=TrialStatus.SCORED
-    ).order_by("handed_at", "pk")
-    by_key = {plan.pk: plan for plan in plans}
-    told = ("trial__station__name", "slot__scene__name", "slot__position__number", "trial__verdict__success")
+def _tried(name: str, plan: Plan, scenes: set[str]) -> list[_Tried]:
+    """Trials of it that count, in the order in which they were handed out; as they were judged at a reveal."""
     return [
-        _Tried(by_key[plan], (station, scene, position), success)
-        for plan, station, scene, position, success in rows.values_list("plan_id", *told)
+        _Tried(plan, (each.station, each.scene, each.position), each.success)
+        for each in outcomes_of_plan(plan)
+        if each.checkpoint == name and each.scene in scenes
     ]
 
 

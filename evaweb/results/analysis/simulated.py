@@ -68,13 +68,20 @@ def _rate(outcomes: Sequence[Outcome]) -> Proportion:
 
 
 def _matched(real: Sequence[Outcome], simulated: Sequence[Outcome]) -> Powered:
-    left = _by_condition(simulated)
-    paired = []
-    for condition, rows in _by_condition(real).items():
-        there = left.get(condition, [])
-        paired += list(zip(rows, there, strict=False))
-        left[condition] = there[len(rows) :]
-    return Powered(paired, [value for rows in left.values() for value in rows])
+    ours, theirs = _by_condition(real), _by_condition(simulated)
+    paired = [
+        pair
+        for condition, rows in ours.items()
+        for pair in zip(rows, theirs.get(condition, []), strict=False)
+    ]
+    # Those beside them are of the same conditions in the same proportions: else an easy one would count for more.
+    times = min((len(theirs.get(condition, [])) // len(rows) for condition, rows in ours.items()), default=0)
+    beside = [
+        value
+        for condition, rows in ours.items()
+        for value in theirs.get(condition, [])[len(rows) : times * len(rows)]
+    ]
+    return Powered(paired, beside)
 
 
 def _by_condition(outcomes: Iterable[Outcome]) -> dict[str, list[float]]:

@@ -267,8 +267,9 @@ def _estimates(plan: Plan, found: Design, blocks: Sequence[Block]) -> Iterator[s
         if one.winner == "second":
             first, second, said = second, first, said.reversed
         yield (
-            f"{first} is ahead of {second} by {points(said)}, corrected for stopping early (median unbiased); the raw "
-            "difference is on average too large"
+            f"{first} is ahead of {second} by {points(said)}, corrected for stopping early (median unbiased over all "
+            "ways in which the design can end; where it ends early this is still mostly too large, the raw difference "
+            "more so)"
         )
 
 

@@ -80,8 +80,8 @@ def _ways(
 
     def without(what: str, part: Callable[[Attempt], bool]) -> dict[str, Any]:
         left = [at for at in range(len(base)) if not any(map(part, counting[at]))]
-        if not left:
-            return said(what, [])
+        if not left or len(left) == len(base):  # then it is what was decided, by Holm over all of them
+            return said(what, [base[at] for at in left])
         told: list[str] = []
         ways: list[Conclusion] = []
         for number, pair in enumerate(found.comparisons):

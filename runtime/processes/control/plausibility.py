@@ -168,8 +168,8 @@ class Plausibility:
     def middle(self, joints: Float64) -> Float64:
         """The middle of the newest three believed samples, number by number: a spike among them does not count.
 
-        Angles that wrap are counted in the turn of `joints` [D]. After a gap it is `joints` until there are three: those
-        from before it say where the arm was.
+        Angles that wrap are counted in the turn of `joints` [D]. After a gap it is `joints` until there are three:
+        those from before it say where the arm was.
         """
         newest = [] if self._chain is None else list(islice(reversed(self._chain.samples), _CONSISTENT))
         gaps = [after.captured - before.captured for after, before in pairwise(newest)]

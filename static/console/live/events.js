@@ -14,6 +14,7 @@ export class Events {
   #count = document.getElementById("events-count");
   #boot = "";
   #newest = 0;
+  #covered = false; // some are kept from who looks
   #rows = new WeakMap(); // row -> its event
 
   constructor() {
@@ -34,6 +35,12 @@ export class Events {
 
   /** `covered`: some are kept from who looks, so that numbers are missing. */
   add({ boot, events, covered = false }) {
+    if (covered !== this.#covered) {
+      // Other numbers: all of them come once more.
+      this.#covered = covered;
+      this.#newest = 0;
+      this.#list.replaceChildren();
+    }
     if (boot && boot !== this.#boot) {
       if (this.#boot && this.#newest) this.#divide("The station was started anew");
       this.#boot = boot;
@@ -59,7 +66,7 @@ export class Events {
     row.dataset.words = `${kind} ${kindWords(kind)} ${event.text} ${text}`.toLowerCase();
     const time = document.createElement("time");
     time.textContent = clock(wall);
-    time.title = `event ${number}`;
+    if (!this.#covered) time.title = `event ${number}`;
     const name = document.createElement("span");
     name.className = "event-kind clip";
     name.textContent = kindWords(kind);

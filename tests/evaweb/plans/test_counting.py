@@ -6,6 +6,7 @@ import pytest
 
 from evaweb.errors import Conflict
 from evaweb.plans.allocation import hand_out
+from evaweb.plans.draft_checks import problems
 from evaweb.plans.exchange import exported, imported
 from evaweb.plans.models import CountsAs, Plan
 from evaweb.plans.services import plan_amend, plan_freeze
@@ -120,3 +121,28 @@ def test_exports_say_what_ended_each_run_and_the_reports_program_holds_it_agains
         f"trial {rows[0]['trial']} was repeated, its end (estop) is a failure by the plan"
     ]
     assert ending_faults({}, [{**row, "ended_by": ""} for row in rows]) == []
+
+
+def test_what_is_a_failure_by_the_plan_is_not_voided_away_before_its_score(bench, declared):
+    plan = declared(on_estop=CountsAs.FAILURE)
+    trial = ended(bench, plan, ESTOP)
+    with pytest.raises(Conflict, match="that is a failure; score it before the next one"):
+        voids.trial_void(user=bench.operator, trial=trial, reason="the plate had slipped")
+    scored(bench, trial, False)
+    asked = voids.trial_void(
+        user=bench.operator, trial=Trial.objects.get(pk=trial.pk), reason="it had slipped"
+    )
+    assert asked.status == "void asked"
+
+
+def test_what_left_no_row_is_repeated_whatever_the_plan_says(bench, declared):
+    plan = declared(on_interruption=CountsAs.FAILURE)
+    trial = ended(bench, plan, FAULT)
+    Trial.objects.filter(pk=trial.pk).update(episode=None)
+    assert hand_out(user=bench.operator, station=bench.station, plan=plan).trial.attempt == 2
+
+
+def test_a_failure_by_the_plan_keeps_no_partial_credit(draft):
+    draft.outcome, draft.on_estop = "score", CountsAs.FAILURE
+    (found,) = problems(draft)
+    assert "the e-stop counts as a failure, which keeps its partial credit" in found.text

@@ -143,3 +143,16 @@ def test_what_is_covered_by_its_id_is_no_other_sentence_that_is_shown():
 def test_of_the_policy_nothing_is_said(kind):
     pattern = Pattern(f"{kind}.anything_at_all", "the server at alder has answered")
     assert reasons.uncovered(pattern()) is None
+
+
+def test_neither_numbers_nor_gaps_in_them_count_the_events_that_are_left_out():
+    def told(hidden):
+        rows = [{"kind": "state", "text": "idle -> ready", "time": 2.5, "data": {}}]
+        rows += [{"kind": "limited", "text": "x", "time": 2.5 + 0.1 * at, "data": {}} for at in range(hidden)]
+        rows += [{"kind": "estopped", "text": "e-stop", "time": 9.0, "data": {}}] * 2
+        return redaction.events([{**row, "number": at} for at, row in enumerate(rows, 1)], EVERYTHING)
+
+    assert told(0) == told(5)
+    assert [row["number"] for row in told(3)] == [2_500_000, 9_000_000, 9_000_001]
+    states = [redaction.state({"state": "ready", "newest_event": newest}, EVERYTHING) for newest in (3, 8)]
+    assert states[0] == states[1]

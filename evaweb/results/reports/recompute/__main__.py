@@ -80,6 +80,9 @@ def main() -> int:
         print(f"and {len(wrong) - _SHOWN} others")
     kept = "with its key, schedule and codes" if seal["key"] else "by its digest"
     print(f"frozen under the commitment {seal['commitment']}: hold it against what was published then")
+    if seal["at_reveal"]:
+        digest = seal["at_reveal"]["digest"]
+        print(f"kept at the reveal under the digest {digest}: hold it against what was published then")
     print(f"{seen} numbers from {len(rows)} trials, and the plan {kept}: {len(wrong)} do not come out")
     return 1 if wrong else 0
 

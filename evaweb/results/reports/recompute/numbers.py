@@ -134,8 +134,11 @@ def numbers(trials: Trials, plan: Mapping[str, Any], said: Sequence[Mapping[str,
 def _recipes(arms: Mapping[str, Trials], plan: Mapping[str, Any]) -> dict[str, Any]:
     """Of each recipe of which several runs were tried the mean of their rates; of three or more with its interval."""
     runs: dict[str, dict[str, float]] = defaultdict(dict)
-    for row in plan.get("checkpoints", ()):
-        if row.get("recipe") and row["name"] in arms:
+    rows = plan.get("checkpoints", ())
+    weights = [row["digest"] for row in rows if row.get("digest")]
+    for row in rows:
+        served = row.get("strategy") or weights.count(row.get("digest")) > 1  # the same weights once more
+        if row.get("recipe") and row["name"] in arms and not served:
             runs[row["recipe"]][row["name"]] = _rate(arms[row["name"]])
     found = {}
     for recipe, rates in runs.items():

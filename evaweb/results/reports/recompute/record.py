@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
@@ -19,6 +20,9 @@ SCORE = (
     *("reason", "scored_at"),
 )
 Rows = Sequence[Mapping[str, str]]
+_HIDDEN = re.compile(
+    r"<!--.*?-->|<(script|style|template)\b.*?</\1>", re.DOTALL
+)  # of a page, from who reads it
 
 
 def gaps(rows: Rows, scores: Rows, record: Mapping[str, Any]) -> list[str]:
@@ -72,7 +76,7 @@ def changes(
     ]
     if digest({"attempts": attempts, "scores": said}) != kept["record"]:
         found.append("attempts, scores, reasons or times are not those of which the reveal kept the digest")
-    text = html.unescape(page)
+    text = html.unescape(_HIDDEN.sub("", page))
     found += [f"index.html does not say: {one}" for one in _unsaid(kept, text)]
     return found
 

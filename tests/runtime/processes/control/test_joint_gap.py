@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from runtime.ipc.shared_state import EStop
+from tests.runtime.compliant import standing
 from tests.runtime.tick_bench import PERIOD, Bench, following, wave
 
 STARTED = 10  # ticks of the run before the joints are gone
@@ -204,3 +205,31 @@ def test_a_motion_of_ours_is_held_as_before():
     bench.run(20)
     assert bench.behaviour == "hold"
     assert bench.said("refusals")[0].text.startswith("10 actions refused in a row")
+
+
+@pytest.mark.parametrize("seconds", [0.2, 0.3, 0.45])
+@pytest.mark.parametrize("speed", [0.8, 1.5])
+def test_an_e_stop_that_is_pressed_in_a_gap_drives_nothing_back(speed, seconds):
+    """What was seen before the gap says where the arm was, and not where it is."""
+    bench = standing(0.0)
+    following(bench, wave(300, speed))
+    bench.seconds(1.0)
+    bench.feed = False
+    bench.seconds(seconds)
+    bench.stop().seconds(0.1)
+    bench.feed = True
+    before = len(bench.course)
+    bench.seconds(2.0)
+    course = np.array(bench.course[before:])
+    back = np.maximum.accumulate(course, axis=0) - course
+    assert back.max() < 0.06
+    assert np.abs(np.diff(bench.sent[-30:], axis=0)).max() < 1e-6  # it stands
+
+
+def test_an_e_stop_without_a_gap_is_obeyed_by_what_is_seen_just_now():
+    bench = standing(0.0)
+    following(bench, wave(300, 1.0))
+    bench.seconds(1.0)
+    at = bench.true.copy()
+    bench.stop().seconds(2.0)
+    assert (bench.true - at).max() < 0.12

@@ -121,3 +121,25 @@ def test_hold_home_release_and_the_first_chunk_begin_at_the_command(error):
     assert bench.sent[-1] == pytest.approx(np.zeros(2), abs=1e-9)
     told = bench.sent[-90:]
     assert np.abs(told).max() <= 1e-9
+
+
+@pytest.mark.parametrize("error", [0.03, 0.09])
+def test_an_e_stop_just_after_a_take_over_leaves_the_command_where_it_is(error):
+    bench = Compliant(error)
+    bench.say("motion", goal=np.zeros(2))
+    bench.seconds(0.1)
+    at = bench.sent[-1].copy()
+    bench.stop().seconds(2.0)
+    assert bench.sent[-1] == pytest.approx(at, abs=0.011)
+
+
+@pytest.mark.parametrize("error", [0.05, 0.09])
+def test_a_joint_that_hangs_by_its_error_stays_while_another_one_is_led(error):
+    """A hand moves the first joint, the second is not touched."""
+    bench = standing(error).stop().seconds(1.5)
+    before = bench.sent[-1].copy()
+    for _ in range(2):
+        bench.error = np.array([bench.error[0] + 0.8, error])
+        bench.seconds(6.0)
+    assert abs(bench.sent[-1][0] - before[0]) > 0.1
+    assert bench.sent[-1][1] == pytest.approx(before[1], abs=1e-6)
