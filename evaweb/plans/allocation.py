@@ -115,7 +115,7 @@ def _handed_out(user: User, station: Station, plan: Plan) -> Handout:
         checkpoint=slot.checkpoint,
         number=slot.repetition,
         attempt=before.attempt + 1 if before else 1,
-        strategy=(held.document or {})["strategy"],
+        strategy=(held.document or {}).get("strategy"),
     )
     return Handout.objects.create(
         plan=held,
