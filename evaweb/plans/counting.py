@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 from evaweb.episodes.models import EpisodeStatus
-from evaweb.episodes.selectors import unrecorded_because
+from evaweb.episodes.selectors import CLOSED
 from evaweb.errors import Conflict
 from evaweb.plans.models import CountsAs, Handout, Plan
 from evaweb.trials.models import Trial, TrialStatus
@@ -56,7 +56,9 @@ def fails_by(plan: Plan, trial: Trial) -> bool:
     nobody could score.
     """
     counts = getattr(plan, ended_by(trial) or "on_nothing", CountsAs.JUDGED)
-    return counts == CountsAs.FAILURE and not unrecorded_because(episode=trial.episode)
+    episode = trial.episode
+    nothing = episode is None or (episode.status in CLOSED and not episode.frames)
+    return counts == CountsAs.FAILURE and not nothing
 
 
 def _judged(what: str, trial: Trial, user: Any) -> None:
