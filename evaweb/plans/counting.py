@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import EpisodeStatus
-from evaweb.episodes.selectors import CLOSED
 from evaweb.errors import Conflict
 from evaweb.plans.models import CountsAs, Handout, Plan
 from evaweb.trials.models import Trial, TrialStatus
