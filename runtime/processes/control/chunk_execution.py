@@ -146,9 +146,6 @@ class ExecuteChunks(Behaviour):
             reason = _TOO_FAR(where=where, allowed=safety.jump)
             return JoinResult(dropped(chunk, step, reason), reason, too_far=True)
         away, where = self._away_where_used(arrival, step, commanded)
-        if away > safety.jump:  # a late chunk begins with a later row: the arm would go all that way at once
-            reason = _TOO_FAR(where=where, allowed=safety.jump)
-            return JoinResult(dropped(chunk, step, reason), reason, too_far=True)
         far = _BLENDED_IN(where=where) if away > safety.first_action_far else ""
         held = commanded if away > _JOINED_AT_ONCE or self.starved else None
         switched = self._switched

@@ -132,7 +132,7 @@ def test_what_is_a_failure_by_the_plan_is_not_voided_away_before_its_score(bench
     asked = voids.trial_void(
         user=bench.operator, trial=Trial.objects.get(pk=trial.pk), reason="it had slipped"
     )
-    assert asked.status == "void asked"
+    assert asked.status == "void_asked"
 
 
 def test_what_left_no_row_is_repeated_whatever_the_plan_says(bench, declared):

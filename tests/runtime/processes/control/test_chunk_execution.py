@@ -119,21 +119,6 @@ def test_a_far_start_is_said_with_joint_and_distance_a_near_one_is_not():
     assert near.said("far_start") == []
 
 
-@pytest.mark.parametrize("kind", ["async", "naive", "ensemble"])
-def test_a_late_chunk_whose_first_used_row_is_far_holds_like_one_that_begins_there(kind):
-    """Its first row is where the robot stands; what is left of it when it arrives is 0.7 rad away."""
-    bench = Bench({"kind": kind})
-    bench.say("follow", run=1)
-    bench.run(8)
-    rows = np.full((30, 2), 0.7)
-    rows[:6] = 0.0
-    bench.chunk(1, rows, step=bench.step - 8)
-    bench.run(10)
-    assert bench.behaviour == "hold"
-    assert "safety.jump" in bench.said("too_far")[0].text
-    assert np.abs(bench.sent).max() < 1e-6
-
-
 def test_a_later_chunk_of_sync_is_executed_as_it_is():
     bench = Bench({"kind": "sync"})
     bench.say("follow", run=1)
