@@ -21,7 +21,7 @@ from evaweb.statistics.sequential import ALPHA, score_evidence
 
 PEER = Path(__file__).parents[1] / "build" / "peers" / "nscore" / "bin" / "python"
 SECONDS = 0.0  # cases bound it
-RUNS, PAIRS, STEPS = 200, 100, 3  # steps: milestones of a trial, each reached by the checkpoint's chance
+RUNS, PAIRS, STEPS = 60, 60, 3  # steps: milestones of a trial, each reached by the checkpoint's chance
 CHANCES = ((0.5, 0.5), (0.5, 0.6), (0.5, 0.7), (0.5, 0.8))
 # Two one-sided tests at alpha/2 each, as ours are; it takes scores by their place among all that there are.
 _ASKED = """
