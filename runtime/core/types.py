@@ -52,6 +52,7 @@ class Observation:
     truth: Mapping[str, Any] | None = (
         None  # what a simulated bench says of itself: JSON, never shown to a policy
     )
+    commanded: Float64 | None = None  # [D] what the robot was told last, None where it is told nothing
     drives: Mapping[str, Any] | None = None  # {"enabled": bool, "faults": [str]} where the node reports them
 
 

@@ -9,6 +9,9 @@ from pydantic import Field
 from robots.clearance import MARGIN
 from runtime.core.settings import Settings
 
+_NOISE = 0.02  # [rad] beyond a servo error that is set
+_BESIDE = 0.1  # [rad] that an arm may be off where less is set
+
 
 class WorkspaceBox(Settings):
     """A box in an arm's declared frame that its end effector must stay in [m]."""
@@ -68,3 +71,8 @@ class SafetySettings(Settings):
     collision_margin: float = Field(default=MARGIN, ge=0, le=0.5)
     """Distance within which links count as colliding [m]; the capsules that stand for them cover them whole, so
     that little is needed on top."""
+
+    @property
+    def sagged(self) -> float:
+        """How far an arm may be off by its servo error alone [rad]."""
+        return _BESIDE if self.steady_error <= _BESIDE else self.steady_error + _NOISE

@@ -44,16 +44,26 @@ _SPARE_ROWS = 2  # beyond the age limit: silence is told by its age, not by star
 class Relay(Policy):
     """Follows a leader: to where it is ("absolute"), or by as much as it moved since the engagement ("relative").
 
-    The engagement is the first question after a reset. Grippers are absolute in either; joints of groups that the
-    leader does not have stay where the robot had them then.
+    The engagement is the first question after a reset, or after the robot was held: what the leader did meanwhile is
+    not caught up. Grippers are absolute in either; joints of groups that the leader does not have stay where the robot
+    had them then. That is where they were told to be, if they stand within `steady_error` of it: from where they are
+    read, gravity would lower the arm at each engagement.
     """
 
     sees_pictures = False
 
     def __init__(
-        self, leader: Leader, robot: Robot, mode: Following, max_age: float, rate: float, clock: Clock
+        self,
+        leader: Leader,
+        robot: Robot,
+        mode: Following,
+        max_age: float,
+        rate: float,
+        clock: Clock,
+        steady_error: float,
     ) -> None:
         self.leader = leader
+        self._steady_error = steady_error
         self.mode = mode
         self._max_age = max_age
         self._rows = math.ceil(max_age * rate) + _SPARE_ROWS
@@ -91,16 +101,25 @@ class Relay(Policy):
             raise PolicyError(_JOINTS_SHAPE(shape=list(observation.qpos.shape)))
         pose = self._pose()
         if self._last is None:
-            self._wanted = np.asarray(observation.qpos, np.float64).copy()
+            self._wanted = self._engaged_at(np.asarray(observation.qpos, np.float64), observation.commanded)
         target = self._follow(pose)
         return ActionChunk(np.tile(target, (self._rows, 1)).astype(np.float32))
 
-    def aim(self, qpos: Float64) -> Float64 | None:
-        """First goal of a robot at `qpos` [D]; None if the leader is silent, or leads from where it is."""
+    def aim(self, qpos: Float64, commanded: Float64 | None) -> Float64 | None:
+        """First goal of a robot at `qpos` that is told to be at `commanded` [D], None where it is told nothing.
+
+        None if the leader is silent, or leads from where it is.
+        """
         if self.mode == "relative" or self.silence():
             return None
         joints = self._pose().joints
-        return np.where(np.isnan(joints), qpos, joints)
+        return np.where(np.isnan(joints), self._engaged_at(qpos, commanded), joints)
+
+    def _engaged_at(self, qpos: Float64, commanded: Float64 | None) -> Float64:
+        if commanded is None:
+            return qpos.copy()
+        off = np.abs(difference(commanded, qpos, self._endless))
+        return np.where(off <= self._steady_error, commanded, qpos)
 
     def _pose(self) -> LeaderPose:
         newest, why = self.leader.newest, self.silence()
@@ -123,6 +142,10 @@ class Relay(Policy):
     def reset(self) -> None:
         """The next question engages anew."""
         self._last = None
+
+    def resume(self) -> None:
+        """The robot was held, or not seen: so it does after that."""
+        self.reset()
 
     def close(self) -> None:
         self.leader.close()

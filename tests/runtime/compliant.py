@@ -11,6 +11,7 @@ from runtime.ipc.shared_state import EStop
 from tests.runtime.tick_bench import PERIOD, Bench
 
 SUBSTEP_S = 1e-3
+SAGS = 1.0  # [rad/s]
 STIFFNESS, DAMPING = 900.0, 60.0  # [1/s2], [1/s]: critically damped, a lag of 67 ms
 
 
@@ -25,6 +26,7 @@ class Compliant(Bench):
         self.wall = np.full(2, np.inf)
         self.true, self.speed = np.zeros(2), np.zeros(2)
         self.node = self.error.copy()
+        self.limp: Float64 | None = None  # [D] where it sags to, whatever it is told, while its drive is off
         self.course: list[Float64] = []
         self._random, self._noise = np.random.default_rng(1), noise
         super().__init__({"kind": "naive"}, **given)
@@ -35,6 +37,10 @@ class Compliant(Bench):
 
     def move(self, seconds: float) -> None:
         told = self.sent[-1] if len(self.sent) else self.node
+        if self.limp is not None:
+            self.true = self.true + np.clip(self.limp - self.true, -SAGS * seconds, SAGS * seconds)
+            self.speed = np.zeros(2)
+            seconds = 0.0
         for _ in range(round(seconds / SUBSTEP_S)):
             push = STIFFNESS * (told - self.error - self.true) - DAMPING * self.speed
             self.speed = self.speed + push * SUBSTEP_S

@@ -21,11 +21,13 @@ _HELD_ELSEWHERE = Pattern(
     " shown, then set up again",
 )
 
-_RETURNED_AWAY = 0.1  # [rad] that an arm may be off after it was not seen, by sagging
 _AGREES_S = 1.0  # that a joint reads where it is told to be, before its readings lead its command again
-_NOISE = 0.02  # [rad] beyond a servo error that is set
 _THERE = 1e-6  # [rad]
 _LATELY_S = 1.0  # ago a command that moved went away from a joint that was blocked, and not the joint from it
+_MOVED = 0.01  # [rad] of a command that has moved
+_BESIDE = 0.02  # [rad] that an arm under the e-stop is read farther away than it hangs
+_RESTLESS, _STILL_S = 0.1, 0.3  # [rad/s], [s] of readings that rest, or slip slowly
+_VERDICTS = 3  # ways that readings said nothing of, after which a joint is not led again
 
 
 def silent_sibling(shared: SharedState, now: float, allowed: Callable[[str], float]) -> str:
@@ -46,6 +48,10 @@ class Displacement:
     An encoder that is off looks like that, but its joint follows the command, and its readings keep their distance. So
     no command follows a joint that leapt before the two have agreed for _AGREES_S, nor one a second time that has kept
     its distance: that one is followed again after a set-up, for the operator to look.
+
+    A held arm may be as far from its target as it is allowed to follow late. Under the e-stop an arm that rests
+    somewhere else is led from 0.1 rad on: one whose drive is off has sagged, and would spring back when it is switched
+    on.
     """
 
     def __init__(self, settings: TickSettings, plausibility: Plausibility) -> None:
@@ -54,12 +60,21 @@ class Displacement:
         self._angles = settings.limits.places
         dim = len(settings.limits.names)
         self._followed = np.zeros(dim, bool)  # their command was led to where they were read
+        self._unsaid = np.zeros(dim, np.int64)  # how often readings said nothing on that way
+        self._along = np.zeros(
+            dim, np.int64
+        )  # parts in which they went along, since a hand was seen to move them
         self._off = np.zeros(dim, bool)  # they were somewhere else again then
         self._apart_at = np.full(dim, float("-inf"))  # when each was last read away from its command
         self._meeting = False  # a set-up takes the robot over where it is read, and not yet there
         self.goal: Float64 | None = None  # where the command is being led to
+        self._goal_at_first: Float64 = np.zeros(dim)
+        self._restless_at = np.full(dim, float("-inf"))  # when the readings of each last moved
         self._led: Led | None = None  # how far, while it is
-        self._free_at = float("-inf")  # when the command was last free to move
+        self._blind = np.zeros(dim, bool)  # joints that are led there without a look whether they go along
+        self._moved_at = np.full(dim, float("-inf"))  # when each command last moved, but for being led
+        self._moved_from: Float64 = np.full(dim, np.nan)
+        self._proven_at = np.full(dim, float("-inf"))  # when it was last seen that a hand moves each
         self.begins = False  # whether it has been since this tick
         self._doubt = ""  # which joints are not followed since this tick, and why
 
@@ -69,17 +84,19 @@ class Displacement:
         return doubt
 
     def __call__(
-        self, robot: RobotActuator, seen: LatestObservation, now: float, held: bool
+        self, robot: RobotActuator, seen: LatestObservation, now: float, held: bool, stopped: bool = False
     ) -> Float64 | None:
-        """Goal of the command [D] if the robot is too far from where it is `held`; None where all is well."""
+        """Goal of the command [D] if the robot is too far from where it is `held`; None where all is well.
+
+        `stopped`: by the e-stop.
+        """
         self.begins = False
+        self._note_moves(robot, now)
         measured = robot.measured(seen, now)
         self._compare(robot, measured, now)
         if measured is None:
             return None
         returned = self._plausibility.returned()
-        if not held:
-            self._free_at = now
         if not (held or (returned and robot.engaged)) or self._settings.safety.report_only:
             self.goal = None
             return None
@@ -89,14 +106,19 @@ class Displacement:
             along = self._angles & self._led.look(
                 robot.commanded, measured, self.goal, self._plausibility.speed(), now
             )
+            self._doubt = self._named(along & ~self._off, robot, measured)
             self._off |= along
-            self._doubt = self._named(along, robot, measured)
             self.goal = np.where((on & ~along) | ~self._angles, self.goal, robot.commanded)
-            if self._led.proven:  # it was a hand: what it does next is followed as well
-                self._followed &= self._off
+            self._proven_at[self._led.alone] = now
+            self._along = np.where(self._led.alone, 0, self._led.along)
             if self.distance(robot, self.goal) <= _THERE:
-                self.goal = None
-        allowed = self._sagged if returned or self._meeting else self._settings.safety.following_error
+                self._finish(robot)
+        safety, still = self._settings.safety, self._still(now)
+        allowed = np.full(
+            len(measured), safety.sagged if returned or self._meeting else safety.following_error
+        )
+        if stopped:
+            allowed[still] = min(allowed[0], safety.sagged + _BESIDE)
         away = self.goal is None and self._away(robot, measured, allowed)
         self._meeting = self._meeting and (away or self.goal is not None)
         if away:
@@ -106,22 +128,12 @@ class Displacement:
                 limits = self._settings.limits
                 goal = np.clip(self.trusted(robot, where), limits.lower, limits.upper)
                 # What hangs by its error alone stays: it would sink by it each time that another joint is led.
-                self.goal = np.where(np.abs(where - robot.commanded) > self._sagged, goal, robot.commanded)
-                self._led = Led(
-                    robot.commanded,
-                    measured,
-                    self._plausibility.speed(),
-                    now,
-                    at_once=not self._meeting and (bool(returned) or now - self._free_at < _LATELY_S),
-                )
+                least = np.where(still, safety.sagged, allowed) if stopped else safety.sagged
+                self.goal = np.where(np.abs(where - robot.commanded) > least, goal, robot.commanded)
+                self._goal_at_first = self.goal
+                self._lead(robot, measured, now, bool(returned))
                 self.begins = True
         return None if self.goal is None or self._led is None else self._led.end(self.goal)
-
-    @property
-    def _sagged(self) -> float:
-        """How far an arm may be off by its servo error alone [rad]."""
-        steady = self._settings.safety.steady_error
-        return _RETURNED_AWAY if steady <= _RETURNED_AWAY else steady + _NOISE
 
     def distance(self, robot: RobotActuator, measured: Float64) -> float:
         """Distance of the farthest joint from its command [rad]."""
@@ -134,7 +146,7 @@ class Displacement:
     def follow(self, robot: RobotActuator, measured: Float64) -> None:
         """The command is about to be led to `measured` [D]: `doubt` names the joints for which it was before."""
         where = self.trusted(robot, measured)
-        away = self._angles & (np.abs(where - robot.commanded) > self._sagged)
+        away = self._angles & (np.abs(where - robot.commanded) > self._settings.safety.sagged)
         off = away & self._followed
         self._off |= off
         self._followed |= away
@@ -153,7 +165,9 @@ class Displacement:
             return ""
         led = self._distrusted | (self._meeting or self.goal is not None)
         away = np.abs(measured - robot.commanded)
-        far = self._angles & (away > np.where(led, self._sagged, self._settings.safety.following_error))
+        far = self._angles & (
+            away > np.where(led, self._settings.safety.sagged, self._settings.safety.following_error)
+        )
         if not far.any():
             return ""
         worst = int(np.where(far, away, 0.0).argmax())
@@ -164,9 +178,10 @@ class Displacement:
     @property
     def speed(self) -> Float64:
         """Velocity at which the command is led [D]: as motions of ours, and as a hand moves what is proven."""
-        whole = not self._meeting and self._led is not None and self._led.whole
-        scale = 1.0 if whole else self._settings.safety.motion_velocity_scale
-        return self._settings.limits.velocity * scale
+        whole = False if self._meeting or self._led is None else self._led.whole
+        return self._settings.limits.velocity * np.where(
+            whole, 1.0, self._settings.safety.motion_velocity_scale
+        )
 
     def meet(self) -> None:
         """Lead what is held to where joints are read, also those that leapt: the operator wants it there."""
@@ -182,22 +197,58 @@ class Displacement:
         """Follow all joints again."""
         for joints in (self._followed, self._off, self._plausibility.leapt):
             joints[:] = False
+        self._unsaid[:], self._along[:] = 0, 0
+
+    def _lead(self, robot: RobotActuator, measured: Float64, now: float, returned: bool) -> None:
+        self._blind = returned | (now - self._moved_at < _LATELY_S)
+        at_once = self._blind | (now - self._proven_at < _LATELY_S)
+        self._proven_at[:] = float("-inf")
+        speed = self._plausibility.speed()
+        at_once &= not self._meeting
+        self._led = Led(robot.commanded, measured, speed, now, at_once=at_once, along=self._along)
+
+    def _finish(self, robot: RobotActuator) -> None:
+        """The command has been led to its goal. A joint that went alone is led again, one whose readings said nothing
+        a few times.
+        """
+        assert self._led is not None
+        verdict = np.where(self._blind, 1, self._led.verdict)
+        self._along[verdict < 0] = 0
+        came_back = np.abs(self._goal_at_first - robot.commanded) > _THERE
+        self._unsaid += self._followed & (verdict == 0) & ~came_back
+        self._followed &= (verdict > 0) | ((verdict == 0) & (self._unsaid >= _VERDICTS))
+        self.goal = None
+
+    def _note_moves(self, robot: RobotActuator, now: float) -> None:
+        moved = np.abs(robot.commanded - self._moved_from) > _MOVED
+        if self.goal is None:
+            self._moved_at[moved] = now
+        self._moved_from = np.where(moved | np.isnan(self._moved_from), robot.commanded, self._moved_from)
 
     @property
     def _distrusted(self) -> np.ndarray:
         return np.asarray(self._off | self._plausibility.leapt)
 
-    def _away(self, robot: RobotActuator, measured: Float64, allowed: float) -> bool:
-        far = self.distance(robot, self.trusted(robot, measured)) > allowed
+    def _away(self, robot: RobotActuator, measured: Float64, allowed: Float64) -> bool:
+        apart = np.abs(self.trusted(robot, measured) - robot.commanded)
+        far = bool((self._angles & (apart > allowed)).any())
         return far and self._plausibility.apart(robot.commanded, allowed, self._distrusted)
+
+    def _still(self, now: float) -> np.ndarray:
+        """The joints whose readings rest, bool [D]."""
+        self._restless_at[np.abs(self._plausibility.speed()) > _RESTLESS] = now
+        return now - self._restless_at >= _STILL_S
 
     def _compare(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
         """Follow those joints again that agree with their command."""
         if not robot.engaged:
             self.forget()
             self.goal = None
-        apart = True if measured is None else np.abs(measured - robot.commanded) > self._sagged
+        apart = (
+            True if measured is None else np.abs(measured - robot.commanded) > self._settings.safety.sagged
+        )
         self._apart_at[apart & self._angles] = now
         agrees = now - self._apart_at >= _AGREES_S
         for joints in (self._followed, self._plausibility.leapt):
             joints[agrees & ~self._off] = False
+        self._unsaid[agrees] = 0

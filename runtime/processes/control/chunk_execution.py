@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +30,10 @@ _TOO_FAR = Pattern(
     "{where}, allowed {allowed:g} (safety.jump): approach it, or start elsewhere",
 )
 _BLENDED_IN = Pattern("control.blended_in", "{where}: blended in")
+_BEGUN_LATE = Pattern(
+    "control.begun_late",
+    "{where} by now: the robot stood meanwhile, and begins with the first row of the answer",
+)
 _FIRST_ACTION_FAR = Pattern(
     "control.first_action_far",
     "{joint}: the first action is {distance:.2f} rad from where the robot stands",
@@ -101,6 +105,14 @@ class ExecuteChunks(Behaviour):
             return None
         return Target(planned.action, self._source, "policy", planned.makers)
 
+    def ran_on(self, step: int, commanded: Float64) -> bool:
+        """Whether what is planned for `step` has gone on while the robot, told to be at `commanded` [D], stood."""
+        planned = self.timeline.at(step)
+        if planned is None:
+            return False
+        apart = np.abs(difference(planned.action, commanded, self._settings.dims.wrapping))
+        return bool(apart.max(where=self._settings.limits.places, initial=0.0) > _JOINED_AT_ONCE)
+
     def begin_anew(self) -> None:
         """Forget what is planned: the next chunk is a first one, and the robot waits for it."""
         self.timeline.clear()
@@ -146,7 +158,13 @@ class ExecuteChunks(Behaviour):
             reason = _TOO_FAR(where=where, allowed=safety.jump)
             return JoinResult(dropped(chunk, step, reason), reason, too_far=True)
         away, where = self._away_where_used(arrival, step, commanded)
-        far = _BLENDED_IN(where=where) if away > safety.first_action_far else ""
+        far, late = _BLENDED_IN(where=where) if away > safety.first_action_far else "", away > safety.jump
+        if late:  # the robot stood where the policy means to begin: no row of it is stale
+            arrival, far = replace(arrival, waited=True), _BEGUN_LATE(where=where)
+            away, where = self._away_where_used(arrival, step, commanded)
+        if away > safety.jump:
+            reason = _TOO_FAR(where=where, allowed=safety.jump)
+            return JoinResult(dropped(chunk, step, reason), reason, too_far=True)
         held = commanded if away > _JOINED_AT_ONCE or self.starved else None
         switched = self._switched
         merged = join(
@@ -159,6 +177,7 @@ class ExecuteChunks(Behaviour):
             joining=switched,
             commanded=commanded,
         )
+        merged = replace(merged, mistimed=merged.delay) if late else merged
         self._switched = switched and bool(merged.dropped)
         return JoinResult(self._told(chunk, merged), far)
 

@@ -77,8 +77,10 @@ class CommandPipeline:
         settings: TickSettings,
         report: Telemetry,
         believed: Callable[[], bool],
+        known: Callable[[], bool],
     ) -> None:
         self._believed = believed  # whether the newest joints are
+        self._known = known  # whether any were since they were last missing
         self.actuator = actuator
         self._safety = safety
         self._locks = locks
@@ -92,6 +94,7 @@ class CommandPipeline:
         self._refused_at = float("-inf")
         self.refused = 0  # in a row
         self._unseen = 0  # of these the last ones, in a run, whose only fault was the age of the joints
+        self._unseen_since = 0.0  # when the last joints before them were measured [s]
         self._gap: _Gap | None = None
         self._gaps: deque[float] = deque(maxlen=_GAPS)  # when the newest of them began, in this run
         self.behaviour: Behaviour = Silent()
@@ -201,6 +204,8 @@ class CommandPipeline:
         run = self.run
         if run is not None and self._gap is not None:
             return self._wait_for_joints(run, self._gap, step, planned, seen)
+        if run is not None and self._unseen:
+            self._look_whether_seen(run, step, planned, seen)
         target = self.behaviour.target(step, self.actuator.elapsed(planned))
         if target is None:
             return self._nothing_planned(step, planned, seen)
@@ -272,7 +277,10 @@ class CommandPipeline:
         seen: LatestObservation,
     ) -> Sent:
         run, unseen = self.run, self._safety.unseen(self.actuator.state(seen, planned, None))
+        if self._unseen and not self._known():  # back, and not yet believed
+            unseen = notes[-1]
         self.refused += 1
+        self._unseen_since = self._unseen_since if self._unseen else seen.joints_captured
         self._unseen = self._unseen + 1 if unseen and run is not None else 0
         self._verdicts.append(True)
         self._brace()
@@ -282,8 +290,8 @@ class CommandPipeline:
         refused = sum(self._verdicts)
         if refused < self._settings.safety.refusals_to_hold:
             pass
-        elif run is not None and self._unseen >= refused and self._may_wait(planned, seen):
-            self._gap = _Gap(seen.joints_captured, planned)
+        elif run is not None and self._unseen >= refused and self._may_wait(planned):
+            self._gap = _Gap(self._unseen_since, planned)
             self._gaps.append(planned)
             run.begin_anew()
             seconds = self._settings.safety.joint_gap_s
@@ -315,10 +323,18 @@ class CommandPipeline:
             self.hold_because("refusals", why)
         return self._stand(step, planned, seen)._replace(refused=True)
 
-    def _may_wait(self, planned: float, seen: LatestObservation) -> bool:
+    def _look_whether_seen(
+        self, run: ExecuteChunks, step: int, planned: float, seen: LatestObservation
+    ) -> None:
+        """Joints are back before the run waited for them: what was planned meanwhile is not caught up either."""
+        state = self.actuator.state(seen, planned, None)
+        if not self._safety.unseen(state) and not state.doubt and run.ran_on(step, state.previous):
+            self._go_on(run, planned - self._unseen_since)
+
+    def _may_wait(self, planned: float) -> bool:
         """Whether a run may stand for its joints: not for long ones, nor again and again."""
         often = len(self._gaps) == _GAPS and planned - self._gaps[0] < _GAPS_S
-        return not often and planned - seen.joints_captured < self._settings.safety.joint_gap_s
+        return not often and planned - self._unseen_since < self._settings.safety.joint_gap_s
 
     def _elsewhere(self, state: RobotState, missing: float) -> str:
         """Which joint is not where it was told to stand, "" where all are."""

@@ -9,6 +9,9 @@ from runtime.core.types import Float64
 PART = 0.11  # rad (m) that a joint is led before its readings are looked at
 _REST_S = 0.4  # after each part: what follows a command, late as it may be, has come to a stand
 _SAY = 2  # parts that have to say the same; of three one may be wrong, where a hand stops or begins to pull
+_DRIFTS = (
+    0.1  # [rad/s] by which readings of a slipping encoder go faster or slower after a part than before it
+)
 _THERE = 1e-6
 
 
@@ -18,20 +21,30 @@ class Led:
     Readings of a joint that a hand moves go on as the hand does, whatever its command does. Those of a joint that
     follows its command, and is read somewhere else by an encoder that is off, go with the command, and stand (or slip
     on) with it. So what counts is how far readings went in a part beyond what their speeds before and after it make:
-    where that is more than half of the command's way in two parts, the encoder is off.
+    where that is more than half of the command's way in two parts, the encoder is off. A part after which readings go
+    on at another speed than before, as those of a hand that goes to and fro do, says nothing, but where they came
+    against the command.
     """
 
     def __init__(
-        self, commanded: Float64, measured: Float64, speed: Float64, now: float, *, at_once: bool = False
+        self,
+        commanded: Float64,
+        measured: Float64,
+        speed: Float64,
+        now: float,
+        *,
+        at_once: np.ndarray | bool = False,
+        along: np.ndarray | int = 0,
     ) -> None:
         """From `commanded` [D], while joints are read at `measured` [D] and go at `speed` [D] by themselves.
 
-        `at_once`: without parts, or an arm that was switched off and on again would be pulled back meanwhile, and one
-        that is blocked would go on pressing.
+        `at_once`, bool [D]: without parts, or an arm that was switched off and on again would be pulled back meanwhile,
+        and one that is blocked would go on pressing. `along`, int [D]: parts of former ways in which readings went
+        along.
         """
-        self.at_once = at_once
-        self._along = np.zeros(len(commanded), np.int64)
-        self._parts = 0
+        self.at_once = np.broadcast_to(np.asarray(at_once, bool), commanded.shape)
+        self.along: np.ndarray = np.zeros(len(commanded), np.int64) + along
+        self._alone = np.zeros(len(commanded), np.int64)
         self._begin(commanded, measured, speed, now)
 
     def _begin(self, commanded: Float64, measured: Float64, speed: Float64, now: float) -> None:
@@ -39,33 +52,41 @@ class Led:
         self._rests: float | None = None  # since when the command has stood at the end of the part
 
     @property
-    def proven(self) -> bool:
-        """Whether readings were seen not to go along."""
-        return self._parts > _SAY or (self._parts == _SAY and not self._along.any())
+    def alone(self) -> np.ndarray:
+        """Joints whose readings were seen not to go along, bool [D]."""
+        return np.asarray(self._alone >= _SAY)
 
     @property
-    def whole(self) -> bool:
-        """Whether the rest of the way is led without a rest."""
-        return self.at_once or self.proven
+    def verdict(self) -> np.ndarray:
+        """By how many parts more each joint goes along than it does not, int [D]."""
+        return np.asarray(self.along - self._alone)
+
+    @property
+    def whole(self) -> np.ndarray:
+        """Joints that are led the rest of the way without a rest, bool [D]."""
+        return np.asarray(self.at_once | self.alone)
 
     def end(self, goal: Float64) -> Float64:
         """How far the command may be led to `goal` now [D]."""
-        return goal if self.whole else np.clip(goal, self._from - PART, self._from + PART)
+        return np.where(self.whole, goal, np.clip(goal, self._from - PART, self._from + PART))
 
     def look(
         self, commanded: Float64, measured: Float64, goal: Float64, speed: Float64, now: float
     ) -> np.ndarray:
         """The joints, bool [D], whose readings have gone along with the command."""
-        none = np.zeros(len(commanded), bool)
-        if self.whole or np.abs(self.end(goal) - commanded).max() > _THERE:
-            return none
+        off = np.asarray(self.along >= _SAY)
+        if np.abs(self.end(goal) - commanded).max(where=~self.whole, initial=0.0) > _THERE:
+            return off
         self._rests = now if self._rests is None else self._rests
         if now - self._rests < _REST_S:
-            return none
+            return off
         way = commanded - self._from
         alone = (self._speed + speed) / 2.0 * (now - self._at)
-        went = (measured - self._read - alone) * np.sign(way)
-        self._along += (np.abs(way) > PART / 2.0) & (went > np.abs(way) / 2.0)
-        self._parts += 1
+        went = (measured - self._read) * np.sign(way)
+        goes_along = went - alone * np.sign(way) > np.abs(way) / 2.0
+        far, steady = np.abs(way) > PART / 2.0, np.abs(speed - self._speed) <= _DRIFTS
+        says = ~self.whole & far & (steady | (went < -PART / 2.0))
+        self.along += says & goes_along
+        self._alone += says & ~goes_along
         self._begin(commanded, measured, speed, now)
-        return np.asarray(self._along >= _SAY)
+        return np.asarray(self.along >= _SAY)

@@ -136,10 +136,13 @@ class Plausibility:
         self._judged = now
         if not seen.measured:
             return seen
-        # A stamp may stay: joints of several messages are as old as the oldest of them.
-        if seen.joints_captured != self._captured or not np.array_equal(seen.joints, self._joints):
+        # A stamp may stay: joints of several messages are as old as the oldest of them. For as long as that, some of
+        # them are not seen.
+        fresh = seen.joints_captured != self._captured
+        if fresh or (self._unseen <= UNSEEN_S and not np.array_equal(seen.joints, self._joints)):
             self._captured, self._joints = seen.joints_captured, seen.joints
             self._doubt = self._take(_Sample(seen.joints, seen.joints_captured, now), commanded)
+            self._unseen = 0.0 if fresh else self._unseen
         return replace(seen, doubt=self._doubt) if self._doubt else seen
 
     @property
@@ -152,13 +155,13 @@ class Plausibility:
         """True if samples have agreed for as long as they have to, up to the newest."""
         return self._chain is not None and not self._doubt and bool(self._chain.lately(self._needed))
 
-    def apart(self, held: Float64, allowed: float, but: np.ndarray | bool = False) -> bool:
-        """True if all samples that have to agree are farther than `allowed` [rad] from `held` [D].
+    def apart(self, held: Float64, allowed: Float64 | float, but: np.ndarray | bool = False) -> bool:
+        """True if all samples that have to agree are farther than `allowed` [rad] or [D] from `held` [D].
 
         The joints `but`, bool [D], do not count.
         """
         lately = self._chain.lately(self._needed) if self._chain and not self._doubt else []
-        return bool(lately) and all(self._away(sample.joints, held, but) > allowed for sample in lately)
+        return bool(lately) and all(self._away(sample.joints, held, allowed, but) for sample in lately)
 
     def returned(self) -> float:
         """For how long the joints were missing before those that are believed now came [s]; 0 the second time."""
@@ -189,9 +192,8 @@ class Plausibility:
         return np.asarray(np.median(steps, axis=0)) if steps else np.zeros(len(self._limits.names))
 
     def _take(self, sample: _Sample, commanded: Float64 | None) -> str:
-        unseen, self._unseen = self._unseen, 0.0
-        if self._chain and unseen > UNSEEN_S:
-            self._before, self._missing = self._chain.newest.joints, unseen
+        if self._chain and self._unseen > UNSEEN_S:
+            self._before, self._missing = self._chain.newest.joints, self._unseen
             self._chain = self._other = None
             self._needed = CONSISTENT_S
         if beyond := self._beyond(sample.joints):
@@ -361,9 +363,9 @@ class Plausibility:
         was = ", ".join(f"{before[i]:.3f}" for i in dead)
         return _ZERO_AFTER(joints=", ".join(self._limits.names[i] for i in dead), before=was)
 
-    def _away(self, joints: Float64, held: Float64, but: np.ndarray | bool) -> float:
+    def _away(self, joints: Float64, held: Float64, allowed: Float64 | float, but: np.ndarray | bool) -> bool:
         apart = np.abs(difference(joints, held, self._wrapping))
-        return float(apart.max(where=self._places & np.logical_not(but), initial=0.0))
+        return bool((self._places & np.logical_not(but) & (apart > allowed)).any())
 
 
 class Unquestioned(Plausibility):
@@ -378,8 +380,8 @@ class Unquestioned(Plausibility):
     def settled(self) -> bool:
         return self._chain is not None
 
-    def apart(self, held: Float64, allowed: float, but: np.ndarray | bool = False) -> bool:
-        return self._chain is not None and self._away(self._chain.newest.joints, held, but) > allowed
+    def apart(self, held: Float64, allowed: Float64 | float, but: np.ndarray | bool = False) -> bool:
+        return self._chain is not None and self._away(self._chain.newest.joints, held, allowed, but)
 
 
 class _Digits:

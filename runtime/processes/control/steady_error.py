@@ -64,7 +64,10 @@ class SteadyError:
         self._presses[:] = False
 
     def keeps(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
-        """The joints that stand within a steady error of their command: a stop leaves that as it is, bool [D]."""
+        """The joints of which a stop leaves the command as it is, bool [D]: they stand within a steady error of it, or
+        it has rested for so long that nobody knows what moved their readings away. They may be those of an encoder
+        that has slipped: such a command is led (`Displacement`).
+        """
         if self._inherited:
             error = self._error(robot, measured)
             standing = self._settings.limits.places & (np.abs(error) <= self._settings.safety.steady_error)
@@ -78,7 +81,14 @@ class SteadyError:
             new &= self._settings.limits.places & (np.abs(now_off) <= self._settings.safety.steady_error)
             error, standing = np.where(standing, error, now_off), standing | new
         self.last = np.where(standing, error, self.last)
-        return standing
+        return np.asarray(standing | self._moved_at_rest(robot, measured, now))
+
+    def _moved_at_rest(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
+        """Joints, bool [D], that are farther from a command than by an error, and did not come there by its moves."""
+        rested = now - self._samples[0].time >= _WINDOW_S - _EVERY_S if self._samples else False
+        far = np.abs(self._error(robot, measured)) > self._settings.safety.sagged
+        rests = np.ptp([sample.commanded for sample in self._samples], axis=0) <= _STILL if rested else False
+        return self._settings.limits.places & far & rests & ~self._presses
 
     @property
     def known(self) -> Float64:

@@ -158,7 +158,11 @@ class Tick:
         def believed() -> bool:
             return self._plausibility.settled
 
-        return CommandPipeline(actuator, self._safety, self._locks, self._settings, self._report, believed)
+        def known() -> bool:
+            return self._plausibility.known
+
+        judged = (self._safety, self._locks, self._settings, self._report)
+        return CommandPipeline(actuator, *judged, believed, known)
 
     def _drive(self, step: int, planned: float) -> Sent:
         """Move every lane on by a tick; what became of it on the one that is led, for the record."""
@@ -417,8 +421,9 @@ class Tick:
     def _check_displaced(self, now: float) -> None:
         """Hold where the robot is, and not where it was told to hold, once these are far apart."""
         behaviour = self._robot.behaviour
-        held = (self._robot.stands or isinstance(behaviour, EStopped)) and self._actuator.engaged
-        where = self._displacement(self._actuator, self._seen, now, held)
+        stopped = isinstance(behaviour, EStopped)
+        held = (self._robot.stands or stopped) and self._actuator.engaged
+        where = self._displacement(self._actuator, self._seen, now, held, stopped)
         self._name_followed_twice()
         if where is None:
             return

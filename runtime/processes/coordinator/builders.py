@@ -66,7 +66,15 @@ def _teleoperation(spec: StationSpec, clock: Clock, leader: Callable[[StationSpe
         raise ConfigurationError("this deployment has no [collection]: it says nothing of who leads")
     if wanted.source == "node":
         return NodeLed()
-    return Relay(leader(spec, clock), spec.robot, wanted.mode, wanted.max_age_s, spec.rate, clock)
+    return Relay(
+        leader(spec, clock),
+        spec.robot,
+        wanted.mode,
+        wanted.max_age_s,
+        spec.rate,
+        clock,
+        spec.deployment.safety.steady_error,
+    )
 
 
 def make_kinematics(spec: StationSpec) -> Kinematics:

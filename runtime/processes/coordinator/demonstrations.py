@@ -196,7 +196,9 @@ class Demonstrations:
         relay = self._relay
         if relay is not None:
             qpos = np.array(self._page.observation.read()["qpos"], np.float64)
-            self._setup.expect(relay.aim(qpos))
+            status = self._page.control.read()
+            commanded = np.array(status["commanded"], np.float64) if status["engaged"] else None
+            self._setup.expect(relay.aim(qpos, commanded))
 
     # --- what the node reports ---------------------------------------------------------------------------------
 

@@ -297,7 +297,7 @@ class SessionActions:
         """Go to the policy's first action on a limited path: the one of the set-up, or the one that is shown."""
         made, first = self.inference.proposal, self.setup.first_action
         if self._state() is not SessionState.READY and made is not None:
-            self.runs.approach(self.manual.checked("approach", made.rows[0]))
+            self.runs.approach(self.manual.checked("approach", made.answered.made.meant))
         elif first is not None:
             self.setup.begin_approach(self.manual.checked("approach", first))
 

@@ -231,10 +231,11 @@ class Inference:
         self._commitment.clear()
 
     def forget_plan(self) -> None:
-        """Control has dropped its plan: the robot is committed to nothing, and no answer that is still out counts."""
+        """Control has dropped its plan: the robot stood, is committed to nothing, and no answer still out counts."""
         self._flight, self._stale_since = None, None
         self._unmerged.clear()
         self._commitment.clear()
+        self.requests.resume()
 
     # --- what control says -----------------------------------------------------------------------------------
 

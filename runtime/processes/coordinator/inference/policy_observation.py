@@ -77,7 +77,9 @@ class PolicyObservation:
         missing = [camera for camera in cameras if camera not in seen.pictures]
         if missing:
             raise PolicyError(_NO_PICTURE(cameras=", ".join(missing)))
-        shown = replace(seen, step=self._step_of(seen), prompt=prompt)
+        told = self.commanded()
+        commanded = None if told is None else told[1]
+        shown = replace(seen, step=self._step_of(seen), prompt=prompt, commanded=commanded)
         return self._of_the_simulated_robot(shown) if self.simulated else shown
 
     def commanded(self) -> tuple[int, Float64] | None:

@@ -62,7 +62,7 @@ def test_a_robot_is_displaced_beyond_the_following_error_and_only_while_it_is_he
     held = Held()
     assert moved(held, 0.4) == [None] * 8
     assert moved(held, 0.6, held=False) == [None] * 8
-    assert moved(held, 0.6)[-1] == pytest.approx([0.6, 0.0])
+    assert moved(held, 0.6)[-1] == pytest.approx([PART, 0.0])
 
 
 def test_what_has_been_held_for_a_while_is_led_by_a_part_to_see_whether_it_goes_along():

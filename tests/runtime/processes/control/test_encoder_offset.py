@@ -129,7 +129,7 @@ def moved_by_hand(bench, way, speed=1.0):
     for _ in range(round(abs(way) / speed / PERIOD)):
         bench.moved_by_hand = bench.measured = bench.measured + step
         bench.run()
-    bench.run(45)
+    bench.run(75)
 
 
 @pytest.mark.some(4)
@@ -290,3 +290,64 @@ def test_a_stop_ends_at_once_what_a_set_up_leads_to_where_a_joint_is_read(end):
     bench.go(2.0)
     assert abs(bench.true[0] - begins) <= 0.1
     assert bench.shared.doubt
+
+
+@pytest.mark.some(4)
+@pytest.mark.parametrize("lag", [0, 5, 8])
+@pytest.mark.parametrize("over", [0.03, 0.5, 3.0])
+@pytest.mark.parametrize("slip", [0.15, 0.3, -0.45])
+def test_an_e_stop_goes_to_a_reading_that_slipped_at_rest_in_parts(slip, over, lag):
+    """Whether a person holds the arm there, or its encoder has slipped, is seen on the way."""
+    bench = following(Servo(lambda true, since: true + slip * min(since / over, 1.0), lag), wave(60, 0.0))
+    bench.go(1.5)
+    told(bench, "hold")
+    bench.go(1.5)
+    bench.break_encoder()
+    bench.go(over + 2.0)
+    begins, sent = bench.true[0], len(bench.sent)
+    told(bench, "estop")
+    bench.go(6.0)
+    assert np.ptp([begins, *bench.moves[-180:]]) <= MOST_LED
+    most = TWO_JOINTS.velocity[0] * bench.safety.motion_velocity_scale * PERIOD
+    assert np.abs(np.diff(bench.sent[sent - 1 :, 0])).max() <= most * 1.01
+
+
+@pytest.mark.parametrize("way", [0.15, -0.3, 0.45])
+def test_an_e_stop_lets_go_of_a_person_who_pushes_an_arm_away(way):
+    bench = following(Bench(), wave(60, 0.0))
+    told(bench, "hold")
+    bench.run(60)
+    moved_by_hand(bench, way, 0.5)
+    told(bench, "estop")
+    bench.run(60)
+    assert abs(bench.sent[-1, 0] - bench.measured[0]) <= 0.1
+    assert not bench.said("implausible")
+
+
+@pytest.mark.parametrize("reach", [0.1, 0.25, 0.4, 0.8])
+def test_a_hand_that_goes_to_and_fro_is_not_taken_for_an_encoder(reach):
+    bench = following(Bench(), wave(60, 0.0))
+    told(bench, "estop")
+    bench.run(60)
+    start, turn, way = bench.measured[0], 1.0, 0.0
+    for _ in range(240):
+        way += turn * 0.5 * PERIOD
+        turn = -turn if abs(way) >= reach else turn
+        bench.moved_by_hand = bench.measured = np.array([start + way, 0.0])
+        bench.run()
+    bench.run(90)
+    assert not bench.said("implausible")
+    assert abs(bench.sent[-1, 0] - bench.measured[0]) <= 0.1
+
+
+@pytest.mark.some(3)
+@pytest.mark.parametrize("end", ["hold", "estop", "nothing"])
+@pytest.mark.parametrize("slip", [0.3, 0.6, 0.8])
+def test_an_encoder_that_slips_in_a_run_that_stands_still_is_not_followed_at_once(slip, end):
+    bench = following(Servo(lambda true, since: true + min(0.6 * since, slip)), wave(400, 0.0))
+    bench.go(2.0)
+    bench.break_encoder()
+    bench.go(1.5)
+    told(bench, end)
+    bench.go(6.0)
+    assert np.abs(bench.moves).max() <= MOST_LED

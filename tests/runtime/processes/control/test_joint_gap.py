@@ -68,6 +68,17 @@ def test_what_was_planned_before_is_not_caught_up():
     assert bench.sent[-1] == pytest.approx(stood, abs=1e-9)
 
 
+@pytest.mark.parametrize("seconds", [0.25, 0.3, 0.4, 0.45, 0.5, 0.53])
+def test_nor_is_it_after_a_gap_that_ends_before_the_run_waits(seconds):
+    bench = gone(seconds, rows=wave(200, 1.0))
+    stood = bench.sent[-1].copy()
+    bench.run(30)
+    assert np.abs(np.diff(bench.sent[-31:], axis=0)).max() <= 1.0 * PERIOD + 1e-9
+    assert np.abs(bench.sent[-1] - stood).max() <= 0.06
+    assert bench.behaviour == "follow"
+    assert goes_on(bench)
+
+
 def test_a_chunk_far_from_where_it_stands_holds_like_a_first_one():
     bench = gone(0.8)
     bench.run(8)

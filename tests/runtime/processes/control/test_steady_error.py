@@ -143,3 +143,15 @@ def test_a_joint_that_hangs_by_its_error_stays_while_another_one_is_led(error):
         bench.seconds(6.0)
     assert abs(bench.sent[-1][0] - before[0]) > 0.1
     assert bench.sent[-1][1] == pytest.approx(before[1], abs=1e-6)
+
+
+@pytest.mark.parametrize("sags", [0.15, 0.3, 0.45])
+def test_an_arm_that_sags_under_the_e_stop_stays_there_when_its_drive_is_switched_on_again(sags):
+    bench = standing(0.03).stop().seconds(1.0)
+    bench.limp = bench.true - sags
+    bench.seconds(4.0)
+    bench.limp = None
+    bench.course.clear()
+    bench.seconds(3.0)
+    assert np.abs(np.array(bench.course) - bench.course[0]).max() <= bench.safety.steady_error
+    assert not bench.said("implausible")

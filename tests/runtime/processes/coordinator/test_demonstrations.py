@@ -117,6 +117,36 @@ def test_relative_is_engaged_anew_after_a_halt(tmp_path: Path) -> None:
     station.close()
 
 
+def test_no_demonstration_lowers_an_arm_that_stands_below_its_command(tmp_path: Path) -> None:
+    station = collecting(tmp_path, mode="relative")
+    station.ready(collect=True)
+    station.robot.bias[LEFT] = -0.09
+    station.command("arm")
+    demonstrated(station, 20, turn=0.0)
+    told = station.robot.commands[-1].action.copy()
+    for _ in range(3):
+        demonstrated(station, 20, turn=0.0)
+    assert station.robot.commands[-1].action == pytest.approx(told, abs=1e-6)
+    station.close()
+
+
+def test_what_a_leader_did_while_joints_were_missing_is_not_caught_up(tmp_path: Path) -> None:
+    station = collecting(tmp_path, mode="relative").armed()
+    station.command("run")
+    station.go(20)
+    stood = station.robot.commands[-1].action[LEFT]
+    station.robot.silent, station.turn = True, 0.01
+    station.go(24)
+    station.robot.silent, station.turn = False, 0.0
+    station.go(20)
+    assert station.events("joints_back")
+    assert station.robot.commands[-1].action[LEFT] == pytest.approx(stood, abs=0.08)
+    station.turn = 0.01
+    station.go(20)
+    assert station.robot.commands[-1].action[LEFT] > stood + 0.1
+    station.close()
+
+
 def test_a_leader_that_is_far_away_is_approached_before_it_is_followed(tmp_path: Path) -> None:
     station = collecting(tmp_path)
     station.ready(collect=True)
