@@ -19,7 +19,8 @@ from benchmarks.estop_presses import OpenPage
 from benchmarks.labs import RunningLab, machine_used, named, watch
 from benchmarks.report import Figure
 
-MOST_STATIONS = 32
+RUNGS = (1, 2, 4, 8, 16, 32)  # stations
+MOST_STATIONS = RUNGS[-1]
 _MOST_VIEWERS = 640
 _ESTOP_MS, _VIEWER_MS = 200.0, 250.0
 _FULL = 90.0  # percent of a core
@@ -72,7 +73,7 @@ def stations(
     """
     rungs: list[Any] = []
     up = 1
-    for count in (1, 2, 4, 8, 16, MOST_STATIONS):
+    for count in RUNGS:
         if psutil.virtual_memory().available < (count - up) * _STATION_BYTES:
             return _told("stations", rungs, "the machine's memory")
         while up < count:

@@ -18,12 +18,19 @@ OPTIONS = {
     "results": {"plans": 2, "trials": 40, "runs": 20},
 }
 FEWER = {
-    "designs": {"designs.SIZES": [50], "designs._RUNS": 50},
+    "designs": {"designs.SIZES": [50], "designs._RUNS": 50, "designs._RUNS_OF_RATES": 200},
+    "lab": {"climb.RUNGS": [1, 2], "climb._MOST_VIEWERS": 10, "lab._CUTS": 2, "lab._UPLOAD_MB": 50},
     "loop": {"loop.RATES": [30.0]},
     "measures": {"measures._VARIANTS": ["", "fifo"]},
     "moving_target": {"moving_target.SEEDS": 1, "moving_target.DELAYS": [8]},
     "pages": {"pages.LOADS": 1},
     "partial_credit": {"partial_credit.RUNS": 5, "partial_credit.PAIRS": 10},
+    "recording": {
+        "recording._KILLED_S": [1.0, 1.0],
+        "recording._BESIDE_S": 2.0,
+        "recording._LISTED": 300,
+    },
+    "replay": {"replay._AGAIN": 1},
     "start": {"start._STARTS": 1},
     "strategies": {
         "moving_target.SEEDS": 1,
