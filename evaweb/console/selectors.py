@@ -18,6 +18,7 @@ from evaweb.stations.selectors import last_set_up, leases_open, station_list
 from evaweb.trials.failures import Level, offered
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED, checkpoint_list, scene_list, trial_list, trial_open
+from evaweb.trials.services import failing
 
 SESSION_KEY = "station"
 
@@ -58,6 +59,7 @@ class Panel:
     set_up: bool
     failures: tuple[Level, ...]
     hidden: bool  # which checkpoint the trial is of
+    fails: str = ""  # why the trial is a failure whatever was reached
     plans: tuple[Plan, ...] = ()
     plan: Plan | None = None
     handout: Handout | None = None
@@ -158,6 +160,7 @@ def panel(*, station: Station, user: Any, sight: Sight, scene: str = "", plan: s
         set_up=trial is not None and _is_set_up(trial),
         failures=offered() if trial else (),
         hidden=trial is not None and sight.hides(trial),
+        fails=failing(trial) if trial else "",
         plans=plans,
         plan=worked,
         handout=handout,

@@ -10,7 +10,7 @@ from evaweb.episodes.models import EpisodeStatus
 from evaweb.errors import Conflict
 from evaweb.plans.models import CountsAs, Handout, Plan
 from evaweb.trials.models import Trial, TrialStatus
-from evaweb.trials.services import declare_check
+from evaweb.trials.services import declare_check, declare_failing
 from runtime.core.sentences import Pattern
 
 _REPEATED = Pattern(
@@ -20,6 +20,9 @@ _REPEATED = Pattern(
 _FAILURE = Pattern(
     "plans.counting.failure",
     "trial {trial} was ended by {what}: by {plan} that is a failure, whatever was reached",
+)
+_A_FAILURE = Pattern(
+    "plans.counting.a_failure", "Ended by {what}: a failure by the plan, whatever was reached. Tick what was."
 )
 _SCORE_IT_FIRST = Pattern(
     "plans.counting.score_it_first",
@@ -79,4 +82,12 @@ def _judged(what: str, trial: Trial, user: Any) -> None:
         raise Conflict(_FAILURE(trial=trial.pk, what=ENDS[end], plan=handout.plan))
 
 
+def _failing(trial: Trial) -> str:
+    handout = Handout.objects.select_related("plan").filter(trial=trial).first()
+    if handout is None or not fails_by(handout.plan, trial):
+        return ""
+    return str(_A_FAILURE(what=ENDS[ended_by(trial)]))
+
+
 declare_check(_judged)
+declare_failing(_failing)

@@ -104,7 +104,9 @@ _NO_REASON = Pattern(
 __all__ = [
     "checked",
     "declare_check",
+    "declare_failing",
     "declare_settled",
+    "failing",
     "open_bench",
     "run_changed",
     "trial_abandon",
@@ -117,6 +119,7 @@ HIGHEST_SEED = 2**31 - 1
 Check = Callable[[str, Trial, Any], None]
 _checks: list[Check] = []
 _settled: list[Callable[[Trial, Any], None]] = []
+_failing: list[Callable[[Trial], str]] = []
 _TRIES = 5  # to get a number that nobody else takes at the same moment
 
 
@@ -135,6 +138,16 @@ def declare_check(check: Check) -> None:
 def declare_settled(told: Callable[[Trial, Any], None]) -> None:
     """`told` hears of each trial that was scored, voided or abandoned, with the user, in the same transaction."""
     _settled.append(told)
+
+
+def declare_failing(rule: Callable[[Trial], str]) -> None:
+    """`rule` says why a trial is a failure whatever was reached in it, "" where that decides."""
+    _failing.append(rule)
+
+
+def failing(trial: Trial) -> str:
+    """Why it is a failure whatever was reached in it; "" where that decides."""
+    return next((why for rule in _failing if (why := rule(trial))), "")
 
 
 def checked(what: str, trial: Trial, user: Any) -> None:
@@ -333,7 +346,10 @@ def trial_score(
         checked("judged", held, user)
         rows = list(held.scene.milestones.order_by("order"))
         when = _times_before(held, rows, milestones) if times is None else times
-        judged = partial(verdict, rows, milestones, success, times=when, ordered=held.scene.ordered)
+        fails = bool(failing(held))
+        judged = partial(
+            verdict, rows, milestones, success, times=when, ordered=held.scene.ordered, fails=fails
+        )
         said = {"rater": user, "source": source, **words}
         first = held.verdict if uuid is None else Score.objects.filter(uuid=identity_of(uuid)).first()
         if first is not None and first.trial == held and _says(first, said, judged()):

@@ -78,21 +78,23 @@ def verdict(
     *,
     times: Mapping[object, object] | None = None,
     ordered: bool = False,
+    fails: bool = False,
 ) -> Verdict:
     """The verdict on one trial from `ticks`: milestone id -> reached, one for each of the scene's milestones.
 
     `times`: milestone id -> when it was reached [s after the start of the run], as far as that is known; one reached
     after its time limit does not count and has to be unticked. `ordered`: none without all before it.
 
-    Success is: all required milestones are reached. Where none is required it has to be given. EvaError says
-    which ids are missing or not the scene's, and what contradicts itself.
+    Success is: all required milestones are reached. Where none is required it has to be given. `fails`: it is a failure
+    whatever was reached, unless somebody says otherwise. EvaError says which ids are missing or not the scene's, and
+    what contradicts itself.
     """
     answers = _answers(milestones, ticks)
     when = _times(milestones, answers, times or {})
     reached = tuple((m, answers[m.pk], when.get(m.pk)) for m in milestones)
     if ordered:
         _require_order(reached)
-    implied = _implied(reached)
+    implied = False if fails and not success else _implied(reached)
     if implied is None and success is None:
         raise EvaError(_SUCCESS_MISSING_NO_MILESTONE_THIS)
     if implied is not None and success is not None and success != implied:

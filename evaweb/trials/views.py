@@ -127,6 +127,7 @@ def _trial_page(
         "truth": () if hidden and not found.verdict_id else _truth(found),
         "milestones": [(milestone, _ticked(found, milestone.pk, typed)) for milestone in milestones],
         "implied": any(milestone.required for milestone in milestones),
+        "fails": services.failing(found),
         "may_score": operator and lifecycle.allows(found, Move.SCORE),
         "words_alone": _words_alone(found, request.user) if found.verdict_id else "",
         "may_void": operator

@@ -19,6 +19,7 @@ from evaweb.results.ratings.video_available import seen
 from evaweb.results.selectors import plan_get
 from evaweb.roles import Role, role_of
 from evaweb.trials import failures
+from evaweb.trials.services import failing
 from runtime.core.sentences import Pattern
 
 _VERSION_ALLOWED_NUMBER = Pattern(
@@ -54,6 +55,7 @@ def rate(request: HttpRequest) -> HttpResponse:
         "view": view,
         "milestones": [(milestone, str(milestone.pk) in ticked) for milestone in milestones],
         "implied": any(milestone.required for milestone in milestones),
+        "fails": failing(handout.trial) if handout else "",
         "failures": failures.offered(typed),
         "unable": _unable(user, [view]),
         "fault": fault,

@@ -26,7 +26,7 @@ from evaweb.roles import Role, require
 from evaweb.trials import failures
 from evaweb.trials.models import Score, Trial, TrialStatus
 from evaweb.trials.record import file_of
-from evaweb.trials.services import checked, declare_check
+from evaweb.trials.services import checked, declare_check, failing
 from evaweb.trials.verdicts import LONGEST_NOTE, verdict
 from runtime.core.sentences import Pattern, fixed
 
@@ -175,7 +175,8 @@ def rate(
         raise NotAllowed(_YOU_RAN_SCORED_TRIAL_SOMEONE(code=code))
     checked("judged", trial, user)
     twice = f"you have rated trial {code} already"
-    found = verdict(list(trial.scene.milestones.order_by("order")), milestones, success)
+    fails = bool(failing(trial))
+    found = verdict(list(trial.scene.milestones.order_by("order")), milestones, success, fails=fails)
     said = {
         "success": found.success,
         "score": found.score,

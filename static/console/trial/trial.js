@@ -171,7 +171,9 @@ function scoreRule() {
   if (!form) return;
   const required = [...form.querySelectorAll('[data-required="yes"]')];
   const choice = form.elements.success;
-  const success = required.length ? required.every((box) => box.checked) : choice.value === "" ? null : choice.value === "yes";
+  const said = () => (choice.value === "" ? null : choice.value === "yes");
+  const fails = form.querySelector("[data-fails]") !== null;
+  const success = fails ? false : required.length ? required.every((box) => box.checked) : said();
   const verdict = form.querySelector(".verdict");
   verdict.textContent = success === null ? "Success? Say yes or no." : success ? "Success" : "No success";
   verdict.dataset.verdict = String(success);

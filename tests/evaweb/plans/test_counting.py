@@ -10,8 +10,8 @@ from evaweb.plans.draft_checks import problems
 from evaweb.plans.exchange import exported, imported
 from evaweb.plans.models import CountsAs, Plan
 from evaweb.plans.services import plan_amend, plan_freeze
-from evaweb.results.reports.recompute.scenes import ending_faults
-from evaweb.results.reports.tables import outcome_pages
+from evaweb.results.reports.recompute.scenes import ending_faults, scene_faults
+from evaweb.results.reports.tables import outcome_pages, score_pages
 from evaweb.tabular_export import plain
 from evaweb.trials import services, voids
 from evaweb.trials.models import Trial
@@ -39,8 +39,8 @@ def ended(bench, plan, reason, status="interrupted"):
     return Trial.objects.get(pk=trial.pk)
 
 
-def scored(bench, trial, success, **said):
-    ticks = bench.ticks(True, success, success)
+def scored(bench, trial, reached, **said):
+    ticks = bench.ticks(True, reached, reached)
     return services.trial_score(user=bench.operator, trial=trial, milestones=ticks, **said)
 
 
@@ -56,13 +56,16 @@ def test_what_is_a_failure_by_the_plan_is_scored_as_one_and_stays_one(bench, dec
     plan = declared(**{name: CountsAs.FAILURE})
     trial = ended(bench, plan, reason, status)
     with pytest.raises(Conflict, match="by Blocks v1 that is a failure, whatever was reached"):
-        scored(bench, trial, True)
+        scored(bench, trial, True, success=True)
     if status == "interrupted":
         with pytest.raises(Conflict, match="score it before the next one"):
             hand_out(user=bench.operator, station=bench.station, plan=plan)
-    assert scored(bench, trial, False).success is False
+    assert "a failure by the plan, whatever was reached" in services.failing(trial)
+    honest = scored(bench, trial, True)
+    assert (honest.success, honest.score) == (False, 1.0)
+    again = Trial.objects.get(pk=trial.pk)
     with pytest.raises(Conflict, match="that is a failure"):
-        scored(bench, Trial.objects.get(pk=trial.pk), True, reason="it had it after all")
+        scored(bench, again, True, success=True, reason="it had it after all")
     assert hand_out(user=bench.operator, station=bench.station, plan=plan).trial.attempt == 1
 
 
@@ -102,13 +105,21 @@ def test_it_is_frozen_amended_and_exported_with_the_plan(bench, declared, owner)
 def test_exports_say_what_ended_each_run_and_the_reports_program_holds_it_against_the_plan(bench, declared):
     plan = declared(on_estop=CountsAs.REPEATED, on_timeout="failure")
     ended(bench, plan, ESTOP)
-    scored(bench, ended(bench, plan, TIME, "ended"), False)
+    scored(bench, ended(bench, plan, TIME, "ended"), True)
     scored(bench, ended(bench, plan, "stopped by the operator", "ended"), True)
     voids.trial_void(user=bench.operator, trial=ended(bench, plan, FAULT), reason="the e-stop box fell on it")
     (page,) = outcome_pages(plan)
     assert [row["ended_by"] for row in page] == ["estop", "timeout", "", ""]
     rows = [{name: plain(value) for name, value in row.items()} for row in page]
     assert ending_faults(plan.document, rows) == []
+    scores = [
+        {name: plain(value) for name, value in row.items()} for page in score_pages(plan) for row in page
+    ]
+    assert scene_faults(plan.document, rows, scores) == []
+    judged = {**plan.document, "counts_as": {}}
+    assert scene_faults(judged, rows, scores) == [
+        f"trial {rows[1]['trial']}, judged by ann: success is False, its required milestones say True"
+    ]
     rows[0]["status"] = "scored"
     rows[1]["success"] = "true"
     assert ending_faults(plan.document, rows) == [

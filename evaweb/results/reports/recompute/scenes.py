@@ -18,12 +18,14 @@ def scene_faults(
         return []
     scenes = {scene["name"]: scene["milestones"] for scene in plan["scenes"]}
     played = {row["trial"]: row["scene"] for row in rows}
+    counts = plan.get("counts_as", {})
+    fails = {row["trial"] for row in rows if counts.get(f"on_{row.get('ended_by', '')}") == "failure"}
     return [
         f"trial {said['trial']}, judged by {said['rater']}: {fault}"
         for one in judged
         for said in one
         if said["trial"] in played
-        for fault in _faults(said, scenes.get(played[said["trial"]], []))
+        for fault in _faults(said, scenes.get(played[said["trial"]], []), said["trial"] in fails)
     ]
 
 
@@ -44,7 +46,7 @@ def ending_faults(plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) ->
     return found
 
 
-def _faults(said: Mapping[str, str], milestones: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _faults(said: Mapping[str, str], milestones: Sequence[Mapping[str, Any]], fails: bool) -> Iterator[str]:
     reached = json.loads(said["milestones"] or "[]")
     if [text for text, _ in reached] != [row["text"] for row in milestones]:
         yield "its milestones are not those of the plan"
@@ -52,7 +54,7 @@ def _faults(said: Mapping[str, str], milestones: Sequence[Mapping[str, Any]]) ->
     ticks = [bool(done) for _, done in reached]
     success = said["success"] == "true"
     required = [done for done, row in zip(ticks, milestones, strict=True) if row["required"]]
-    if required and success != all(required):
+    if required and not fails and success != all(required):
         yield f"success is {success}, its required milestones say {all(required)}"
     points = [row["points"] for row in milestones]
     total = sum(points)
