@@ -19,6 +19,8 @@ ATTEMPT = (
     *("trial", "uuid", "order", "code", "slot", "block", "checkpoint", "scene", "position", "repetition"),
     *("attempt", "why_again", "station", "operator", "started_at", "ended_at"),
 )
+MEASURED = ("trial", "duration_s", "ended_by")
+LOOKED_AT = ("smoothness", "smoothness_commanded")  # of a recording, by the worker
 
 
 def kept_of(plan: Plan) -> dict[str, Any]:
@@ -28,7 +30,22 @@ def kept_of(plan: Plan) -> dict[str, Any]:
         "headline": list(said.said) if said else [],
         "caveats": caveats_of(plan),
         "record": digest({"attempts": list(_attempts(plan)), "scores": list(_scores(plan))}),
+        "measured": _measured(plan),
     }
+
+
+def _measured(plan: Plan) -> dict[str, Any]:
+    """The digest of what was measured of each run; `later`: the trials whose recording has not been looked at yet."""
+    rows = [row for page in outcome_pages(plan) for row in page]
+    later = [row["trial"] for row in rows if any(row[name] is None for name in LOOKED_AT)]
+    values = [
+        [
+            *(plain(row[name]) for name in MEASURED),
+            *(() if row["trial"] in later else (plain(row[name]) for name in LOOKED_AT)),
+        ]
+        for row in rows
+    ]
+    return {"digest": digest(values), "later": later}
 
 
 def _attempts(plan: Plan) -> Iterator[list[str]]:

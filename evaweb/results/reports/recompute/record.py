@@ -15,6 +15,8 @@ ATTEMPT = (
     *("trial", "uuid", "order", "code", "slot", "block", "checkpoint", "scene", "position", "repetition"),
     *("attempt", "why_again", "station", "operator", "started_at", "ended_at"),
 )
+MEASURED = ("trial", "duration_s", "ended_by")
+LOOKED_AT = ("smoothness", "smoothness_commanded")
 SCORE = (
     *("trial", "rater", "source", "success", "score", "milestones", "failure", "failure_phase", "note"),
     *("reason", "scored_at"),
@@ -76,6 +78,15 @@ def changes(
     ]
     if digest({"attempts": attempts, "scores": said}) != kept["record"]:
         found.append("attempts, scores, reasons or times are not those of which the reveal kept the digest")
+    if "measured" in kept:  # those of before have none
+        later = {str(trial) for trial in kept["measured"]["later"]}
+        values = [
+            [row[name] for name in (*MEASURED, *(() if row["trial"] in later else LOOKED_AT))] for row in rows
+        ]
+        if digest(values) != kept["measured"]["digest"]:
+            found.append(
+                "durations, smoothness or what ended a run are not those of which the reveal kept the digest"
+            )
     text = html.unescape(_HIDDEN.sub("", page))
     found += [f"index.html does not say: {one}" for one in _unsaid(kept, text)]
     return found

@@ -11,7 +11,15 @@ from typing import Any
 from .designs import arms_of
 
 _IMBALANCE = 3  # trials by which one of two checkpoints in random order may be ahead at a condition
-_KEPT = ("pairs", "blocks", "arms", "headline", "caveats", "record")  # of a reveal, under its digest
+_KEPT = (
+    "pairs",
+    "blocks",
+    "arms",
+    "headline",
+    "caveats",
+    "record",
+    "measured",
+)  # of a reveal, under its digest
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
 
 

@@ -1,4 +1,5 @@
 import csv
+import html
 import json
 import os
 import shutil
@@ -236,6 +237,11 @@ def of_text(name, before, after):
     return tamper
 
 
+def another_headline(report):
+    said = json.loads((report / "data" / "seal.json").read_text("utf-8"))["at_reveal"]["headline"][0]
+    of_text("index.html", html.escape(said), "pi0 failed as often as pi0-new.")(report)
+
+
 def first_of_two(rows):
     corrected = next(row for row in rows if row["reason"])
     return next(row for row in rows if row["trial"] == corrected["trial"])
@@ -272,10 +278,7 @@ TAMPERINGS = {
         "has a correction and no score before it",
     ),
     "the key": (no_key, "seal.json has no key"),
-    "the headline": (
-        of_text("index.html", "succeeded more often than", "failed as often as"),
-        "does not say: pi0",
-    ),
+    "the headline": (another_headline, "does not say: "),
     "a caveat": (of_text("index.html", "Attempts voided", "Attempts"), "does not say: Attempts voided"),
     "integrity.json": (
         lambda report: (report / "data" / "integrity.json").write_text("{}"),
@@ -285,6 +288,14 @@ TAMPERINGS = {
     "a time": (
         of_table("scores", lambda rows: rows[0].update(scored_at="2026-01-01T00:00:00+00:00")),
         RECORD,
+    ),
+    "a duration": (
+        of_table("trials", lambda rows: rows[3].update(duration_s="1.5")),
+        "durations, smoothness",
+    ),
+    "what ended a run": (
+        of_table("trials", lambda rows: rows[3].update(ended_by="timeout")),
+        "durations, smoothness",
     ),
     "a reason": (of_table("scores", lambda rows: rows[-1].update(reason="a better one")), RECORD),
 }
