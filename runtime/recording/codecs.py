@@ -5,13 +5,12 @@ A frame has to reach the file at once and in the order of the rows: no B-frames,
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, Literal
 
-CodecName = Literal["libx264", "libx265", "libsvtav1", "h264_nvenc"]
+CodecName = Literal["libx264", "libx265", "h264_nvenc"]
 PIXELS = "yuv420p"
 _X26 = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
 # x264's look-ahead would halve the size of still scenes, and keep each frame for as many periods; without force-cfr it
@@ -24,21 +23,19 @@ _X265_AT_ONCE = (
 
 @dataclass(frozen=True, slots=True)
 class Codec:
-    """One encoder: `coded` is the format it writes, `largest_crf` the end of its scale of quality."""
+    """One encoder: `coded` is the format it writes."""
 
     coded: str
     presets: tuple[str, ...]
     preset: str
     crf: int
-    largest_crf: int
     tag: str | None = None  # where browsers want another one than the muxer's
 
 
 CODECS: Mapping[str, Codec] = {
-    "libx264": Codec("h264", _X26, "veryfast", 23, 51),
-    "libx265": Codec("hevc", _X26, "ultrafast", 28, 51, "hvc1"),
-    "libsvtav1": Codec("av1", tuple(str(n) for n in range(4, 11)), "10", 35, 63),
-    "h264_nvenc": Codec("h264", tuple(f"p{n}" for n in range(1, 8)), "p4", 23, 51),
+    "libx264": Codec("h264", _X26, "veryfast", 23),
+    "libx265": Codec("hevc", _X26, "ultrafast", 28, "hvc1"),
+    "h264_nvenc": Codec("h264", tuple(f"p{n}" for n in range(1, 8)), "p4", 23),
 }
 
 
@@ -49,9 +46,6 @@ def options(name: str, preset: str, crf: int, gop: int) -> dict[str, str]:
         return {**chosen, "x264-params": f"keyint={gop}:min-keyint=1:{_X264_AT_ONCE}"}
     if name == "libx265":
         return {**chosen, "x265-params": f"keyint={gop}:min-keyint=1:{_X265_AT_ONCE}"}
-    if name == "libsvtav1":
-        low_delay = f"keyint={gop}:pred-struct=1:lookahead=0:scd=0:lp=1"
-        return {"preset": preset, "crf": str(crf), "svtav1-params": low_delay}
     return {
         "preset": preset,
         "rc": "vbr",
@@ -69,8 +63,6 @@ def set_up(
     context: Any, name: str, size: tuple[int, int], rate: Fraction, told: Mapping[str, str], gop: int
 ) -> None:
     """Make an encoder's context ready for pictures of (height, width) at `rate`."""
-    if name == "libsvtav1":
-        os.environ.setdefault("SVT_LOG", "1")  # errors alone: it describes itself at length
     context.height, context.width = size
     context.pix_fmt = PIXELS
     context.time_base = 1 / rate

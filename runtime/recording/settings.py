@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from runtime.core.errors import ConfigurationError
 from runtime.core.settings import Settings
@@ -21,11 +21,10 @@ class RecordingSettings(Settings):
     codec: CodecName = "libx264"
     """Video encoder. H.264 (libx264, h264_nvenc) plays in every browser and in every reader of datasets."""
     preset: str | None = None
-    """The encoder's trade of processor time against size: libx264 and libx265 `ultrafast` to `veryslow`, libsvtav1 `4`
-    to `10`, h264_nvenc `p1` to `p7`; where it is not given `veryfast`, `ultrafast`, `10`, `p4`."""
-    crf: int | None = Field(default=None, ge=0, le=63)
-    """Constant quality: smaller is better and larger on disk, up to 51 (libsvtav1: 63); where it is not given 23, 28,
-    35, 23."""
+    """The encoder's trade of processor time against size: libx264 and libx265 `ultrafast` to `veryslow`,
+    h264_nvenc `p1` to `p7`; where it is not given `veryfast`, `ultrafast`, `p4`."""
+    crf: int | None = Field(default=None, ge=0, le=51)
+    """Constant quality: smaller is better and larger on disk; where it is not given 23, 28, 23."""
     gop: int | None = Field(default=None, ge=1, le=300)
     """Most frames between two key frames; half a second of them, at most 15, where it is not given."""
     height: Height | None = None
@@ -53,16 +52,22 @@ class RecordingSettings(Settings):
     drain_timeout_s: float = Field(default=10.0, gt=0.0)
     """Longest time that the end of an episode waits for the encoders, and then for the disk [s]."""
 
+    @field_validator("codec", mode="before")
+    @classmethod
+    def _refuse_what_stops(cls, codec: object) -> object:
+        if codec == "libsvtav1":
+            raise ConfigurationError(
+                f"recording.codec = {codec!r}: as PyAV brings it, this encoder stops for good now and then, and the "
+                f"camera's video with it; allowed: {', '.join(CODECS)}"
+            )
+        return codec
+
     @model_validator(mode="after")
     def _fit_the_codec(self) -> Self:
         codec = CODECS[self.codec]
         if self.preset is not None and self.preset not in codec.presets:
             raise ConfigurationError(
                 f"recording.preset = {self.preset!r} with codec {self.codec!r}; allowed: {', '.join(codec.presets)}"
-            )
-        if self.crf is not None and self.crf > codec.largest_crf:
-            raise ConfigurationError(
-                f"recording.crf = {self.crf} with codec {self.codec!r}; allowed: 0 to {codec.largest_crf}"
             )
         return self
 

@@ -11,7 +11,6 @@ from av.video.frame import PictureType
 
 from runtime.core.errors import ConfigurationError
 from runtime.recording.codecs import CODECS, PIXELS, options, set_up
-from runtime.recording.ordinary import ordinary_threads
 from runtime.recording.settings import RecordingSettings
 
 _SIZE = (192, 256)  # height and width; hardware encoders refuse smaller ones
@@ -22,8 +21,7 @@ def require(settings: RecordingSettings) -> None:
     """ConfigurationError naming the encoder, and those that work, where this machine cannot code as it is asked to."""
     name = settings.codec
     try:
-        with ordinary_threads():
-            _code(name, settings.chosen_preset, settings.chosen_crf, settings.gop or 1)
+        _code(name, settings.chosen_preset, settings.chosen_crf, settings.gop or 1)
     except (av.FFmpegError, ValueError) as error:
         others = ", ".join(other for other in CODECS if other != name and works(other))
         why = getattr(error, "strerror", None) or str(error)
@@ -36,8 +34,7 @@ def works(name: str) -> bool:
     """True if this machine can use that encoder as it is by default."""
     codec = CODECS[name]
     try:
-        with ordinary_threads():
-            _code(name, codec.preset, codec.crf, 1)
+        _code(name, codec.preset, codec.crf, 1)
     except (av.FFmpegError, ValueError):
         return False
     return True

@@ -17,7 +17,6 @@ from runtime.recording import codecs
 from runtime.recording.backlog import RUN
 from runtime.recording.files import AppendFile
 from runtime.recording.fragments import frames_in
-from runtime.recording.ordinary import ordinary_threads
 from runtime.recording.planes import planes
 from runtime.recording.settings import RecordingSettings
 
@@ -51,8 +50,7 @@ class FragmentedVideo:
         }
         self._container = av.open(self._muxed, "w", format="mp4", options=options)
         self._stream = self._open_stream(fps, settings)
-        with ordinary_threads():
-            self._container.start_encoding()
+        self._container.start_encoding()
         self._store()
 
     def encode(self, picture: UInt8 | None) -> None:
