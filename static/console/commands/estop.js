@@ -1,4 +1,5 @@
-// The software e-stop: a button that never moves, Escape, and space but on a control that has the focus, which it is for.
+// The software e-stop: a button that never moves, Escape, and space. While the robot is idle or ready, or stopped already,
+// space is for a control that has the focus.
 // Escape first closes what is open, unless the robot may move: then it does both. The e-stop waits for nothing: it goes
 // over the socket and to the process for stops at once, under one uuid, which the station carries out once. What is
 // left, plain HTTP to the web, where these say nothing; and red letters where nobody does. estop_state.js has what is true.
@@ -11,6 +12,7 @@ import { EStopState } from "./estop_state.js";
 const ACK_MS = 500;
 const ASK_MS = 5000;
 const CONTROLS = 'input, textarea, select, button, summary, [contenteditable="true"]'; // what was clicked gives the focus back: keys.js
+const AT_REST = ["idle", "ready"];
 const OPEN = "dialog[open], details[open]:has(> .float)";
 const WORDS = {
   pressed: { kind: "pressed", text: "E-stop pressed …" },
@@ -166,8 +168,9 @@ export class EStop {
   #isStop(event) {
     if (event.ctrlKey || event.altKey || event.metaKey) return "";
     if (event.key === "Escape") return "Escape";
-    if (event.code === "Space" && !event.target.closest?.(CONTROLS)?.checkVisibility()) return "space";
-    return "";
+    if (event.code !== "Space") return "";
+    const control = event.target.closest?.(CONTROLS)?.checkVisibility();
+    return control && this.#leavesSpace() ? "" : "space";
   }
 
   #key(event) {
@@ -177,6 +180,11 @@ export class EStop {
     if (event.repeat) return;
     const closed = why === "Escape" && closeTop();
     if (!closed || !this.#atRestForSure()) this.press(why);
+  }
+
+  /** Nothing may begin to move but by a button, or the e-stop is latched: who has the focus of a control types. */
+  #leavesSpace() {
+    return this.#state.latched || (this.#store.fresh && AT_REST.includes(this.#store.snapshot.state));
   }
 
   /** Nothing moves by what this page knows, and it knows it now. */

@@ -47,8 +47,7 @@
 
   document.getElementById("estop").addEventListener("click", () => alone() && press("button"));
   window.addEventListener("keydown", (event) => {
-    const taken = event.code === "Space" && event.target.closest?.("input, textarea, select, button, summary");
-    if (!alone() || event.repeat || taken || !["Escape", "Space"].includes(event.code)) return;
+    if (!alone() || event.repeat || !["Escape", "Space"].includes(event.code)) return;
     event.preventDefault();
     press(event.code);
   });

@@ -573,7 +573,7 @@ def test_the_e_stop_works_before_and_without_the_modules() -> None:
     await settled();
     const first = shown();
     listeners.keydown({ code: "Escape", preventDefault() {}, target: {} });
-    listeners.keydown({ code: "Space", preventDefault() {}, target: { closest: () => true } });  // typed
+    listeners.keydown({ code: "Space", preventDefault() {}, target: { closest: () => true } });
     parts["estop-area"].dataset.ready = "";
     listeners.estop();
     return { first, posted, rest: parts["estop-note"].dataset.rest };
@@ -584,6 +584,7 @@ def test_the_e_stop_works_before_and_without_the_modules() -> None:
     assert found["posted"] == [
         ["/estop", "button on the page, before it had started"],
         ["/estop", "Escape on the page, before it had started"],
+        ["/estop", "Space on the page, before it had started"],
     ]
     assert found["rest"] == "at rest"
 
@@ -675,6 +676,42 @@ def test_a_press_that_fails_both_ways_says_so_and_what_is_left_is_tried() -> Non
     assert pressed('ack("failed"); ' + told, dead=[STOPS_AT]) == once_more
     dead = 'ack("failed"); await until(() => posted.length === 2 && kinds.length === 3); return kinds;'
     assert pressed(dead, dead=[STOPS_AT, "/estop"]) == ["pressed", "failed", "failed"]
+
+
+SPACES = """
+const keys = [];
+globalThis.window.addEventListener = (kind, act) => kind === "keydown" && keys.push(act);
+const store = { on() {}, open: true, fresh: true, snapshot: { state: "idle", estop: false } };
+new EStop(store, socket, way);
+const press = (over) => {
+  sent.length = 0;
+  const control = over ? { checkVisibility: () => true } : null;
+  const event = { code: "Space", target: { closest: () => control }, prevented: 0 };
+  event.preventDefault = () => (event.prevented = 1);
+  keys.at(-1)(event);
+  return [sent.length, event.prevented];
+};
+const found = {};
+for (const state of given.states) {
+  store.snapshot = { ...store.snapshot, state };
+  found[state] = [press(true), press(false)];
+}
+store.fresh = false;
+store.snapshot = { ...store.snapshot, state: "idle" };
+found.unheard = [press(true), press(false)];
+return found;
+"""
+
+
+def test_space_is_a_controls_only_while_the_robot_is_idle_or_ready() -> None:
+    stops, types = (1, 1), (0, 0)
+    moving = ("setting_up", "running", "holding", "disconnected")
+    found = pressed(SPACES, states=["idle", "ready", *moving])
+    assert {state: tuple(of_state[0]) for state, of_state in found.items()} == {
+        **dict.fromkeys(("idle", "ready"), types),
+        **dict.fromkeys((*moving, "unheard"), stops),
+    }
+    assert all(tuple(of_state[1]) == stops for of_state in found.values())
 
 
 def camera(
