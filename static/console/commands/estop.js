@@ -49,6 +49,7 @@ export class EStop {
     store.on("snapshot", () => this.#news());
     this.ask();
     this.#area.dataset.ready = ""; // estop_early.js leaves it to us
+    startedAfterAll(document.getElementById("outcome"));
   }
 
   /** Have the process for stops know who is here, before anybody presses; again until it answers: it may be starting. */
@@ -195,6 +196,13 @@ export class EStop {
   #keyUp(event) {
     if (this.#isStop(event) === "space") event.preventDefault();
   }
+}
+
+/** Take back that the page has not started. */
+function startedAfterAll(outcome) {
+  if (outcome?.dataset.late === undefined) return;
+  outcome.textContent = "";
+  delete outcome.dataset.late;
 }
 
 /** Close what was opened last; whether there was anything. */

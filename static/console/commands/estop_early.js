@@ -52,6 +52,9 @@
     press(event.code);
   });
   setTimeout(() => {
-    if (alone()) document.getElementById("outcome").textContent = "This page has not started: reload it. Its e-stop works.";
+    if (!alone()) return;
+    const outcome = document.getElementById("outcome");
+    outcome.textContent = "This page has not started: reload it. Its e-stop works.";
+    outcome.dataset.late = ""; // which estop.js takes back where it starts after all
   }, LATE_MS);
 })();

@@ -560,7 +560,9 @@ const fetch = async (address, { body }) => {
   return { ok: given.status === 200, status: given.status, json: async () => ({ status: given.said }) };
 };
 const quiet = { error() {} };
-new Function("document", "window", "fetch", "console", "setTimeout", source)(document, window, fetch, quiet, () => {});
+let late;
+const later = (act) => (late = act);
+new Function("document", "window", "fetch", "console", "setTimeout", source)(document, window, fetch, quiet, later);
 const settled = () => new Promise((resolve) => setTimeout(resolve, 5));
 const shown = () => [parts["estop-area"].dataset.kind, parts["estop-note"].textContent];
 """
@@ -712,6 +714,23 @@ def test_space_is_a_controls_only_while_the_robot_is_idle_or_ready() -> None:
         **dict.fromkeys((*moving, "unheard"), stops),
     }
     assert all(tuple(of_state[1]) == stops for of_state in found.values())
+
+
+def test_a_page_that_starts_late_takes_back_that_it_has_not() -> None:
+    given = {"module": (MODULES / "commands/estop_early.js").as_uri(), "status": 200, "said": "accepted"}
+    early = run(
+        "live/words.js", EARLY + "late(); return [parts.outcome.textContent, parts.outcome.dataset];", given
+    )
+    assert early == ["This page has not started: reload it. Its e-stop works.", {"late": ""}]
+    body = """
+    elements.outcome = { dataset: { late: "" }, textContent: "This page has not started" };
+    new EStop({ on() {} }, socket, way);
+    const late = elements.outcome.textContent;
+    elements.outcome.textContent = "accepted";
+    new EStop({ on() {} }, socket, way);
+    return [late, elements.outcome.textContent];
+    """
+    assert pressed(body) == ["", "accepted"]
 
 
 def camera(
