@@ -14,6 +14,13 @@ const NAMES = {
   move: "Take it here",
 };
 
+const GIVEN_AWAY = ["give_up", "hand_over"];
+const WHY = {
+  elsewhere: "you took the station on another page",
+  other: "",
+  free: "the lease was ended by the station",
+};
+
 export class LeaseControls {
   #store;
   #socket;
@@ -26,6 +33,8 @@ export class LeaseControls {
   #awake = null;
   #refused = 0;
   #before = "unknown";
+  #mine = false; // this page has commanded, and nothing was heard yet of who does since
+  #heardAt = 0; // when its lease was last renewed
 
   constructor(store, socket, commands) {
     this.#store = store;
@@ -46,7 +55,10 @@ export class LeaseControls {
   /** The server answered a renewal; the station's own state says the rest. */
   #renewed({ ok, reason }) {
     this.#refused = ok || this.#store.lease !== "mine" ? 0 : this.#refused + 1;
-    if (ok) this.#away = "";
+    if (ok) {
+      this.#away = "";
+      this.#heardAt = performance.now();
+    }
     if (this.#refused > 1) this.#commands.say(`Lease not renewed: ${reason}`, "refused"); // once: it was just handed over
   }
 
@@ -57,10 +69,14 @@ export class LeaseControls {
       name.textContent = this.#store.commander;
     }
     document.body.dataset.lease = lease;
-    if (this.#away && !["mine", "unknown"].includes(lease)) this.#ended();
+    if (!["mine", "unknown"].includes(lease)) this.#ended(lease);
     if (lease === this.#before) return;
-    if (lease === "mine") this.#stayAwake();
-    else if (this.#before === "mine") this.#letSleep();
+    if (lease === "mine") {
+      this.#mine = true;
+      this.#heardAt = performance.now();
+      this.#stayAwake();
+    }
+    if (this.#before === "mine") this.#letSleep();
     this.#before = lease;
   }
 
@@ -114,11 +130,14 @@ export class LeaseControls {
 
   async #act(action, name, content) {
     this.#commands.say(`${name}: pressed …`, "pressed");
+    const mine = this.#mine;
+    if (GIVEN_AWAY.includes(action)) this.#mine = false; // what is given up is not lost
     try {
       await post(config.api.lease, { action, page: this.#store.page, ...content });
       this.#commands.say(`${name}: done`, "accepted");
       return true;
     } catch (error) {
+      this.#mine = mine;
       this.#commands.fail(name, error);
       return false;
     } finally {
@@ -146,9 +165,20 @@ export class LeaseControls {
     this.#draw();
   }
 
-  #ended() {
-    this.#commands.say(this.#away, "refused");
+  /** This page commands no more: said here, with since when and why, but where it gave the station away itself. */
+  #ended(lease) {
+    if (this.#mine || this.#away) this.#commands.say(this.#away || this.#lost(lease), "refused");
+    this.#mine = false;
     this.#away = "";
+  }
+
+  #lost(lease) {
+    const silent = (performance.now() - this.#heardAt) / 1000;
+    const expired = silent > 0.8 * this.#store.snapshot.facts.lease_ttl_s;
+    const why = expired ? `your page was not heard for ${silent.toFixed(0)} s` : WHY[lease];
+    const taken = lease === "other" ? `${this.#store.commander} commands` : "";
+    const at = new Date().toLocaleTimeString("en-GB");
+    return `You do not command any more, since ${at}: ${[why, taken].filter(Boolean).join("; ")}.`;
   }
 
   #leaving(event) {

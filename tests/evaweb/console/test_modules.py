@@ -716,6 +716,52 @@ def test_space_is_a_controls_only_while_the_robot_is_idle_or_ready() -> None:
     assert all(tuple(of_state[1]) == stops for of_state in found.values())
 
 
+LEASE = """
+const quiet = () => {};
+globalThis.document = {
+  title: "bench-1", hidden: false, body: { dataset: {}, addEventListener: quiet }, addEventListener: quiet,
+  querySelectorAll: () => [], querySelector: () => null,
+  getElementById: () => ({ textContent: JSON.stringify({ page: "eval", api: { lease: "/lease" }, beat: "/beat.js" }) }),
+};
+globalThis.window = { addEventListener: quiet, htmx: { trigger: quiet } };
+globalThis.Worker = class { addEventListener() {} };
+globalThis.fetch = async () => ({ ok: given.answers, status: given.answers ? 200 : 409, text: async () => "{}" });
+let now = 0;
+globalThis.performance = { now: () => now };
+const handlers = {}, said = [];
+const { LeaseControls } = await import(given.module);
+const store = {
+  on: (names, act) => [names].flat().forEach((name) => (handlers[name] = act)),
+  page: "p", commander: "bob", fresh: true, lease: "mine", snapshot: { facts: { lease_ttl_s: 5 }, state_is: {} },
+};
+const clicks = [];
+globalThis.document.addEventListener = (kind, act) => kind === "click" && clicks.push(act);
+new LeaseControls(store, { send: quiet }, { say: (text) => said.push(text), fail: quiet });
+const becomes = (lease, fresh = true) => { Object.assign(store, { lease, fresh }); handlers.snapshot(); };
+const press = (action) => clicks[0]({ target: { closest: () => ({ dataset: { lease: action } }) } });
+const lost = () => said.filter((text) => text.startsWith("You do not")).map((text) => text.replace(/[0-9:]{8}/, "T"));
+"""
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ('now = 4500; becomes("free")', "your page was not heard for 5 s"),
+        ('becomes("mine", false); now = 7000; becomes("free")', "your page was not heard for 7 s"),
+        ('now = 4500; handlers.renewed({ ok: true }); becomes("other")', "bob commands"),
+        ('now = 6000; becomes("other")', "your page was not heard for 6 s; bob commands"),
+        ('becomes("elsewhere")', "you took the station on another page"),
+        ('await press("give_up"); becomes("free")', ""),
+        ('store.lease = "free"; becomes("free"); becomes("other")', ""),
+    ],
+)
+def test_a_page_says_that_it_commands_no_more_with_since_when_and_why(body: str, said: str) -> None:
+    given = {"module": (MODULES / "commands/lease.js").as_uri(), "answers": True}
+    opened = LEASE.replace('lease: "mine"', 'lease: "free"') if "store.lease" in body else LEASE
+    found = run("live/words.js", opened + body + '; becomes("free"); return lost();', given)
+    assert found == ([f"You do not command any more, since T: {said}."] if said else [])
+
+
 def test_a_page_that_starts_late_takes_back_that_it_has_not() -> None:
     given = {"module": (MODULES / "commands/estop_early.js").as_uri(), "status": 200, "said": "accepted"}
     early = run(
