@@ -28,7 +28,7 @@ from evaweb.results.analysis.simulated import is_simulated, set_beside, simulate
 from evaweb.results.pages import pages
 from evaweb.results.presentation import listings
 from evaweb.results.presentation.citing import HEAD, Citation, citation
-from evaweb.results.presentation.integrity import delays_banner, integrity_document
+from evaweb.results.presentation.integrity import delays_banner, integrity_document, too_few_words
 from evaweb.results.ratings.automatic import judge_ask, judges_ready
 from evaweb.results.ratings.unblinding import has_results, require_seen, sealing, why_sealed
 from evaweb.results.reports.reporting import write_report
@@ -150,6 +150,7 @@ def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
     context = {
         "record": record,
         "banner": delays_banner(record),
+        "too_few": too_few_words(record),
         "most": MOST_LINES,
         **_common(request, found),
     }

@@ -40,6 +40,7 @@ from evaweb.statistics.many import letters
 # spread differently around one mean cannot, either.
 _DIFFER = 6
 _BEST = 6  # and which is the best of several is said
+_UNDECIDED = 6  # and that so few trials cannot tell two apart
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,6 +229,8 @@ def _sentence(
     if found.margin is not None:
         claim = f"{first} is {'' if one.winner else 'not shown to be '}not worse than {second}"
         return f"{claim} by {100 * found.margin:g} points or more: {counts}"
+    if one.winner is None and not one.dropped and not _could_tell(plan, found, pair, blocks):
+        return f"Undecided: {one.at} {found.unit} cannot tell {first} and {second} apart: {counts}"
     if one.winner is None:
         why = ", when one of them was dropped" if one.dropped else ""
         return f"No significant difference between {first} and {second}: {counts}{why}"
@@ -237,6 +240,14 @@ def _sentence(
     if found.rule == FIXED and (plan.document or {}).get("format", 1) >= _DIFFER:
         return f"Scores of {better} and {worse} differ: {counts}"
     return f"{better} reached higher scores than {worse}: {counts}"
+
+
+def _could_tell(plan: Plan, found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> bool:
+    """Whether any outcomes of so many trials would have told these two apart."""
+    if (plan.document or {}).get("format", 1) < _UNDECIDED:
+        return True
+    apart = [tuple((arm, float(arm == pair[0])) for arm, _ in block) for block in blocks]
+    return findings(found, apart).each[found.comparisons.index(pair)].winner is not None
 
 
 def _counts(found: Design, one: Conclusion, ours: Sequence[float], theirs: Sequence[float]) -> str:

@@ -45,6 +45,16 @@ def delays_banner(found: Mapping[str, Any]) -> str:
     )
 
 
+def too_few_words(found: Mapping[str, Any]) -> str:
+    """A sentence where the pairs are so few that no test of delays could say anything; "" where one could."""
+    delays = found["delays"]
+    pairs = [test["pairs"] for row in delays["rows"] for test in row["tests"] if test["p"] is not None]
+    most = max(pairs, default=0)
+    if not most or 2.0 ** (1 - most) <= delays["alpha"]:  # the smallest p of sign flips
+        return ""
+    return f"{_of(most, 'pair')} {'is' if most == 1 else 'are'} too few for any of these tests"
+
+
 def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
     other = [row["what"] for row in found["headline"] if row["same"] is False]
     if other:

@@ -190,7 +190,7 @@ def test_all_pairs_made_close_it_too(bench, draft, owner):
     carry_out(bench, plan, 4)
     assert plan.closed_because == "all pairs of its comparison are made, after 2 pairs"
     assert headline(plan).sentence.startswith(
-        f"No significant difference between {BETTER} and pi0-block: 2/2"
+        f"Undecided: 2 pairs cannot tell {BETTER} and pi0-block apart: 2/2"
     )
 
 

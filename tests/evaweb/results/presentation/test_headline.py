@@ -4,6 +4,7 @@ import pytest
 
 from evaweb.plans.models import Plan
 from evaweb.results.presentation.headline import _counts, best_of
+from evaweb.results.presentation.integrity import too_few_words
 from evaweb.statistics.designs import conclude, design, in_blocks
 
 SCORES = in_blocks([(0.75, 0.5)] * 10)
@@ -51,3 +52,13 @@ def test_which_of_several_is_best_is_said_where_all_were_compared(successes, sai
 
 def test_a_plan_of_before_it_was_said_keeps_its_words():
     assert best(38, 20, 5, format=5) == ""
+
+
+@pytest.mark.parametrize(
+    ("pairs", "said"), [(0, ""), (1, "1 pair is too few"), (5, "5 pairs are too few"), (6, "")]
+)
+def test_pairs_that_no_test_of_delays_could_tell_apart_are_said_to_be_too_few(pairs, said):
+    test = {"pairs": pairs, "p": 1.0 if pairs else None}
+    found = too_few_words({"delays": {"alpha": 0.05, "rows": [{"tests": [test]}]}})
+    assert found.startswith(said)
+    assert bool(found) == bool(said)
