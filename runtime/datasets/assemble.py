@@ -36,7 +36,7 @@ from runtime.datasets.renaming import Names
 from runtime.datasets.rows import numbers, write_table
 from runtime.datasets.sides import FOLDER, side_file, side_files
 from runtime.datasets.splits import TRAIN, episodes_of, written
-from runtime.datasets.staging import Draft
+from runtime.datasets.staging import LOCK, Draft
 from runtime.datasets.stats import Statistic, fault, picture_statistic, video_statistic
 from runtime.recording.files import disk_fault
 
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _PLACED = ("episode_index", "index", "task_index")  # columns that depend on where an episode is
+_ROUNDED, _LOST = 2.0**-23, 1e-3  # of a number, by float32; of what a column spans
 _OURS = {layout.INFO, layout.EPISODES, layout.TASKS, layout.EPISODES_STATS, layout.STATS, layout.TASKS_V30}
 _OURS |= {layout.EVA_EPISODES}
 SUBTASKS = "meta/subtasks.parquet"  # of LeRobot 0.6: what subtask_index numbers
@@ -294,7 +295,7 @@ class _Assembly:
             path = self._root / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
-        self._others()
+        self._others() if self._copying else self._carry(self._sources[0])
         return Assembled(
             self._root,
             catalog.version,
@@ -400,6 +401,7 @@ class _Assembly:
 
     def _cast(self, part: Part, column: pa.ChunkedArray, field: pa.Field) -> pa.Array:
         import pyarrow as pa
+        import pyarrow.compute as pc
 
         array = column.combine_chunks()
         root, where = part.source.dataset.root, f"episode {part.index}, column {field.name!r}"
@@ -408,15 +410,21 @@ class _Assembly:
             return pa.array([pictures.row(k) for k in range(len(pictures))], field.type)
         nested = pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type)
         if nested and not (pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type)):
-            if len(array.flatten()) != len(array):
+            if array.null_count or pc.any(pc.not_equal(pc.list_value_length(array), 1)).as_py():
                 raise RecordingError(f"{root}, {where} has other than one value per row, declared is one")
             array = array.flatten()
         try:
-            return array.cast(field.type)
+            found = array.cast(field.type)
         except pa.ArrowException as error:
             raise RecordingError(
                 f"{root}, {where} is {array.type}, declared {field.type}: {error}"
             ) from error
+        if changed := _changed(array, found):
+            raise RecordingError(
+                f"{root}, {where} is {array.type}, declared {field.type}, which cannot hold {changed}: "
+                "declare it as it is stored"
+            )
+        return found
 
     def _video(self, part: Part, key: str, target: Path, frames: int) -> None:
         span = part.source.dataset.entry(part.index).videos[part.source.names.old(key)]
@@ -447,10 +455,70 @@ class _Assembly:
                 if name == layout.MODALITY:
                     if source is self._sources[0] and source.names.empty:
                         shutil.copyfile(path, self._root / name)
+                elif path.is_symlink() and not _is_its_own(path, root):
+                    self._left_out[f"{path}: a link to {path.resolve()}, which is not of the dataset"] = None
                 elif path.is_file() and (len(self._sources) == 1 or name == SUBTASKS):
                     shutil.copyfile(path, self._root / name)
                 else:
                     self._left_out[str(path)] = None
+
+    def _carry(self, source: Source) -> None:
+        """Take along everything in the folder that is replaced but the format's own files and those of episodes."""
+        root = source.dataset.root
+        listed = source.dataset.episodes
+        known = {root / name for name in _OURS} | {root / LOCK}
+        known |= {path for one in listed for path in (one.data, *(span.path for span in one.videos.values()))}
+        known |= {
+            path for told in source.eva.values() for path in side_files(root, str(told["uuid"])).values()
+        }
+        known |= set((root / EPISODES_FOLDER).rglob("*.parquet"))
+        for path in sorted(root.rglob("*")):
+            name = path.relative_to(root)
+            if (
+                path in known
+                or name.parts[0] == layout.PUBLISHING
+                or (path.is_dir() and not path.is_symlink())
+            ):
+                continue
+            target = self._root / name
+            if not target.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(path, target, follow_symlinks=False)
+
+
+def _is_its_own(path: Path, root: Path) -> bool:
+    """Whether a link leads into the dataset, or to where the cache of a hub keeps the files of a snapshot."""
+    here = root.resolve()
+    places = (here, here.parent.parent / "blobs")
+    return any(path.resolve().is_relative_to(place) for place in places)
+
+
+def _changed(given: pa.Array, made: pa.Array) -> str:
+    """The value that another type changed most, in words; "" where it changed none by more than float32 rounds."""
+    before, after = (np.asarray(_leaves(array).to_numpy(zero_copy_only=False)) for array in (given, made))
+    if before.dtype == after.dtype or not all(
+        np.issubdtype(one.dtype, np.number) or one.dtype == bool for one in (before, after)
+    ):
+        return ""
+    exact, kept = before.astype(np.float64), after.astype(np.float64)
+    finite = np.isfinite(exact)
+    spread = float(np.ptp(exact[finite])) if finite.any() else 0.0
+    with np.errstate(invalid="ignore", over="ignore"):
+        allowed = _LOST * spread if spread else _ROUNDED * np.maximum(np.abs(exact), 1.0)
+        off = finite & ~(np.abs(kept - exact) <= allowed)
+    return f"{exact[off][0]:.17g} ({kept[off][0]:.9g} would be left)" if off.any() else ""
+
+
+def _leaves(array: pa.Array) -> pa.Array:
+    import pyarrow as pa
+
+    while (
+        pa.types.is_list(array.type)
+        or pa.types.is_fixed_size_list(array.type)
+        or pa.types.is_large_list(array.type)
+    ):
+        array = array.flatten()
+    return array
 
 
 def _without_nan(value: Any) -> Any:

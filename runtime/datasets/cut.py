@@ -38,6 +38,12 @@ def cut(span: Span, target: Path, frames: int, fps: float) -> None:
         times, ticks = scan.times, scan.stamps
     if len(times) < frames:
         raise RecordingError(f"{span.path} has {len(times)} frames for {frames} rows")
+    off = np.abs(np.array(times[:frames]) - times[0] - np.arange(frames) / fps).max(initial=0.0)
+    if len(times) != frames and off > 0.5 / fps:  # as many pictures as rows are those of the rows
+        raise RecordingError(
+            f"{span.path}: its pictures are up to {off:.2f} s off the rows, which come at {fps:g} Hz: "
+            "make its video anew at that rate"
+        )
     if not span.start and _is_ready(span.path, frames, fps):
         shutil.copyfile(span.path, target)
         return

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -252,5 +252,17 @@ def open_dataset(root: Path | str) -> Dataset:
         info=info,
         fps=float(info["fps"]),
         episodes=tuple(entry(root, info, line) for line in episode_lines(root, info)),
-        tasks={line["task_index"]: line["task"] for line in task_lines(root, info)},
+        tasks=_numbered(root, task_lines(root, info)),
     )
+
+
+def _numbered(root: Path, lines: Iterable[Mapping[str, Any]]) -> dict[int, str]:
+    """Tasks by their numbers; RecordingError where a number is that of two."""
+    found: dict[int, str] = {}
+    for line in lines:
+        number, task = line["task_index"], line["task"]
+        if found.setdefault(number, task) != task:
+            raise RecordingError(
+                f"{root}: task_index {number} is {found[number]!r} and {task!r}; allowed: one task each"
+            )
+    return found

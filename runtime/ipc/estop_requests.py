@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 from uuid import uuid4
 
@@ -137,18 +137,22 @@ class _Table(list[tuple[str, Any]]):
 
 
 _JSON = json.JSONDecoder(object_pairs_hook=_Table)
+_READ_WHOLE, _WINDOW = 8192, 4096  # characters
 
 
 def in_json(said: str | bytes, *keys: str) -> dict[str, Any] | None:
     """Fields of a press in JSON, {} where they cannot be read; None where the message is no press.
 
     `keys` are those under which such a message names what it is: {"type": "estop"}. "web:estop" and "estop:REASON" are
-    names of it too.
+    names of it too. One that is longer than a press has reason to be is looked at where it begins and where it ends.
     """
     text = said if isinstance(said, str) else said.decode(json.detect_encoding(said), "replace")
     text = text.lstrip("\ufeff \t\r\n")
     if NAME not in text and "\\u" not in text:
         return None
+    if len(text) > _READ_WHOLE:  # whoever sends a lot must not keep presses of others waiting
+        parts = (text[:_WINDOW], text[-_WINDOW:])
+        return _fields(parts) if any(_loosely(part, keys) for part in parts) else None
     try:
         found, end = _JSON.raw_decode(text)
     except (ValueError, RecursionError):
@@ -159,8 +163,20 @@ def in_json(said: str | bytes, *keys: str) -> dict[str, Any] | None:
             return {key: _plain(value) for key, value in found}
         if named and not text[end:].strip():
             return None
+    return {} if _loosely(text, keys) else None
+
+
+def _fields(parts: Sequence[str]) -> dict[str, Any]:
+    """What of a long press is kept, as far as it stands in those parts."""
+    pattern = r'"%s"\s{0,9}:\s{0,9}"([^"\\]{1,240})'
+    found = ((key, re.search(pattern % key, part)) for part in reversed(parts) for key in ("uuid", "why"))
+    return {key: match[1] for key, match in found if match}
+
+
+def _loosely(text: str, keys: Sequence[str]) -> bool:
+    """Whether it says somewhere that it is a press, however broken it is."""
     bare = _ESCAPED.sub(lambda code: chr(int(code[1], 16)), text).replace("\\", "")
-    return {} if re.search(_LOOSE % "|".join(keys), bare) else None
+    return re.search(_LOOSE % "|".join(keys), bare) is not None
 
 
 def why_in(said: Mapping[str, Any], default: str = WHY) -> str:

@@ -75,7 +75,7 @@ def _file(data: Path, episode: str) -> Path:
 
 def _read(line: str) -> Label | None:
     try:
-        row: Any = json.loads(line)
+        row: Any = json.loads(line.removeprefix("\ufeff"))
         label = Label(
             float(row["time"]), str(row["by"]), row["result"], str(row["note"]), row["discarded"] is True
         )

@@ -25,7 +25,7 @@ from runtime.datasets.operations import convert
 from runtime.datasets.reader import open_dataset
 from runtime.datasets.stats import video_statistic
 from tests.runtime.datasets.foreign import Plan, write
-from tests.runtime.datasets.small import HEIGHT, WIDTH, seen
+from tests.runtime.datasets.small import HEIGHT, WIDTH, seen, write_video
 
 CAM = "observation.images.cam"
 ROWS = "data/chunk-000/episode_000000.parquet"
@@ -316,3 +316,78 @@ def test_pictures_declared_with_their_channels_first_are_whole(
     for key in (CAM, "observation.images.wrist"):
         declare(tmp_path / "set", key, shape=[3, HEIGHT, WIDTH], names=names)
     assert check(tmp_path / "set") == []
+
+
+def own(tmp_path: Path, column: pa.Array, dtype: str) -> Path:
+    """A dataset of one episode of 7 rows with a column of its own that is declared so."""
+    root = tmp_path / "set"
+    write(root, Plan("v2.1", lengths=(7,), videos=()))
+    table = pq.read_table(root / ROWS)
+    pq.write_table(table.append_column("mine", column), root / ROWS)
+    declare(root, "mine", dtype=dtype, shape=[1], names=None)
+    return root
+
+
+ONE_ROW = "other than one value per row"
+
+
+@pytest.mark.parametrize(
+    ("column", "dtype", "said"),
+    [
+        (pa.array([[1.0, 2.0], [], *([float(k)] for k in range(5))]), "float32", ONE_ROW),
+        (pa.array([[1.0], None, [4.0, 5.0], *([float(k)] for k in range(4))]), "float32", ONE_ROW),
+        (pa.array([1.7e9 + k / 10 for k in range(7)]), "float32", "cannot hold 1700000000"),
+        (pa.array([1e300, *range(6)], pa.float64()), "float32", "cannot hold 1.0"),
+        (pa.array(range(7), pa.int64()), "bool", "cannot hold 2"),
+    ],
+)
+def test_values_that_a_declared_type_cannot_hold_are_refused(
+    tmp_path: Path, column: pa.Array, dtype: str, said: str
+) -> None:
+    root = own(tmp_path, column, dtype)
+    with pytest.raises(RecordingError, match=f"episode 0, column 'mine' .*{said}"):
+        convert(root, tmp_path / "new", "v3.0")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("column", "dtype"),
+    [
+        (pa.array([0.1 * k for k in range(7)]), "float32"),
+        (pa.array([1.7e9] * 7), "float64"),
+        (pa.array([k % 2 for k in range(7)], pa.int64()), "bool"),
+        (pa.array([float("nan"), *(0.5 * k for k in range(6))]), "float32"),
+    ],
+)
+def test_values_that_it_can_hold_are_taken(tmp_path: Path, column: pa.Array, dtype: str) -> None:
+    root = own(tmp_path, column, dtype)
+    made = convert(root, tmp_path / "new", "v3.0")
+    assert made.frames == 7
+
+
+def test_a_task_number_of_two_tasks_is_refused(root: Path) -> None:
+    path = root / "meta/tasks.jsonl"
+    path.write_text(path.read_text() + json.dumps({"task_index": 0, "task": "another"}) + "\n")
+    with pytest.raises(RecordingError, match="task_index 0 is 'task 0' and 'another'"):
+        open_dataset(root)
+
+
+def test_a_video_of_another_rate_than_its_rows_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "set", Plan("v2.1", lengths=(8,), videos=("cam",)))
+    path = next((tmp_path / "set/videos").rglob("*.mp4"))
+    write_video(path, 16, fps=20.0)
+    with pytest.raises(
+        RecordingError, match=r"its pictures are up to 0.35 s off the rows, which come at 10 Hz"
+    ):
+        convert(tmp_path / "set", tmp_path / "new", "v3.0")
+
+
+def test_links_that_lead_out_of_a_dataset_are_left_out_with_a_word(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("key")
+    (root / "README.md").symlink_to(tmp_path / "secret")
+    (root / "notes.md").write_text("here")
+    (root / "same.md").symlink_to("notes.md")
+    made = convert(root, tmp_path / "new", "v3.0")
+    assert not (tmp_path / "new/README.md").exists()
+    assert [one for one in made.left_out if "README.md: a link to" in one]
+    assert (tmp_path / "new/same.md").read_text() == "here"

@@ -596,3 +596,27 @@ def test_every_episode_is_told_of(tmp_path: Path) -> None:
     convert(dataset, tmp_path / "new", "v3.0", tell=told.append)
     split(dataset, {tmp_path / "one": [1]}, tell=told.append)
     assert told == ["episode 1 of 2", "episode 2 of 2", "one: episode 1 of 1"]
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_deleting_an_episode_leaves_what_it_does_not_know(tmp_path: Path, version: str) -> None:
+    root = tmp_path / "set"
+    write(root, Plan(version, videos=("cam_high",)))
+    others = {
+        ".git/HEAD": "ref",
+        ".gitattributes": "lfs",
+        "calibration/left/cam.yaml": "k",
+        "meta/own/notes.json": "{}",
+        "videos/chunk-000/depth_raw/episode_000001.npy": "x",
+        "data/notes.txt": "n",
+        "README.md": "read",
+    }
+    for name, content in others.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(content)
+    (root / "latest").symlink_to("data")
+    assert delete(root, [1]).left_out == ()
+    assert {name: (root / name).read_text() for name in others} == others
+    assert os.readlink(root / "latest") == "data"
+    assert shows(root, 1, 2, 9)
+    assert len(list((root / "videos").rglob("*.mp4"))) == 2

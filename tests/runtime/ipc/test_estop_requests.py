@@ -109,3 +109,23 @@ def test_a_text_without_the_word_is_no_press(said: str | bytes) -> None:
 )
 def test_the_reason_is_found_where_people_write_it(said: dict[str, object], why: str) -> None:
     assert why_in(said) == why
+
+
+@pytest.mark.parametrize("many", [3_000, 200_000])
+def test_a_long_message_is_looked_at_where_it_begins_and_ends(many):
+    """What whoever sends a lot costs must not keep the presses of others waiting."""
+    noise = ("kind" + " " * 9 + ":" + " " * 9) * (many // 22)
+    assert in_json(noise + "\\u0041 estop", "kind") in (None, {})
+    looked = []
+    told = in_json('{"kind": "estop", "why": "smoke", "uuid": "u-1", "args": "' + "x" * many + '"}', "kind")
+    looked.append(told)
+    looked.append(
+        in_json('{"args": "' + "x" * many + '", "uuid": "u-1", "why": "smoke", "kind": "estop"}', "kind")
+    )
+    assert [(one["why"], one["uuid"]) for one in looked] == [("smoke", "u-1")] * 2
+    assert in_json('{"kind": "move", "args": "' + "estop " * many + '"}', "kind") is None
+
+
+def test_a_long_message_that_is_no_press_is_not_parsed(monkeypatch):
+    monkeypatch.setattr("runtime.ipc.estop_requests._JSON", None)
+    assert in_json("[" + '{"a":1},' * 20_000 + '{"type": "\\u0041 estop"}]', "kind") is None
