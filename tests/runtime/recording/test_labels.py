@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import uuid
 from pathlib import Path
 
 import pytest
 
-from runtime.recording.labels import Label, append, labels, newest
+from runtime.recording.labels import FOLDER, Label, append, labels, newest
 from tests.runtime.datasets.odd_lines import ENDS_NO_LINE
 
 
@@ -23,3 +24,12 @@ def test_what_only_some_programs_take_for_the_end_of_a_line_ends_none(tmp_path: 
         append(tmp_path, episode, label)
     assert labels(tmp_path, episode) == said
     assert newest(tmp_path, episode) == said[-1]
+
+
+def test_a_label_after_a_byte_order_mark_counts(tmp_path: Path) -> None:
+    episode = "00000000-0000-4000-8000-000000000001"
+    path = tmp_path / FOLDER / f"{episode}.jsonl"
+    path.parent.mkdir()
+    line = {"time": 1.0, "by": "ann", "result": None, "note": "", "discarded": True}
+    path.write_text("\ufeff" + json.dumps(line) + "\n", "utf-8")
+    assert [label.discarded for label in labels(tmp_path, episode)] == [True]
