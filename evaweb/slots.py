@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine
+from collections import Counter
+from collections.abc import Awaitable, Callable, Coroutine, Hashable
+from contextlib import AsyncExitStack
 from typing import Any
 
 from evaweb.callers import SHARE, share_of
@@ -12,12 +14,18 @@ from evaweb.lock_wait import hurried
 
 _AT_ONCE = 32
 _MOST_WAITING = 256
+_OF_ONE, _OF_ADDRESS = 8, 24  # of them, for one login or token, and for an address with all of its people
+_WAITING_OF_ONE = 64
+_EXPORTS = 2  # tables of a whole lab, each of which keeps a processor for seconds
+_EXPORTED = (b"format=csv", b"format=parquet")
 _COMMANDING = "/api/v1/stations/"  # what is posted there commands, takes or renews
 _BUSY = b'{"error": "too many requests at once: try again in a few seconds"}'
 
 
 class Slots:
     """An ASGI application in front of another one: requests take turns, and those that command do not wait long.
+
+    Nobody has more than a share of them, so that one who asks for a lot keeps pages for the others.
 
     A turn ends with the work on its request, whose thread and connection to the database nobody can end: not when its
     client hangs up. Nothing that stops a robot comes here: evaweb.api.door answers it before.
@@ -26,26 +34,39 @@ class Slots:
     def __init__(self, application: Callable[..., Awaitable[Any]]) -> None:
         self._application = application
         self._turns = asyncio.Semaphore(_AT_ONCE)
+        self._exports = asyncio.Semaphore(_EXPORTS)
+        self._people, self._addresses = _Shares(_OF_ONE), _Shares(_OF_ADDRESS)
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def __call__(self, scope: dict[str, Any], receive: Any, send: Any) -> None:
         if scope["path"] == "/healthz":
             await self._application(scope, receive, send)
-        elif len(self._tasks) >= _AT_ONCE + _MOST_WAITING:
+            return
+        address = share_of(scope)
+        who = address, _login_of(scope)
+        if (
+            len(self._tasks) >= _AT_ONCE + _MOST_WAITING
+            or self._people.asking[who] >= _OF_ONE + _WAITING_OF_ONE
+        ):
             await _refuse(send)
         else:
-            task = asyncio.create_task(self._in_turn(scope, _Client(receive, send)))
+            shares = self._people.asked(who), self._addresses.asked(address)
+            task = asyncio.create_task(self._in_turn(scope, _Client(receive, send), *shares))
+            task.add_done_callback(lambda _: (self._people.answered(who), self._addresses.answered(address)))
             self._tasks.add(task)  # an event loop keeps none by itself
             task.add_done_callback(self._tasks.discard)
             await asyncio.shield(task)
 
-    async def _in_turn(self, scope: dict[str, Any], client: _Client) -> None:
-        await client.unless_gone(self._turns.acquire())
-        try:
+    async def _in_turn(
+        self, scope: dict[str, Any], client: _Client, own: asyncio.Semaphore, of_all: asyncio.Semaphore
+    ) -> None:
+        exports = (self._exports,) if _is_export(scope) else ()
+        async with AsyncExitStack() as stack:
+            for turns in (own, *exports, of_all, self._turns):
+                await client.unless_gone(turns.acquire())
+                stack.callback(turns.release)
+            stack.callback(client.end)
             await self._work(scope, client)
-        finally:
-            client.end()
-            self._turns.release()
 
     async def _work(self, scope: dict[str, Any], client: _Client) -> None:
         SHARE.set(share_of(scope))  # of this task alone, and of the threads that work for it
@@ -54,6 +75,36 @@ class Slots:
                 await self._application(scope, client.receive, client.send)
         else:
             await self._application(scope, client.receive, client.send)
+
+
+class _Shares:
+    """At most so many turns at once of each name; `asking`: how many have one, or wait."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._of: dict[Hashable, asyncio.Semaphore] = {}
+        self.asking: Counter[Hashable] = Counter()
+
+    def asked(self, name: Hashable) -> asyncio.Semaphore:
+        """The turns of that name, which asks for one."""
+        self.asking[name] += 1
+        return self._of.setdefault(name, asyncio.Semaphore(self._most))
+
+    def answered(self, name: Hashable) -> None:
+        """It has had it, or waits no more."""
+        self.asking[name] -= 1
+        if not self.asking[name]:
+            del self.asking[name], self._of[name]
+
+
+def _is_export(scope: dict[str, Any]) -> bool:
+    asked = scope.get("query_string", b"").lower()
+    return scope["path"].endswith(".csv") or any(word in asked for word in _EXPORTED)
+
+
+def _login_of(scope: dict[str, Any]) -> bytes:
+    """What says who asks, not looked at: made-up ones of one address have that address's share together."""
+    return b"".join(value for name, value in scope["headers"] if name in (b"authorization", b"cookie"))
 
 
 class _Client:

@@ -55,6 +55,7 @@ class Job(models.Model):
         indexes = [
             models.Index(fields=("status", "queue", "created_at")),
             models.Index(fields=("-finished_at",)),
+            models.Index(fields=("key", "id")),  # whether a failed one was asked for again since
         ]
         constraints = [
             models.UniqueConstraint(

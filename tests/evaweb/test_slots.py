@@ -80,6 +80,70 @@ def test_so_many_are_worked_on_so_many_wait_and_the_others_are_told():
     asyncio.run(scenario())
 
 
+def test_nobody_has_more_than_a_share_of_the_turns():
+    async def scenario():
+        application, sent = Application(), []
+        turns = Slots(application)
+
+        async def send(message):
+            sent.append(message)
+
+        def of(login):
+            return {**asked(), "headers": [(b"authorization", login)]}
+
+        def begin(login, count):
+            return [asyncio.create_task(turns(of(login), a_request(), send)) for _ in range(count)]
+
+        tasks = begin(b"greedy", slots._OF_ONE + slots._WAITING_OF_ONE + 5)
+        await turn_of_the_loop(lambda: len(statuses(sent)) == 5)
+        assert (application.at_once, statuses(sent)) == (slots._OF_ONE, [503] * 5)
+        tasks += begin(b"another", 2)
+        await turn_of_the_loop(lambda: application.at_once == slots._OF_ONE + 2)
+        for number in range(40):  # made up, of the same address
+            tasks += begin(b"%d" % number, 1)
+        await turn_of_the_loop(lambda: application.at_once == slots._OF_ADDRESS)
+        elsewhere = {**of(b"bob"), "client": ("10.0.0.7", 4000)}
+        tasks.append(asyncio.create_task(turns(elsewhere, a_request(), send)))
+        await turn_of_the_loop(lambda: application.at_once == slots._OF_ADDRESS + 1)
+        application.may_end.set()
+        await asyncio.gather(*tasks)
+        assert set(statuses(sent)[5:]) == {200}
+        assert not turns._people.asking
+        assert not turns._addresses.asking
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize(
+    "export",
+    [
+        {"path": "/result/failures.csv"},
+        {"query_string": b"limit=1&format=csv"},
+        {"query_string": b"format=Parquet"},
+    ],
+)
+def test_few_exports_are_made_at_once_and_pages_do_not_wait_for_them(export):
+    async def scenario():
+        application, sent = Application(), []
+        turns = Slots(application)
+
+        async def send(message):
+            sent.append(message)
+
+        def begin(count, **scope):
+            return [asyncio.create_task(turns({**asked(), **scope}, a_request(), send)) for _ in range(count)]
+
+        tasks = begin(4, **export)
+        await turn_of_the_loop(lambda: application.at_once == slots._EXPORTS)
+        tasks += begin(3)
+        await turn_of_the_loop(lambda: application.at_once == slots._EXPORTS + 3)
+        application.may_end.set()
+        await asyncio.gather(*tasks)
+        assert statuses(sent) == [200] * 7
+
+    asyncio.run(scenario())
+
+
 @pytest.mark.usefixtures("few")
 def test_one_that_hangs_up_while_it_waits_gives_its_place_back():
     async def scenario():

@@ -18,6 +18,11 @@ def job(status="running", key="toy:1", took=10.0, **facts):
     )
 
 
+def test_what_failed_and_was_asked_for_again_is_found_by_an_index():
+    """Each of thousands that failed is looked up among all jobs."""
+    assert "jobs_job_key" in jobs_failed().explain()
+
+
 def test_what_is_over_or_asked_for_again_is_not_listed():
     failed, again = job("failed"), job("queued")
     running, done, gone = job(key="toy:2"), job("done", key="toy:3"), job("failed", key="toy:4")
