@@ -93,7 +93,7 @@ class Source:
             tuple(str(line["task"]) for line in tasks),
             {int(line["episode_index"]): own_keys(line) for line in episode_lines(root, dataset.info)},
             {line["episode_index"]: names.keys(line["stats"]) for line in statistics},
-            {line["episode_index"]: line for line in eva},
+            _each_once(root, eva),
         )
 
     @property
@@ -484,6 +484,18 @@ class _Assembly:
             if not target.exists():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(path, target, follow_symlinks=False)
+
+
+def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
+    """Our lines by the episode that each is about; RecordingError where two are about one."""
+    found = {line["episode_index"]: line for line in lines}
+    if len(found) < len(lines):
+        counts = Counter(line["episode_index"] for line in lines)
+        twice = sorted(index for index, count in counts.items() if count > 1)
+        raise RecordingError(
+            f"{root / layout.EVA_EPISODES} has more than one line about the episodes {twice}"
+        )
+    return found
 
 
 def _is_its_own(path: Path, root: Path) -> bool:

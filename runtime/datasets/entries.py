@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,10 +113,17 @@ def statistic_lines(root: Path, info: Info) -> list[Line]:
 _OF_FORMAT = ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index", "file_stem")
 
 
+# Where v3.0 says in which file an episode is, its statistics, and what pandas makes of its index.
+_PLACES = re.compile(
+    r"(?:data|meta/episodes)/(?:chunk|file)_index|videos/.+/(?:(?:chunk|file)_index|(?:from|to)_timestamp)"
+    r"|stats/.+|__index_level_\d+__",
+    re.DOTALL,
+)
+
+
 def own_keys(line: Line) -> Line:
     """What a line of the list of episodes says beyond the format, which its writer alone knows."""
-    places = ("data/", "videos/", "stats/", "meta/episodes/", "__")  # "__": pandas' index
-    return {key: line[key] for key in line if key not in _OF_FORMAT and not key.startswith(places)}
+    return {key: line[key] for key in line if key not in _OF_FORMAT and not _PLACES.fullmatch(key)}
 
 
 def entry(root: Path, info: Info, line: Line) -> EpisodeEntry:

@@ -215,3 +215,25 @@ def test_subtasks_that_are_numbered_otherwise_are_not_merged(tmp_path: Path) -> 
     pq.write_table(pa.table({"subtask": ["grasp", "reach"]}), roots[1] / "meta/subtasks.parquet")
     with pytest.raises(RecordingError, match=r"meta/subtasks\.parquet differ"):
         merge(roots, tmp_path / "never")
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_own_keys_are_kept_whatever_they_begin_with(tmp_path: Path, version: str) -> None:
+    write(tmp_path / "set", Plan("v2.1", lengths=(3, 4), videos=()))
+    own = {"__operator": "ann", "data/source": "bench", "videos/quality": "good"}
+    said = [line | own for line in lines(tmp_path / "set")]
+    (tmp_path / "set/meta/episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in said))
+    made = convert(tmp_path / "set", tmp_path / "new", version)
+    assert made.left_out == ()
+    assert [{key: line[key] for key in own} for line in lines(tmp_path / "new")] == [own] * 2
+    assert check(tmp_path / "new") == []
+
+
+def test_two_lines_about_one_episode_are_refused(tmp_path: Path) -> None:
+    publish(record(tmp_path / "episodes", frames=4), tmp_path / "set")
+    path = tmp_path / "set/meta/eva_episodes.jsonl"
+    path.write_text(path.read_text() * 2)
+    with pytest.raises(
+        RecordingError, match=r"eva_episodes.jsonl has more than one line about the episodes \[0\]"
+    ):
+        convert(tmp_path / "set", tmp_path / "new", "v3.0")
