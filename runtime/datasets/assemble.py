@@ -17,7 +17,7 @@ from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog, info_of, own_line
 from runtime.datasets.columns import column_statistics
-from runtime.datasets.cut import NotCopyableError, cut, encode
+from runtime.datasets.cut import NotCopyableError, cut, encode, other_streams
 from runtime.datasets.entries import entry, episode_lines, own_keys, statistic_lines, task_lines
 from runtime.datasets.features import (
     LANGUAGE,
@@ -437,6 +437,8 @@ class _Assembly:
                 ) from error
             encode(span, target, frames, self._fps)
             self._encoded.append(f"{key} of episode {part.index} of {part.source.dataset.root}")
+        for kind in sorted(other_streams(span.path) - other_streams(target)):
+            self._left_out[f"{kind} of {span.path}: the video is written without it"] = None
 
     def _sides(self, part: Part, uuid: str) -> None:
         for kind, path in side_files(part.source.dataset.root, uuid).items():

@@ -78,6 +78,12 @@ def encode(span: Span, target: Path, frames: int, fps: float) -> None:
         raise RecordingError(f"{span.path} cannot be coded again: {error}") from error
 
 
+def other_streams(path: Path) -> set[str]:
+    """Kinds of what a video file holds beside its pictures."""
+    with open_video(path) as container:
+        return {stream.type for stream in container.streams} - {"video"}
+
+
 def _is_ready(path: Path, frames: int, fps: float) -> bool:
     """True if the whole file is what is wanted: these frames at these times, its index at the front."""
     with Pictures(path) as whole:

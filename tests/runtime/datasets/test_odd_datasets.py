@@ -391,3 +391,23 @@ def test_links_that_lead_out_of_a_dataset_are_left_out_with_a_word(root: Path, t
     assert not (tmp_path / "new/README.md").exists()
     assert [one for one in made.left_out if "README.md: a link to" in one]
     assert (tmp_path / "new/same.md").read_text() == "here"
+
+
+def test_sound_that_a_video_loses_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "set", Plan("v2.1", lengths=(8,), videos=("cam",)))
+    path = next((tmp_path / "set/videos").rglob("*.mp4"))
+    silent = path.rename(path.with_suffix(".silent"))
+    with av.open(str(silent)) as source, av.open(str(path), "w", format="mp4") as container:
+        pictures = container.add_stream_from_template(source.streams.video[0])
+        sound = container.add_stream("aac", rate=16_000, layout="mono")
+        for packet in source.demux(video=0):
+            if packet.size:
+                packet.stream = pictures
+                container.mux(packet)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        frame.rate, frame.pts = 16_000, 0
+        container.mux(sound.encode(frame))
+        container.mux(sound.encode(None))
+    silent.unlink()
+    made = convert(tmp_path / "set", tmp_path / "new", "v3.0")
+    assert made.left_out == (f"audio of {path}: the video is written without it",)
