@@ -50,7 +50,7 @@ def seed(plans: int, trials: int) -> Seeded:
     operators = [User.objects.create_user(f"operator-{i:02}") for i in range(_OPERATORS)]
     group = Group.objects.get_or_create(name="operator")[0]
     group.user_set.add(*operators)
-    viewer = User.objects.create_user("viewer")
+    viewer = User.objects.get_or_create(username="viewer")[0]
     stations = [Station.objects.create(name=f"bench-{i}", robot="agilex_piper") for i in range(_STATIONS)]
     scenes = [
         Scene.objects.create(name=f"scene-{i}", title=f"Scene {i}", instruction="put the block on the plate")

@@ -11,6 +11,9 @@ from contextlib import closing, contextmanager
 from typing import Any
 from uuid import uuid4
 
+from websockets.exceptions import ConnectionClosed
+
+from benchmarks.attacks.requests import again_and_again, long_to_parse
 from benchmarks.attacks.target import Target
 from benchmarks.estop_lab import OTHER, PRESSED
 from evaweb.lab.patience import VisitFailed
@@ -18,6 +21,7 @@ from evaweb.lab.visitor import LivePage, Visitor
 from runtime.ipc.bus import Endpoints
 
 _STOPS, _PRESSES = 5000, 1500
+_SLOW = 2 << 20
 _QUIET_S = 5.0  # after which nothing more is answered
 
 
@@ -37,6 +41,13 @@ class _Page(LivePage):
         for _ in range(times):
             self._send({**message, "uuid": str(uuid4())})
 
+    def shout(self, text: str) -> None:
+        """Send it as it is."""
+        try:
+            self._socket.send(text)
+        except ConnectionClosed as error:
+            self._fail(str(error))
+
     def _told(self, message: Mapping[str, Any]) -> None:
         self.answered += message.get("type") == "ack"
 
@@ -51,6 +62,22 @@ def dead_station(target: Target) -> Counter[str]:
 def viewer_stops(target: Target) -> Counter[str]:
     """Ask for stop as somebody who may not command the station."""
     return _waves(target, PRESSED, {"type": "stop", "epoch": 0}, target.part(_STOPS))
+
+
+def slow_frames(target: Target) -> Counter[str]:
+    """Messages of 2 MiB that take long to parse, over two sockets of a viewer."""
+    visitor = target.visitor("viewer")
+    texts = [long_to_parse(target.part(_SLOW), number) for number in (0, 1)]
+
+    def shouts(target: Target, number: int) -> str:
+        with closing(_Page(visitor, PRESSED)) as page:
+            sent = 0
+            while not target.ended.is_set() and not page.closed:
+                page.shout(texts[sent % 2])
+                sent += 1
+            return f"closed after {sent}"
+
+    return again_and_again(target, 2, shouts)
 
 
 @contextmanager

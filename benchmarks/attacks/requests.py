@@ -1,9 +1,10 @@
-"""Loads on a web over HTTP: half requests, passwords, bodies, a file that is slow to read."""
+"""Loads on a web over HTTP: half requests, passwords, bodies, what is slow to read, exports."""
 
 from __future__ import annotations
 
 import asyncio
 import http.client
+import os
 import socket
 import threading
 from collections import Counter
@@ -11,15 +12,19 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from functools import partial
 from itertools import count
+from urllib.parse import urlsplit
 
 from benchmarks.attacks.target import Target
 from benchmarks.estop_lab import GUESSED, PRESSED
 from evaweb.lab.patience import VisitFailed
 from evaweb.lab.visitor import Visitor
+from evaweb.roles import Role
 
 _CONNECTIONS, _LOGINS, _BODIES = 1100, 10, 4
 _BODY, _CHUNK = 200_000_000, bytes(1_000_000)
 _PARTS = 20_000
+_EXPORTS, _PLANS, _TRIALS = 36, 40, 6000
+_SLOW, _SLOW_POSTS = 250_000, 8
 _HALF = b"POST /login/ HTTP/1.1\r\nHost: localhost\r\nContent-Le"
 _ANSWER_S = 30.0
 _OPENING_S = 5.0  # at most, until all connections stand
@@ -112,6 +117,51 @@ def _posted_file(visitor: Visitor, target: Target, path: str, text: str) -> int:
     with closing(http.client.HTTPConnection(*target.address, timeout=_ANSWER_S)) as connection:
         connection.request("POST", path, f"{said}--{border}--\r\n".encode(), headers)
         return connection.getresponse().status
+
+
+def exports(target: Target) -> Counter[str]:
+    """Export 6,000 trials from 36 clients of one viewer."""
+    _seed(target)
+    cookies = target.visitor(Role.VIEWER).cookies
+
+    def export(target: Target, number: int) -> str:
+        with closing(http.client.HTTPConnection(*target.address, timeout=4 * _ANSWER_S)) as connection:
+            connection.request("GET", "/api/v1/trials?format=csv", headers={"Cookie": cookies})
+            answer = connection.getresponse()
+            return f"answered {answer.status} with {len(answer.read()) >> 20} MB"
+
+    return again_and_again(target, target.part(_EXPORTS), export)
+
+
+def _seed(target: Target) -> None:
+    """Evaluations as after years in the lab's database."""
+    import django
+
+    os.environ |= {"EVA_DATA_DIR": str(target.data), "DJANGO_SETTINGS_MODULE": "evaweb.settings"}
+    django.setup()
+    from benchmarks.results_seed import seed
+
+    seed(target.part(_PLANS), target.part(_TRIALS))
+
+
+def slow_json(target: Target) -> Counter[str]:
+    """Post JSON that takes long to parse to the process for stops, as nobody, eight at a time."""
+    address = urlsplit(target.stops)
+
+    def post(target: Target, number: int) -> str:
+        with closing(http.client.HTTPConnection(address.netloc, timeout=_ANSWER_S)) as connection:
+            headers = {"Content-Type": "application/json"}
+            path = f"/api/v1/stations/{PRESSED}/estop"
+            connection.request("POST", path, long_to_parse(target.part(_SLOW), number), headers)
+            return f"answered {connection.getresponse().status}"
+
+    return again_and_again(target, _SLOW_POSTS, post)
+
+
+def long_to_parse(size: int, number: int) -> str:
+    """JSON of about `size` bytes that makes many objects, or digits, by turns."""
+    part = "[]" if number % 2 else "9" * 4000
+    return f'{{"type": "watch", "streams": [{",".join([part] * (size // (len(part) + 1)))}]}}'
 
 
 def again_and_again(target: Target, at_once: int, ask: Callable[[Target, int], str]) -> Counter[str]:

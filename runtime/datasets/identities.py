@@ -6,25 +6,29 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 from uuid import NAMESPACE_URL, UUID, uuid5
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.assemble import Tell, silent
 from runtime.datasets.catalog import Catalog
+from runtime.datasets.entries import EpisodeEntry
 from runtime.datasets.operations import convert
+from runtime.datasets.pictures import Pictures, StoredPictures, Stretch
 from runtime.datasets.reader import Dataset, open_dataset
+from runtime.datasets.rows import is_list
 from runtime.datasets.staging import locked
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import disk_fault, sync_folder, write_whole
 
-_INDEX = ("index", "task_index")  # of a dataset, not of the episode
+_PLACES = ("index", "episode_index", "task_index")  # of a dataset, not of the episode
 
 
 def named_copy(
@@ -49,7 +53,7 @@ def named_copy(
         with locked(dataset):
             _name(dataset)
     elif target.exists():
-        _require_same(dataset, target)
+        _require_same(dataset, target, tell)
     else:
         _copy(dataset, target, rename or {}, reencode, tell)
     return open_dataset(target)
@@ -61,14 +65,55 @@ def uuids_of(dataset: Path) -> dict[int, str]:
 
 
 def identity(dataset: Dataset, index: int, place: int | None = None) -> str:
-    """A uuid that is of these rows: the same for the same numbers at the same index, whatever columns are called.
+    """A uuid of what the episode holds: each column by its name, its tasks, its coded pictures; RecordingError.
 
     `place`: the index that the episode has in a copy without gaps.
     """
+    entry, table = dataset.entry(index), dataset.table(index)
+    stored = layout.image_keys(dataset.features)
+    held = {
+        name: _digest_column(table[name]) for name in table.column_names if name not in (*_PLACES, *stored)
+    }
+    for key in stored:
+        pictures = StoredPictures(f"{entry.data}, {key!r}", table[key].to_pylist(), dataset.root)
+        rows = (pictures.row(row) for row in range(len(pictures)))
+        held[key] = _digest(b"" if row is None else row["bytes"] for row in rows)
+    for key, span in entry.videos.items():
+        stretch = None if span.start is None else Stretch(span.start, entry.length, dataset.fps)
+        with Pictures(span.path, stretch) as video:
+            held[key] = _digest(video.coded())
+    told = [index if place is None else place, dataset.fps, table.num_rows, sorted(entry.tasks), held]
+    content = json.dumps(told, sort_keys=True, ensure_ascii=True).encode()
+    return str(uuid5(NAMESPACE_URL, f"eva-imported-2:{hashlib.sha256(content).hexdigest()}"))
+
+
+def _digest_column(column: pa.ChunkedArray) -> str:
+    values = column.combine_chunks()
+    lengths = []
+    while is_list(values.type):
+        lengths.append(pc.list_value_length(values).to_pylist())
+        values = values.flatten()
+    if pa.types.is_temporal(values.type):
+        values = values.view(pa.int64() if values.type.bit_width == 64 else pa.int32())
+    if pa.types.is_floating(values.type):
+        numbers = np.ascontiguousarray(values.to_numpy(zero_copy_only=False), np.float64)
+        return _digest([repr(lengths).encode(), numbers.tobytes()])
+    return _digest([repr(lengths).encode(), repr(values.to_pylist()).encode("utf-8", "surrogatepass")])
+
+
+def _digest(parts: Iterable[bytes]) -> str:
+    whole = hashlib.sha256()
+    for part in parts:
+        whole.update(hashlib.sha256(part).digest())
+    return whole.hexdigest()
+
+
+def _identity_of_numbers(dataset: Dataset, index: int, place: int) -> str:
+    """The uuid that earlier versions gave: of the columns of floats alone."""
     digests = []
     table = dataset.table(index)
     for name in table.column_names:
-        if name in _INDEX or name in layout.image_keys(dataset.features):
+        if name in ("index", "task_index", *layout.image_keys(dataset.features)):
             continue
         column = table[name].combine_chunks()
         while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
@@ -76,7 +121,7 @@ def identity(dataset: Dataset, index: int, place: int | None = None) -> str:
         if pa.types.is_floating(column.type):
             values = np.ascontiguousarray(column.to_numpy(zero_copy_only=False), np.float64)
             digests.append(hashlib.sha256(values.tobytes()).hexdigest())
-    told = json.dumps([index if place is None else place, dataset.fps, table.num_rows, sorted(digests)])
+    told = json.dumps([place, dataset.fps, table.num_rows, sorted(digests)])
     return str(uuid5(NAMESPACE_URL, f"eva-imported:{hashlib.sha256(told.encode()).hexdigest()}"))
 
 
@@ -92,7 +137,8 @@ def _copy(dataset: Path, target: Path, rename: Mapping[str, str], reencode: bool
             rename=rename,
             reencode=reencode,
         )
-        _name(draft)
+        source = open_dataset(dataset)
+        _name(draft, {place: (source, entry.index) for place, entry in enumerate(source.episodes)})
         os.rename(draft, target)
         sync_folder(target.parent)
         for thing in made.left_out:
@@ -103,19 +149,21 @@ def _copy(dataset: Path, target: Path, rename: Mapping[str, str], reencode: bool
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _name(root: Path) -> None:
-    """Write a line for each episode that has none."""
+def _name(root: Path, sources: Mapping[int, tuple[Dataset, int]] | None = None) -> None:
+    """Write a line for each episode that has none; `sources`: the episode that each was copied from."""
     dataset, told = open_dataset(root), {int(line["episode_index"]): line for line in _told(root)}
-    lines = [told.get(entry.index) or _line(dataset, entry.index) for entry in dataset.episodes]
+    lines = []
+    for entry in dataset.episodes:
+        source, index = (sources or {}).get(entry.index, (dataset, entry.index))
+        lines.append(told.get(entry.index) or _line(entry, identity(source, index, entry.index)))
     content = "".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines)
     write_whole(root / layout.EVA_EPISODES, content.encode())
 
 
-def _line(dataset: Dataset, index: int) -> dict[str, Any]:
-    entry = dataset.entry(index)
+def _line(entry: EpisodeEntry, uuid: str) -> dict[str, Any]:
     return {
-        "episode_index": index,
-        "uuid": identity(dataset, index),
+        "episode_index": entry.index,
+        "uuid": uuid,
         "frames": entry.length,
         "task": ", ".join(entry.tasks),
         "kind": IMPORTED,
@@ -124,15 +172,23 @@ def _line(dataset: Dataset, index: int) -> dict[str, Any]:
     }
 
 
-def _require_same(dataset: Path, target: Path) -> None:
-    source, known = open_dataset(dataset), uuids_of(dataset)
-    wanted = {
-        place: known.get(entry.index) or identity(source, entry.index, place)
-        for place, entry in enumerate(source.episodes)
-    }
-    if uuids_of(target) != wanted:
-        raise RecordingError(
-            f"{target} is there and holds other episodes: import {dataset} under another name"
+def _require_same(dataset: Path, target: Path, tell: Tell) -> None:
+    source, known, there = open_dataset(dataset), uuids_of(dataset), uuids_of(target)
+    other = RecordingError(f"{target} is there and holds other episodes: import {dataset} under another name")
+    if len(there) != len(source.episodes):
+        raise other
+    by_numbers = 0
+    for place, entry in enumerate(source.episodes):
+        uuid = known.get(entry.index) or identity(source, entry.index, place)
+        if there.get(place) == uuid:
+            continue
+        by_numbers += 1
+        if entry.index in known or there.get(place) != _identity_of_numbers(source, entry.index, place):
+            raise other
+    if by_numbers:
+        tell(
+            f"{target} was imported by a version that compared numbers alone, and is taken as it is: where pictures "
+            f"or words of {dataset} differ, import it under another name"
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ Line = dict[str, Any]  # what a list of the metadata says of one episode or task
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object in `path`; raises RecordingError where there is none."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = _parse(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise RecordingError(f"{path} does not exist") from None
     except (OSError, ValueError) as error:
@@ -71,13 +71,29 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
         if not line.strip():
             continue
         try:
-            content = json.loads(line)
+            content = _parse(line)
         except ValueError as error:
             raise RecordingError(f"{path}, line {number} is no JSON: {error}") from error
         if not isinstance(content, dict):
             raise RecordingError(f"{path}, line {number} holds {type(content).__name__}, expected an object")
         lines.append(content)
     return lines
+
+
+def _parse(text: str) -> Any:
+    """The JSON in `text`; ValueError for a key that is there twice, which readers would take differently."""
+    try:
+        return json.loads(text, object_pairs_hook=_unique)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"it gives {next(key for key in keys if keys.count(key) > 1)!r} twice")
+    return found
 
 
 def read_info(root: Path) -> dict[str, Any]:

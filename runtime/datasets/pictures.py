@@ -152,6 +152,18 @@ class Pictures(PictureSequence):
         """When each frame is shown, as its time stamp in the file."""
         return list(self._times)
 
+    def coded(self) -> Iterator[bytes]:
+        """The packets of the frames as they are stored, in coded order; the next picture that is read seeks."""
+        wanted = set(self._times)
+        self._upcoming = None
+        try:
+            self._container.seek(self._key_before(0), stream=self._stream)
+            for packet in self._packets():
+                if packet.pts in wanted:
+                    yield bytes(packet)
+        except self._errors as error:
+            raise RecordingError(f"{self._path} cannot be read: {error}") from error
+
     @property
     def size(self) -> tuple[int, int]:
         """Height and width, as the stream says."""

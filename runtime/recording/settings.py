@@ -57,7 +57,7 @@ class RecordingSettings(Settings):
     def _refuse_what_stops(cls, codec: object) -> object:
         if codec == "libsvtav1":
             raise ConfigurationError(
-                f"recording.codec = {codec!r}: as PyAV brings it, this encoder stops for good now and then, and the "
+                f"recording.codec = {codec!r}: as PyAV brings it, this encoder has stopped for good here, and the "
                 f"camera's video with it; allowed: {', '.join(CODECS)}"
             )
         return codec

@@ -1,4 +1,4 @@
-"""JSON Lines of a dataset end at "\\n" alone, whoever wrote them."""
+"""Metadata of a dataset: lines end at "\\n" alone, and every key is there once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from runtime.core.errors import RecordingError
-from runtime.datasets.layout import read_lines
+from runtime.datasets.layout import read_json, read_lines
 from tests.runtime.datasets.odd_lines import ENDS_NO_LINE
 
 
@@ -28,3 +28,15 @@ def test_lines_of_another_system_and_empty_ones_are_read_and_a_broken_one_is_nam
     path.write_bytes(b'{"a": 1}\n{"a":\n')
     with pytest.raises(RecordingError, match="line 2 is no JSON"):
         read_lines(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [('{"a": {"fps": 10, "fps": 50}}', "gives 'fps' twice"), ('{"a": ' + "[" * 100_000, "nested too deeply")],
+)
+def test_what_readers_would_take_differently_is_refused(tmp_path: Path, text: str, why: str) -> None:
+    path = tmp_path / "info.json"
+    path.write_text(text)
+    for read in (read_json, read_lines):
+        with pytest.raises(RecordingError, match=why):
+            read(path)

@@ -23,7 +23,7 @@ def test_h264_is_the_default() -> None:
     ("given", "said"),
     [
         ({"preset": "p4"}, "recording.preset = 'p4' with codec 'libx264'; allowed: ultrafast, .*veryslow"),
-        ({"codec": "libsvtav1"}, "recording.codec = 'libsvtav1': .* stops for good now and then"),
+        ({"codec": "libsvtav1"}, "recording.codec = 'libsvtav1': .* has stopped for good"),
         ({"codec": "h264_nvenc", "preset": "veryfast"}, "recording.preset = 'veryfast' .*allowed: p1, p2"),
     ],
 )

@@ -143,22 +143,36 @@ def test_poses_out_of_reach_may_be_executed_as_near_as_can_be_and_are_recorded_a
     station.close()
 
 
+def far_away(observation: Observation, number: int) -> Float64:
+    rows = ramp(observation.step, 20)
+    rows[:, MOVED] += 0.9
+    return rows
+
+
 @pytest.mark.parametrize("strategy", ["sync", "async"])
 def test_a_policy_that_means_to_begin_far_away_is_found_out_although_the_first_step_is_small(
     tmp_path: Path, strategy: str
 ) -> None:
-    def far(observation: Observation, number: int) -> Float64:
-        rows = ramp(observation.step, 20)
-        rows[:, MOVED] += 0.9
-        return rows
-
-    station = speaking(Station(stubbed(tmp_path, strategy=strategy)), far, SIX).ready()
+    station = speaking(Station(stubbed(tmp_path, strategy=strategy)), far_away, SIX).ready()
     first = station.coordinator.snapshot()["first_action"]
     assert first["far"]
     assert first["distance"] == pytest.approx(0.9, abs=0.01)
     station.command("run")
     station.reach(SessionState.HOLDING)
     assert "the first action is 0.9" in station.reason
+    station.close()
+
+
+def test_an_approach_to_a_shown_chunk_goes_to_where_its_first_pose_is_meant(tmp_path: Path) -> None:
+    station = speaking(Station(stubbed(tmp_path)), far_away, SIX).ready()
+    station.command("run", mode="preview")
+    station.go(3)
+    station.command("step")
+    station.go(3)
+    assert station.coordinator.snapshot()["proposal"]["distance"] == pytest.approx(0.9, abs=0.02)
+    station.command("approach")
+    station.until(lambda: station.coordinator.snapshot()["phase"] == "proposed", 20.0, "to arrive")
+    assert station.coordinator.snapshot()["proposal"]["distance"] < 0.02
     station.close()
 
 
