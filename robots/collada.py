@@ -12,6 +12,7 @@ import numpy as np
 from robots.rotations import Float64
 
 _NAMESPACE = "{*}"
+_MOST_NODES = 20_000  # a file of some lines can show one a billion times
 
 
 def points(path: Path) -> Float64:
@@ -27,11 +28,12 @@ def points(path: Path) -> Float64:
     library = {f"#{one.get('id')}": one for one in root.iterfind(f".//{_NAMESPACE}node")}
     unit = root.find(f"{_NAMESPACE}asset/{_NAMESPACE}unit")
     metres = 1.0 if unit is None else float(unit.get("meter", "1"))
+    visits = iter(range(_MOST_NODES))
     found = [
         geometries[url] @ place[:3, :3].T + place[:3, 3]
         for scene in root.iterfind(f".//{_NAMESPACE}visual_scene")
         for node in scene.iterfind(f"{_NAMESPACE}node")
-        for url, place in _instances(node, np.eye(4), library, 0)
+        for url, place in _instances(node, np.eye(4), library, 0, visits)
         if url in geometries
     ]
     return np.concatenate(found) * metres if found else np.empty((0, 3))
@@ -50,9 +52,11 @@ def _positions(geometry: ET.Element) -> Float64:
 
 
 def _instances(
-    node: ET.Element, above: Float64, library: dict[str, ET.Element], depth: int
+    node: ET.Element, above: Float64, library: dict[str, ET.Element], depth: int, visits: Iterator[int]
 ) -> Iterator[tuple[str, Float64]]:
-    """The geometries that a node and those below it show, and where."""
+    """The geometries that a node and those below it show, and where; `visits` ends with the nodes allowed."""
+    if next(visits, None) is None:
+        raise ValueError(f"more than {_MOST_NODES} nodes, with those that it shows again")
     if depth > 64:
         raise ValueError("nodes that contain each other")
     place = above
@@ -65,9 +69,9 @@ def _instances(
         if kind == "instance_geometry":
             yield element.get("url", ""), place
         elif kind == "node":
-            yield from _instances(element, place, library, depth + 1)
+            yield from _instances(element, place, library, depth + 1, visits)
         elif kind == "instance_node" and (shown := library.get(element.get("url", ""))) is not None:
-            yield from _instances(shown, place, library, depth + 1)
+            yield from _instances(shown, place, library, depth + 1, visits)
 
 
 def _motion(kind: str, numbers: Float64) -> Float64:

@@ -18,6 +18,8 @@ from robots.rotations import Float64
 ENVIRONMENT = "EVA_ROBOT_MESHES"
 SUFFIXES = (".stl", ".obj", ".dae")
 Bounds = tuple[Float64, Float64]
+_SPACE = r"[^\S\n]"  # within a line
+_CORNER = 3 * rf"{_SPACE}+(\S+)"
 
 
 def roots(folder: Path) -> tuple[Path, ...]:
@@ -39,15 +41,18 @@ def named(folder: Path, owner: str, filename: str) -> Path:
     if Path(filename).suffix.lower() not in SUFFIXES:
         raise RobotError(f"{owner}: mesh {filename!r}; allowed: files {', '.join(SUFFIXES)}")
     allowed = roots(folder)
-    places = [place for root in allowed for place in _places(root, owner, filename)]
+    try:
+        places = [place for root in allowed for place in _places(root, owner, filename)]
+        there = [place for place in places if place.is_file()]
+    except (OSError, ValueError) as error:  # longer than a file system has names, or with a null in it
+        raise RobotError(f"{owner}: mesh {filename!r:.120} is no name of a file: {error!s:.80}") from error
     for place in places:
         if not any(place.is_relative_to(root) for root in allowed):
             raise RobotError(
                 f"{owner}: mesh {filename!r} is {place}; allowed: files in {' or '.join(map(str, allowed))}"
             )
-    for place in places:
-        if place.is_file():
-            return place
+    for place in there:
+        return place
     raise RobotError(
         f"{owner}: mesh {filename!r} is missing; looked for {', '.join(map(str, dict.fromkeys(places)))}"
         f"; put it there, or under ${ENVIRONMENT}/{folder.name}"
@@ -110,11 +115,11 @@ def _stl(content: bytes) -> Float64:
         return np.frombuffer(content, triangle, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
     if not content.lstrip().startswith(b"solid"):
         raise ValueError("neither a binary STL of the length that it says nor a text one")
-    found = re.findall(r"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)", content.decode(errors="replace"), re.MULTILINE)
+    found = re.findall(rf"^{_SPACE}*vertex{_CORNER}", content.decode(errors="replace"), re.MULTILINE)
     return np.array(found, dtype=np.float64).reshape(-1, 3)
 
 
 def _obj(text: str) -> Float64:
     """The vertices [n, 3] of an OBJ."""
-    found = re.findall(r"^\s*v\s+(\S+)\s+(\S+)\s+(\S+)", text, re.MULTILINE)
+    found = re.findall(rf"^{_SPACE}*v{_CORNER}", text, re.MULTILINE)
     return np.array(found, dtype=np.float64).reshape(-1, 3)

@@ -274,4 +274,14 @@ def _root(path: Path, links: list[str], joints: list[Joint]) -> str:
     roots = [link for link in links if link not in children]
     if len(roots) != 1:
         raise RobotError(f"{path}: the links without a parent are {roots}; allowed: exactly one")
+    below: dict[str, list[str]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint.child)
+    reached = [roots[0]]
+    for link in reached:  # which grows meanwhile
+        reached += below.get(link, [])
+    if in_circles := sorted(set(links) - set(reached)):
+        raise RobotError(
+            f"{path}: the links {in_circles} hang on each other in a circle, and not on {roots[0]!r}"
+        )
     return roots[0]

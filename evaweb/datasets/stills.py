@@ -9,11 +9,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import simplejpeg
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from evaweb.datasets.playing import Played
 from evaweb.errors import NotFound
-from runtime.core.picture_bounds import TooLargeError, require_size
+from runtime.core.picture_bounds import DAMAGED, TooLargeError, require_scans, require_size
 from runtime.core.sentences import Pattern
 from runtime.datasets.pictures import shown, stored_row
 from runtime.recording.files import RecordingError
@@ -31,6 +31,7 @@ def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
     key = episode.cameras[camera]
     content = _stored(episode, key, row)
     try:
+        require_scans(content, f"picture {row} of {key!r} has")
         with Image.open(io.BytesIO(content)) as picture:
             require_size(*picture.size, f"picture {row} of {key!r} is")
             kind = _SHOWN.get(picture.format or "")
@@ -39,7 +40,7 @@ def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
             pixels = np.ascontiguousarray(shown(picture))
     except TooLargeError as error:
         raise RecordingError(str(error)) from None
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except (*DAMAGED, Image.DecompressionBombError) as error:
         raise RecordingError(f"picture {row} of {key!r} cannot be decoded: {error}") from error
     jpeg: bytes = simplejpeg.encode_jpeg(pixels, quality=QUALITY)
     return jpeg, "image/jpeg"

@@ -22,7 +22,7 @@ from django.conf import settings
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import wire_to
-from runtime.core.picture_bounds import MOST_PIXELS
+from runtime.core.picture_bounds import MOST_PIXELS, require_scans
 from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CodecError, Subscriber
 
@@ -120,6 +120,7 @@ def decoded(jpeg: bytes, colorspace: str) -> np.ndarray[tuple[int, ...], np.dtyp
             raise EvaError(
                 _PICTURE_X_PIXELS_ALLOWED_PIXELS(width=width, height=height, most_pixels=MOST_PIXELS)
             )
+        require_scans(jpeg)
         return simplejpeg.decode_jpeg(jpeg, colorspace=colorspace)
     except ValueError as error:
         raise EvaError(_THIS_NO_JPEG(error=error)) from None

@@ -1,17 +1,27 @@
-"""The most pixels of a picture that others give us: a file of some hundred bytes can say that it is gigabytes large."""
+"""The most pixels and scans of pictures that others give us: some hundred bytes can say that they are gigabytes."""
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
 MOST_PIXELS = 2**24  # such as 4096 x 4096
+MOST_SCANS = 64  # encoders write about ten, and their thumbnails some more
 # FFmpeg's option, looked at before memory is taken: of sizes that decoders have rounded up, so that ours decides.
 DECODING = {"max_pixels": str(MOST_PIXELS * 5 // 4)}
 
 
+# What Pillow raises of a picture that is damaged, whichever its format, beside its own errors (which are OSError).
+DAMAGED = (
+    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, SyntaxError, TypeError, ValueError),
+    *(struct.error, zlib.error),
+)
+
+
 class TooLargeError(ValueError):
-    """A picture has more pixels than any camera's."""
+    """A picture has more pixels, or more scans, than any camera's."""
 
 
 def require_size(width: int, height: int, whose: str = "its pictures are") -> None:
@@ -20,6 +30,13 @@ def require_size(width: int, height: int, whose: str = "its pictures are") -> No
         raise TooLargeError(
             f"{whose} {width} x {height}; allowed: {MOST_PIXELS} pixels in all, such as 4096 x 4096"
         )
+
+
+def require_scans(coded: bytes, whose: str = "its JPEG has") -> None:
+    """Raise TooLargeError for a JPEG of so many scans that some bytes each cost a whole picture."""
+    scans = coded.count(b"\xff\xda") if coded.startswith(b"\xff\xd8") else 0  # coded pixels never hold it
+    if scans > MOST_SCANS:
+        raise TooLargeError(f"{whose} {scans} scans; allowed: {MOST_SCANS}")
 
 
 def open_video(path: Path | str) -> Any:

@@ -26,6 +26,7 @@ from runtime.datasets.features import (
     differences,
     figure_shapes,
     holds_nothing,
+    other_shape,
     stored,
 )
 from runtime.datasets.layout import Line
@@ -33,7 +34,7 @@ from runtime.datasets.parquet_lists import EPISODES_FOLDER, is_storable
 from runtime.datasets.pictures import StoredPictures
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.datasets.renaming import Names
-from runtime.datasets.rows import numbers, write_table
+from runtime.datasets.rows import numbers, row_shape, write_table
 from runtime.datasets.sides import FOLDER, side_file, side_files
 from runtime.datasets.splits import TRAIN, episodes_of, written
 from runtime.datasets.staging import LOCK, Draft
@@ -291,7 +292,13 @@ class _Assembly:
         listed = tuple(self._told(lines))
         catalog = Catalog(self._root, self._info, listed, tasks, tuple(statistics), tuple(eva))
         catalog = replace(catalog, info={**self._info, **catalog.totals(), "splits": self._splits()})
-        for name, content in (catalog.documents_before_data() | catalog.documents_after_data()).items():
+        try:
+            documents = catalog.documents_before_data() | catalog.documents_after_data()
+        except UnicodeEncodeError as error:
+            raise RecordingError(
+                f"the metadata say {error.object!r:.120}, which is no text: {error.reason}"
+            ) from error
+        for name, content in documents.items():
             path = self._root / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
@@ -329,7 +336,7 @@ class _Assembly:
                     statistics[key] = made
         if self._info["codebase_version"] == layout.V21:
             statistics |= {key: _of_three(statistics[key]) for key in self._shown if key in statistics}
-        return statistics | _completed(statistics, self._computed(table))
+        return statistics | _completed(statistics, self._computed(part, table))
 
     @property
     def _shown(self) -> list[str]:
@@ -348,12 +355,15 @@ class _Assembly:
                 found[key] = statistic
         return found
 
-    def _computed(self, table: pa.Table) -> dict[str, Statistic]:
-        columns = {
-            key: numbers(table, key).reshape(table.num_rows, *feature["shape"])
-            for key, feature in stored(self._features).items()
-            if feature["dtype"] not in WORDS
-        }
+    def _computed(self, part: Part, table: pa.Table) -> dict[str, Statistic]:
+        columns = {}
+        for key, feature in stored(self._features).items():
+            if feature["dtype"] in WORDS:
+                continue
+            if wrong := other_shape(key, feature, row_shape(table, key)):
+                raise RecordingError(f"{part.source.dataset.root}, episode {part.index}: {wrong}")
+            rows = numbers(table, key, math.prod(feature["shape"]))
+            columns[key] = rows.reshape(table.num_rows, *feature["shape"])
         return column_statistics(columns, {key: self._features[key] for key in columns})
 
     def _table(self, part: Part, line: Line, first: int) -> pa.Table:
@@ -542,7 +552,7 @@ def _without_nan(value: Any) -> Any:
 
 def _is_json(values: Sequence[Any]) -> bool:
     try:
-        return bool(json.dumps(values, allow_nan=False))
+        return bool(json.dumps(values, allow_nan=False, ensure_ascii=False).encode())
     except (TypeError, ValueError):
         return False
 

@@ -29,11 +29,12 @@ from runtime.datasets.features import (
     holds_nothing,
     is_depth,
     is_language,
+    other_shape,
     picture_size,
     stored,
 )
 from runtime.datasets.pictures import Pictures, StoredPictures, Stretch
-from runtime.datasets.rows import numbers, read_rows
+from runtime.datasets.rows import numbers, read_rows, row_shape
 from runtime.datasets.sides import strays
 from runtime.datasets.splits import episodes_of
 from runtime.datasets.stats import FIGURES, fault, finite
@@ -91,7 +92,7 @@ def _said(root: Path) -> list[str]:
         ]
     except RecordingError as error:
         return [str(error)]
-    except (KeyError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         return [f"the metadata of {root} are not of the format: {error!r}"]
 
 
@@ -247,9 +248,12 @@ def _values(table: pa.Table, info: layout.Info) -> Iterator[str]:
             continue
         try:
             values = numbers(table, key)
+            wrong = other_shape(key, feature, row_shape(table, key))
         except RecordingError as error:
             yield str(error)
             continue
+        if wrong:
+            yield wrong
         if (infinite := np.isinf(values.astype(np.float64)).any(axis=1)).any():
             yield f"{key!r} is infinite in {_rows(infinite)}"
 

@@ -97,6 +97,14 @@ def figure_shapes(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], ...]:
     return tuple(dict.fromkeys((shape, (math.prod(shape),))))
 
 
+def other_shape(key: str, feature: Mapping[str, Any], found: tuple[int, ...]) -> str:
+    """Sentence on rows of several axes that are not as long as declared, "" where they are."""
+    declared = list(feature["shape"])
+    if len(declared) < 2 or not found or list(found) == declared:
+        return ""
+    return f"{key!r} has rows of shape {list(found)}, declared {declared}"
+
+
 def holds_nothing(feature: Mapping[str, Any]) -> bool:
     """True of a shape with an axis of length 0: no loader reads such a column."""
     return 0 in list(feature["shape"])

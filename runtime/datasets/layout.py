@@ -105,10 +105,36 @@ def read_info(root: Path) -> dict[str, Any]:
     missing = [key for key in ("fps", "features", "total_episodes") if key not in info]
     if missing:
         raise RecordingError(f"{root / INFO} lacks {missing}, it has {sorted(info)}")
-    fps = info["fps"]
+    fps, features, splits = info["fps"], info["features"], info.get("splits")
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps < float("inf"):
         raise RecordingError(f"{root / INFO} gives fps {fps!r}, expected a positive number")
+    for key, least in (("total_episodes", 0), ("chunks_size", 1)):
+        if not _is_count(info.get(key, least), least):
+            raise RecordingError(
+                f"{root / INFO} gives {key} {info[key]!r}, expected a whole number from {least} on"
+            )
+    if not isinstance(features, dict) or not (splits is None or isinstance(splits, dict)):
+        raise RecordingError(
+            f"{root / INFO}: features and splits are JSON objects, these are {features!r:.80}, {splits!r:.80}"
+        )
+    for key, feature in features.items():
+        if not _declares(feature):
+            raise RecordingError(
+                f"{root / INFO}: feature {key!r} is {feature!r:.120}, expected an object with dtype and shape (lengths)"
+            )
     return info
+
+
+def _is_count(value: object, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def _declares(feature: object) -> bool:
+    """True of an object that gives a type and the lengths of its axes."""
+    if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
+        return False
+    shape = feature.get("shape")
+    return isinstance(shape, list) and all(_is_count(length, 0) for length in shape)
 
 
 def resolve(root: Path, template: str, **fields: Any) -> Path:

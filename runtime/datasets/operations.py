@@ -108,7 +108,7 @@ def delete(
     With `known`, the `fingerprint` of the dataset that the indices are about, they are never taken from another one.
     Raises RecordingError where an episode is not there, or none would be left.
     """
-    root = Path(dataset)
+    root = Path(dataset).resolve()  # a link to it stays
     _require_dataset(root)
     with locked(root):
         recover(root)
@@ -138,7 +138,7 @@ def fingerprint(dataset: Path) -> str:
 
 def repair(dataset: Path) -> list[str]:
     """Take back what was cut off by a crash; what `check` then still finds, which cannot be repaired here."""
-    root = Path(dataset)
+    root = Path(dataset).resolve()
     remove_drafts(root)
     _require_dataset(root)
     with locked(root):

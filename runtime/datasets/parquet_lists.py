@@ -25,7 +25,7 @@ def read_episodes(root: Path) -> list[Line]:
     for path in _files(root):
         names = [name for name in _schema(path).names if not name.startswith(_STATS)]
         place = _numbers(path)
-        lines += [line | place for line in _read(path, names).to_pylist()]
+        lines += [line | place for line in _plain(_read(path, names)).to_pylist()]
     return lines
 
 
@@ -78,7 +78,7 @@ def is_storable(values: Sequence[Any]) -> bool:
 
     try:
         return bool(_bytes(pa.table({"values": pa.array(values)})))
-    except (pa.ArrowException, TypeError, OverflowError):
+    except (pa.ArrowException, TypeError, ValueError, OverflowError):
         return False
 
 
@@ -115,6 +115,16 @@ def tasks_file(tasks: Iterable[Line]) -> bytes:
         "pandas_version": "2.2.3",
     }
     return _bytes(table.replace_schema_metadata({"pandas": json.dumps(pandas)}))
+
+
+def _plain(table: pa.Table) -> pa.Table:
+    """Times that Python has no type for, those of nanoseconds, as text."""
+    import pyarrow as pa
+
+    for place, field in enumerate(table.schema):
+        if pa.types.is_temporal(field.type) and getattr(field.type, "unit", "") == "ns":
+            table = table.set_column(place, field.name, table.column(place).cast(pa.string()))
+    return table
 
 
 def _flat(statistics: Mapping[str, Mapping[str, Any]]) -> Line:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from runtime.core.errors import RecordingError
-from runtime.core.picture_bounds import TooLargeError, open_video, require_size
+from runtime.core.picture_bounds import DAMAGED, TooLargeError, open_video, require_scans, require_size
 from runtime.core.types import UInt8
 
 if TYPE_CHECKING:
@@ -315,15 +315,17 @@ class StoredPictures(PictureSequence):
 
     @contextmanager
     def _opened(self, index: int) -> Iterator[Image.Image]:
-        from PIL import Image, UnidentifiedImageError
+        from PIL import Image
 
         try:
-            with Image.open(io.BytesIO(self._coded(index))) as image:
+            coded = self._coded(index)
+            require_scans(coded, f"{self._name}, picture {index} has")
+            with Image.open(io.BytesIO(coded)) as image:
                 require_size(*image.size, f"{self._name}, picture {index} is")
                 yield image
         except TooLargeError as error:
             raise RecordingError(str(error)) from None
-        except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        except (*DAMAGED, Image.DecompressionBombError) as error:
             raise RecordingError(f"{self._name}, picture {index} cannot be decoded: {error}") from error
 
     def _coded(self, index: int) -> bytes:

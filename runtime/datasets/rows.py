@@ -30,6 +30,9 @@ def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             names = file.schema_arrow.names
+            if len(set(names)) < len(names):
+                twice = sorted({name for name in names if names.count(name) > 1})
+                raise RecordingError(f"{path} has more than one column named {', '.join(map(repr, twice))}")
             wanted = [name for name in names if name not in left_out] if left_out else None
             if episode is None:
                 return file.read(columns=wanted)
@@ -45,22 +48,21 @@ def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -
     return table.filter(pc.equal(table.column(EPISODE), episode))
 
 
-def numbers(table: pa.Table, name: str) -> np.ndarray[Any, Any]:
+def numbers(table: pa.Table, name: str, width: int = 1) -> np.ndarray[Any, Any]:
     """Column `name` as an array [N, W], whatever lists it is nested in; NaN where it is null.
+
+    `width`: W of a column that is null everywhere.
 
     Raises RecordingError naming the column where its rows differ in length, or hold no numbers.
     """
     import pyarrow as pa
-    import pyarrow.compute as pc
 
     column = table.column(name).combine_chunks()
     known = column.is_valid().to_numpy(zero_copy_only=False)
     flat = column.drop_null()
-    while is_list(flat.type):
-        lengths = pc.unique(pc.list_value_length(flat)).to_pylist()
-        if len(lengths) > 1:
-            raise RecordingError(f"rows of {name!r} have lengths {sorted(lengths, key=str)}, expected one")
-        flat = flat.flatten()
+    if len(column) and not len(flat):
+        return np.full((len(column), width), np.nan)
+    flat, _ = _flattened(flat, name)
     if pa.types.is_boolean(flat.type) and flat.null_count:
         flat = flat.cast(pa.int8())
     if not (
@@ -74,6 +76,27 @@ def numbers(table: pa.Table, name: str) -> np.ndarray[Any, Any]:
     rows = np.full((len(known), found.shape[1]), np.nan)
     rows[known] = found
     return rows
+
+
+def row_shape(table: pa.Table, name: str) -> tuple[int, ...]:
+    """The lengths of the lists in which each row of column `name` is nested, () of single values.
+
+    Raises RecordingError naming the column where its rows differ.
+    """
+    return _flattened(table.column(name).combine_chunks().drop_null(), name)[1]
+
+
+def _flattened(flat: pa.Array, name: str) -> tuple[pa.Array, tuple[int, ...]]:
+    import pyarrow.compute as pc
+
+    shape: list[int] = []
+    while is_list(flat.type):
+        lengths = pc.unique(pc.list_value_length(flat)).to_pylist()
+        if len(lengths) > 1:
+            raise RecordingError(f"rows of {name!r} have lengths {sorted(lengths, key=str)}, expected one")
+        shape += lengths
+        flat = flat.flatten()
+    return flat, tuple(shape)
 
 
 def is_list(kind: pa.DataType) -> bool:

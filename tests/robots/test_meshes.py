@@ -93,6 +93,25 @@ def test_what_is_no_mesh_is_refused_by_name(tmp_path: Path, name: str, content: 
         meshes.bounds(tmp_path / name)
 
 
+@pytest.mark.parametrize(("name", "content"), [("a.obj", OBJ), ("a.stl", STL)])
+def test_empty_lines_cost_nothing(tmp_path: Path, name: str, content: str) -> None:
+    """300,000 of them would take hours if the space before a word could be theirs."""
+    first, rest = content.split("\n", 1)
+    (tmp_path / name).write_text(first + 300_000 * "\n" + rest)
+    assert meshes.bounds(tmp_path / name)[0].tolist() == pytest.approx([0, 0, -0.3])
+
+
+def test_a_collada_that_shows_one_mesh_a_billion_times_is_refused(tmp_path: Path) -> None:
+    nodes = "".join(
+        f'<node id="n{k}">{2 * f"""<instance_node url="#n{k + 1}"/>"""}</node>' for k in range(30)
+    )
+    (tmp_path / "a.dae").write_text(
+        DAE.replace('<node id="kept">', f'{nodes}<node id="kept">').replace("#kept", "#n0")
+    )
+    with pytest.raises(RobotError, match="more than 20000 nodes"):
+        meshes.bounds(tmp_path / "a.dae")
+
+
 @pytest.mark.parametrize(
     ("filename", "place"),
     [
@@ -145,6 +164,7 @@ def test_a_mesh_elsewhere_is_refused_even_where_it_exists(tmp_path: Path, filena
     [
         (mesh("a.stl"), "link 'a': mesh 'a.stl' is missing; looked for {folder}/a.stl; put it there"),
         (mesh("a.glb"), "link 'a': mesh 'a.glb'; allowed: files .stl, .obj, .dae"),
+        (mesh(300 * "a" + ".stl"), "is no name of a file"),
         (mesh("http://there/a.stl"), "allowed: a path, package://... or file://..."),
         (mesh("a.stl", ' scale="1 0 1"'), "mesh scale 1 0 1; allowed: factors other than zero"),
         ("<visual><geometry><mesh/></geometry></visual>", "a <mesh> has no 'filename'"),

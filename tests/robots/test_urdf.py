@@ -58,6 +58,12 @@ def test_everything_declared_is_read_at_full_precision(tmp_path: Path) -> None:
             LINKS + JOINT.format(kind="revolute", rest='<mimic joint="z"/>'),
             "mimics 'z', which is not declared",
         ),
+        (
+            LINKS
+            + JOINT.format(kind="fixed", rest="")
+            + '<link name="c"/><joint name="c" type="fixed"><parent link="c"/><child link="c"/></joint>',
+            "the links ['c'] hang on each other in a circle, and not on 'a'",
+        ),
         ('<link name="a"/>' + JOINT.format(kind="fixed", rest=""), "names link 'b', which is not declared"),
         (LINKS + JOINT.format(kind="fixed", rest="") * 2, "joint j declared more than once"),
         (LINKS + '<joint name="j" type="fixed"><child link="b"/></joint>', "'j' names no parent link"),

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from evaweb.plans.design import compared
-from evaweb.plans.models import Plan, StoppingRule
+from evaweb.plans.models import Plan, PrimaryOutcome, StoppingRule
 from evaweb.results.analysis.analysis import Analysis, Comparison, Standing
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.presentation.addresses import compare_address
@@ -23,17 +23,21 @@ from evaweb.results.presentation.wording import (
     verdict,
 )
 
+_DIFFERENCE = "How much better?"
+_ANYTIME = "How much better, at any time?"
+_SCORE_ANYTIME = "With partial credit, how much at any time?"
 # A small p may come of another spread around the same mean, too.
 _EXCHANGEABLE = "sign flips within pairs, exact: are both exchangeable?"
 
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A question that a comparison answers: how, and what came out."""
+    """A question that a comparison answers: how, and what came out. `own`: by the plan's own interval."""
 
     question: str
     method: str
     answer: str
+    own: bool = False
 
 
 def primaries_of(plan: Plan, analysis: Analysis) -> list[Comparison]:
@@ -52,13 +56,17 @@ def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[
     """The sentence, and each question that a comparison answers; of the planned one its design says the sentence."""
     names = compared(plan.document or {})
     planned = headline(plan) if (found.first, found.second) in names else None
+    own = _own_interval(plan) if planned else ""
     return {
         "sentence": planned.sentences[names.index((found.first, found.second))]
         if planned
         else comparison_sentence(analysis, found),
         "headline": planned,
         "names": f"{found.first} and {found.second}",
-        "facts": [*_of_the_rates(plan, analysis, found), *_of_the_evidence(found), *_beyond(found)],
+        "facts": [
+            replace(fact, own=fact.question == own)
+            for fact in (*_of_the_rates(plan, analysis, found), *_of_the_evidence(found), *_beyond(found))
+        ],
         "standing": found.standing.name.lower(),
         "notes": found.notes,
         "reversed": bool(found.stratified and found.stratified.reversed),
@@ -68,9 +76,17 @@ def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[
     }
 
 
+def _own_interval(plan: Plan) -> str:
+    """The question that the interval of the plan's design answers; that of a boundary stands below the headline."""
+    by_score = (plan.document or {}).get("stopping", {}).get("outcome") == PrimaryOutcome.SCORE
+    if plan.stopping == StoppingRule.EVIDENCE:
+        return _SCORE_ANYTIME if by_score else _ANYTIME
+    return _DIFFERENCE if plan.stopping == StoppingRule.NONE and not by_score else ""
+
+
 def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator[Fact]:
     fixed = "n as planned" if plan.stopping == StoppingRule.NONE else "as if n had been fixed"
-    yield Fact("How much better?", "Newcombe, 95 %", points(found.difference))
+    yield Fact(_DIFFERENCE, "Newcombe, 95 %", points(found.difference))
     if found.test and found.corrected is not None:
         corrected = f", Holm {probability(found.corrected)}" if len(analysis.comparisons) > 1 else ""
         chance = f"{p_words(found.test.p)}{corrected}"
@@ -104,8 +120,8 @@ def _of_the_evidence(found: Comparison) -> Iterator[Fact]:
         ()
         if found.standing is Standing.OPEN
         else (
-            ("How much better, at any time?", found.anytime),
-            ("With partial credit, how much at any time?", found.score_anytime),
+            (_ANYTIME, found.anytime),
+            (_SCORE_ANYTIME, found.score_anytime),
         )
     ):
         how = f"confidence sequence, {100 * (1 - found.alpha):.3g} %"

@@ -6,7 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, tee
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from django.contrib.auth.models import User
@@ -73,7 +73,7 @@ _STATES = (PlanState.FROZEN, PlanState.CLOSED, PlanState.REVEALED)
 
 
 T = TypeVar("T")
-_NAMED = 500  # ids in one question to the database
+_NAMED = 200  # pairs in one question to the database
 
 
 class Offer(NamedTuple, Generic[T]):
@@ -111,7 +111,7 @@ def to_rate(user: User) -> Offer[Handout]:
             continue
         open_ones = {handout.slot.index: handout for handout in _unrated(plan, user)}
         mine += [open_ones[index] for index in sample_of(plan) if index in open_ones]
-    return _offered(mine, lambda handout: (handout,))
+    return _offered(mine, len(mine), lambda handout: (handout,))
 
 
 def _rated_first(what: str, trial: Trial, user: User) -> None:
@@ -132,16 +132,19 @@ def _rated_first(what: str, trial: Trial, user: User) -> None:
 declare_check(_rated_first)
 
 
-def _offered(waiting: Sequence[T], of: Callable[[T], tuple[Handout, ...]]) -> Offer[T]:
-    """The first of which all pictures are there, else the first of which they may come; what lies before is passed."""
-    for there in (seen, coming):
+def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, ...]]) -> Offer[T]:
+    """The first of which all pictures are there, else the first of which they may come; what lies before is passed.
+
+    No more of what is `waiting` is read than has to be.
+    """
+    for there, each in zip((seen, coming), tee(waiting), strict=True):
         passed: list[str] = []
-        for one in waiting:
+        for one in each:
             lacking = [handout.code for handout in of(one) if not there(handout.trial.episode)]
             if not lacking:
-                return Offer(one, len(waiting), tuple(dict.fromkeys(passed)))
+                return Offer(one, count, tuple(dict.fromkeys(passed)))
             passed += lacking
-    return Offer(None, len(waiting), tuple(dict.fromkeys(passed)))
+    return Offer(None, count, tuple(dict.fromkeys(passed)))
 
 
 def _unrated(plan: Plan, user: User) -> QuerySet[Handout]:
@@ -198,12 +201,18 @@ def rate(
 
 def to_prefer(user: User, plans: Iterable[Plan] | None = None) -> Offer[Pair]:
     """The next two trials that this user has not compared, of those of which there are pictures."""
-    fresh: list[Pair] = []
+    fresh: list[tuple[Plan, list[tuple[int, int]]]] = []
     for plan in plans if plans is not None else Plan.objects.filter(state__in=_STATES).order_by("pk"):
         if not has_looked_at_the_same(plan, user):
             judged = set(Preference.objects.filter(plan=plan, rater=user).values_list("first", "second"))
-            fresh += _named(plan, [pair for pair in _pairs(plan) if pair not in judged])
-    return _offered(fresh, lambda pair: (pair.first, pair.second))
+            fresh.append((plan, [pair for pair in _pairs(plan) if pair not in judged]))
+    named = (
+        pair
+        for plan, pairs in fresh
+        for begin in range(0, len(pairs), _NAMED)
+        for pair in _named(plan, pairs[begin : begin + _NAMED])
+    )
+    return _offered(named, sum(len(pairs) for _, pairs in fresh), lambda pair: (pair.first, pair.second))
 
 
 def _pairs(plan: Plan) -> list[tuple[int, int]]:
@@ -220,7 +229,7 @@ def _pairs(plan: Plan) -> list[tuple[int, int]]:
 
 def _named(plan: Plan, pairs: Sequence[tuple[int, int]]) -> list[Pair]:
     trials = {trial for pair in pairs for trial in pair}
-    of_plan = plan.handouts.filter(trial__in=trials) if len(trials) < _NAMED else plan.handouts.all()
+    of_plan = plan.handouts.filter(trial__in=trials)
     rows = {
         row.trial_id: row
         for row in of_plan.select_related("trial__episode", "trial__scene", "trial__position")

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from runtime.core.errors import CodecError
-from runtime.core.picture_bounds import MOST_PIXELS
+from runtime.core.picture_bounds import MOST_PIXELS, require_scans
 from runtime.core.types import Float32, Float64, UInt8
 from runtime.transports.ros.messages import CompressedImage, Image, JointState, PoseStamped
 from runtime.transports.ros.topics import Part
@@ -187,6 +187,7 @@ def _jpeg(message: CompressedImage) -> UInt8:
     data = message.data.tobytes()
     height, width, _, _ = simplejpeg.decode_jpeg_header(data)
     _check_size(height, width)
+    require_scans(data)
     return np.asarray(simplejpeg.decode_jpeg(data, "RGB"), np.uint8)
 
 

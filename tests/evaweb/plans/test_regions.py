@@ -149,6 +149,10 @@ def test_a_small_file_that_is_a_very_large_picture_is_refused_before_it_is_decod
         pictures.match(large, large)
     with pytest.raises(EvaError, match="4100 x 4100 pixels"):
         check_sizes([], large)
+    small = simplejpeg.encode_jpeg(np.zeros((8, 8, 1), "u1"), colorspace="GRAY")
+    monkeypatch.undo()
+    with pytest.raises(EvaError, match="this is no JPEG: its JPEG has 101 scans; allowed: 64"):
+        pictures.match(small + 100 * b"\xff\xda", small)
 
 
 # --- the real episode ----------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -21,7 +22,8 @@ from runtime.datasets.catalog import Catalog
 from runtime.datasets.consistency import check
 from runtime.datasets.cut import encode
 from runtime.datasets.entries import Span
-from runtime.datasets.operations import convert
+from runtime.datasets.operations import convert, delete
+from runtime.datasets.pictures import StoredPictures
 from runtime.datasets.reader import open_dataset
 from runtime.datasets.stats import video_statistic
 from tests.runtime.datasets.foreign import Plan, write
@@ -411,3 +413,105 @@ def test_sound_that_a_video_loses_is_named(tmp_path: Path) -> None:
     silent.unlink()
     made = convert(tmp_path / "set", tmp_path / "new", "v3.0")
     assert made.left_out == (f"audio of {path}: the video is written without it",)
+
+
+@pytest.mark.parametrize("stored", [None, pa.null()])
+def test_a_column_that_is_null_in_all_of_an_episode_is_named_and_copied(
+    root: Path, tmp_path: Path, stored: pa.DataType | None
+) -> None:
+    edit(root, "action", lambda rows: pa.nulls(len(rows), stored) if stored else [None] * len(rows))
+    (root / "meta/episodes_stats.jsonl").write_text("")
+    assert "episode 0: 'action' is null in 7 rows, the first is 0" in check(root)
+    convert(root, tmp_path / "new", "v2.1")
+    assert check(tmp_path / "new") == ["episode 0: 'action' is null in 7 rows, the first is 0"]
+
+
+def test_times_finer_than_those_of_python_are_kept_as_text(tmp_path: Path) -> None:
+    write(tmp_path / "set", Plan("v3.0", lengths=(3, 4), videos=()))
+    path = next((tmp_path / "set/meta/episodes").rglob("*.parquet"))
+    table = pq.read_table(path)
+    pq.write_table(table.append_column("recorded", pa.array([1, 2], pa.timestamp("ns"))), path)
+    convert(tmp_path / "set", tmp_path / "new", "v2.1")
+    listed = (tmp_path / "new/meta/episodes.jsonl").read_text()
+    assert '"recorded": "1970-01-01 00:00:00.000000002"' in listed
+
+
+def test_an_episode_is_deleted_through_a_link_that_stays(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "links").mkdir()
+    link = tmp_path / "links" / "set"
+    link.symlink_to(root)
+    delete(link, [0])
+    assert link.is_symlink()
+    assert [path.name for path in link.parent.iterdir()] == ["set"]
+    assert [entry.length for entry in open_dataset(root).episodes] == [5]
+
+
+def test_rows_whose_axes_are_exchanged_are_named(root: Path, tmp_path: Path) -> None:
+    kind = pa.list_(pa.list_(pa.float32()))
+    edit(root, "action", lambda rows: pa.array([[row[:2], row[2:4], row[4:]] for row in rows], kind))
+    declare(root, "action", shape=[2, 3], names=None)
+    (root / "meta/episodes_stats.jsonl").write_text("")
+    said = "'action' has rows of shape [3, 2], declared [2, 3]"
+    assert f"episode 0: {said}" in check(root)
+    with pytest.raises(RecordingError, match=re.escape(said)):
+        convert(root, tmp_path / "new", "v2.1")
+
+
+INFOS = [
+    ('"total_episodes": 2', '"total_episodes": 1e999', "gives total_episodes inf, expected a whole number"),
+    ('"chunks_size": 1000', '"chunks_size": 0', "gives chunks_size 0, expected a whole number from 1 on"),
+    ('"splits": {', '"splits": true, "was": {', "features and splits are JSON objects"),
+    ('"features": {', '"features": null, "were": {', "features and splits are JSON objects"),
+    ('"shape": [6]', '"shape": 6', "expected an object with dtype and shape"),
+    ('"dtype": "float32"', '"dtype": null', "expected an object with dtype and shape"),
+]
+
+
+@pytest.mark.parametrize(("one", "other", "said"), INFOS, ids=[other for _, other, _ in INFOS])
+def test_an_info_that_is_none_is_refused_by_everything(root: Path, one: str, other: str, said: str) -> None:
+    path = root / "meta/info.json"
+    text = json.dumps(json.loads(path.read_text()))
+    assert one in text
+    path.write_text(text.replace(one, other, 1))
+    assert said in check(root)[0]
+    with pytest.raises(RecordingError, match=said):
+        open_dataset(root)
+
+
+def test_two_columns_of_one_name_are_refused(root: Path, tmp_path: Path) -> None:
+    table = pq.read_table(root / ROWS)
+    pq.write_table(table.append_column("action", table["action"]), root / ROWS)
+    said = f"{root / ROWS} has more than one column named 'action'"
+    assert f"episode 0: {said}" in check(root)
+    with pytest.raises(RecordingError, match="more than one column named 'action'"):
+        convert(root, tmp_path / "new", "v2.1")
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_half_a_character_is_no_text(root: Path, tmp_path: Path, version: str) -> None:
+    path = root / "meta/tasks.jsonl"
+    path.write_text(path.read_text().replace("task 1", "task \\ud83d"))
+    with pytest.raises(RecordingError, match=r"the metadata say .*task .ud83d.*, which is no text"):
+        convert(root, tmp_path / "new", version)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of Pillow, on tags
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "JPEG"])
+def test_a_damaged_picture_is_named_or_seen(stills: Path, kind: str) -> None:
+    whole = coded(np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8), kind)
+    chance = np.random.default_rng(2)
+    damaged = []
+    for _ in range(100):
+        content = bytearray(whole)
+        for place in chance.integers(0, min(len(whole), 200), 2):
+            content[place] = chance.integers(0, 256)
+        damaged.append({"bytes": bytes(content), "path": None})
+    pictures = StoredPictures("column", damaged, stills)
+    said = []
+    for number in range(len(pictures)):
+        try:
+            assert pictures[number].ndim == 3
+        except RecordingError as error:
+            said.append((number, str(error)))
+    assert len(said) > 20
+    assert [(number, error) for number, error in said if f"picture {number} " not in error] == []

@@ -147,3 +147,14 @@ def test_a_picture_whose_header_says_that_it_is_huge_is_not_decoded(tmp_path: Pa
     huge = content[:size] + struct.pack(">HH", 5000, 6000) + content[size + 4 :]
     with pytest.raises(RecordingError, match="picture 0 is 6000 x 5000; allowed: 16777216 pixels"):
         StoredPictures("cam", [{"bytes": huge}], tmp_path)[0]
+
+
+def test_a_picture_of_thousands_of_scans_is_not_decoded(tmp_path: Path) -> None:
+    coded = io.BytesIO()
+    Image.new("RGB", (16, 16)).save(coded, "JPEG", progressive=True)
+    content = coded.getvalue()
+    assert StoredPictures("cam", [{"bytes": content}], tmp_path)[0].shape == (16, 16, 3)
+    last = content.rindex(b"\xff\xda")
+    many = content[:last] + 1000 * content[last:-2] + content[-2:]
+    with pytest.raises(RecordingError, match=r"picture 0 has 10\d+ scans; allowed: 64"):
+        StoredPictures("cam", [{"bytes": many}], tmp_path)[0]

@@ -13,12 +13,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from .designs import error, kept_faults, planned, planned_letters, share_of
+from .designs import error, kept_blocks, kept_faults, planned, planned_letters, share_of
 from .judged import agreement, by_words, calibration, on_milestone, preferences, score_alpha
 from .numbers import Drawn, Trial, numbers
 from .record import changes, gaps
 from .scenes import ending_faults, scene_faults
 from .sealed import faults
+from .words import headline_faults, page_faults
 
 _SHOWN = 40
 _CLOSE = 1e-6  # relative: both ways to a number end in the last bits of different sums
@@ -54,6 +55,10 @@ def main() -> int:
         wrong += [*scene_faults(plan, rows, scores, ratings), *ending_faults(plan, rows)]
         people = Counter(map(_of, preferred))
         said = planned(trials, plan, seal["at_reveal"])
+        if seal["at_reveal"]:
+            blocks, told = kept_blocks(seal["at_reveal"]), seal["at_reveal"].get("headline", ())
+            wrong += headline_faults(said, blocks, plan, told)
+        wrong += page_faults(page, shown, trials)
         found = numbers(trials, plan, said)
         found |= {
             "letters": planned_letters(trials, plan, seal["at_reveal"]) or found["letters"],

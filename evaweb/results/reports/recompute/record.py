@@ -22,7 +22,7 @@ SCORE = (
     *("reason", "scored_at"),
 )
 Rows = Sequence[Mapping[str, str]]
-_HIDDEN = re.compile(
+HIDDEN = re.compile(
     r"<!--.*?-->|<(script|style|template)\b.*?</\1>", re.DOTALL
 )  # of a page, from who reads it
 
@@ -87,7 +87,7 @@ def changes(
             found.append(
                 "durations, smoothness or what ended a run are not those of which the reveal kept the digest"
             )
-    text = html.unescape(_HIDDEN.sub("", page))
+    text = html.unescape(HIDDEN.sub("", page))
     found += [f"index.html does not say: {one}" for one in _unsaid(kept, text)]
     return found
 

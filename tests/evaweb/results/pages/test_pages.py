@@ -15,6 +15,7 @@ from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode
 from evaweb.plans.services import plan_close
 from evaweb.results.analysis import caching
+from evaweb.results.presentation.facts import comparison_facts
 from evaweb.results.ratings import judging
 from evaweb.results.selectors import PlanRow
 from evaweb.trials import services, voids
@@ -125,11 +126,30 @@ def test_the_page_says_the_comparison_with_n_and_interval(revealed, as_, viewer)
         "confidence sequence, 95 %",
         "uniform priors",
         "would be missed",
+        "the plan's own interval",
     ):
         assert method in text
     assert text.count('<svg class="drawing') >= 7
     assert "Clopper-Pearson" in text
     assert "Holm" in text
+
+
+@pytest.mark.parametrize(
+    ("rule", "outcome", "own"),
+    [
+        ("none", "success", ["How much better?"]),
+        ("none", "score", []),
+        ("evidence", "success", ["How much better, at any time?"]),
+        ("evidence", "score", ["With partial credit, how much at any time?"]),
+        ("late", "success", []),  # that of its boundary stands with the headline
+    ],
+)
+def test_of_several_intervals_the_plans_own_is_marked(revealed, rule, outcome, own):
+    revealed.stopping = rule
+    revealed.document["stopping"] |= {"rule": rule, "outcome": outcome}
+    analysis = caching.analysis_of(revealed)
+    facts = comparison_facts(revealed, analysis, analysis.comparisons[0])["facts"]
+    assert [fact.question for fact in facts if fact.own] == own
 
 
 def test_every_number_leads_to_its_trials(revealed, as_, viewer):

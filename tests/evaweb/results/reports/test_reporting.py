@@ -199,6 +199,24 @@ def test_pairs_of_the_reveal_that_were_forged_with_their_digest_are_found(report
     assert "the blocks of the reveal are not those of the scores that stood then" in said
 
 
+def test_a_headline_of_the_reveal_that_its_blocks_do_not_give_is_found(report):
+    """Another winner, other counts, or one sentence more: with a digest that fits."""
+    path = report / "data" / "seal.json"
+    kept = path.read_text("utf-8")
+    told = json.loads(kept)["at_reveal"]["headline"]
+    for change in (
+        lambda said: said.replace("pi0-new", "X").replace("pi0-block", "pi0-new").replace("X", "pi0-block"),
+        lambda said: said.replace("/", "0/", 1),
+    ):
+        path.write_text(kept, "utf-8")
+        said = forged(report, lambda held, change=change: held.update(headline=[change(one) for one in told]))
+        assert "headline: no sentence begins " in said
+        assert "headline: nothing comes out as " in said
+    path.write_text(kept, "utf-8")
+    said = forged(report, lambda held: held.update(headline=[*told, "pi0-new is the best of 2"]))
+    assert "headline: nothing comes out as 'pi0-new is the best of 2'" in said
+
+
 def test_sums_of_the_reveal_that_were_forged_with_their_digest_are_found(report):
     def change(held):
         held["arms"][0]["score"] += 0.01
@@ -240,6 +258,11 @@ def of_text(name, before, after):
 def another_headline(report):
     said = json.loads((report / "data" / "seal.json").read_text("utf-8"))["at_reveal"]["headline"][0]
     of_text("index.html", html.escape(said), "pi0 failed as often as pi0-new.")(report)
+
+
+def a_rate(report):
+    arm = json.loads((report / "data" / "numbers.json").read_text("utf-8"))["arms"]["pi0-new"]
+    of_text("index.html", f"<td>{arm['successes']}/{arm['n']},", f"<td>{arm['n']}/{arm['n']},")(report)
 
 
 def first_of_two(rows):
@@ -297,11 +320,16 @@ TAMPERINGS = {
         of_table("trials", lambda rows: rows[3].update(ended_by="timeout")),
         "durations, smoothness",
     ),
+    "a rate on the page": (a_rate, "index.html says of pi0-new"),
+    "a trial on the page": (
+        of_text("index.html", "<td>yes</td>", "<td>no</td>"),
+        "index.html does not say of trial",
+    ),
     "a reason": (of_table("scores", lambda rows: rows[-1].update(reason="a better one")), RECORD),
 }
 
 
-SOME = ("a first score", "a caveat", "an operator")
+SOME = ("a first score", "a caveat", "an operator", "a rate on the page")
 
 
 @pytest.mark.parametrize(
