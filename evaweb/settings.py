@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from datetime import timedelta
 from importlib.metadata import PackageNotFoundError, files, version
@@ -206,12 +207,23 @@ AXES_SENSITIVE_PARAMETERS = ["username", "ip_address", "csrfmiddlewaretoken"]
 AXES_DISABLE_ACCESS_LOG = True  # evaweb.audit logs who comes and goes
 AXES_ENABLE_ADMIN = False  # evaweb.api.admin has a page of its own
 AXES_VERBOSE = False
+
+
+def _in_one_line(record: logging.LogRecord) -> bool:
+    record.exc_info = None
+    return True
+
+
 LOGGING = {
     "version": 1,
     "disable_existing_loggers": False,
     "formatters": {"line": {"format": "%(asctime)s %(levelname)s %(name)s: %(message)s"}},
     "handlers": {"console": {"class": "logging.StreamHandler", "formatter": "line"}},
-    "loggers": {"axes": {"level": "ERROR"}},  # what it tells of logins evaweb.audit tells better
+    "filters": {"in_one_line": {"()": "django.utils.log.CallbackFilter", "callback": _in_one_line}},
+    "loggers": {
+        "axes": {"level": "ERROR"},  # what it tells of logins evaweb.audit tells better
+        "django.security.DisallowedHost": {"filters": ["in_one_line"]},  # anybody can ask by any name
+    },
     "root": {"handlers": ["console"], "level": environment.log_level("EVA_LOG_LEVEL", "INFO")},
 }
 

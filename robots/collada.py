@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from robots.errors import RobotError
 from robots.rotations import Float64
+from robots.urdf import parsed
 
 _NAMESPACE = "{*}"
 _MOST_NODES = 20_000  # a file of some lines can show one a billion times
@@ -21,9 +23,9 @@ def points(path: Path) -> Float64:
     The file's up axis is left as it is, as robots' viewers do.
     """
     try:
-        root = ET.parse(path).getroot()
-    except (ET.ParseError, LookupError) as error:  # of an encoding that nobody knows
-        raise ValueError(str(error)) from error
+        root = parsed(path)
+    except RobotError as error:
+        raise ValueError(str(error.__cause__ or error)) from error
     geometries = {f"#{one.get('id')}": _positions(one) for one in root.iterfind(f".//{_NAMESPACE}geometry")}
     library = {f"#{one.get('id')}": one for one in root.iterfind(f".//{_NAMESPACE}node")}
     unit = root.find(f"{_NAMESPACE}asset/{_NAMESPACE}unit")

@@ -21,6 +21,7 @@ from evaweb.canonical import difference, digest
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans import reveals
+from evaweb.plans.counting import fails_by
 from evaweb.plans.design import (
     ENDED_EVENT,
     at_the_reveal,
@@ -402,11 +403,14 @@ def _trials(plan: Plan) -> QuerySet[Trial]:
 
 
 def _unfinished(plan: Plan) -> list[Trial]:
-    return list(
-        Trial.objects.filter(
-            handout__plan=plan, status__in=(*OPEN, TrialStatus.ENDED), verdict=None
-        ).select_related("handout", "station")
-    )
+    """Trials that are under way or yet to be scored: of those that were broken off, failures by the plan."""
+    states = (*OPEN, TrialStatus.ENDED, TrialStatus.INTERRUPTED)
+    rows = Trial.objects.filter(handout__plan=plan, status__in=states, verdict=None)
+    return [
+        trial
+        for trial in rows.select_related("handout", "station", "episode")
+        if trial.status != TrialStatus.INTERRUPTED or fails_by(plan, trial)
+    ]
 
 
 def _close(plan: Plan, user: User, why: str) -> None:

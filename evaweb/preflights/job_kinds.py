@@ -22,5 +22,5 @@ def preflight(work: Work) -> Mapping[str, Any]:
     if row.status != PreflightStatus.RUNNING:
         return {"verdict": row.verdict}
     work.tell(f"asking the server of {row.checkpoint}")
-    asked = {"deployment": row.station.deployment, "changes": {"policy": row.policy}}
+    asked = {"deployment": row.station.deployment, "changes": row.changes}
     return {"verdict": preflight_ended(row=row, report=fly(asked, LONGEST_S)).verdict}

@@ -74,6 +74,12 @@ class Preflight(models.Model):
             models.Index(fields=("status", "station")),
         ]
 
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The tables that go on top of the station's deployment."""
+        served = {"strategy": self.checkpoint.strategy} if self.checkpoint.strategy else {}
+        return {"policy": self.policy, **served}
+
     def __str__(self) -> str:
         return f"preflight of {self.checkpoint} at {self.station.name}: {self.verdict or self.status}"
 

@@ -158,7 +158,7 @@ def _of_station(row: Preflight) -> Preflight:
     row.by = Preflight.By.STATION
     row.save(force_insert=True)
     checkpoint = {"id": row.checkpoint_id, "name": row.checkpoint.name}
-    args = {"id": str(row.pk), "policy": row.policy, "checkpoint": checkpoint}
+    args = {"id": str(row.pk), **row.changes, "checkpoint": checkpoint}
     username = row.user.get_username() if row.user else ""
     said = {"user": username, "holder": username, "role": role_of(row.user) if row.user else ""}
     command = Command(str(uuid4()), "preflight", args, vouched=list(TABLES), **said)
@@ -183,7 +183,7 @@ def _of_worker(row: Preflight, gone: StationGone) -> Preflight:
     if not file:
         raise StationGone(_DEPLOYMENT_FILE_NOT_KNOWN_HERE(gone=gone))
     try:
-        resolved = deployment.changed(deployment.load(Path(file)), {"policy": row.policy}, "the checkpoint")
+        resolved = deployment.changed(deployment.load(Path(file)), row.changes, "the checkpoint")
         _require_free(server_of(resolved.deployment), row.station)
     except ConfigurationError as error:
         log.info("%s: %s", row, error)  # what the report will say

@@ -91,12 +91,13 @@ class SetUpRequest(Settings):
 class PreflightRequest(Settings):
     """`preflight`: which policy is asked without the robot; what is absent is the deployment's own.
 
-    `policy` as in a set-up; `id` names the report; it ends after `deadline_s` [s] at the latest, without it after what
+    `policy` and `strategy` as in a set-up; `id` names the report; it ends after `deadline_s` [s] at the latest, without it after what
     the policy's own deadlines come to.
     """
 
     id: Annotated[str, Field(min_length=1, max_length=200)]
     policy: Map | None = None
+    strategy: Map | None = None
     task: Annotated[str, Field(max_length=2000)] | None = None
     checkpoint: Checkpoint | None = None
     deadline_s: float | None = Field(default=None, gt=0, le=3600)
@@ -104,7 +105,7 @@ class PreflightRequest(Settings):
     @property
     def changes(self) -> dict[str, Any]:
         """The tables that go on top of the deployment."""
-        wanted = {"policy": self.policy, "task": self.task}
+        wanted = {"policy": self.policy, "strategy": self.strategy, "task": self.task}
         return {key: value for key, value in wanted.items() if value is not None}
 
     @property

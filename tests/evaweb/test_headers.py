@@ -86,3 +86,10 @@ def test_no_template_has_what_the_policy_forbids():
     templates = sorted(Path(settings.BASE_DIR, "templates").rglob("*.html"))
     assert len(templates) > 80
     assert [path.name for path in templates if ATTRIBUTES.search(path.read_text("utf-8"))] == []
+
+
+def test_a_name_that_is_none_of_the_labs_is_one_line_of_the_log(caplog):
+    assert Client().get("/", headers={"host": "elsewhere.example"}).status_code == 400
+    (record,) = [one for one in caplog.records if one.name == "django.security.DisallowedHost"]
+    assert "elsewhere.example" in record.getMessage()
+    assert record.exc_info is None

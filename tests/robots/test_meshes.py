@@ -67,6 +67,14 @@ def test_the_box_around_a_collada_follows_its_scene_and_its_unit(tmp_path: Path)
     np.testing.assert_allclose(upper, [0.1, 0.2, 1.0], atol=1e-12)
 
 
+def test_a_collada_is_read_in_any_encoding(tmp_path: Path) -> None:
+    text = DAE.replace('<?xml version="1.0"?>', '<?xml version="1.0" encoding="GBK"?>').replace(
+        'id="kept"', 'id="手"'
+    )
+    (tmp_path / "a.dae").write_bytes(text.replace("#kept", "#手").encode("gbk"))
+    assert meshes.bounds(tmp_path / "a.dae")[1].tolist() == pytest.approx([0.1, 0.2, 1.0])
+
+
 def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
     file = tmp_path / "a.obj"
     file.write_text("v 0 0 0\nv 1 1 1\n")

@@ -9,7 +9,7 @@ from evaweb.plans.allocation import hand_out
 from evaweb.plans.draft_checks import problems
 from evaweb.plans.exchange import exported, imported
 from evaweb.plans.models import CountsAs, Plan
-from evaweb.plans.services import plan_amend, plan_freeze
+from evaweb.plans.services import plan_amend, plan_close, plan_freeze
 from evaweb.results.reports.recompute.scenes import ending_faults, scene_faults
 from evaweb.results.reports.tables import outcome_pages, score_pages
 from evaweb.tabular_export import plain
@@ -144,6 +144,16 @@ def test_what_is_a_failure_by_the_plan_is_not_voided_away_before_its_score(bench
         user=bench.operator, trial=Trial.objects.get(pk=trial.pk), reason="it had slipped"
     )
     assert asked.status == "void_asked"
+
+
+def test_a_plan_is_not_closed_before_its_failures_are_scored(bench, declared, owner):
+    plan = declared(on_estop=CountsAs.FAILURE, on_interruption=CountsAs.REPEATED)
+    trial = ended(bench, plan, ESTOP)
+    with pytest.raises(Conflict, match=r"1 trials of Blocks v1 are not finished, .* is interrupted: score"):
+        plan_close(user=owner, plan=plan, reason="enough")
+    scored(bench, trial, False)
+    ended(bench, plan, FAULT)
+    assert plan_close(user=owner, plan=plan, reason="enough").state == "closed"
 
 
 def test_what_left_no_row_is_repeated_whatever_the_plan_says(bench, declared):

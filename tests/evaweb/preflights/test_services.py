@@ -43,6 +43,13 @@ def test_the_station_is_asked_with_the_checkpoints_table(ask, bench, checkpoint,
     assert row.over_by - timezone.now() > timedelta(seconds=250)
 
 
+def test_it_is_asked_as_the_checkpoint_is_served(ask, checkpoint, runtime):
+    assert "strategy" not in (ask(), runtime.heard[-1])[1].args
+    checkpoint.strategy = {"kind": "rtc"}
+    ask()
+    assert runtime.heard[-1].args["strategy"] == {"kind": "rtc"}
+
+
 def test_its_report_is_kept_when_somebody_looks(ask, runtime):
     row = ask()
     assert preflight_settled(row=row).status == "running"
