@@ -24,6 +24,11 @@ COVERED = fixed(
     "hidden until the reveal: look whether the robot stands safely, then resume, or stop and have the trial repeated",
 )
 
+COVERED_AT_REST = fixed(
+    "blinding.covered_at_rest",
+    "hidden until the reveal: set up again; if that fails again, return the trial unrun",
+)
+
 # Sentences that no checkpoint has a part in. All others may name a server, a time or a number of rows.
 _HARMLESS = re.compile(
     r"""

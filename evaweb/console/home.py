@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
@@ -34,6 +34,7 @@ from evaweb.trials.voids import may_answer
 
 MOST = 5  # of each kind
 FULL = 0.10  # share of the disk that is free, below which it is said
+_OLD_S = 10.0  # a picture, of a camera that is lost
 WAITED = timedelta(minutes=2)  # a job that waits for so long, while none runs
 _VOIDS = 20  # that are looked at, for each is asked whether this user may answer
 
@@ -135,6 +136,9 @@ def _alarms() -> Iterator[Item]:
         elif stands.get("tone") == "danger":  # why may tell what it is set up for: its own page says it
             words = f"{station} is {stands['label']}"
             yield Item(words, reverse("station-eval", args=[station.name]), "Its page", grave=True)
+        if lost := _cameras_lost(feed.state) if feed.link.ok else "":
+            words = f"{station} has no picture of {lost}"
+            yield Item(words, reverse("station-debug", args=[station.name]), "Its page", grave=True)
     yield from _disk()
     yield from _recordings()
     failed = jobs_failed().count()
@@ -151,6 +155,15 @@ def _alarms() -> Iterator[Item]:
     if not lacking and asked and not Job.objects.filter(status=JobStatus.RUNNING).exists():
         words = "Jobs are waiting, but no worker takes them: does one hang?"
         yield Item(words, reverse("jobs"), "Jobs", grave=True)
+
+
+def _cameras_lost(state: Mapping[str, Any]) -> str:
+    """The cameras without a picture for a while, of a station whose joints arrive."""
+    ages = dict(state.get("link", {}).get("ages", {}))
+    joints = ages.pop("joints", None)
+    if joints is None or not joints < _OLD_S:
+        return ""
+    return ", ".join(name for name, age in ages.items() if age is None or not age < _OLD_S)
 
 
 def _disk() -> Iterator[Item]:

@@ -13,8 +13,11 @@ from evaweb.plans.counting import ENDS
 from evaweb.plans.design import check_drafted, planned
 from evaweb.plans.models import Allocation, Comparing, CountsAs, Plan, PrimaryOutcome, StoppingRule
 from evaweb.plans.schedule import Condition, check_schedule
-from evaweb.trials.models import Scene
-from evaweb.trials.tables import check_strategy
+from evaweb.statistics.difference import barnard
+from evaweb.trials.models import Milestone, Scene
+from evaweb.trials.tables import TRUTHS, check_strategy
+
+_ENOUGH = 20  # pairs, of which all won by one checkpoint tell at any alpha that a plan may have
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +129,25 @@ def _comparisons(plan: Plan, chosen: set[int]) -> Iterator[Remark]:
         )
 
 
+def _finds_nothing(plan: Plan) -> str:
+    """Sentence where not even the clearest outcome of all trials would be significant, "" where one can be."""
+    n, comparisons = plan.positions.count() * plan.repetitions, len(planned(plan))
+    if (
+        not (comparisons and 0 < n <= _ENOUGH)
+        or plan.margin is not None
+        or plan.allocation != Allocation.PAIRED
+    ):
+        return ""
+    p = 2.0 ** (1 - n) if plan.outcome == PrimaryOutcome.SCORE else barnard(n, n, 0, n).p
+    share = plan.alpha / comparisons
+    if p <= share:
+        return ""
+    return (
+        f"{n} pair{'s' if n > 1 else ''} find nothing: even if one checkpoint won all of them, p = {p:.2g} is above "
+        f"{share:.2g}."
+    )
+
+
 def thoughts(plan: Plan) -> Iterator[Remark]:
     """What is allowed, and what a reader of the result will ask about."""
     if not plan.question.strip():
@@ -153,6 +175,15 @@ def thoughts(plan: Plan) -> Iterator[Remark]:
         yield Remark("conditions", "Only one position: the result says nothing about any other.")
     for station in plan.stations.filter(active=False):
         yield Remark("conditions", f"Station {station} is switched off.")
+    if few := _finds_nothing(plan):
+        yield Remark("design", few)
+    odd = Milestone.objects.filter(scene__positions__plan=plan).exclude(truth__in=("", *TRUTHS)).distinct()
+    for milestone in odd:
+        yield Remark(
+            "conditions",
+            f"Milestone “{milestone}” of scene {milestone.scene} is what a bench reports as “{milestone.truth}”: "
+            f"simulated benches of ours report {', '.join(TRUTHS)}.",
+        )
     if not plan.blind:
         yield Remark("design", "The plan is open: operators see which checkpoint runs, and may favour one.")
     if not plan.second_rater_share:

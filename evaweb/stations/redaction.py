@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from evaweb.blinding import COVERED, Sight
+from evaweb.blinding import COVERED, COVERED_AT_REST, Sight
 from runtime.core.sentences import Sentence, heard, identity, shows, texts
+from runtime.ipc.session_state import SessionState
 
 # Of a snapshot: the robot, the bench, who commands; nothing of the policy, its times and its chunks.
 _SHOWN = (
@@ -64,7 +65,9 @@ _JUDGED = ("milestones", "success")  # of the bench's truth: people score before
 def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
     """A snapshot, in the same shape: what would tell is empty, and "veiled" says that it is."""
     shown = {key: snapshot[key] for key in _SHOWN if key in snapshot}
-    shown["reason"] = _reason(snapshot.get("reason"), (snapshot.get("sentences") or {}).get("reason"), sight)
+    covered = COVERED_AT_REST if snapshot.get("state") == SessionState.IDLE else COVERED
+    reason = (snapshot.get("sentences") or {}).get("reason")
+    shown["reason"] = _reason(snapshot.get("reason"), reason, sight, covered)
     shown |= {key: empty for key, empty in _COVERED.items() if key in snapshot}
     if isinstance(snapshot.get("truth"), Mapping):
         shown["truth"] = {key: said for key, said in snapshot["truth"].items() if key not in _JUDGED}
@@ -86,10 +89,10 @@ def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
     return shown | {"veiled": True}
 
 
-def _reason(text: object, said: object, sight: Sight) -> str:
-    """Why the station is where it is, as it may be read; `said` has its id and arguments."""
+def _reason(text: object, said: object, sight: Sight, covered: str) -> str:
+    """Why the station is where it is, as it may be read, else `covered`; `said` has its id and arguments."""
     return sight.told(
-        _sentence({"text": str(text or ""), **(said if isinstance(said, Mapping) else {})}), COVERED
+        _sentence({"text": str(text or ""), **(said if isinstance(said, Mapping) else {})}), covered
     )
 
 

@@ -53,6 +53,9 @@ def check_tags(given: object) -> None:
         raise ValidationError(_sentence(given, "each tag once"))
 
 
+TRUTHS = ("grasped", "lifted", "over_plate", "placed")  # milestones that our simulated benches report
+
+
 def check_term(given: str) -> None:
     """ValidationError where a phase or cause of failure would be taken for another one, or for none."""
     if given != given.strip():

@@ -76,7 +76,7 @@ async function start() {
     expected: () => store.link.ok,
   });
   new EStop(store, socket, way); // first of all that can be pressed
-  keyboard();
+  keyboard((words) => commands.say(words, "refused"));
   statusBar(store);
   const commands = new Commands(store, socket, way);
   new LeaseControls(store, socket, commands);

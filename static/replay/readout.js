@@ -7,7 +7,7 @@ const steps = (count) => `${count} step${count === 1 ? "" : "s"}`;
 /** Sentences about the step at `time`: [{text, warn}], the most important first. */
 export function readout(chunks, time) {
   const id = chunks.ownerAt(time);
-  if (id < 0) return [{ text: "no chunk owns this step" }];
+  if (id < 0) return [{ text: "no policy output at this step" }];
   return whose(chunks, id, makers(chunks, time));
 }
 

@@ -86,7 +86,7 @@ document.body.addEventListener("htmx:afterRequest", ({ detail }) => {
   if (detail.successful) {
     if (said.querySelector("[data-whole]") && sent === typed) {
       forget();
-      if (waiting) document.getElementById(waiting)?.showModal();
+      if (waiting) askToFreeze(document.getElementById(waiting));
     } else if (sessionStorage.getItem(BASE) !== null) sessionStorage.setItem(BASE, was());
     waiting = null;
   } else failed(detail.xhr.status ? reason(detail.xhr) : "the server cannot be reached");
@@ -135,8 +135,17 @@ async function preflight(button) {
   }
 }
 
+/** Open the question whether to freeze, with the power as it stands beside the design. */
+function askToFreeze(dialog) {
+  if (!dialog) return;
+  const line = dialog.querySelector("[data-power]");
+  const said = document.querySelector("#power [role=status]")?.textContent.trim();
+  if (line) line.textContent = said || "not known: see Design";
+  dialog.showModal();
+}
+
 function ask(dialog) {
-  if (sent === typed && !form.classList.contains("htmx-request")) document.getElementById(dialog).showModal();
+  if (sent === typed && !form.classList.contains("htmx-request")) askToFreeze(document.getElementById(dialog));
   else {
     waiting = dialog;
     save();

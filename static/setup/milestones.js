@@ -36,6 +36,8 @@ export class MilestoneList {
       const row = this.#rows.children[index];
       for (const name of FIELDS) {
         const field = row.querySelector(`[data-milestone=${name}]`);
+        // A bench of the lab's own may report what ours do not: it is shown as it is kept.
+        if (field.matches("select") && ![...field.options].some(({ value }) => value === milestone[name])) field.add(new Option(milestone[name], milestone[name]));
         if (field.type === "checkbox") field.checked = milestone[name];
         else field.value = milestone[name] ?? "";
       }

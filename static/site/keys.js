@@ -91,10 +91,10 @@ export function open(dialog) {
   else dialog.showModal();
 }
 
-/** What is pressed with it: the first that is on the page and visible. */
-function meant(event) {
+/** What is pressed with it: the first that is on the page, and visible unless `hidden`. */
+function meant(event, hidden = false) {
   for (const name of namesOf(event)) {
-    const element = [...document.querySelectorAll(`[data-key="${CSS.escape(name)}"]`)].find(usable);
+    const element = [...document.querySelectorAll(`[data-key="${CSS.escape(name)}"]`)].find((one) => hidden || usable(one));
     if (element) return element;
   }
   return null;
@@ -118,8 +118,8 @@ export function press(element) {
   else if (!element.disabled) element.focus();
 }
 
-/** Listen for keys. */
-export function keyboard() {
+/** Listen for keys; `refused` is told in words of one whose control is not on the screen. */
+export function keyboard(refused = () => {}) {
   const dialog = document.getElementById("keys");
   for (const button of document.querySelectorAll("[data-open-keys]")) button.addEventListener("click", () => show(dialog));
   window.addEventListener("keydown", (event) => {
@@ -131,8 +131,13 @@ export function keyboard() {
       else show(dialog);
       return;
     }
-    if (!element || document.querySelector("dialog:modal")) return;
-    event.preventDefault();
-    press(element);
+    if (document.querySelector("dialog:modal")) return;
+    if (element) {
+      event.preventDefault();
+      press(element);
+      return;
+    }
+    const hidden = meant(event, true);
+    if (hidden) refused(`${meaning(hidden)} (${label(hidden.dataset.key)}): ${ELSEWHERE}`);
   });
 }

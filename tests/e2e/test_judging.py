@@ -50,7 +50,7 @@ def test_trials_are_rated_again_and_compared_from_their_videos_without_the_first
     page, keys = rater.page, rater.page.keyboard
     ready = page.locator("[data-player]")
     rater.open("/result/")
-    page.get_by_role("link", name="Rate again").click()
+    page.get_by_role("link", name="Second ratings").click()
     for left in (2, 1):
         page.get_by_text(f"{left} left for you").wait_for()
         eventually(lambda: page.reload() and ready.is_visible(), "its videos can be watched", 3 * PATIENCE_S)
@@ -61,7 +61,7 @@ def test_trials_are_rated_again_and_compared_from_their_videos_without_the_first
         page.get_by_role("button", name="Save and continue").click()
     page.get_by_text("Nothing is left for you to rate.").wait_for()
 
-    page.get_by_role("link", name="Prefer").click()
+    page.get_by_role("link", name="Pairwise preference").click()
     page.get_by_text("1 pair left for you").wait_for()
     assert page.locator(".judge-pair section").count() == 2
     ready.wait_for()

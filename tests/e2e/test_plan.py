@@ -104,7 +104,7 @@ def test_trials_of_a_blind_plan_are_made_through_the_tab(operator, patient):
     second = handed(operator)
     assert second != first
     drawn(operator)
-    page.locator("summary", has_text="Give it back").click()
+    page.locator("summary", has_text="Return this trial unrun").click()
     page.fill("#return-why", "the block fell off the table")
     page.locator("[data-return]").click()
     page.locator("[data-next]").wait_for()

@@ -109,7 +109,9 @@ def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator
 
 def _of_the_evidence(found: Comparison) -> Iterator[Fact]:
     if found.evidence:
-        yield Fact("May you stop?", f"e-process, alpha {found.alpha:.2g}", evidence_words(found.evidence))
+        yield Fact(
+            "Enough evidence to stop?", f"e-process, alpha {found.alpha:.2g}", evidence_words(found.evidence)
+        )
     if found.score_evidence:
         yield Fact(
             "With partial credit, at any time?",
@@ -148,10 +150,10 @@ def _beyond(found: Comparison) -> Iterator[Fact]:
         by = f"{abs(found.sooner.value):.1f} s"
         lead = f"{ahead} by {by}, failures counted in full" if found.sooner.value else "neither"
         of_times = f"{lead}, {p_words(found.sooner.p)} of {found.sooner.pairs} pairs"
-        yield Fact("Sooner?", _EXCHANGEABLE, of_times)
+        yield Fact("Which is faster?", _EXCHANGEABLE, of_times)
     if found.better is not None:
         believed = f"{found.first} is better with probability {_chance(found.better)}"
-        yield Fact("What to believe?", "uniform priors", believed)
+        yield Fact("Bayesian view", "uniform priors", believed)
 
 
 def missed_words(analysis: Analysis, found: Comparison | None = None) -> str:

@@ -64,7 +64,8 @@ def missed(n: int, rate: float | None, alpha: float) -> str:
     gain = detectable(n, min(rate, 0.999), POWER, alpha)
     base = f"With {n} trials of each checkpoint, and a rate of {100 * rate:.0f} % for the weaker one"
     if gain is None:
-        return f"{base}, no gain at all would be found in {POWER:.0%} of evaluations."
+        share = f"{1 - POWER:.0%} of such evaluations"
+        return f"{base}, even the largest possible gain would be missed in more than {share}."
     return (
         f"{base}, a gain below {100 * gain:.0f} points would be missed in more than one evaluation of five "
         f"(alpha {alpha:g}, power {POWER:.0%})."

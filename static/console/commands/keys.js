@@ -22,8 +22,8 @@ function released() {
   }, { capture: true });
 }
 
-/** Listen for keys. */
-export function keyboard() {
+/** Listen for keys; `refused` as of every page. */
+export function keyboard(refused) {
   released();
-  everywhere();
+  everywhere(refused);
 }

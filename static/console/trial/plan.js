@@ -27,7 +27,7 @@ export class PlanControls {
     const { next, giveBack, confirmCameras, override, scene, position } = button.dataset;
     if (button.getAttribute("aria-disabled") === "true") this.#commands.say(button.title, "refused");
     else if (next) this.#act("Next trial", () => this.#next(next));
-    else if (button.dataset.return) this.#act("Give back", () => post(`${config.trial}/${button.dataset.return}/abandon`, { reason: why("return-why") }));
+    else if (button.dataset.return) this.#act("Return", () => post(`${config.trial}/${button.dataset.return}/abandon`, { reason: why("return-why") }));
     else if (giveBack) this.#act("Give trials to others", () => post(`${config.plans}/${giveBack}/give-back`, { station: config.station, reason: why("back-why") }));
     else if (confirmCameras !== undefined) this.#act("Cameras", () => post(config.cameras_confirmed, { first: confirmCameras === "first" }));
     else if (override) this.#act("Bench accepted", () => post(`${config.trial}/${override}/achieved`, { override: why("override-why") }));

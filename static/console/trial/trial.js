@@ -175,7 +175,13 @@ function scoreRule() {
   const fails = form.querySelector("[data-fails]") !== null;
   const success = fails ? false : required.length ? required.every((box) => box.checked) : said();
   const verdict = form.querySelector(".verdict");
-  verdict.textContent = success === null ? "Success? Say yes or no." : success ? "Success" : "No success";
+  const means = !fails && required.length > 0 && success === false;
+  const criterion = form.querySelector("[data-criterion]");
+  if (criterion) criterion.hidden = means;
+  const wanted = criterion?.textContent || required.map((box) => box.dataset.text).join(", ");
+  if (success === null) verdict.textContent = "Success? Say yes or no.";
+  else if (means) verdict.textContent = `Success means: ${wanted}`;
+  else verdict.textContent = success ? "Success" : "No success";
   verdict.dataset.verdict = String(success);
   const why = form.querySelector("#why");
   if (why) why.hidden = success !== false;

@@ -72,6 +72,21 @@ def test_who_asks_for_my_station_is_said(bench):
     assert seen(ben).work == []
 
 
+@pytest.mark.parametrize(
+    ("ages", "lost"),
+    [
+        ({"joints": 0.1, "cam_high": 0.2, "cam_low": 0.1}, []),
+        ({"joints": 0.1, "cam_high": 0.2, "cam_low": None}, ["bench-1 has no picture of cam_low"]),
+        ({"joints": 0.1, "cam_high": 30.0, "cam_low": 11.0}, ["bench-1 has no picture of cam_high, cam_low"]),
+        ({"joints": None, "cam_high": None, "cam_low": None}, []),  # nothing arrives: it is disconnected
+        ({}, []),
+    ],
+)
+def test_a_camera_that_is_lost_is_an_alarm(bench, monkeypatch, ages, lost):
+    monkeypatch.setattr(feeds.of("bench-1"), "state", {"link": {"ages": ages}})
+    assert texts(seen(bench.operator).alarms) == lost
+
+
 def test_alarms_are_said_until_they_are_over(bench, monkeypatch):
     long_ago = timezone.now() - timedelta(days=40)
     monkeypatch.setattr(feeds.of("bench-1"), "link", Link(False, "bench-1 is not running"))

@@ -716,6 +716,42 @@ def test_space_is_a_controls_only_while_the_robot_is_idle_or_ready() -> None:
     assert all(tuple(of_state[1]) == stops for of_state in found.values())
 
 
+KEYS = """
+const handlers = [], clicked = [], said = [];
+globalThis.window = { addEventListener: (kind, act) => handlers.push(act) };
+globalThis.CSS = { escape: (text) => text };
+const all = given.controls.map(([key, shown]) => ({
+  dataset: { key, keyText: "Save the score" }, matches: () => false, click: () => clicked.push(key),
+  checkVisibility: () => shown,
+}));
+globalThis.document = {
+  getElementById: () => null, querySelector: () => (given.modal ? {} : null),
+  querySelectorAll: (selector) => all.filter(({ dataset }) => selector === `[data-key="${dataset.key}"]`),
+};
+const { keyboard } = await import(given.module);
+keyboard((words) => said.push(words));
+handlers[0]({ key: given.key, target: { closest: () => null, checkVisibility: () => true }, preventDefault: () => {} });
+return [clicked, said];
+"""
+
+
+@pytest.mark.parametrize(
+    ("controls", "key", "modal", "found"),
+    [
+        ([["s", False], ["s", True]], "s", False, [["s"], []]),
+        ([["s", False]], "s", False, [[], ["Save the score (S): not on the screen at the moment"]]),
+        ([["s", False]], "s", True, [[], []]),
+        ([["s", False]], "x", False, [[], []]),
+    ],
+)
+def test_a_key_whose_control_is_not_on_the_screen_says_so(
+    controls: list[Any], key: str, modal: bool, found: list[Any]
+) -> None:
+    module = (MODULES.parent / "site/keys.js").as_uri()
+    given = {"module": module, "controls": controls, "key": key, "modal": modal}
+    assert run("live/words.js", KEYS, given) == found
+
+
 LEASE = """
 const quiet = () => {};
 globalThis.document = {

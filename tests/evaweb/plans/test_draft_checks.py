@@ -3,7 +3,7 @@ import pytest
 from evaweb.errors import EvaError
 from evaweb.plans.draft_checks import problems, thoughts
 from evaweb.plans.services import plan_amend, plan_freeze
-from evaweb.trials.models import Checkpoint
+from evaweb.trials.models import Checkpoint, Milestone
 
 
 def said(rows):
@@ -46,6 +46,35 @@ def test_a_design_that_cannot_be_is_said_without_computing_it(draft):
         (found,) = problems(draft)
         assert found.step == "design"
         assert words in found.text
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        (
+            {"repetitions": 1},
+            "2 pairs find nothing: even if one checkpoint won all of them, p = 0.12 is above 0.05.",
+        ),
+        ({"repetitions": 2, "outcome": "score"}, "4 pairs find nothing"),
+        ({"repetitions": 2, "alpha": 0.001}, "is above 0.001."),
+        ({"repetitions": 3, "outcome": "score"}, ""),
+        ({"repetitions": 3}, ""),
+    ],
+)
+def test_so_few_trials_that_nothing_can_be_found_are_said(draft, changed, words):
+    for name, value in changed.items():
+        setattr(draft, name, value)
+    found = [row.text for row in thoughts(draft) if "find nothing" in row.text]
+    assert len(found) == bool(words)
+    assert all(words in text for text in found)
+
+
+def test_a_milestone_that_no_bench_of_ours_reports_is_named(draft, bench):
+    milestone = bench.scene.milestones.first()
+    Milestone.objects.filter(pk=milestone.pk).update(truth="plced")
+    (found,) = [row.text for row in thoughts(draft) if "plced" in row.text]
+    assert str(milestone) in found
+    assert "grasped, lifted, over_plate, placed" in found
 
 
 def test_what_a_reader_will_ask_about_is_said_with_the_step_that_answers_it(draft):

@@ -7,7 +7,7 @@ import pytest
 
 import runtime
 from evaweb import blinding_reasons as reasons
-from evaweb.blinding import COVERED, EVERYTHING
+from evaweb.blinding import COVERED, COVERED_AT_REST, EVERYTHING
 from evaweb.stations import redaction
 from runtime.core.sentences import Pattern, identity, known, plain, within
 from runtime.processes.coordinator import operations
@@ -75,6 +75,13 @@ def test_of_a_snapshot_those_sentences_are_left_that_are_shown_whole():
     assert shown["reason"] == COVERED
     assert shown["sentences"] == {"guarded.run": identity(STOPPED), "reason": identity(COVERED)}
     assert "alder" not in str(shown)
+
+
+def test_what_is_covered_says_what_can_be_done_where_the_set_up_failed():
+    said = {"state": "idle", "reason": LOST}
+    shown = redaction.state({**said, "sentences": within(said)}, EVERYTHING)
+    assert shown["reason"] == COVERED_AT_REST
+    assert shown["sentences"]["reason"] == identity(COVERED_AT_REST)
 
 
 @pytest.mark.parametrize(("kind", "told"), [("truth", False), ("camera_back", True), ("estopped", True)])

@@ -108,17 +108,21 @@ def violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
 
 def difference(found: Comparison) -> Drawing:
     """The first minus the second in percentage points, with Newcombe's interval, on an axis around nothing."""
-    height = 74
+    height = 114
     scale = Scale(-1, 1, 30, WIDTH - 30)
     interval = found.difference.interval
-    parts = []
+    parts = [
+        words(30, 20, "Difference of the success rates, percentage points, 95 % Newcombe", class_="small"),
+        label(30, 104, f"← {found.second} is better", _LETTERS + 12, "start"),
+        label(WIDTH - 30, 104, f"{found.first} is better →", _LETTERS + 12, "end"),
+    ]
     for at in range(-100, 101, 25):
         x = scale(at / 100)
-        parts.append(line([(x, 8), (x, 46)], "zero" if at == 0 else "grid"))
-        parts.append(words(x, 62, f"{at:+d}".replace("-", "−") if at else "0", "middle", "tick"))
+        parts.append(line([(x, 30), (x, 68)], "zero" if at == 0 else "grid"))
+        parts.append(words(x, 84, f"{at:+d}".replace("-", "−") if at else "0", "middle", "tick"))
     low, high = scale(interval.low), scale(interval.high)
-    parts.append(element("rect", x=low, y=20.0, width=high - low, height=12.0, class_=f"band {series(None)}"))
-    parts.append(mark(None, scale(found.difference.value), 26))
+    parts.append(element("rect", x=low, y=42.0, width=high - low, height=12.0, class_=f"band {series(None)}"))
+    parts.append(mark(None, scale(found.difference.value), 48))
     said = f"{found.first} minus {found.second}: {points(found.difference)}"
     return drawing(
         WIDTH, height, "Difference of the success rates in points", said, *parts, kind="difference",
