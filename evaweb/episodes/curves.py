@@ -80,6 +80,7 @@ def curves_of(
         held=held,
         marks=[
             *_marks(episode, start, _JUDGED if unscored else ()),
+            *_interventions(episode),
             *_milestones(episode, unscored, [(_played(at, held), words) for at, words in milestones]),
         ],
     )
@@ -214,10 +215,26 @@ def _period(episode: Episode) -> float:
 
 def held_spans(sources: Sequence[str], fps: float) -> list[list[float]]:
     """Spans [s] in which the robot was not asked for anything."""
-    held = np.asarray([source in HELD for source in sources], np.int8)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], held, [0]])))
+    return _spans([source in HELD for source in sources], fps)
+
+
+def _spans(there: Sequence[bool], fps: float) -> list[list[float]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(there, np.int8), [0]])))
     return [
         [float(first) / fps, float(end) / fps] for first, end in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+def _interventions(episode: Episode) -> list[dict[str, Any]]:
+    """Where a person had a hand in it; nothing of what a person drove throughout."""
+    if "intervention" not in episode.rows.column_names:
+        return []
+    spans = _spans([bool(one) for one in episode.rows.column("intervention").to_pylist()], episode.layout.fps)
+    whole = episode.rows.num_rows / episode.layout.fps
+    return [
+        {"time": begin, "kind": "intervention", "text": f"a person intervenes for {end - begin:.1f} s"}
+        for begin, end in spans
+        if end - begin < whole
     ]
 
 

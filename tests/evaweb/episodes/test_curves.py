@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from evaweb.binary_frames import decode
 from evaweb.episodes import poses as posing
-from evaweb.episodes.curves import curves, held_spans
+from evaweb.episodes.curves import _interventions, curves, held_spans
 from evaweb.episodes.poses import poses
 from evaweb.errors import NotFound
 from evaweb.stations.robot_geometry import looks_of
@@ -60,6 +61,24 @@ def test_the_policys_own_rows_lie_at_the_step_they_were_meant_for(folder: Path) 
     )
     assert frame.array("raw", "chunk").tolist() == [row["chunk_id"] for row in used]
     assert frame.header["streams"]["raw"]["json"]["spaces"] == ["joint"]
+
+
+@pytest.mark.parametrize(
+    ("hands", "marks"),
+    [
+        ([0, 1, 1, 0, 0, 1], [(0.1, "0.2"), (0.5, "0.1")]),
+        ([1, 1, 0, 0, 0, 0], [(0.0, "0.2")]),
+        ([1] * 6, []),  # demonstrated from its beginning to its end
+        ([0] * 6, []),
+    ],
+)
+def test_interventions_are_marked(folder: Path, hands: list[int], marks: list[tuple[float, str]]) -> None:
+    episode = open_episode(folder)
+    rows = pa.table({"intervention": [bool(one) for one in hands]})
+    found = _interventions(replace(episode, rows=rows, layout=replace(episode.layout, fps=10.0)))
+    assert [(mark["time"], mark["text"]) for mark in found] == [
+        (time, f"a person intervenes for {seconds} s") for time, seconds in marks
+    ]
 
 
 def test_held_spans_and_events_are_on_the_same_clock(folder: Path) -> None:
