@@ -13,6 +13,7 @@ from typing import Any
 
 from evaweb.lab.once import recorded, run_to_its_end, score_by_truth, set_up_and_run, take
 from evaweb.lab.patience import VisitFailed, until
+from evaweb.lab.progress import Progress
 from evaweb.lab.visitor import LivePage, Visitor
 
 _TRIES = 3  # of one trial, whose set-up or run was interrupted
@@ -34,7 +35,9 @@ class Made:
     times: Mapping[str, float]
 
 
-def carry_out(operator: Visitor, station: str, plan: str, count: int, tell: Tell) -> list[Made]:
+def carry_out(
+    operator: Visitor, station: str, plan: str, count: int, tell: Tell, progress: Progress
+) -> list[Made]:
     """The next `count` trials of a plan, or fewer where its design ends it.
 
     VisitFailed where one does not come about, or tells what it is of.
@@ -45,7 +48,8 @@ def carry_out(operator: Visitor, station: str, plan: str, count: int, tell: Tell
         operator.post(f"stations/{station}/cameras", {"first": True})
         for number in range(1, count + 1):
             try:
-                one = _made(operator, page, station, plan)
+                with progress.during(f"trial {number} of {count}"):
+                    one = _made(operator, page, station, plan)
             except VisitFailed:
                 if operator.get(f"plans/{plan}")["state"] == "frozen":
                     raise

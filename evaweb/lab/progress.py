@@ -1,4 +1,4 @@
-"""The steps of a start as lines on the terminal: what is being done, and a dot every few seconds while it lasts."""
+"""The steps of a start as lines on the terminal: what is being done, and a line every few seconds while it lasts."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 
-_DOT_EVERY_S = 5.0
+_EVERY_S = 10.0
 
 
 class Progress:
     """Steps that are told as "2 of 6 the simulated bench ...": nothing is silent for long."""
 
     def __init__(self, write: Callable[[str], object], steps: int) -> None:
-        """`write` takes a piece of a line, and shows it at once."""
+        """`write` takes a line, and shows it at once."""
         self._write, self._steps, self._at = write, steps, 0
 
     def step(self, what: str) -> AbstractContextManager[None]:
@@ -25,7 +25,7 @@ class Progress:
     @contextmanager
     def during(self, what: str) -> Iterator[None]:
         """A line of its own, for as long as the block lasts."""
-        self._say(f"{what} ")
+        self._say(f"{what}\n")
         done = threading.Event()
         ticking = threading.Thread(target=self._tick, args=(done,), daemon=True)
         ticking.start()
@@ -34,24 +34,25 @@ class Progress:
         finally:
             done.set()
             ticking.join()
-            self._say("\n")
 
     def _tick(self, done: threading.Event) -> None:
-        while not done.wait(_DOT_EVERY_S):
-            self._say(".")
+        took = 0.0
+        while not done.wait(_EVERY_S):
+            took += _EVERY_S
+            self._say(f"  ... still at it, {took:.0f} s\n")
 
-    def _say(self, piece: str) -> None:
+    def _say(self, line: str) -> None:
         with suppress(
             OSError
         ):  # of a terminal that is gone: what is being done goes on, and is ended in order
-            self._write(piece)
+            self._write(line)
 
 
 def on_terminal(steps: int) -> Progress:
     """One that tells standard error: standard output is for what a command finds."""
-    return Progress(lambda piece: print(piece, end="", file=sys.stderr, flush=True), steps)
+    return Progress(lambda line: print(line, end="", file=sys.stderr, flush=True), steps)
 
 
 def silent() -> Progress:
     """One that tells nobody."""
-    return Progress(lambda piece: None, 0)
+    return Progress(lambda line: None, 0)

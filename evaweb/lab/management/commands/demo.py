@@ -22,7 +22,7 @@ from evaweb.lab.benches import Bench
 from evaweb.lab.lab import Lab, a_lab
 from evaweb.lab.lifetime import Ended
 from evaweb.lab.once import Choice, perform, report
-from evaweb.lab.progress import on_terminal
+from evaweb.lab.progress import Progress, on_terminal
 from evaweb.lab.seed import Login
 from evaweb.lab.simulated import CLUMSY, POLICIES, SKILLED, benches_of, known_port, simulated_options
 from evaweb.lab.visitor import Visitor
@@ -108,7 +108,7 @@ class Command(BaseCommand):
                 if options["once"]:
                     self._once(url, logins[0], options)
                 elif options["evaluate"]:
-                    self._evaluate(url, logins, options)
+                    self._evaluate(url, logins, options, progress)
                 else:
                     self._welcome(url, logins)
                     lab.watch(benches_of(options))
@@ -187,7 +187,7 @@ class Command(BaseCommand):
         self.stdout.write("Ctrl-C ends everything.")
         self.stdout.flush()
 
-    def _evaluate(self, url: str, logins: list[Login], options: dict[str, Any]) -> None:
+    def _evaluate(self, url: str, logins: list[Login], options: dict[str, Any], progress: Progress) -> None:
         begun, count = time.monotonic(), options["evaluate"]
         name = f"evaluate-{time.strftime('%Y%m%d-%H%M%S')}"
         positions = seed.demo_scene().positions.count()
@@ -203,10 +203,11 @@ class Command(BaseCommand):
         visitors = [Visitor(url) for _ in logins]
         for visitor, login in zip(visitors, logins, strict=True):
             visitor.login(login.username, login.password)
-        made = evaluate.carry_out(visitors[0], _STATION, name, count, self.stderr.write)
-        result = evaluate.revealed(visitors[1], name, made)
-        plan.refresh_from_db()
-        found = analysis_of(plan)
+        made = evaluate.carry_out(visitors[0], _STATION, name, count, self.stderr.write, progress)
+        with progress.during("the reveal, and what came out"):
+            result = evaluate.revealed(visitors[1], name, made)
+            plan.refresh_from_db()
+            found = analysis_of(plan)
         said = headline(plan)
         result["headline"] = said.sentence if said else ""
         result |= {"lockstep": True, "analysis": asdict(found), "wall_s": time.monotonic() - begun}
