@@ -91,8 +91,8 @@ class SetUpRequest(Settings):
 class PreflightRequest(Settings):
     """`preflight`: which policy is asked without the robot; what is absent is the deployment's own.
 
-    `policy` and `strategy` as in a set-up; `id` names the report; it ends after `deadline_s` [s] at the latest, without it after what
-    the policy's own deadlines come to.
+    `policy` and `strategy` as in a set-up; `id` names the report; it ends after `deadline_s` [s] at the latest, without
+    it after what the policy's own deadlines come to.
     """
 
     id: Annotated[str, Field(min_length=1, max_length=200)]

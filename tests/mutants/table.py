@@ -240,7 +240,7 @@ MUTANTS = (
     Mutant(
         "blinding/reason-of-the-station",
         "evaweb/stations/redaction.py",
-        '_reason(snapshot.get("reason"), (snapshot.get("sentences") or {}).get("reason"), sight)',
+        '_reason(snapshot.get("reason"), reason, sight, covered)',
         'str(snapshot.get("reason") or "")',
         _OF_REDACTION,
     ),
