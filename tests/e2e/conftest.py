@@ -46,7 +46,8 @@ def pytest_collection_modifyitems(items):
 
     def place(item):
         used = [number for number, lab in enumerate(LABS) if lab in item.fixturenames]
-        return (used or [len(LABS)])[0], item.path.stem != FIRST, item.path.stem in LAST
+        stem = item.path.stem
+        return (used or [len(LABS)])[0], stem != FIRST, 1 + LAST.index(stem) if stem in LAST else 0
 
     items.sort(key=place)
 

@@ -47,8 +47,10 @@ def trial(operator):
     page.keyboard.press("s")
     operator.reaches("READY")
     page.locator("#score").wait_for()
+    seen["verdicts"] = [page.locator("#score .verdict").inner_text()]
     for check in page.locator("input[name=milestone]").all():
         check.check()
+    seen["verdicts"].append(page.locator("#score .verdict").inner_text())
     page.fill("#note", "first try, <b>gripper</b> a little late")
     page.locator("button[form=score]").click()
     eventually(lambda: operator.api("trials")["items"][0]["status"] == "scored", "the trial is scored")
@@ -74,6 +76,9 @@ def test_the_robot_moves_in_the_pictures_and_in_3d(trial):
 
 @pytest.mark.story
 def test_the_score_is_kept_with_its_words(trial):
+    asked, ticked = trial["verdicts"]
+    assert asked.startswith("Success means: ")
+    assert ticked == "Success"
     kept = trial["trial"]
     assert (kept["success"], kept["score"]) == (True, 1.0)
     assert kept["note"] == "first try, <b>gripper</b> a little late"
