@@ -18,6 +18,7 @@ from evaweb.statistics.designs import (
     Design,
     Findings,
     alone,
+    conclude,
     design,
     findings,
     of_so_many,
@@ -31,8 +32,8 @@ def would_be(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
     same checkpoints are ahead by the design. None without a comparison.
 
     A part is left out by whole blocks. What is left is judged by the rule of the design, each comparison by itself, as
-    if it had foreseen so many, or, of checkpoints in random order, by one test of all of it; where the design did not
-    end nothing is left out, for nothing was concluded. `matches` is the least match of each trial's bench, where known.
+    if it had foreseen so many (at its step of Holm's procedure, where the design takes them), or, of checkpoints in
+    random order, by one test of all of it; where the design did not end nothing is left out, for nothing was concluded. `matches` is the least match of each trial's bench, where known.
     """
     found = frozen(plan.document) if plan.document else None
     if found is None:
@@ -80,12 +81,13 @@ def _ways(
 
     def without(what: str, part: Callable[[Attempt], bool]) -> dict[str, Any]:
         left = [at for at in range(len(base)) if not any(map(part, counting[at]))]
-        if not left or len(left) == len(base):  # then it is what was decided, by Holm over all of them
+        if not left or len(left) == len(base):  # then it is what was decided
             return said(what, [base[at] for at in left])
         told: list[str] = []
         ways: list[Conclusion] = []
-        for number, pair in enumerate(found.comparisons):
-            by, blocks = _of_these(found, pair, left, base)
+        for number, (by, blocks) in enumerate(
+            _stepped(found, [_of_these(found, p, left, base) for p in found.comparisons])
+        ):
             if not blocks:
                 first, second = compared(plan.document or {})[number]
                 told.append(f"No pair of {first} and {second} is left")
@@ -136,3 +138,23 @@ def _of_these(
         return replace(found, rule=FIXED, blocks=len(left), boundary=None, counts=tuple(counts)), blocks
     made = design(rule=FIXED, blocks=len(left), alpha=found.alpha, margin=found.margin, counts=counts)
     return made, blocks
+
+
+_Left = list[tuple[Design, list[Block]]]  # of each comparison the design by itself, and what is left of it
+
+
+def _stepped(found: Design, left: _Left) -> _Left:
+    """Each at its share of alpha; of a design by Holm at the share of its step, those with nothing left counted too."""
+    if not found.holm:
+        return left
+    stepped, count = list(left), len(left)
+    tests = {n: conclude(by, blocks, by.comparisons[0]).p for n, (by, blocks) in enumerate(left) if blocks}
+    if None in tests.values():
+        return left
+    for done, number in enumerate(sorted(tests, key=lambda n: tests[n] or 0.0)):
+        by, blocks = left[number]
+        by = replace(by, alpha=found.alpha / (count - done))
+        stepped[number] = by, blocks
+        if conclude(by, blocks, by.comparisons[0]).winner is None:
+            break
+    return stepped
