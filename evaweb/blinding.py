@@ -55,7 +55,7 @@ class Sight:
     """Data hidden from one user: checkpoints by id and by name, in trials, episodes and at stations.
 
     `stations` are those, by name, at which a trial of such a plan was handed out; `at_work` those at which one is not
-    finished; `plans` says of which, in words, `keys` by their ids.
+    finished; `plans` says of which, in words, `keys` by their ids. `user` is the account, None for nobody's.
     """
 
     checkpoints: frozenset[int] = frozenset()
@@ -64,6 +64,7 @@ class Sight:
     at_work: frozenset[str] = frozenset()
     keys: frozenset[int] = frozenset()
     plans: str = ""
+    user: int | None = None
 
     @property
     def clear(self) -> bool:
@@ -127,8 +128,13 @@ class Sight:
         return self.label(trial) if trial is not None else HIDDEN
 
     def tags_of(self, episode: Any) -> list[str]:
-        """Tags of a recording as far as they name no hidden checkpoint: people write what they like."""
-        return [tag.words for tag in episode.tags.all() if not self.named_in(tag.words)]
+        """Tags of a recording, without those of others before the reveal, and those that name a hidden checkpoint."""
+        tags = [tag for tag in episode.tags.all() if not self.hides_opinion(episode, tag.by_id)]
+        return [tag.words for tag in tags if not self.named_in(tag.words)]
+
+    def hides_opinion(self, episode: Any, author: int | None) -> bool:
+        """True for what another person says of a recording that this user may still have to judge blind."""
+        return author != self.user and self.hides_episode(episode)
 
     def named_in(self, words: str) -> bool:
         """True if words of somebody name a hidden checkpoint, in whatever letters."""

@@ -36,6 +36,12 @@ def tags_of(context: Any, episode: Any) -> list[str]:
 
 
 @register.simple_tag(takes_context=True)
+def hidden_opinion(context: Any, episode: Any, author: int) -> bool:
+    """True for what that person says of a recording, before the reveal."""
+    return sight_for(context["request"]).hides_opinion(episode, author)
+
+
+@register.simple_tag(takes_context=True)
 def hidden(context: Any, trial: Any) -> bool:
     """True if the trial's checkpoint is hidden."""
     return sight_for(context["request"]).hides(trial)

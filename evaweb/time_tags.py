@@ -19,6 +19,12 @@ def lab_zone() -> str:
 
 
 @register.simple_tag
+def zone_name() -> str:
+    """The name of the lab's time zone, for scripts."""
+    return timezone.get_default_timezone_name()
+
+
+@register.simple_tag
 def when(moment: datetime | date | None, form: str = "Y-m-d H:i", nothing: str = "–") -> str:
     """A time or a day as `form` has it, with all of it and the time zone on hover; `nothing` where there is none."""
     if not moment:

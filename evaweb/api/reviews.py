@@ -57,18 +57,19 @@ class QualityOut(Schema):
 
 
 class ReviewOut(Schema):
-    """One reviewer's verdict; the newest pass or fail counts."""
+    """One reviewer's verdict or note, of one `frame` or of all; the newest pass or fail counts."""
 
     uuid: UUID
     verdict: str
     note: str
+    frame: int | None
     reviewer: str
     at: datetime
 
     @staticmethod
     def of(review: Review) -> dict[str, Any]:
         """With the reviewer's name."""
-        plain = ("uuid", "verdict", "note", "at")
+        plain = ("uuid", "verdict", "note", "frame", "at")
         return {**{name: getattr(review, name) for name in plain}, "reviewer": review.reviewer.get_username()}
 
 
@@ -102,20 +103,25 @@ class LabelOut(Schema):
 
 
 class SaidOut(Schema):
-    """All that is said of an episode: reviews newest first, segments in order, the report where there is one."""
+    """All that is said of an episode: reviews newest first, segments in order, the report where there is one.
+
+    `covered`: how much of that others say, kept from whoever may still have to judge its trial.
+    """
 
     verdict: ReviewOut | None
     reviews: list[ReviewOut]
     segments: list[SegmentOut]
+    covered: int
     asked: bool
     quality: QualityOut | None
 
 
 class ReviewIn(Body):
-    """A verdict, or a note that leaves the verdict as it is."""
+    """A verdict, or a note that leaves the verdict as it is; of the moment `frame`, or of the whole episode."""
 
     verdict: Annotated[str, Field(description="pass, fail or note")]
     note: str = ""
+    frame: _Frame | None = None
 
 
 class SegmentIn(Body):
@@ -185,7 +191,7 @@ def labels(request: HttpRequest) -> Any:
 )
 def said(request: HttpRequest, uuid: UUID) -> Any:
     """Verdicts, annotations, and what the checks found."""
-    return _said(uuid)
+    return _said(request, uuid)
 
 
 @router.post(
@@ -197,7 +203,7 @@ def said(request: HttpRequest, uuid: UUID) -> Any:
 def review(request: HttpRequest, uuid: UUID, given: ReviewIn) -> Any:
     """Add to what is said; operators. Nothing that was said is changed."""
     services.review_add(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
-    return _said(uuid)
+    return _said(request, uuid)
 
 
 @router.post(
@@ -209,7 +215,7 @@ def review(request: HttpRequest, uuid: UUID, given: ReviewIn) -> Any:
 def segment(request: HttpRequest, uuid: UUID, given: SegmentIn) -> Any:
     """Mark a part, or change one of one's own; operators."""
     services.segment_put(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
-    return _said(uuid)
+    return _said(request, uuid)
 
 
 @router.post(
@@ -221,7 +227,7 @@ def segment(request: HttpRequest, uuid: UUID, given: SegmentIn) -> Any:
 def segment_removed(request: HttpRequest, uuid: UUID, segment: UUID) -> Any:
     """One of one's own; administrators any."""
     services.segment_remove(user=request.auth, episode=episode_get(uuid=uuid), segment=segment)
-    return _said(uuid)
+    return _said(request, uuid)
 
 
 @router.get("/reviews/tags", response={200: list[TagOut], **FAILURES}, summary="Tags", url_name="tags")
@@ -268,13 +274,17 @@ def quality_asked(request: HttpRequest, uuid: UUID) -> Any:
     return Status(202, JobOut.of(asked, sight_for(request)))
 
 
-def _said(uuid: UUID) -> dict[str, Any]:
+def _said(request: Any, uuid: UUID) -> dict[str, Any]:
     episode = episode_get(uuid=uuid)
     standing = selectors.standing_of(episode=episode)
+    reviews, segments, covered = selectors.opinions_of(
+        user=request.auth, episode=episode, sight=sight_for(request)
+    )
     return {
-        "verdict": ReviewOut.of(standing.review) if standing.review else None,
-        "reviews": [ReviewOut.of(review) for review in selectors.reviews_of(episode=episode)],
-        "segments": [SegmentOut.of(segment) for segment in selectors.segments_of(episode=episode)],
+        "verdict": ReviewOut.of(standing.review) if standing.review in reviews else None,
+        "reviews": [ReviewOut.of(review) for review in reviews],
+        "segments": [SegmentOut.of(segment) for segment in segments],
+        "covered": covered,
         "asked": standing.asked_at is not None,
         "quality": selectors.report_of(uuid=uuid),
     }

@@ -91,7 +91,7 @@ def episode_list(
 ) -> QuerySet[Episode]:
     """The newest first; `words` are looked for in task, checkpoint, operator, scene, code and uuid.
 
-    In the names of checkpoints only as far as `sight` does not hide them.
+    In the names of checkpoints, tags and verdicts only as far as `sight` does not hide them.
 
     `quality` is a key of QUALITY, `review` one of REVIEW; others choose nothing. EvaError: too many words.
     """
@@ -103,10 +103,12 @@ def episode_list(
         found = found.filter(mode=mode)
     if status:
         found = found.filter(status=status)
-    if tag:
-        found = found.filter(tags__words=tag)
-    found = found.filter(QUALITY.get(quality, _ALL)[1], REVIEW.get(review, _ALL)[1])
     seen = ~Q(checkpoint__in=sight.names) & ~Q(trial__checkpoint__in=sight.checkpoints)
+    if tag:
+        found = found.filter(_by_someone(seen, "tags__by", sight), tags__words=tag)
+    if review in ("pass", "fail"):
+        found = found.filter(_by_someone(seen, "standing__review__reviewer", sight))
+    found = found.filter(QUALITY.get(quality, _ALL)[1], REVIEW.get(review, _ALL)[1])
     for word in words_of(words):
         found = found.filter(
             Q(task__icontains=word)
@@ -121,8 +123,14 @@ def episode_list(
 
 def tag_counts(*, sight: Sight = EVERYTHING) -> dict[str, int]:
     """The lab's tags in the order of the alphabet, and how many episodes have each."""
-    rows = Tag.objects.order_by("words").values_list("words")
+    seen = ~Q(episode__checkpoint__in=sight.names) & ~Q(episode__trial__checkpoint__in=sight.checkpoints)
+    rows = Tag.objects.filter(_by_someone(seen, "by", sight)).order_by("words").values_list("words")
     return {words: n for words, n in rows.annotate(n=Count("pk")) if not sight.named_in(words)}
+
+
+def _by_someone(seen: Q, author: str, sight: Sight) -> Q:
+    """What somebody said of an episode that is not hidden, or this user of any."""
+    return Q() if sight.clear else seen | Q(**{author: sight.user})
 
 
 def stage_of(*, episode: Episode) -> Stage:

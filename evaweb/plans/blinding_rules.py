@@ -95,6 +95,7 @@ def hidden_from(user: Any) -> Sight:
         at_work=frozenset(station for station, status in handed if status in UNFINISHED),
         plans=f"{masked(f'{title} v{version}' for _, title, version, *_ in (*found, *lost))} is blind until it is "
         "revealed",
+        user=user.pk,
     )
 
 

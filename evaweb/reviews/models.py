@@ -33,6 +33,7 @@ class Review(models.Model):
     episode = models.ForeignKey(Episode, on_delete=models.PROTECT, related_name="reviews")
     verdict = models.CharField(max_length=4, choices=Verdict)
     note = models.TextField(blank=True)
+    frame = models.PositiveIntegerField(null=True, blank=True, help_text="The moment that it is about.")
     reviewer = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="reviews")
     at = models.DateTimeField(default=timezone.now)
 

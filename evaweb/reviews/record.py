@@ -20,6 +20,7 @@ class ReviewLine(Line):
     uuid: UUID
     verdict: Literal["pass", "fail", "note"]
     note: str = ""
+    frame: _Frame | None = None
     by: Annotated[Person, From("reviewer__username")]
     at: Moment
 

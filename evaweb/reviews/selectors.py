@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 from uuid import UUID
 
 from django.db.models import F, Q, QuerySet
 
+from evaweb.blinding import Sight
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.errors import Conflict, NotFound
@@ -24,6 +25,9 @@ _EPISODE_HAS_NOT_BEEN_CHECKED = Pattern(
     "reviews.selectors.episode_has_not_been_checked",
     "episode {uuid} has not been checked yet: POST to this address has it done",
 )
+
+Judges = Callable[[Any, Episode], bool]
+_judges: list[Judges] = []
 
 
 def standing_of(*, episode: Episode) -> Standing:
@@ -48,6 +52,25 @@ def report_get(*, uuid: UUID) -> Mapping[str, Any]:
     if found is None:
         raise NotFound(_EPISODE_HAS_NOT_BEEN_CHECKED(uuid=uuid))
     return found
+
+
+def opinions_of(*, user: Any, episode: Episode, sight: Sight) -> tuple[list[Review], list[Segment], int]:
+    """What people said of it and its annotated parts, and how much of both is kept from this user.
+
+    What others say is kept from whoever may still have to judge its trial.
+    """
+    reviews, segments = list(reviews_of(episode=episode)), list(segments_of(episode=episode))
+    if not sight.hides_episode(episode) and not any(judges(user, episode) for judges in _judges):
+        return reviews, segments, 0
+    own = [row for row in reviews if row.reviewer_id == user.pk]
+    marked = [row for row in segments if row.annotator_id == user.pk]
+    return own, marked, len(reviews) + len(segments) - len(own) - len(marked)
+
+
+def still_judges(judges: Judges) -> Judges:
+    """Declare from above who has to judge the trial of an episode without knowing what others say of it."""
+    _judges.append(judges)
+    return judges
 
 
 def reviews_of(*, episode: Episode) -> QuerySet[Review]:

@@ -37,6 +37,7 @@ _FIRST_LAST_ALLOWED_FRAMES_0 = Pattern(
     "reviews.services.first_last_allowed_frames_0",
     "first = {first}, last = {last}; allowed: frames 0 to {frames}, the last not before the first",
 )
+_FRAME_ALLOWED = Pattern("reviews.services.frame_allowed", "frame = {frame}; allowed: 0 to {last}")
 _EPISODE_HAS_NO_SEGMENT = Pattern(
     "reviews.services.episode_has_no_segment",
     "episode {uuid} has no segment {uuid_2}",
@@ -64,8 +65,13 @@ MOST_TAGS = 30  # of an episode
 
 
 @transaction.atomic
-def review_add(*, user: Any, episode: Episode, verdict: str, note: str = "") -> Review:
-    """Say pass, fail or a note of an episode that is closed; operators. The newest pass or fail counts."""
+def review_add(
+    *, user: Any, episode: Episode, verdict: str, note: str = "", frame: int | None = None
+) -> Review:
+    """Say pass, fail or a note of an episode that is closed, or of one moment of it; operators.
+
+    The newest pass or fail counts.
+    """
     require(user, Role.OPERATOR)
     if verdict not in Verdict.values:
         raise EvaError(_VERDICT_ALLOWED(verdict=verdict, values=", ".join(Verdict.values)))
@@ -73,10 +79,13 @@ def review_add(*, user: Any, episode: Episode, verdict: str, note: str = "") -> 
     if verdict == Verdict.NOTE and not note:
         raise EvaError(_NOTE_EMPTY_NOTE_NEEDS_WORDS)
     _held(episode)
+    if frame is not None and not 0 <= frame < episode.frames:
+        raise EvaError(_FRAME_ALLOWED(frame=frame, last=episode.frames - 1))
+    said = {"verdict": verdict, "note": note, "frame": frame, "reviewer": user}
     newest = Review.objects.filter(episode=episode).order_by("-at", "-pk").first()
-    if newest is not None and (newest.reviewer, newest.verdict, newest.note) == (user, verdict, note):
+    if newest is not None and all(getattr(newest, name) == value for name, value in said.items()):
         return newest  # said once more, because the answer was lost
-    review = Review(episode=episode, verdict=verdict, note=note, reviewer=user, at=timezone.now())
+    review = Review(episode=episode, at=timezone.now(), **said)
     REVIEWS.append(episode.uuid, ReviewLine.written(review))
     review.save(force_insert=True)
     standing_changed(episode=episode, review=review if verdict in DECIDES else None)

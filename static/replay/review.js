@@ -1,17 +1,20 @@
 // The review of an episode: what the checks found, verdicts, annotated parts; everything has a key.
 
 import { get, post } from "../site/api.js";
+import { when } from "../site/times.js";
 import { Annotation } from "./annotation.js";
 import { sayLost } from "./lost.js";
 import { bands, flagFrom, flagsAt, list } from "./review_lanes.js";
 
+const NOTE_S = 2; // a note is shown from its moment on
 const LOOK_AGAIN_MS = 4000; // while the checks are not done
 const element = (id) => document.getElementById(id);
 
 export class Review {
   #clock;
   #bar = element("review");
-  #said = { flags: [], segments: [], reviews: [], quality: null, verdict: null };
+  #said = { flags: [], segments: [], reviews: [], covered: 0, quality: null, verdict: null };
+  #noted = 0; // the row at which a note was begun
   #annotation;
   #asked = Promise.resolve(); // what was pressed, one after the other
   #shown = 0; // answers to what was pressed
@@ -77,11 +80,12 @@ export class Review {
 
   #show(said) {
     this.#said = { ...said, flags: said.quality?.flags ?? [] };
-    const { flags, segments, reviews, verdict, quality } = this.#said;
+    const { flags, segments, reviews, verdict, quality, covered } = this.#said;
     const state = element("review-state");
     state.textContent = verdict ? `${verdict.verdict} by ${verdict.reviewer}` : "unreviewed";
     state.dataset.verdict = verdict?.verdict ?? "";
-    bands(element("flags"), [...flags].reverse(), this.#frames, (band, flag) => {
+    const notes = this.#notes.map(({ frame, note, reviewer }) => ({ first: frame, last: frame, severity: "note", text: `${reviewer}: ${note}` }));
+    bands(element("flags"), [...[...flags].reverse(), ...notes], this.#frames, (band, flag) => {
       band.dataset.severity = flag.severity;
       band.title = flag.text;
       band.addEventListener("click", () => this.#clock.seekRow(flag.first));
@@ -95,13 +99,19 @@ export class Review {
     );
     list(
       element("history-list"),
-      reviews.map((one) => ({ words: one.note ? `${one.verdict}: ${one.note}` : one.verdict, detail: `${one.reviewer}, ${new Date(one.at).toLocaleString()}`, mark: one.verdict })),
+      reviews.map((one) => ({
+        words: one.note ? `${one.verdict}: ${one.note}` : one.verdict,
+        detail: `${one.frame === null ? "" : `at ${this.#seconds(one.frame)}, `}${one.reviewer}, ${when(one.at)}`,
+        mark: one.verdict,
+        go: one.frame === null ? null : () => this.#clock.seekRow(one.frame),
+      })),
       "No review yet.",
     );
     element("flags-count").textContent = quality ? (flags.length ? `Flags ${flags.length}` : "Clean") : "Unchecked";
     element("flags-count").dataset.severity = quality?.worst ?? "";
     element("segments-count").textContent = `Segments ${segments.length || ""}`.trim();
-    element("history-count").textContent = `History ${reviews.length || ""}`.trim();
+    element("history-count").textContent = `Notes ${reviews.length || ""}`.trim();
+    element("history-covered").hidden = !covered;
     this.#annotation.show(segments);
     this.#at();
   }
@@ -117,6 +127,15 @@ export class Review {
     return [...flags, ...unchecked];
   }
 
+  /** Those of one moment, in order. */
+  get #notes() {
+    return this.#said.reviews.filter(({ frame }) => frame !== null).sort((one, other) => one.frame - other.frame);
+  }
+
+  #seconds(row) {
+    return `${(row / this.#clock.fps).toFixed(2)} s`;
+  }
+
   get #frames() {
     return Number(this.#bar.dataset.frames);
   }
@@ -125,9 +144,10 @@ export class Review {
   #at() {
     const row = this.#clock.row;
     const [flag] = flagsAt(this.#said.flags, row);
+    const near = this.#notes.findLast(({ frame }) => frame <= row && row - frame < NOTE_S * this.#clock.fps);
     const here = element("flag-here");
-    here.textContent = here.title = flag?.text ?? "";
-    here.dataset.severity = flag?.severity ?? "";
+    here.textContent = here.title = near ? `${near.reviewer}: ${near.note}` : (flag?.text ?? "");
+    here.dataset.severity = near ? "note" : (flag?.severity ?? "");
     sayLost(this.#said.flags, row);
   }
 
@@ -139,7 +159,7 @@ export class Review {
       fail: () => this.#verdict("fail"),
       passNext: () => this.#verdictAndNext("pass"),
       failNext: () => this.#verdictAndNext("fail"),
-      note: () => this.#open("note-form"),
+      note: () => this.#note(),
       begin: () => this.#annotation.begin(),
       end: () => this.#annotation.end(),
       edit: () => this.#annotation.edit(),
@@ -162,10 +182,19 @@ export class Review {
     if (await this.#verdict(verdict)) this.#next();
   }
 
+  #note() {
+    this.#noted = this.#clock.row;
+    element("note-moment").textContent = this.#seconds(this.#noted);
+    this.#open("note-form");
+  }
+
   async #saveNote(event) {
     event.preventDefault();
-    const field = event.target.elements.note;
-    if (await this.#ask(() => post(this.#bar.dataset.address, { verdict: "note", note: field.value }), "The note is saved.")) {
+    const { note: field, here } = event.target.elements;
+    const frame = here.checked ? this.#noted : null;
+    const done = here.checked ? "The note is saved; the address of this page leads to its moment." : "The note is saved.";
+    if (await this.#ask(() => post(this.#bar.dataset.address, { verdict: "note", note: field.value, frame }), done)) {
+      if (frame !== null) this.#clock.seekRow(frame);
       field.value = "";
       this.#close();
     }

@@ -1,6 +1,7 @@
 // Annotations and verdicts that came along with an episode of a dataset: to be seen, not to be changed here.
 
 import { get } from "../site/api.js";
+import { when } from "../site/times.js";
 import { list } from "./review_lanes.js";
 import { SegmentLane } from "./segment_lane.js";
 
@@ -17,7 +18,7 @@ export async function travelled(clock, address) {
       detail: `${first} to ${last}${milestone ? `, then ${milestone}` : ""}, ${by}`,
       go: () => clock.seekRow(first),
     }));
-    const judged = [...reviews].reverse().map(({ verdict, note, by, at }) => ({ words: note ? `${verdict}: ${note}` : verdict, detail: `${by}, ${new Date(at).toLocaleString()}`, mark: verdict }));
+    const judged = [...reviews].reverse().map(({ verdict, note, by, at }) => ({ words: note ? `${verdict}: ${note}` : verdict, detail: `${by}, ${when(at)}`, mark: verdict }));
     list(document.getElementById("segments-list"), said, "No segment is annotated.");
     list(document.getElementById("history-list"), judged, "No review.");
     count.textContent = `Segments ${segments.length || ""}`.trim();

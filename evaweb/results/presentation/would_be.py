@@ -33,7 +33,8 @@ def would_be(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
 
     A part is left out by whole blocks. What is left is judged by the rule of the design, each comparison by itself, as
     if it had foreseen so many (at its step of Holm's procedure, where the design takes them), or, of checkpoints in
-    random order, by one test of all of it; where the design did not end nothing is left out, for nothing was concluded. `matches` is the least match of each trial's bench, where known.
+    random order, by one test of all of it; where the design did not end nothing is left out, for nothing was concluded.
+    `matches` is the least match of each trial's bench, where known.
     """
     found = frozen(plan.document) if plan.document else None
     if found is None:

@@ -13,7 +13,7 @@ from django.contrib.auth.models import User
 from django.db import IntegrityError, transaction
 from django.db.models import Exists, OuterRef, QuerySet
 
-from evaweb.episodes.models import EpisodeStatus
+from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.journal import text
 from evaweb.plans.blinding_rules import has_looked_at_the_same
@@ -22,7 +22,8 @@ from evaweb.plans.seeded_draws import Chance
 from evaweb.results.models import Preference, Rating
 from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
 from evaweb.results.ratings.video_available import coming, require_seen_on_video, seen
-from evaweb.roles import Role, require
+from evaweb.reviews.selectors import still_judges
+from evaweb.roles import Role, require, role_of
 from evaweb.trials import failures
 from evaweb.trials.models import Score, Trial, TrialStatus
 from evaweb.trials.record import file_of
@@ -121,15 +122,29 @@ def _rated_first(what: str, trial: Trial, user: User) -> None:
     """
     if what != "reworded":
         return
-    for plan in Plan.objects.filter(handouts__trial=trial, state__in=_STATES, second_rater_share__gt=0):
-        handout = _unrated(plan, user).filter(trial=trial).first()
-        if handout is None or not handout.trial.episode.cameras or has_looked_at_the_same(plan, user):
-            continue  # nobody will ask this user
-        if handout.slot.index in sample_of(plan):
-            raise NotAllowed(_TRIAL_RATED_BY_SECOND_PERSON(trial=trial.pk))
+    if any(_still_rates(user, plan, trial) for plan in Plan.objects.filter(handouts__trial=trial)):
+        raise NotAllowed(_TRIAL_RATED_BY_SECOND_PERSON(trial=trial.pk))
 
 
 declare_check(_rated_first)
+
+
+@still_judges
+def _may_be_asked(user: User, episode: Episode) -> bool:
+    """Whether this user may be asked to rate the trial of an episode a second time."""
+    trial = getattr(episode, "trial", None)
+    if trial is None or role_of(user) is Role.VIEWER:
+        return False
+    return any(_still_rates(user, plan, trial) for plan in Plan.objects.filter(handouts__trial=trial))
+
+
+def _still_rates(user: User, plan: Plan, trial: Trial) -> bool:
+    if plan.state not in _STATES or not plan.second_rater_share:
+        return False
+    handout = _unrated(plan, user).filter(trial=trial).first()
+    if handout is None or not handout.trial.episode.cameras or has_looked_at_the_same(plan, user):
+        return False  # nobody will ask this user
+    return handout.slot.index in sample_of(plan)
 
 
 def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, ...]]) -> Offer[T]:

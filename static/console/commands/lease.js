@@ -2,6 +2,7 @@
 // station while nothing moves and nobody else asks; a run that goes on is held, after a countdown with tones.
 
 import { post } from "../../site/api.js";
+import { clockTime } from "../../site/times.js";
 import { config } from "../live/config.js";
 
 const NAMES = {
@@ -177,7 +178,7 @@ export class LeaseControls {
     const expired = silent > 0.8 * this.#store.snapshot.facts.lease_ttl_s;
     const why = expired ? `your page was not heard for ${silent.toFixed(0)} s` : WHY[lease];
     const taken = lease === "other" ? `${this.#store.commander} commands` : "";
-    const at = new Date().toLocaleTimeString("en-GB");
+    const at = clockTime(Date.now());
     return `You do not command any more, since ${at}: ${[why, taken].filter(Boolean).join("; ")}.`;
   }
 

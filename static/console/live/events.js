@@ -1,12 +1,9 @@
 // The station's events, newest first: the sentences of its log, without gaps, filtered by words.
 
+import { clockTime } from "../../site/times.js";
 import { kindWords, sentence, weight } from "./event_words.js";
 
 const KEPT = 400;
-
-function clock(wall) {
-  return new Date(wall * 1000).toLocaleTimeString("en-GB", { hour12: false });
-}
 
 export class Events {
   #list = document.getElementById("events");
@@ -65,7 +62,7 @@ export class Events {
     row.dataset.weight = weight(event);
     row.dataset.words = `${kind} ${kindWords(kind)} ${event.text} ${text}`.toLowerCase();
     const time = document.createElement("time");
-    time.textContent = clock(wall);
+    time.textContent = clockTime(wall * 1000);
     if (!this.#covered) time.title = `event ${number}`;
     const name = document.createElement("span");
     name.className = "event-kind clip";

@@ -41,6 +41,16 @@ def test_the_newest_pass_or_fail_counts_and_all_are_kept(closed, data, ann, bob)
     ]
 
 
+def test_a_note_on_a_moment_keeps_its_frame(closed, data, ann):
+    episode = closed()
+    services.review_add(user=ann, episode=episode, verdict="note", note="it slips", frame=FRAMES - 1)
+    services.review_add(user=ann, episode=episode, verdict="note", note="it slips", frame=3)
+    services.review_add(user=ann, episode=episode, verdict="note", note="it slips", frame=3)  # asked again
+    assert [line["frame"] for line in said(data, episode)] == [FRAMES - 1, 3]
+    with pytest.raises(EvaError, match=f"frame = {FRAMES}; allowed: 0 to {FRAMES - 1}"):
+        services.review_add(user=ann, episode=episode, verdict="note", note="it slips", frame=FRAMES)
+
+
 def test_the_database_itself_keeps_what_was_said(closed, ann):
     review = services.review_add(user=ann, episode=closed(), verdict="pass")
     with pytest.raises(DatabaseError, match="never changed"), transaction.atomic():

@@ -5,7 +5,11 @@ from itertools import combinations
 from evaweb.results.presentation.would_be import _of_these, _stepped
 from evaweb.statistics.designs import conclude, design, findings
 
-SUCCESSES = (38, 26, 16)  # of 40; the second and third are told apart at the last step of Holm's procedure alone
+SUCCESSES = (
+    38,
+    26,
+    16,
+)  # of 40; the second and third are told apart at the last step of Holm's procedure alone
 
 
 def winners(found, blocks):

@@ -1,0 +1,86 @@
+"""What others say of a recording is kept from whoever may still have to judge its trial."""
+
+import pytest
+from django.test import Client
+from django.urls import reverse
+
+from evaweb.blinding import sight_of
+from evaweb.episodes.selectors import episode_get, episode_list, tag_counts
+from evaweb.plans.allocation import hand_out
+from evaweb.plans.models import Plan
+from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.results.ratings import judging
+from evaweb.reviews.services import review_add, segment_put, tags_change
+from evaweb.trials import services
+from tests.evaweb.trials import builders
+
+
+@pytest.fixture
+def bob(db):
+    return builders.user("bob")
+
+
+@pytest.fixture
+def trial(bench, draft, owner, bob):
+    """One of a blind plan, run and scored by ann; bob has said three things of it, and she one."""
+    frozen = plan_freeze(user=owner, plan=draft)
+    made = hand_out(user=bench.operator, station=bench.station, plan=frozen).trial
+    builders.over(made, 9.0, cameras=["front"])
+    services.trial_score(user=bench.operator, trial=made, milestones=bench.ticks(True, False, False))
+    tags_change(user=bob, episode=made.episode, add=["slips"])
+    tags_change(user=bench.operator, episode=made.episode, add=["dark"])
+    review_add(user=bob, episode=made.episode, verdict="fail", note="it slips here", frame=12)
+    segment_put(user=bob, episode=made.episode, first=3, last=9, label="reach")
+    review_add(user=bench.operator, episode=made.episode, verdict="note", note="the lamp was off")
+    return made
+
+
+def said(user, episode):
+    browser = Client()
+    browser.force_login(user)
+    return browser.get(reverse("api:episode-reviews", args=[episode.uuid])).json()
+
+
+def words(user, episode):
+    found = said(user, episode)
+    return [review["note"] for review in found["reviews"]], len(found["segments"]), found["covered"]
+
+
+def test_before_the_reveal_everybody_reads_their_own(bench, trial, owner, bob):
+    assert words(bench.operator, trial.episode) == (["the lamp was off"], 0, 2)
+    assert words(bob, trial.episode) == (["it slips here"], 1, 1)
+    assert (said(bench.operator, trial.episode)["verdict"], said(bob, trial.episode)["verdict"]["note"]) == (
+        None,
+        "it slips here",
+    )
+    ann, row = sight_of(bench.operator), episode_get(uuid=trial.episode.uuid)
+    assert (ann.tags_of(row), tag_counts(sight=ann)) == (["dark"], {"dark": 1})
+    assert [episode_list(tag=tag, sight=ann).count() for tag in ("dark", "slips")] == [1, 0]
+    assert [episode_list(review="fail", sight=sight_of(user)).count() for user in (bench.operator, bob)] == [
+        0,
+        1,
+    ]
+    browser = Client()
+    browser.force_login(bench.operator)
+    page = browser.get("/replay/").content.decode()
+    assert ("What others say of a blind trial" in page, "slips" in page) == (True, False)
+    plan = Plan.objects.get()
+    plan_close(user=owner, plan=plan, reason="enough")
+    plan_reveal(user=owner, plan=plan)
+    assert words(bench.operator, trial.episode) == (["the lamp was off", "it slips here"], 1, 0)
+    assert sight_of(bench.operator).tags_of(episode_get(uuid=trial.episode.uuid)) == ["dark", "slips"]
+
+
+def test_whoever_may_be_asked_to_rate_it_again_reads_their_own_first(bench, draft, owner, bob):
+    Plan.objects.filter(pk=draft.pk).update(blind=False, second_rater_share=1.0)
+    frozen = plan_freeze(user=owner, plan=Plan.objects.get())
+    made = hand_out(user=bench.operator, station=bench.station, plan=frozen).trial
+    builders.over(made, 9.0, cameras=["front"])
+    review_add(user=bench.operator, episode=made.episode, verdict="note", note="it slips")
+    services.trial_score(user=bench.operator, trial=made, milestones=bench.ticks(True, False, False))
+    vic = builders.user("vic", "viewer")
+    assert [words(user, made.episode)[0] for user in (bob, vic)] == [[], ["it slips"]]
+    judging.Rating.objects.create(
+        trial=made, rater=bob, success=False, score=0.25, milestones=[], blind=False
+    )
+    assert words(bob, made.episode)[0] == ["it slips"]
