@@ -13,6 +13,7 @@ from evaweb.blinding import HIDDEN, Sight, sight_for
 from evaweb.jobs import services
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_get
+from evaweb.plans.covered_jobs import Cover, cover_of
 
 router = Router(tags=["jobs"])
 
@@ -21,8 +22,8 @@ class JobOut(Schema):
     """One piece of work; `error` is that of the last attempt.
 
     `attempts` counts those that ended in an error, `deaths` the workers that ended or went silent over it.
-    Progress, error and result may tell which checkpoint was worked on: a user who has not looked behind a blind plan is
-    told only that there are some.
+    Before the reveal a job of a blind trial has no key, no times and no words for a user who has not looked; other work
+    than that on a recording has no words either: they may name a server.
     """
 
     id: int
@@ -35,7 +36,7 @@ class JobOut(Schema):
     progress: str
     error: str
     result: dict[str, Any]
-    created_at: datetime
+    created_at: datetime | None
     claimed_at: datetime | None
     finished_at: datetime | None
 
@@ -43,10 +44,13 @@ class JobOut(Schema):
     def of(job: Job, sight: Sight) -> dict[str, Any]:
         """As it is, or without what may tell."""
         own = {name: getattr(job, name) for name in JobOut.model_fields}
-        if sight.clear:
+        cover = cover_of(job, sight)
+        if cover is Cover.NOTHING:
             return own
-        covered = {name: HIDDEN if own[name] else "" for name in ("progress", "error")}
-        return own | covered | {"result": {}}
+        own |= {name: HIDDEN if own[name] else "" for name in ("progress", "error")} | {"result": {}}
+        if cover is Cover.ALL:
+            own |= {"key": HIDDEN, "created_at": None, "claimed_at": None, "finished_at": None}
+        return own
 
 
 @router.get("", response={200: Page[JobOut], **FAILURES}, summary="Jobs", url_name="jobs")

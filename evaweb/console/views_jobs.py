@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ from evaweb.jobs.selectors import Pace, job_get, jobs_listed, pace_of
 from evaweb.jobs.workers import Served, served
 from evaweb.lists import Column, Filter, Listing
 from evaweb.names import is_name
+from evaweb.plans.covered_jobs import Cover, cover_of
 from evaweb.plans.models import Plan
 from evaweb.roles import Role, require, role_of
 
@@ -56,6 +58,7 @@ class Row:
     pace: Pace
     said: str
     lacks: str  # why no running worker can take it
+    covered: bool = False  # of a blind trial: not when it was, nor of which
 
     @property
     def may_cancel(self) -> bool:
@@ -80,7 +83,7 @@ class Row:
 def jobs(request: HttpRequest) -> HttpResponseBase:
     """What runs, waits and failed; done ones where they are asked for."""
     sight = sight_for(request)
-    listing = Listing(request.GET, _COLUMNS, _FILTERS)
+    listing = Listing(request.GET, _columns(sight), _FILTERS)
     found = jobs_listed(**listing.chosen)
     if listing.wants_file:
         return listing.file(request, "jobs", found)
@@ -116,13 +119,19 @@ def job_act(request: HttpRequest, what: str) -> HttpResponse:
 
 
 def row_of(job: Job, sight: Sight, having: Served) -> Row:
-    """In words; of one that may tell which checkpoint it is about nothing but that it is there."""
+    """In words; of one that may tell which checkpoint it is about no more than that it is there."""
+    title, lacks, said, cover = (
+        KINDS.get(job.kind, job.kind),
+        having.lacks(job),
+        job.error or job.progress,
+        cover_of(job, sight),
+    )
+    if cover is Cover.ALL:
+        return Row(job, title, "a blind trial", "", Pace(), HIDDEN if said else "", lacks, covered=True)
     about, address = _about(job)
-    lacks = having.lacks(job)
-    said = job.error or job.progress
-    if not sight.clear:
-        return Row(job, KINDS.get(job.kind, job.kind), about, address, Pace(), HIDDEN if said else "", lacks)
-    return Row(job, KINDS.get(job.kind, job.kind), about, address, pace_of(job), said, lacks)
+    if cover is Cover.WORDS:
+        return Row(job, title, about, address, Pace(), HIDDEN if said else "", lacks)
+    return Row(job, title, about, address, pace_of(job), said, lacks)
 
 
 def _about(job: Job) -> tuple[str, str]:
@@ -145,13 +154,19 @@ _FILTERS = (
     Filter("status", "State", JobStatus.choices, any="not done"),
     Filter("kind", "Kind", tuple(KINDS.items())),
 )
-_COLUMNS = (
-    Column("kind", "Job", ("kind", "key"), lambda job: job.kind),
-    Column("key", "Key", cell=lambda job: job.key, hidden=True),
-    Column("about", "About"),
-    Column("state", "State", ("status",), lambda job: job.status),
-    Column("progress", "Progress"),
-    Column("asked", "Asked for", ("created_at",), lambda job: job.created_at, down=True),
-    Column("finished", "Ended", ("finished_at",), lambda job: job.finished_at, down=True),
-    Column("acts", "What can be done", quiet=True),
-)
+
+
+def _columns(sight: Sight) -> tuple[Column, ...]:
+    def shown(value: Callable[[Job], Any]) -> Callable[[Job], Any]:
+        return lambda job: "" if cover_of(job, sight) is Cover.ALL else value(job)
+
+    return (
+        Column("kind", "Job", ("kind", "key"), lambda job: job.kind),
+        Column("key", "Key", cell=shown(lambda job: job.key), hidden=True),
+        Column("about", "About"),
+        Column("state", "State", ("status",), lambda job: job.status),
+        Column("progress", "Progress"),
+        Column("asked", "Asked for", ("created_at",), shown(lambda job: job.created_at), down=True),
+        Column("finished", "Ended", ("finished_at",), shown(lambda job: job.finished_at), down=True),
+        Column("acts", "What can be done", quiet=True),
+    )

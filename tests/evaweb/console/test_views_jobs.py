@@ -99,6 +99,6 @@ def test_who_only_looks_is_offered_nothing(episode):
 
 def test_what_may_tell_which_checkpoint_it_is_about_is_hidden(episode):
     job = preview(episode, status="running", progress="asking the server of pi0-secret 2 of 3")
-    row = row_of(job, Sight(checkpoints=frozenset({1})), served())
+    row = row_of(job, Sight(checkpoints=frozenset({1}), names=frozenset({"pi0-secret"})), served())
     assert (row.said, row.pace.fraction, row.minutes_left) == (HIDDEN, None, "")
     services.cancel(user=builders.user("ann"), job=job)
