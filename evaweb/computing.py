@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 AT_ONCE_S = 30.0  # of computing that a person may have asked for; a question of the planner takes up to 10 s
 REFILLED = 0.1  # seconds of it that are given back each second
 _PATIENCE_S = 20.0  # for which a request waits; what it asked for goes on, and is known when it comes again
+_SOON_S = 1.0  # for which a page waits that asks again by itself
 _MOST_WAITING = 8  # requests; the web works on 32 at once
 _MOST_ASKED = 32  # questions that wait for the process, of all persons together
 _KEPT = 512  # answers
@@ -63,6 +64,10 @@ class Busy(EvaError):
     def __init__(self, sentence: str, retry_after_s: int = _AGAIN_S) -> None:
         super().__init__(sentence)
         self.retry_after_s = retry_after_s
+
+
+class UnderWay(Busy):
+    """It is being computed."""
 
 
 class Beside:
@@ -114,8 +119,9 @@ class Questions:
         run: Callable[..., tuple[Any, float]],
         clock: Callable[[], float] = time.monotonic,
         patience_s: float = _PATIENCE_S,
+        soon_s: float = _SOON_S,
     ) -> None:
-        self._run, self._clock, self._patience_s = run, clock, patience_s
+        self._run, self._clock, self._patience_s, self._soon_s = run, clock, patience_s, soon_s
         self._lock = threading.Lock()
         self._turns: Lookups[Any] = Lookups(1, _MOST_ASKED)
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
@@ -125,8 +131,11 @@ class Questions:
         self._spent: dict[Hashable, tuple[float, float]] = {}  # by person: seconds, and when that was so
         self._waiting = 0
 
-    def ask(self, person: Hashable, work: Callable[..., Any], *given: Any) -> Any:
-        """What `work` makes of these; Busy where it is not known in time, or beyond the person's budget; its errors."""
+    def ask(self, person: Hashable, work: Callable[..., Any], *given: Any, soon: bool = False) -> Any:
+        """What `work` makes of these; UnderWay where it is not known in time, or `soon`; its errors.
+
+        Busy beyond the person's budget.
+        """
         question = (work, given)
         with self._lock:
             if question in self._kept:
@@ -137,9 +146,9 @@ class Questions:
             coming = self._asked[question][1] if question in self._asked else self._begun(person, question)
             self._waiting += 1
         try:
-            return coming.result(self._patience_s)
+            return coming.result(self._soon_s if soon else self._patience_s)
         except TimeoutError:
-            raise Busy(_UNDER_WAY) from None
+            raise UnderWay(_UNDER_WAY) from None
         except Crowded:
             raise Busy(_CROWDED) from None
         finally:

@@ -52,7 +52,9 @@ def _estops_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _computing_has_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody's budget is used up, and no slow machine is a refusal."""
-    here = computing.Questions(lambda work, *given: (work(*given), 0.0), patience_s=PATIENCE_S)
+    here = computing.Questions(
+        lambda work, *given: (work(*given), 0.0), patience_s=PATIENCE_S, soon_s=PATIENCE_S
+    )
     monkeypatch.setattr(computing, "questions", here)
 
 

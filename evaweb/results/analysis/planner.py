@@ -104,17 +104,19 @@ def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
     return question
 
 
-def table_of(q: Question, person: Hashable) -> dict[str, Any]:
+def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, Any]:
     """What each design needs for the question, what the time there is for finds, and the gains that it finds.
 
-    Computed for `person`; Busy beyond what theirs may take.
+    Computed for `person`; Busy beyond what theirs may take, UnderWay where it is not known in time, or `soon`.
     """
     comparisons = COMPARISONS[Comparing(q.comparing)](q.checkpoints)
     alpha = q.alpha / comparisons
     affordable = int(q.hours * 3600 * q.stations / q.cycle_s / q.checkpoints)
     tried = min(affordable, MOST)
     gains = tuple(gain for gain in _GAINS if q.rate + gain <= 1)
-    found: Outlook = computing.questions.ask(person, outlook, q.rate, q.better, q.power, alpha, tried, gains)
+    found: Outlook = computing.questions.ask(
+        person, outlook, q.rate, q.better, q.power, alpha, tried, gains, soon=soon
+    )
     return {
         "comparisons": comparisons,
         "alpha": alpha,

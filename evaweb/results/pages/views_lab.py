@@ -9,6 +9,7 @@ from django.http import HttpRequest, HttpResponse
 from django.shortcuts import render
 from django.views.decorators.http import require_GET
 
+from evaweb import computing
 from evaweb.blinding import Sight, sight_for
 from evaweb.errors import EvaError
 from evaweb.plans.models import Comparing, PlanState
@@ -40,13 +41,22 @@ def wall(request: HttpRequest) -> HttpResponse:
 def planner(request: HttpRequest) -> HttpResponse:
     """Trials and robot hours for a wanted difference, and what cannot be detected."""
     fault = table = None
+    waiting = False
     question = Question()
     try:
         question = question_of(request.GET)
-        table = table_of(question, request.user.pk)
+        table = table_of(question, request.user.pk, soon=True)
+    except computing.UnderWay:
+        waiting = True
     except EvaError as error:
         fault = error
-    context = {"question": question, "table": table, "fault": fault, "comparing": Comparing.choices}
+    context = {
+        "question": question,
+        "table": table,
+        "waiting": waiting,
+        "fault": fault,
+        "comparing": Comparing.choices,
+    }
     carried = ("rate", "better", "alpha", "power", "cycle_s", "comparing")
     context |= {
         "here": "planner",

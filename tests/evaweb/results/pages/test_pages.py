@@ -11,6 +11,8 @@ from django.test import Client
 from django.test.utils import CaptureQueriesContext
 from django.utils import timezone
 
+from evaweb import computing
+from evaweb.computing import Questions
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode
 from evaweb.plans.services import plan_close
@@ -21,6 +23,7 @@ from evaweb.results.selectors import PlanRow
 from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.trials import builders
+from tests.processes import eventually
 
 PLAN = "/result/plans/blocks/1/"
 
@@ -439,6 +442,16 @@ def test_the_planner_answers_and_names_what_is_not_allowed(as_, viewer):
         wrong = client.get(f"/result/planner/?{query}")
         assert wrong.status_code == 400
         assert 'role="alert"' in wrong.content.decode()
+
+
+def test_the_planner_shows_its_form_at_once_and_asks_again_by_itself(as_, viewer, monkeypatch):
+    never = Questions(lambda work, *given: (work(*given), 0.0), soon_s=0)
+    monkeypatch.setattr(computing, "questions", never)
+    client, address = as_(viewer), "/result/planner/?rate=0.5&better=0.7"
+    answer = client.get(address)
+    assert (answer.status_code, "Computing" in answer.content.decode()) == (200, True)
+    assert f'hx-get="{address.replace("&", "&amp;")}"' in answer.content.decode()
+    eventually(lambda: "anytime" in client.get(address).content.decode(), "what was asked for")
 
 
 def test_a_pace_that_runs_backwards_is_none(plan):
