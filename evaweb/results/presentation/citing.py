@@ -25,6 +25,7 @@ from evaweb.results.presentation.drawings import rates
 from evaweb.results.presentation.drawings.svg import Drawing, printable
 from evaweb.results.presentation.headline import alpha_words, letters_of, rule_words, sentence_of
 from evaweb.results.presentation.latex import escaped, foreign
+from evaweb.results.presentation.setting import setting_now
 from evaweb.results.presentation.wording import ends, rate_words
 from evaweb.statistics.designs import ANYTIME, FIXED, SUCCESS, Block, Design, looks_at
 from evaweb.statistics.proportions import Proportion, proportion
@@ -135,6 +136,12 @@ class Citation:
         )
 
     @cached_property
+    def setting(self) -> str:
+        """On what robot, in which scenes, when and who scored; "" of a reveal from before it kept that."""
+        said = str(self.kept.get("setting", "")) if self.digest else setting_now(self.plan)
+        return f"{said}." if said else ""
+
+    @cached_property
     def source(self) -> str:
         """Where it is from: plan, version, digests, address."""
         document = self.plan.document or {}
@@ -155,6 +162,13 @@ class Citation:
     def doubts(self) -> list[str]:
         """The same as lines of text."""
         return [f"Reason for doubt: {said}." for said in self.caveats]
+
+    @property
+    def lines(self) -> list[str]:
+        """Sentence, setting, design, reasons for doubt, source."""
+        return [
+            line for line in (self.sentence, self.setting, self.design, *self.doubts, self.source) if line
+        ]
 
     @cached_property
     def rows(self) -> list[Cited]:
@@ -190,7 +204,7 @@ class Citation:
     def text(self) -> dict[str, str]:
         """Sentence, table and figure as plain text."""
         return {
-            "sentence": "\n".join((self.sentence, self.design, *self.doubts, self.source)) + "\n",
+            "sentence": "\n".join(self.lines) + "\n",
             "table": _text_table([row.cells for row in self.rows]),
             "figure": _text_figure(self.known),
         }
@@ -199,8 +213,7 @@ class Citation:
     def latex(self) -> dict[str, str]:
         """The same as LaTeX that needs no package."""
         rows = [row.cells for row in self.rows]
-        lines = (self.sentence, self.design, *self.doubts, self.source)
-        sentence = "\n".join(map(escaped, lines)) + "\n"
+        sentence = "\n".join(map(escaped, self.lines)) + "\n"
         return {"sentence": sentence, "table": _latex_table(rows), "figure": _latex_figure(self.known)}
 
     @cached_property
@@ -213,7 +226,7 @@ class Citation:
     @cached_property
     def svg(self) -> str:
         """Figure with sentence, design and source, black on white, needing nothing beside it."""
-        return printable(self.drawn, above=[self.sentence], below=[self.design, *self.doubts, self.source])
+        return printable(self.drawn, above=[self.sentence], below=self.lines[1:])
 
     def whole(self, form: str) -> str:
         """All of it as a file: "txt", "tex" or "svg"."""
@@ -253,6 +266,7 @@ class Citation:
             },
             "blocks": self.blocks,
             "headline": self.sentence,
+            "setting": self.setting,
             "caveats": self.caveats,
             "arms": [
                 {

@@ -19,6 +19,7 @@ from evaweb.plans.design import (
 )
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.presentation.setting import setting_of
 from evaweb.results.presentation.wording import p_words, points
 from evaweb.statistics.designs import (
     FIXED,
@@ -51,7 +52,7 @@ class Headline:
     been voided. `worst`: of differences, had each attempt that was thrown away unscored been against them. Each is
     empty where it is made of the same blocks. `estimates`: of comparisons that stopped early, how much they differ.
     `letters` and `best`, where all checkpoints were compared with each other: two share a letter if they were not told
-    apart, and which one is best if one is.
+    apart, and which one is best if one is. `setting`: on what robot, in which scenes, when, and who scored.
     """
 
     sentences: tuple[str, ...]
@@ -63,6 +64,7 @@ class Headline:
     versions: tuple[str, ...] = ()
     letters: tuple[tuple[str, str], ...] = ()
     best: str = ""
+    setting: str = ""
 
     @property
     def said(self) -> tuple[str, ...]:
@@ -114,6 +116,7 @@ def headline(plan: Plan) -> Headline | None:
         _versions(plan),
         letters_of(plan, found, at_reveal),
         best_of(plan, found, at_reveal),
+        setting_of(plan),
     )
 
 

@@ -10,6 +10,7 @@ from evaweb.plans.design import declare_kept
 from evaweb.plans.models import Plan
 from evaweb.results.presentation.caveats import caveats_of
 from evaweb.results.presentation.headline import headline
+from evaweb.results.presentation.setting import setting_now
 from evaweb.results.reports.tables import SCORE_COLUMNS, outcome_pages, score_pages
 from evaweb.tabular_export import plain
 from evaweb.trials.models import TrialStatus
@@ -24,11 +25,12 @@ LOOKED_AT = ("smoothness", "smoothness_commanded")  # of a recording, by the wor
 
 
 def kept_of(plan: Plan) -> dict[str, Any]:
-    """Headline and caveats in their words, and the digest of every attempt and every score with its reason and time."""
+    """Headline, setting and caveats in words; the digest of each attempt and score with its reason and time."""
     said = headline(plan)
     return {
         "headline": list(said.said) if said else [],
         "caveats": caveats_of(plan),
+        "setting": setting_now(plan),
         "record": digest({"attempts": list(_attempts(plan)), "scores": list(_scores(plan))}),
         "measured": _measured(plan),
     }

@@ -93,7 +93,7 @@ def changes(
 
 
 def _unsaid(kept: Mapping[str, Any], page: str) -> Iterator[str]:
-    for sentence in (*kept.get("headline", ()), *kept.get("caveats", ())):
+    for sentence in (*kept.get("headline", ()), *kept.get("caveats", ()), kept.get("setting", "")):
         if sentence not in page:
             yield sentence
 

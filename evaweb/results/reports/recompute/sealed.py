@@ -17,6 +17,7 @@ _KEPT = (
     "arms",
     "headline",
     "caveats",
+    "setting",
     "record",
     "measured",
 )  # of a reveal, under its digest

@@ -307,6 +307,10 @@ TAMPERINGS = {
         lambda report: (report / "data" / "integrity.json").write_text("{}"),
         "integrity.json says",
     ),
+    "a real robot": (
+        of_text("index.html", "(simulated)", "(real)"),
+        "does not say: 16 trials on agilex_piper",
+    ),
     "an operator": (of_table("trials", lambda rows: rows[0].update(operator="nobody")), RECORD),
     "a time": (
         of_table("scores", lambda rows: rows[0].update(scored_at="2026-01-01T00:00:00+00:00")),
@@ -329,7 +333,7 @@ TAMPERINGS = {
 }
 
 
-SOME = ("a first score", "a caveat", "an operator", "a rate on the page")
+SOME = ("a first score", "a caveat", "a real robot", "an operator", "a rate on the page")
 
 
 @pytest.mark.parametrize(

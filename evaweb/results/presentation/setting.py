@@ -1,0 +1,48 @@
+"""Where a result is from: on what robot, simulated or real, in which scenes, when, and who scored it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+
+from django.db.models import Count, Max, Min
+
+from evaweb.plans.models import Plan
+from evaweb.trials.models import Score, TrialStatus
+
+
+def setting_of(plan: Plan) -> str:
+    """A sentence on the trials that count, as the reveal kept it, else as it is now; "" where there are none."""
+    kept = (plan.at_reveal or {}).get("setting")
+    return setting_now(plan) if kept is None else str(kept)
+
+
+def setting_now(plan: Plan) -> str:
+    """The same as it is now, its days in UTC."""
+    station, verdict = "trial__station__", "trial__verdict__"
+    groups = plan.handouts.filter(trial__status=TrialStatus.SCORED).order_by()
+    rows = list(
+        groups.values_list(
+            *(f"{station}{name}" for name in ("robot", "simulated", "name")),
+            *(f"{verdict}{name}" for name in ("rater__username", "source")),
+        ).annotate(n=Count("pk"), first=Min("trial__prepared_at"), last=Max("trial__prepared_at"))
+    )
+    if not rows:
+        return ""
+    robots, stations, scorers = set(), set(), defaultdict[str, int](int)
+    for robot, simulated, at, rater, source, n, *_ in rows:
+        robots.add(f"{robot} ({'simulated' if simulated else 'real'})")
+        stations.add(at)
+        scorers["the simulated bench" if source == Score.Source.TRUTH else rater] += n
+    count = sum(scorers.values())
+    days = sorted({f"{min(row[-2] for row in rows):%Y-%m-%d}", f"{max(row[-1] for row in rows):%Y-%m-%d}"})
+    scenes = [f'{scene["title"]}, "{scene["instruction"]}"' for scene in (plan.document or {})["scenes"]]
+    return (
+        f"{count} trial{'s' if count > 1 else ''} on {_and(robots)} at {_and(stations)}, {' to '.join(days)}; "
+        f"{'; '.join(scenes)}; scored by {_and(f'{who} ({n})' for who, n in scorers.items())}"
+    )
+
+
+def _and(given: Iterable[str]) -> str:
+    words = sorted(given)
+    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
