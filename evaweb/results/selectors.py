@@ -13,7 +13,7 @@ from django.db.models import Case, Count, Exists, IntegerField, Max, Min, OuterR
 from evaweb.errors import EvaError, NotFound
 from evaweb.plans.models import Plan, PlanState, Slot
 from evaweb.stations.models import Station
-from evaweb.trials.failure_words import NOT_SAID
+from evaweb.trials.failure_words import is_not_said
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import MilestoneOutcome, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED
@@ -88,7 +88,7 @@ class StationNow:
 class Question:
     """Which trials of a plan are meant; "" where it does not matter.
 
-    `success` is yes or no, `failure` and `failure_phase` may be "not said",
+    `success` is yes or no, `failure` and `failure_phase` may be "not specified",
     `missed` and `reached` are the words of a milestone. Without a `status` those that count.
     """
 
@@ -182,7 +182,7 @@ def trials_of_plan(plan: Plan, question: Question) -> QuerySet[Trial]:
             rows = rows.filter(**{field: value})
     for name in FIELDS:
         if value := getattr(question, name):
-            rows = rows.filter(**{f"verdict__{name}": "" if value == NOT_SAID else value})
+            rows = rows.filter(**{f"verdict__{name}": "" if is_not_said(value) else value})
     if question.position:
         rows = rows.filter(position__number=_whole("position", question.position))
     if question.status:

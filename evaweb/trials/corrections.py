@@ -61,7 +61,7 @@ def trial_failure(
         if score is not None and identity_of(score) != seen.uuid:
             raise Conflict(
                 _TRIAL_SCORED_ANEW_BY_MEANWHILE(
-                    trial=held.pk, user=seen.rater.get_username(), why=seen.why or "failure not said"
+                    trial=held.pk, user=seen.rater.get_username(), why=seen.why or f"failure {NOT_SAID}"
                 )
             )
         after = why_words(words["failure_phase"], words["failure"])

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-NOT_SAID = "not said"
+NOT_SAID = "not specified"
+_BEFORE = "not said"  # addresses that were kept say it
 
 
 def is_not_said(words: str) -> bool:
     """True if these words stand for none."""
-    return words.strip().casefold() == NOT_SAID
+    return words.strip().casefold() in (NOT_SAID, _BEFORE)
 
 
 def why_words(phase: str, cause: str) -> str:

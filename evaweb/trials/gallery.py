@@ -22,7 +22,7 @@ from django.db.models import (
 from evaweb.blinding import HIDDEN, Sight, code_of
 from evaweb.errors import EvaError
 from evaweb.trials.clips import clip_of
-from evaweb.trials.failure_words import NOT_SAID
+from evaweb.trials.failure_words import NOT_SAID, is_not_said
 from evaweb.trials.models import Trial, TrialStatus
 from evaweb.trials.selectors import TrialFilters, trial_list
 from runtime.core.sentences import Pattern
@@ -46,7 +46,7 @@ COLUMNS = (
 class FailureFilters:
     """Which failed trials are meant, and `group`, one of GROUPS; "" where it does not matter.
 
-    `position` is "SCENE/NUMBER"; phase and cause may be "not said".
+    `position` is "SCENE/NUMBER"; phase and cause may be "not specified".
     """
 
     trials: TrialFilters = field(default_factory=TrialFilters)
@@ -94,7 +94,7 @@ def failed_list(filters: FailureFilters, sight: Sight) -> QuerySet[Trial]:
     rows = trial_list(filters.trials, sight).filter(status=TrialStatus.SCORED, verdict__success=False)
     for name in _WORDS:
         if value := getattr(filters, name):
-            rows = rows.filter(**{f"verdict__{name}": "" if value == NOT_SAID else value})
+            rows = rows.filter(**{f"verdict__{name}": "" if is_not_said(value) else value})
     if filters.position:
         scene, _, number = filters.position.rpartition("/")
         if not (number.isascii() and number.isdecimal() and len(number) < 7):

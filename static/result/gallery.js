@@ -121,7 +121,7 @@ class Gallery {
       const changed = uuid !== card.dataset.score;
       card.dataset.score = uuid;
       for (const name of FIELDS) card.dataset[name] = scores[0][name];
-      const why = FIELDS.map((name) => scores[0][name]).filter(Boolean).join(": ") || "not said";
+      const why = FIELDS.map((name) => scores[0][name]).filter(Boolean).join(": ") || "not specified";
       card.querySelector("[data-why]").textContent = why;
       this.#show();
       this.#tell(`Trial ${card.dataset.trial}: ${why}.`);

@@ -30,3 +30,19 @@ scrollers();
 window.addEventListener("resize", scrollers);
 document.addEventListener("htmx:afterSwap", scrollers);
 document.addEventListener("toggle", scrollers, { capture: true }); // a table may be in details
+
+// Filters apply when one is chosen; the address says what they are, and the keyboard stays where it was.
+const APPLIED = "applied filter";
+document.addEventListener("change", ({ target }) => {
+  const form = target.form;
+  if (!form?.matches("[data-applied]")) return;
+  for (const field of form.elements) if (!field.value) field.disabled = true;
+  sessionStorage.setItem(APPLIED, target.name);
+  form.submit();
+});
+const applied = sessionStorage.getItem(APPLIED);
+if (applied) document.querySelector("form[data-applied]")?.elements[applied]?.focus();
+sessionStorage.removeItem(APPLIED);
+window.addEventListener("pageshow", () => {
+  for (const field of document.querySelectorAll("form[data-applied] :disabled")) field.disabled = false; // somebody came back
+});

@@ -182,7 +182,7 @@ def says_why_it_failed(person):
         "the worker has prepared its video",
         3 * PATIENCE_S,
     )
-    assert card.locator("[data-why]").inner_text() == "not said"
+    assert card.locator("[data-why]").inner_text() == "not specified"
     eventually(
         lambda: card.locator("video").evaluate("one => one.played.length > 0"),
         "the clip plays",

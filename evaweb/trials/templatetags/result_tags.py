@@ -11,7 +11,7 @@ from evaweb.statistics.means import Average
 from evaweb.statistics.proportions import Proportion
 from evaweb.trials import figures
 from evaweb.trials.lifecycle import advice
-from evaweb.trials.models import TrialStatus
+from evaweb.trials.models import Evaluation, TrialStatus
 
 register = template.Library()
 
@@ -26,6 +26,27 @@ def percent(share: float | str | None) -> str:
 def seconds(value: float | str | None) -> str:
     """Seconds with one decimal and the unit; a dash where they are not known."""
     return f"{value:.1f} s" if isinstance(value, float | int) else "–"
+
+
+_LABELS = {"failure_phase": "Phase", "failure": "Cause"}
+
+
+@register.simple_tag(takes_context=True)
+def filter_chips(context: Any, names: str) -> list[dict[str, str]]:
+    """Those of the filters `names` that the address applies: `words`, and the address's query `without` each."""
+    given = context["request"].GET
+    chips = []
+    for name in names.split():
+        if value := given.get(name, "").strip():
+            left = given.copy()
+            for key in [key for key in left if key in (name, "page") or not left[key]]:
+                del left[key]
+            known = name == "evaluation" and value.isdecimal() and len(value) < 16
+            said = Evaluation.objects.filter(pk=value).first() if known else value
+            chips.append(
+                {"words": f"{_LABELS.get(name, name.capitalize())}: {said}", "without": left.urlencode()}
+            )
+    return chips
 
 
 @register.filter

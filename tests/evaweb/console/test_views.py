@@ -550,7 +550,7 @@ def test_phases_and_causes_are_offered_with_their_keys_where_a_trial_is_scored(
     type(scene).objects.update(failure_required=True)
     text = text_of(browser, "/stations/bench-1/eval/panel")
     assert 'data-explained="yes"' in text
-    assert "not said" not in text
+    assert "not specified" not in text
     type(trial).objects.filter(pk=trial.pk).update(status="prepared")
     assert "failure" not in text_of(browser, "/stations/bench-1/eval/panel")
 

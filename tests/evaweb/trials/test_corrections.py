@@ -44,7 +44,7 @@ def test_a_corrected_failure_is_another_score_that_leaves_all_else_as_it_was(ben
     assert corrected(bench, trial, **SAID) == undone  # asked for once more
     assert (
         corrected(bench, trial, failure_phase="", failure="").reason
-        == "failure was grasp: dropped, now not said"
+        == "failure was grasp: dropped, now not specified"
     )
 
 

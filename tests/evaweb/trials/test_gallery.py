@@ -87,15 +87,15 @@ def test_failures_stand_in_groups_the_largest_named_first(bench):
     failed(bench, "missed", "approach", checkpoint=other)
     failed(bench)
     bench.scored(True)
-    assert groups("failure") == [("dropped", 2), ("missed", 1), ("not said", 1)]
-    assert groups("failure_phase") == [("not said", 2), ("approach", 1), ("grasp", 1)]
+    assert groups("failure") == [("dropped", 2), ("missed", 1), ("not specified", 1)]
+    assert groups("failure_phase") == [("not specified", 2), ("approach", 1), ("grasp", 1)]
     assert groups("position") == [("block-on-plate/1", 3), ("block-on-plate/2", 1)]
     assert groups("checkpoint") == [("pi0-block", 3), ("act", 1)]
-    assert groups("failure", failure_phase="not said") == [("dropped", 1), ("not said", 1)]
+    assert groups("failure", failure_phase="not specified") == [("dropped", 1), ("not specified", 1)]
     assert groups("failure", position="block-on-plate/2") == [("dropped", 1)]
     assert groups("failure", trials=TrialFilters(checkpoint="act")) == [("missed", 1)]
     shown = [shown_group(trial, FailureFilters()) for trial in failed_list(FailureFilters(), EVERYTHING)]
-    assert shown == ["dropped", "dropped", "missed", "not said"]
+    assert shown == ["dropped", "dropped", "missed", "not specified"]
 
 
 def test_hidden_checkpoints_are_one_group_in_the_order_of_their_trials_and_no_filter(bench):
@@ -125,6 +125,17 @@ def test_a_wrong_filter_is_named_and_all_failures_are_shown(bench, browser, quer
     assert said in answer.content.decode()
     assert "data-trial" in answer.content.decode()
     assert browser.get(f"/result/failures.csv?{query}").status_code in (400, 404)
+
+
+def test_each_filter_that_applies_is_a_chip_that_takes_it_off(bench, browser):
+    bench.scored(success=False)
+    text = browser.get(
+        "/result/failures/?scene=block-on-plate&group=position&page=1&failure="
+    ).content.decode()
+    assert "Scene: block-on-plate" in text
+    assert '<a href="?group=position" aria-label="Remove the filter Scene: block-on-plate"' in text
+    assert text.count("filter-chip") == 1
+    assert "filter-chip" not in browser.get("/result/failures/?evaluation=none").content.decode()
 
 
 def test_the_gallery_has_a_clip_per_failure_with_its_link(bench, browser):

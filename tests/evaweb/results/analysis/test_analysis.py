@@ -52,7 +52,7 @@ def test_the_better_one_comes_first_with_everything_that_is_said_of_it():
     assert new.curve.successes == new.success.successes == new.speed.events
     old = found.arm("old")
     assert sum(mode.count for mode in old.failures) == old.success.n - old.success.successes
-    assert {mode.words for mode in old.failures} == {"grasp: dropped", "dropped", "grasp", "not said"}
+    assert {mode.words for mode in old.failures} == {"grasp: dropped", "dropped", "grasp", "not specified"}
     assert [mode.count for mode in old.failures] == sorted((m.count for m in old.failures), reverse=True)
     assert all(mode.interval == clopper_pearson(mode.count, 40) for mode in old.failures)
     assert found.letters == {"new": "a", "old": "b"}

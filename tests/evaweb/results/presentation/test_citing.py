@@ -76,7 +76,9 @@ def test_the_sentence_names_the_design_and_the_table_has_n_rate_interval_and_sco
     assert cited.sentence.startswith(("pi0-new succeeded more often than", "No significant difference"))
     assert "Design: fixed, one test at the end, 8 pairs foreseen, alpha 0.05" in cited.text["sentence"]
     assert revealed.at_reveal["digest"] in cited.text["sentence"]
-    setting = r'16 trials on agilex_piper \(simulated\) at bench-1.*, 20\d\d-\d\d-\d\d; .*"; scored by ann \(\d+\)'
+    setting = (
+        r'16 trials on agilex_piper \(simulated\) at bench-1.*, 20\d\d-\d\d-\d\d; .*"; scored by ann \(\d+\)'
+    )
     assert re.search(setting, cited.text["sentence"])
     assert "scored by ann" in cited.svg
     rows = {row.checkpoint: row.cells for row in cited.rows}
