@@ -1,15 +1,19 @@
 // One of the small multiples: the curves of a joint, which joint that is, and its values at the cursor.
 
-import { KINDS } from "../console/curves/curve_kinds.js";
+import { KINDS, SECOND } from "../console/curves/curve_kinds.js";
 import { jointOptions } from "../console/manual/joint_names.js";
 import { last } from "../site/ascending.js";
 import { Plot } from "./plot.js";
+
+const OTHERS = ["state", "executed", "smoothed"];
 
 export class CurveCell {
   #read;
   #plot;
   #drawn; // {curves, raw, unit} of the joint
   #select;
+  #second; // which signal of another joint is drawn too
+  #other = null; // its values
   #values = new Map(); // name of a curve -> where its value stands
 
   /**
@@ -31,6 +35,13 @@ export class CurveCell {
       this.draw();
       chose();
     });
+    this.#second = this.element.querySelector("[data-second]");
+    this.#second.setAttribute("aria-label", `Another signal in curve ${number + 1}`);
+    this.#second.append(...OTHERS.map((kind) => signals(kind, joints)));
+    this.#second.addEventListener("change", () => {
+      this.#beside();
+      chose();
+    });
     const off = this.element.querySelector("[data-remove]");
     off.setAttribute("aria-label", `Leave out curve ${number + 1}, ${joints[index]}`);
     off.hidden = count < 2;
@@ -47,6 +58,27 @@ export class CurveCell {
       values.append(value);
       this.#values.set(name, value);
     }
+    const other = document.createElement("span");
+    other.style.setProperty("color", `var(${SECOND.colour})`);
+    values.append(other);
+    this.#values.set("second", other);
+  }
+
+  #beside() {
+    const [kind, index] = this.#second.value.split(":");
+    this.#other = kind ? this.#read(Number(index)).curves[kind] : null;
+    const value = this.#values.get("second");
+    this.#second.title = kind ? this.#second.selectedOptions[0].text : "Another signal in this plot";
+    value.title = kind ? `${this.#second.title}, dotted, axis at the right` : "";
+    this.#plot.beside(this.#other);
+  }
+
+  get second() {
+    return Boolean(this.#other);
+  }
+
+  align(on) {
+    this.#plot.align(on);
   }
 
   focus() {
@@ -71,6 +103,8 @@ export class CurveCell {
     this.#plot.choose(owner);
     for (const name of ["state", "executed", "smoothed"]) this.#say(name, tick < 0 ? NaN : curves[name][tick]);
     this.#say("raw", wanted(raw, time));
+    if (this.#other) this.#say("second", tick < 0 ? NaN : this.#other[tick]);
+    else this.#values.get("second").textContent = "";
   }
 
   #say(name, value) {
@@ -82,6 +116,14 @@ export class CurveCell {
   destroy() {
     this.#plot.destroy();
   }
+}
+
+/** A group of options: `kind` of every joint. */
+function signals(kind, joints) {
+  const group = document.createElement("optgroup");
+  group.label = kind;
+  group.append(...joints.map((name, index) => new Option(`${name} ${kind}`, `${kind}:${index}`)));
+  return group;
 }
 
 /** What the newest chunk wants at `time`; NaN where it says nothing. */

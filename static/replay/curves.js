@@ -102,10 +102,17 @@ class Pane {
       hover: (time) => this.#hover(time),
       chose: () => {
         this.#keep();
+        this.#align();
         this.#at();
       },
       remove: () => this.#remove(number),
     });
+  }
+
+  /** One time axis below each other, also where one of them has a second axis of values. */
+  #align() {
+    const some = this.#cells.some(({ second }) => second);
+    for (const cell of this.#cells) cell.align(some);
   }
 
   get #joints() {

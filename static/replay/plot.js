@@ -1,6 +1,6 @@
 // The curves of one joint over the whole episode, with what happened drawn behind and over them.
 
-import { KINDS, axes, blank, css, series, spread } from "../console/curves/curve_kinds.js";
+import { AXIS, KINDS, SECOND, axes, blank, css, series, spread } from "../console/curves/curve_kinds.js";
 import { LANE, Lane } from "./lane.js";
 
 const LINES = KINDS.filter((kind) => kind.name !== "raw"); // raw is drawn chunk by chunk
@@ -25,6 +25,8 @@ export class Plot {
   #data;
   #behind; // {held, marks, safety, owners}
   #raw = [];
+  #second = null; // values of another signal, on the axis at the right
+  #aligned = false; // with a plot that has such an axis
   #time = 0;
   #shown;
   #lane;
@@ -57,9 +59,26 @@ export class Plot {
   show(curves, raw) {
     this.#raw = raw;
     this.#data = [Array.from(curves.time), ...LINES.map((kind) => blank(curves[kind.name]))];
-    if (this.#plot) this.#plot.setData(this.#data);
+    if (this.#plot) this.#plot.setData(this.#drawn);
     else this.#build();
     this.at(this.#time);
+  }
+
+  /** Draw another signal over the same time, or none: null. */
+  beside(values) {
+    this.#second = values && blank(values);
+    this.#build();
+  }
+
+  /** Leave as much room at the right as those that have an axis there. */
+  align(on) {
+    if (on === this.#aligned) return;
+    this.#aligned = on;
+    this.#build();
+  }
+
+  get #drawn() {
+    return this.#second ? [...this.#data, this.#second] : this.#data;
   }
 
   /** Draw the curve of that name, or leave it out. */
@@ -96,12 +115,12 @@ export class Plot {
     const options = {
       width: this.#element.clientWidth || 600,
       height: this.#element.clientHeight || 160,
-      padding: [this.#strip || 6, null, null, null],
+      padding: [this.#strip || 6, this.#aligned && !this.#second ? AXIS : null, null, null],
       legend: { show: false },
       cursor: { y: false, drag: { x: true, y: false }, points: { show: false }, sync: { key: "replay" } },
-      scales: { x: { time: false }, y: { range: (plot, low, high) => spread(low, high) } },
+      scales: { x: { time: false }, ...Object.fromEntries(["y", "second"].map((name) => [name, { range: (plot, low, high) => spread(low, high) }])) },
       axes: this.#axes(),
-      series: series(LINES, this.#shown),
+      series: this.#series(),
       hooks: {
         drawAxes: [(plot) => this.#drawBehind(plot)],
         draw: [(plot) => this.#drawOver(plot)],
@@ -109,7 +128,7 @@ export class Plot {
         setCursor: [(plot) => this.#hover(plot.cursor.left >= 0 ? plot.posToVal(plot.cursor.left, "x") : null)],
       },
     };
-    this.#plot = new this.#library(options, this.#data, this.#element);
+    this.#plot = new this.#library(options, this.#drawn, this.#element);
     this.#plot.over.append(this.#cursor);
     this.#pick(this.#plot);
     this.at(this.#time);
@@ -117,7 +136,14 @@ export class Plot {
 
   #axes() {
     const [time, values] = axes();
-    return this.#strip ? [time, values] : [{ ...time, size: 6, values: () => [] }, values];
+    const found = this.#strip ? [time, values] : [{ ...time, size: 6, values: () => [] }, values];
+    return this.#second ? [...found, { ...values, scale: "second", side: 1, grid: { show: false } }] : found;
+  }
+
+  #series() {
+    const own = series(LINES, this.#shown);
+    const { colour, width, dash } = SECOND;
+    return this.#second ? [...own, { label: "second", scale: "second", stroke: css(colour), width, dash, points: { show: false } }] : own;
   }
 
   /** A click goes there; a drag looks closer, a double click at everything. */

@@ -8,6 +8,9 @@ export const KINDS = [
   { name: "executed", colour: "--curve-2", width: 1.5, means: "What was sent to the robot, after safety" },
 ];
 
+/** A signal of another joint in the same plot, on an axis of its own. */
+export const SECOND = { colour: "--text-strong", width: 1.5, dash: [1, 3] };
+
 /** The value of a custom property where the page stands now. */
 export function css(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
@@ -24,12 +27,14 @@ export function series(kinds, shown) {
   return [{}, ...kinds.map(look)];
 }
 
+export const AXIS = 56; // px, of the values
+
 /** The two axes: seconds and the joint's unit. */
 export function axes() {
   const line = { stroke: css("--text-muted"), grid: { stroke: css("--hairline"), width: 1 }, ticks: { show: false }, font: `13px ${css("--font")}` };
   return [
     { ...line, size: 24, values: (plot, ticks) => ticks.map((tick) => `${tick} s`) },
-    { ...line, size: 56, values: (plot, ticks) => ticks.map((tick) => tick.toFixed(2)) },
+    { ...line, size: AXIS, values: (plot, ticks) => ticks.map((tick) => tick.toFixed(2)) },
   ];
 }
 
