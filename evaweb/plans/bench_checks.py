@@ -18,8 +18,9 @@ from evaweb.journal import text
 from evaweb.plans import pictures, regions
 from evaweb.plans.allocation import hand_out
 from evaweb.plans.blinding_rules import has_looked_at_the_same
+from evaweb.plans.counting import fails_by
 from evaweb.plans.design import ended_at_an_ask
-from evaweb.plans.documents import require_scene
+from evaweb.plans.documents import require_checkpoints, require_scene
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
 from evaweb.roles import Role, require
 from evaweb.stations.models import Station
@@ -320,6 +321,8 @@ def _before(what: str, trial: Trial, user: Any) -> None:
         raise Conflict(_CLOSED_TRIAL_NOT_REPEATED_SO(plan=handout.plan, trial=trial.pk))
     if what in ("run", "judged"):
         require_scene(handout.plan, trial.scene)
+    if what == "prepared":  # asked for its set-up, then for its run
+        require_checkpoints(handout.plan)
     judged = what in ("scored", "voided", "void answered")
     if judged and handout.plan.sealed and has_looked_at_the_same(handout.plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_OPERATOR(plan=handout.plan))
@@ -331,9 +334,11 @@ def _repeated(handout: Handout) -> bool:
     return others.filter(trial__status=TrialStatus.SCORED).exists()
 
 
-def _blind(trial: Trial) -> bool:
-    return Plan.objects.filter(handouts__trial=trial, blind=True).exists()
+def _of_two(trial: Trial) -> bool:
+    """A scored trial of a blind plan, or a failure by the plan: else it would be tried again instead."""
+    handout = Handout.objects.select_related("plan").filter(trial=trial).first()
+    return handout is not None and (handout.plan.blind or fails_by(handout.plan, trial))
 
 
 declare_check(_before)
-declare_by_two(_blind)
+declare_by_two(_of_two)

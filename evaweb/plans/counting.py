@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.errors import Conflict
 from evaweb.plans.models import CountsAs, Handout, Plan
+from evaweb.trials.endings import ENDINGS, ending_of
 from evaweb.trials.models import Trial, TrialStatus
 from evaweb.trials.services import declare_check, declare_failing
 from runtime.core.sentences import Pattern
@@ -29,21 +29,23 @@ _SCORE_IT_FIRST = Pattern(
     "trial {trial} was ended by {what}: by {plan} that is a failure; score it before the next one",
 )
 
-ENDS = {"on_estop": "the e-stop", "on_interruption": "an interruption", "on_timeout": "its time limit"}
-_ESTOP = re.compile(r"\be-stop\b")
-_TIMEOUT = re.compile(r"the run's [\d.e+]+ s are over")
+ENDS = {f"on_{name}": words for name, words in ENDINGS.items()}
 
 
 def ended_by(trial: Trial) -> str:
     """Which of `ENDS` ended its run; "" where it ended by itself, or was stopped by the operator."""
-    return end_of(trial.status, trial.reason, trial.episode and trial.episode.status)
+    end = end_of(trial.ended_by, trial.status, trial.reason, trial.episode and trial.episode.status)
+    return f"on_{end}" if end else ""
 
 
-def end_of(status: str, reason: str, recording: str | None) -> str:
-    """The same of a trial's status and reason, and of the status of its episode, None without one."""
-    if status == TrialStatus.INTERRUPTED or recording in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED):
-        return "on_estop" if _ESTOP.search(reason) else "on_interruption"
-    return "on_timeout" if _TIMEOUT.search(reason) else ""
+def end_of(kept: str | None, status: str, reason: str, recording: str | None) -> str:
+    """One of `ENDINGS`, or "": as it was `kept` when the run ended; of a trial from before it was kept, None, by its
+    status and reason and the status of its episode, None without one.
+    """
+    if kept is not None:
+        return kept
+    broken = recording in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED)
+    return ending_of(status == TrialStatus.INTERRUPTED or broken, reason)
 
 
 def require_scored_first(plan: Plan, before: Trial | None) -> None:
@@ -62,6 +64,19 @@ def fails_by(plan: Plan, trial: Trial) -> bool:
     episode = trial.episode
     nothing = episode is None or (episode.status in CLOSED and not episode.frames)
     return counts == CountsAs.FAILURE and not nothing
+
+
+def declared_failures(plan: Plan) -> frozenset[int]:
+    """The trials that count as failures by the plan, whatever was reached."""
+    if all(getattr(plan, name) != CountsAs.FAILURE for name in ENDS):
+        return frozenset()
+    rows = Trial.objects.filter(handout__plan=plan, status=TrialStatus.SCORED, episode__frames__gt=0)
+    ends = ("ended_by", "status", "reason", "episode__status")
+    return frozenset(
+        trial
+        for trial, *end in rows.values_list("pk", *ends)
+        if getattr(plan, f"on_{end_of(*end)}", CountsAs.JUDGED) == CountsAs.FAILURE
+    )
 
 
 def _judged(what: str, trial: Trial, user: Any) -> None:

@@ -10,6 +10,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from itertools import combinations
 from typing import Any
 
@@ -45,7 +46,9 @@ ENDED = {
     "full": "all pairs of its comparison are made",
 }
 ENDED_EVENT = "ended"  # of a plan: an ask for its next trial found that, or its last trial
+CROSSED_EVENT = "crossed"  # of a plan: an ask found a boundary crossed while a void waited
 _SINCE_HOLM = 6  # the format of plans from which several comparisons with one test are decided step by step
+_ALL_KEPT = 7  # the format of plans from which a reveal keeps what counts also without a comparison
 _ENDS_NOTED = 6  # the format of plans from which every end that the server finds is such an event
 Names = tuple[str, str]
 
@@ -318,6 +321,12 @@ def ended_at_an_ask(plan: Plan) -> str:
     return told or ""
 
 
+def crossed_while_waiting(plan: Plan, since: datetime) -> str:
+    """Why the plan would have ended, as an ask found after a void was asked for; "" where none did."""
+    told = plan.events.filter(what=CROSSED_EVENT, at__gte=since).values_list("text", flat=True).first()
+    return told or ""
+
+
 def told_reason(plan: Plan, sealed: bool) -> str:
     """Why it was closed; of a plan that is `sealed` for the reader only what the server itself says.
 
@@ -343,7 +352,8 @@ def at_the_reveal(plan: Plan) -> dict[str, Any] | None:
 
     What is corrected later makes no other headline.
     """
-    if frozen(plan.document or {}) is None:
+    document = plan.document or {}
+    if frozen(document) is None and document.get("format", 1) < _ALL_KEPT:
         return None
     kept = counted_now(plan)
     for told in _told_of:
@@ -361,7 +371,9 @@ def recorded_so_far(plan: Plan) -> Hashable:
 def counted_now(plan: Plan) -> dict[str, Any]:
     """The blocks that count, and the sums of each checkpoint."""
     return {
-        "blocks": [[list(trial) for trial in block] for block in tried(plan).counted],
+        "blocks": [[list(trial) for trial in block] for block in tried(plan).counted]
+        if frozen(plan.document or {}) is not None
+        else [],
         "arms": _sums(plan),
     }
 

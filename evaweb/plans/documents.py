@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from typing import Any
 
+from evaweb.canonical import digest
 from evaweb.errors import Conflict, EvaError
 from evaweb.plans.counting import ENDS
 from evaweb.plans.design import drafted, planned
@@ -31,9 +32,22 @@ _SCENE_CHANGED_SINCE_FROZEN = Pattern(
     "scene {name} was changed since {plan} was frozen ({differs}): change it back, or amend the plan",
 )
 
+_CHECKPOINT_SWITCHED_OFF_OWNER_CAN = Pattern(
+    "plans.allocation.checkpoint_switched_off_owner_can",
+    "a checkpoint of {plan} is switched off: its owner can say why",
+)
+_CHECKPOINT_CHANGED_SINCE_FROZEN_CHANGE = Pattern(
+    "plans.allocation.checkpoint_changed_since_frozen_change",
+    "a checkpoint was changed since {plan} was frozen: change it back, or amend the plan",
+)
+_CHECKPOINT_RENAMED_SINCE_FROZEN = Pattern(
+    "plans.allocation.checkpoint_renamed_since_frozen",
+    "a checkpoint of {plan} was renamed since it was frozen: give it its old name back",
+)
 # 2 had no outcome, margin, looks or boundary; 3 one "comparison" at most, of paired blocks; 4 was scored by its scenes
-# as they were then; reveals of 5 kept neither caveats nor the digest of the record.
-FORMAT = 6
+# as they were then; reveals of 5 kept neither caveats nor the digest of the record,
+# those of 6 nothing of a plan without a comparison.
+FORMAT = 7
 _DRAWN_BY_ITSELF = 6  # the order within a block, from this format on
 
 
@@ -126,6 +140,22 @@ def scene_of(scene: Scene, positions: list[Position]) -> dict[str, Any]:
             for m in scene.milestones.order_by("order")
         ],
     }
+
+
+def require_checkpoints(plan: Plan) -> None:
+    """Conflict where one of the plan's checkpoints is not as it was frozen, or is switched off.
+
+    All of them, whichever the trial is of, and not which one: else switching one off would tell what comes next.
+    """
+    there = {row.name: row for row in plan.checkpoints.all()}
+    for row in (plan.document or {})["checkpoints"]:
+        now = there.get(row["name"])
+        if now is None:
+            raise Conflict(_CHECKPOINT_RENAMED_SINCE_FROZEN(plan=plan))
+        if not now.active:
+            raise Conflict(_CHECKPOINT_SWITCHED_OFF_OWNER_CAN(plan=plan))
+        if digest(checkpoint_of(now)) != digest(row):
+            raise Conflict(_CHECKPOINT_CHANGED_SINCE_FROZEN_CHANGE(plan=plan))
 
 
 def require_scene(plan: Plan, scene: Scene) -> None:

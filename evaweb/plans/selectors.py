@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from typing import Any
 
-from django.db.models import Count, Q, QuerySet
+from django.db.models import Q, QuerySet
 
 from evaweb.errors import NotFound
 from evaweb.plans.models import Handout, Plan, PlanState, Reference, Slot
 from evaweb.roles import Role, role_of
 from evaweb.stations.models import Station
-from evaweb.trials.models import Trial, TrialStatus
+from evaweb.trials.models import Checkpoint, Trial, TrialStatus
 from runtime.core.sentences import Pattern
 
 _NO_SUCH_PLAN = Pattern(
@@ -44,10 +46,23 @@ def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
 
 
 def plans_beside(plan: Plan) -> QuerySet[Plan]:
-    """Other plans, by another name, that were frozen with two of its checkpoints or more: they tell of the same."""
-    shared = Count("checkpoints", filter=Q(checkpoints__in=plan.checkpoints.values("pk")), distinct=True)
-    rows = Plan.objects.exclude(name=plan.name).exclude(state=PlanState.DRAFT)
-    return rows.annotate(shared=shared).filter(shared__gte=2).order_by("name", "version")
+    """Other plans, by another name, that were frozen with two of its checkpoints or more: they tell of the same.
+
+    A copy of a checkpoint is the same: of the same weights, or else asked at the same server, served in the same way.
+    """
+    rows = Checkpoint.objects.values_list("pk", "digest", "policy", "strategy")
+    what = {
+        pk: json.dumps([weights or policy, strategy], sort_keys=True)
+        for pk, weights, policy, strategy in rows
+    }
+    mine = Counter(what[pk] for pk in plan.checkpoints.values_list("pk", flat=True))
+    frozen = Plan.objects.exclude(name=plan.name).exclude(state=PlanState.DRAFT)
+    theirs: dict[int, Counter[str]] = defaultdict(Counter)
+    for other, checkpoint in frozen.values_list("pk", "checkpoints"):
+        if checkpoint is not None:
+            theirs[other][what[checkpoint]] += 1
+    same = [other for other, arms in theirs.items() if (arms & mine).total() >= 2]
+    return frozen.filter(pk__in=same).order_by("name", "version")
 
 
 def plans_open(*, station: Station) -> list[Plan]:

@@ -23,6 +23,7 @@ from evaweb.plans import commitment as blinding
 from evaweb.plans import reveals
 from evaweb.plans.counting import fails_by
 from evaweb.plans.design import (
+    CROSSED_EVENT,
     ENDED_EVENT,
     at_the_reveal,
     dropped_of,
@@ -336,7 +337,7 @@ def _revealed(user: User, plan: Plan, ready: tuple[Hashable, dict[str, Any] | No
     units = units_of(held)
     if not blinding.verified(digest(held.document or {}), units, bytes(held.key or b""), held.commitment):
         raise EvaError(_COMMITMENT_BROKEN(held=held, commitment=held.commitment))
-    if _slots(held) != [unit.row for unit in units]:
+    if slots_of(held) != [unit.row for unit in units]:
         raise EvaError(_RENAMED_SINCE_FROZEN(held=held))
     voids_lapse(_trials(held), user=user, now=True)
     held.state, held.revealed_at, held.revealed_by = PlanState.REVEALED, timezone.now(), user
@@ -374,11 +375,10 @@ def plan_end(*, user: User, plan: Plan, asked: bool = False) -> None:
     if found is None:
         return
     ended, waits = ended_at_an_ask(held), voids_waiting(_trials(held)).exists()
-    if (
-        asked and not ended and found.ended == "boundary" and not waits
-    ):  # a void that is refused puts its trial back
-        ended = ended_because(held, found)
-        _note(held, user, ENDED_EVENT, ended)
+    if asked and not ended and found.ended == "boundary":
+        # A void that is refused puts its trial back: until it is answered, the answer stays what it was.
+        ended = "" if waits else ended_because(held, found)
+        _note(held, user, CROSSED_EVENT if waits else ENDED_EVENT, ended_because(held, found))
     if not (ended or found.ended) or waits or _unfinished(held):
         return
     over = bool(ended) or not remaining(held, dropped_of(held))
@@ -461,7 +461,7 @@ def _check(plan: Plan, user: User) -> None:
         raise EvaError(covered(plan, sight_of(user))(found.text))
 
 
-def _slots(plan: Plan) -> list[list[Any]]:
+def slots_of(plan: Plan) -> list[list[Any]]:
     """The schedule as the database has it, as `Unit.row` says it."""
     named = ("index", "block", "checkpoint__name", "scene__name", "position__number", "repetition")
     return [list(row) for row in plan.slots.order_by("index").values_list(*named)]

@@ -16,6 +16,7 @@ from django.db import transaction
 from django.utils import timezone
 
 from evaweb.binary_frames import plain
+from evaweb.blinding import sight_of
 from evaweb.errors import Conflict, StationGone
 from evaweb.jobs.models import JobStatus
 from evaweb.jobs.selectors import job_newest
@@ -39,6 +40,10 @@ _NO_STATION_FREE_NONE_HAS = fixed(
     "preflights.services.no_station_free_none_has",
     "no station is free, and none has a deployment file for the worker: start a station, or wait for one",
 )
+_BLIND_TRIAL_UNDER_WAY = Pattern(
+    "preflights.services.blind_trial_under_way",
+    "{stations}: a blind trial is under way there, and its policy server is hidden from you; ask when it is scored",
+)
 _WITH_SAME_POLICY_SERVER_PREFLIGHT = Pattern(
     "preflights.services.with_same_policy_server_preflight",
     "{other} is {label} with the same policy server: a preflight would disturb it; wait until its run "
@@ -59,6 +64,8 @@ def preflight_ask(*, user: Any, checkpoint: Checkpoint, station: Station | None 
     where neither the station runs nor its deployment file is known.
     """
     require(user, Role.OPERATOR)
+    if hidden := sorted(sight_of(user).at_work):  # whichever server it is: an answer would tell
+        raise Conflict(_BLIND_TRIAL_UNDER_WAY(stations=", ".join(hidden)))
     chosen = station or _first_station()
     row = Preflight(checkpoint=checkpoint, station=chosen, user=user, policy=checkpoint.policy)
     try:

@@ -373,6 +373,12 @@ class Trial(models.Model):
     started_at = models.DateTimeField(null=True, blank=True)
     ended_at = models.DateTimeField(null=True, blank=True)
     duration_s = models.FloatField(null=True, blank=True, help_text="Without the time it was paused.")
+    ended_by = models.CharField(
+        max_length=14,
+        null=True,
+        blank=True,
+        help_text="estop, interruption or timeout, as its run ended; empty where it ended by itself.",
+    )
     voided_at = models.DateTimeField(null=True, blank=True)
     voided_by = models.ForeignKey(
         settings.AUTH_USER_MODEL, null=True, blank=True, on_delete=models.PROTECT, related_name="+"
@@ -393,7 +399,7 @@ class Trial(models.Model):
                 "attempt",
             ),
             *("station", "operator", "instruction", "strategy", "seed", "time_limit_s"),
-            *("prepared_at", "started_at", "ended_at"),
+            *("prepared_at", "started_at", "ended_at", "ended_by"),
         ),
         only=_JUDGED,
         moves={

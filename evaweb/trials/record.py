@@ -97,6 +97,9 @@ class TrialRecord(Line):
     prepared_at: Annotated[Moment | None, Column(open=True, table=False, type=datetime)] = None
     started_at: Annotated[Moment | None, Column(open=True, written="after")] = None
     ended_at: Annotated[Moment | None, Column(open=True, written="after")] = None
+    ended_by: Annotated[
+        str | None, Field(max_length=14), Column(open=True, written="after", api="never", table=False)
+    ] = None
     episode: Annotated[UUID | None, Column("episode_id", open=True, written="never")] = None
     truth: Annotated[dict[str, Any] | None, Column(open=True, written="after", api="detail", table=False)] = (
         None

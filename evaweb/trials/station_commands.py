@@ -210,6 +210,7 @@ def _require_prepared(trial: Trial, what: str, user: User) -> None:
         raise Conflict(
             _NOT_IN_THIS_STATE(trial=trial.pk, label=status.label, what=what, advice=lifecycle.advice(status))
         )
+    checked("prepared", trial, user)
     if not trial.checkpoint.active:
         raise Conflict(_CHECKPOINT_OFF_SINCE(label=sight_of(user).label(trial), trial=trial.pk))
 

@@ -19,6 +19,7 @@ from evaweb.episodes.services import episode_opened, publish_asked
 from evaweb.stations.commands import settle
 from evaweb.stations.models import Command, Station
 from evaweb.trials import lifecycle
+from evaweb.trials.endings import ending_of
 from evaweb.trials.lifecycle import Move
 from evaweb.trials.models import Trial, TrialStatus
 from runtime.ipc.session_state import SessionState
@@ -155,7 +156,7 @@ def _given_back(trial: Trial, reason: str) -> None:
     """It is as it was before its run was asked for, and says why."""
     lifecycle.apply(trial, Move.GIVE_BACK)
     trial.run = trial.run_event = trial.run_since = trial.episode = None
-    trial.started_at = trial.duration_s = None
+    trial.started_at = trial.duration_s = trial.ended_by = None
     trial.run_boot, trial.reason = "", reason
 
 
@@ -180,6 +181,8 @@ def _moved(trial: Trial, move: Move, reason: str, time: float | None) -> None:
     trial.reason = "" if move is Move.RESUME else reason
     if move in (Move.END, Move.INTERRUPT):
         trial.ended_at = timezone.now()
+        # What ended the run stays, whatever becomes of its recording.
+        trial.ended_by = trial.ended_by or ending_of(move is Move.INTERRUPT, reason)
 
 
 def _truth_told(station: Station, event: Mapping[str, Any]) -> Trial | None:

@@ -144,7 +144,7 @@ def alma(db: None) -> User:
 def nobody_computes(monkeypatch: pytest.MonkeyPatch) -> None:
     """The planner's process is busy: no test that asks every address waits for what it computes."""
 
-    def busy(*asked: object) -> None:
+    def busy(*asked: object, soon: bool = False) -> None:
         raise Busy("it computes for others")
 
     monkeypatch.setattr("evaweb.computing.questions.ask", busy)

@@ -58,7 +58,7 @@ def _in_order(lines):
 
 
 _TRIALS = ("trial", "first", "second")
-_LATER = ("failure_phase",)  # not in the lines of then
+_LATER = ("failure_phase", "frame")  # not in the lines of then
 
 
 def _then(line):
@@ -290,6 +290,6 @@ def test_what_is_not_said_to_be_open_is_hidden_with_the_checkpoint(bench):
 def test_a_trial_is_asked_for_with_what_is_known_before_its_run(bench):
     trial = bench.ended()
     assert TrialRecord.written(trial).keys() - TrialRecord.asked(trial).keys() == {
-        *("reason", "duration_s", "started_at", "ended_at", "truth")
+        *("reason", "duration_s", "started_at", "ended_at", "ended_by", "truth")
     }
     assert builders.BOOT not in json.dumps(TrialRecord.asked(trial))

@@ -7,24 +7,27 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Hashable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
 from statistics import median
 from typing import Any
 
 from django.contrib.admin.models import CHANGE, LogEntry
-from django.db.models import Count, F
+from django.db.models import Count, F, Q
 from django.utils import timezone
 
 from evaweb.memo import Kept
 from evaweb.plans.bench_checks import HOLDS
+from evaweb.plans.counting import end_of
 from evaweb.plans.design import Names, compared
 from evaweb.plans.models import Achieved, CameraCheck, Plan
+from evaweb.plans.models import Look as Behind
 from evaweb.plans.selectors import plans_beside
 from evaweb.results.analysis.drift import anchors_of
 from evaweb.results.analysis.integrity import changes_of, with_changes
 from evaweb.statistics.many import holm
 from evaweb.statistics.permutation import sign_flips
+from evaweb.trials.endings import ESTOP, INTERRUPTION
 from evaweb.trials.models import Scene, Score, TrialStatus, VoidRequest
 
 DELAYS = {
@@ -67,6 +70,7 @@ class Run:
     connect: float | None
     warm_up: float | None
     latency: float | None
+    ended: str = ""
 
     @property
     def counts(self) -> bool:
@@ -86,7 +90,7 @@ def conduct_of(plan: Plan, runs: Sequence[Run], looks: Iterable[Look]) -> dict[s
     """
     given_back = plan.events.filter(what="given back").order_by("pk")
     return {
-        "looks": list(plan.looks.order_by("at").values("at", by_name=F("user__username"))),
+        "looks": _looked(plan),
         "beside": [
             {"plan": row.name, "version": row.version, "state": row.state, "trials": row.trials}
             for row in plans_beside(plan).annotate(trials=Count("handouts", distinct=True))
@@ -107,6 +111,19 @@ def conduct_of(plan: Plan, runs: Sequence[Run], looks: Iterable[Look]) -> dict[s
     }
 
 
+def _looked(plan: Plan) -> list[dict[str, Any]]:
+    """Looks behind the blind: of this version, of earlier ones and of plans beside; `before`: it was frozen later."""
+    of_the_same = Q(plan__name=plan.name, plan__version__lte=plan.version) | Q(plan__in=plans_beside(plan))
+    rows = Behind.objects.filter(of_the_same).order_by("at", "pk")
+    named = {"by_name": F("user__username"), "name": F("plan__name"), "version": F("plan__version")}
+    return [
+        {**row, "own": (row["name"], row["version"]) == (plan.name, plan.version)}
+        | {"before": plan.frozen_at is not None and row["at"] < plan.frozen_at}
+        for row in rows.values("at", **named)
+        if plan.kept_at is None or row["at"] <= plan.kept_at
+    ]
+
+
 def runs_of(plan: Plan, looks: Iterable[Look]) -> list[Run]:
     """Every attempt in the order in which it was handed out; one query."""
     fields = (
@@ -121,14 +138,18 @@ def runs_of(plan: Plan, looks: Iterable[Look]) -> list[Run]:
     own = ("status", "attempt", "operator__username", "station__name", "started_at", "ended_at")
     voided = ("reason", "voided_at", "voided_by__username")
     rows, accepted = plan.handouts.order_by("number"), _accepted(looks)
-    told = ("trial__setup_took", "trial__episode__policy")
+    told = ("trial__setup_took", "trial__episode__policy", "trial__ended_by", "trial__episode__status")
     found = []
     named = [f"trial__{name}" for name in (*own, *voided)]
     for row in rows.values_list(*fields, *named, *told):
-        plain, took, policy = row[:-2], row[-2], row[-1]
+        *plain, took, policy, kept, recording = row
         latency = _number(policy, "latency_ms", "p50")
         delays = (_number(took, "connect_s"), _number(took, "warm_up_s"), latency and latency / 1000)
-        found.append(Run(*plain, *accepted.get(row[fields.index("trial_id")], (None, "")), *delays))
+        made = Run(*plain, *accepted.get(row[fields.index("trial_id")], (None, "")), *delays)
+        told_now = made.status == TrialStatus.VOIDED and kept is None  # its reason is a person's
+        found.append(
+            made if told_now else replace(made, ended=end_of(kept, made.status, made.reason or "", recording))
+        )
     return found
 
 
@@ -251,7 +272,7 @@ def _voids(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def _broken_off(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Attempts that were interrupted and have no score, or that never ran, and why."""
+    """Attempts that the e-stop or an interruption ended, or that never ran, and why."""
     return [
         {
             "trial_id": run.trial,
@@ -259,11 +280,14 @@ def _broken_off(runs: Sequence[Run]) -> list[dict[str, Any]]:
             "checkpoint": run.checkpoint,
             "by_name": run.operator,
             "at": run.ended_at or run.handed_at,
-            "ran": run.status == TrialStatus.INTERRUPTED,
+            "ran": run.status != TrialStatus.ABANDONED,
+            "ended": run.ended,
+            "counts": run.counts,
             "reason": run.reason,
         }
         for run in runs
         if run.status in (TrialStatus.INTERRUPTED, TrialStatus.ABANDONED)
+        or run.ended in (ESTOP, INTERRUPTION)
     ]
 
 

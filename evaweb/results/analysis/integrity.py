@@ -8,7 +8,8 @@ from typing import Any
 
 from django.db.models import Count, F, QuerySet
 
-from evaweb.plans.models import Plan
+from evaweb.plans.counting import end_of
+from evaweb.plans.models import CountsAs, Plan
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
 
 VERDICT, CATEGORY, NOTE = "verdict", "category", "note"
@@ -21,7 +22,8 @@ class Changes:
 
     Voided trials are told apart by what their score said before (`voided_unscored`: there was none); of `asked`
     the void waits for a second operator. Scores that were corrected: `to_success`, `to_failure`, and `late` those
-    after the reveal, without corrections of a failure's category alone.
+    after the reveal, without corrections of a failure's category alone. `estop`, `interruption` and `timeout`: runs
+    that these ended; `declared`: those that count and are failures by the plan, whatever was reached.
     """
 
     checkpoint: str
@@ -31,6 +33,10 @@ class Changes:
     voided_failures: int = 0
     voided_unscored: int = 0
     asked: int = 0
+    estop: int = 0
+    interruption: int = 0
+    timeout: int = 0
+    declared: int = 0
     interrupted: int = 0
     abandoned: int = 0
     to_success: int = 0
@@ -49,8 +55,9 @@ def changes_of(plan: Plan) -> list[Changes]:
     """Those of each checkpoint, in the order of their names; as many queries whatever the number of trials."""
     found: dict[str, Changes] = {}
     trials = Trial.objects.filter(handout__plan=plan).order_by("checkpoint__name")
-    for name, status, success, operator, station in trials.values_list(
-        "checkpoint__name", "status", "verdict__success", "operator__username", "station__name"
+    ends = ("ended_by", "status", "reason", "episode__status", "episode__frames")
+    for name, status, success, operator, station, *end, frames in trials.values_list(
+        "checkpoint__name", "status", "verdict__success", "operator__username", "station__name", *ends
     ):
         row = found.setdefault(name, Changes(name))
         row.attempts += 1
@@ -63,6 +70,11 @@ def changes_of(plan: Plan) -> list[Changes]:
         row.abandoned += status == TrialStatus.ABANDONED
         row.operators.add(operator)
         row.stations.add(station)
+        ended = "" if status == TrialStatus.VOIDED and end[0] is None else end_of(*end)
+        if ended:
+            setattr(row, ended, getattr(row, ended) + 1)
+            fails = getattr(plan, f"on_{ended}") == CountsAs.FAILURE
+            row.declared += fails and bool(frames) and status == TrialStatus.SCORED
     scores = Score.objects.filter(trial__handout__plan=plan)
     for score in with_changes(scores, name=F("trial__checkpoint__name"), at=F("scored_at")):
         earlier, success = score["earlier"], score["success"]

@@ -19,6 +19,7 @@ from evaweb.errors import EvaError
 from evaweb.lists import Listing
 from evaweb.plans import services
 from evaweb.plans.blinding_rules import look, may_look
+from evaweb.plans.design import compared
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results import selectors
 from evaweb.results.analysis import caching
@@ -180,7 +181,7 @@ def cite(request: HttpRequest, name: str, version: int) -> HttpResponse:
     sealed = _sealed_page(request, found)
     if sealed:
         return sealed
-    if found.at_reveal:
+    if found.at_reveal and compared(found.document or {}):
         return redirect("result-frozen", digest=found.at_reveal["digest"])
     try:
         return _citation_page(request, citation(found))

@@ -11,6 +11,7 @@ from evaweb.results.analysis.conduct import conduct_of, looks_of, runs_of
 from evaweb.results.analysis.integrity import CATEGORY, VERDICT
 from evaweb.results.presentation.wording import p_words
 from evaweb.results.presentation.would_be import would_be
+from evaweb.trials.endings import ENDINGS, ESTOP, INTERRUPTION
 
 _RARE = 0.05  # probability at or below which an anchor is said to drift
 
@@ -59,9 +60,13 @@ def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
     other = [row["what"] for row in found["headline"] if row["same"] is False]
     if other:
         yield f"The headline would change: {'; '.join(other)}"
-    looks = [row["by_name"] for row in found["looks"]]
+    looks = [row["by_name"] for row in found["looks"] if row["own"]]
     if looks:
         yield f"Looked behind the blind before the reveal: {', '.join(looks)}"
+    for row in found["looks"]:
+        if not row["own"]:
+            when = "before this version was frozen" if row["before"] else "before the reveal of this one"
+            yield f"{row['by_name']} looked behind the blind of {row['name']} v{row['version']} {when}"
     if found["beside"]:
         named = ", ".join(
             f"{row['plan']} v{row['version']} ({_of(row['trials'], 'trial')})" for row in found["beside"]
@@ -81,6 +86,13 @@ def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
         if any(row[what] for row in rows):
             counts = ", ".join(f"{row['checkpoint']} {row[what]} of {row['attempts']}" for row in rows)
             yield f"Attempts {words}: {counts}"
+    for what in (ESTOP, INTERRUPTION):  # most runs that fail end by their time limit
+        if any(row[what] for row in rows):
+            counts = ", ".join(f"{row['checkpoint']} {row[what]} of {row['attempts']}" for row in rows)
+            yield f"Runs ended by {ENDINGS[what]}: {counts}"
+    if any(row["declared"] for row in rows):
+        counts = ", ".join(f"{row['checkpoint']} {row['declared']} of {row['counted']}" for row in rows)
+        yield f"Failures by the plan, whatever was reached: {counts}"
     edits = Counter(row["what"] for row in found["edits"])
     if edits:
         named = ", ".join(f"{what} ({number})" for what, number in sorted(edits.items()))

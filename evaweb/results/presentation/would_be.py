@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from evaweb.memo import Kept
+from evaweb.plans.counting import declared_failures
 from evaweb.plans.design import Attempt, arms_of, attempts_of, blocks_of, compared, frozen, kept_blocks
 from evaweb.plans.models import Plan
 from evaweb.results.presentation.headline import in_the_worst_case, sentence_of, told_alone
@@ -106,6 +107,8 @@ def _ways(
                 f"without {field} {name}", lambda each, name=name, field=field: getattr(each, field) == name
             )
     yield without("only first attempts", lambda each: each.attempt > 1)
+    if declared := declared_failures(plan):
+        yield without("without failures by the plan's declaration", lambda each: each.trial in declared)
     gate = (plan.document or {}).get("match_gate")
     if gate is not None:
         low = f"without trials whose bench matched less than {gate:g}"

@@ -96,7 +96,11 @@ def _order(plan: Plan) -> Item:
 
 
 def _blind(plan: Plan) -> Item:
-    looked = [look.user.get_username() for look in Look.objects.filter(plan=plan).select_related("user")]
+    looks = Look.objects.filter(plan__name=plan.name, plan__version__lte=plan.version).order_by("at")
+    looked = [
+        look.user.get_username() + (f" (version {look.plan.version})" if look.plan_id != plan.pk else "")
+        for look in looks.select_related("user", "plan")
+    ]
     if not plan.blind:
         return Item("Operators blind", "no", "the plan was open")
     words = (

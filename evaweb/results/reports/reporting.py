@@ -15,14 +15,14 @@ from django.template.loader import render_to_string
 from django.utils import timezone
 
 from evaweb.errors import EvaError
+from evaweb.plans.counting import ENDS
 from evaweb.plans.design import blocks_that_count, compared, frozen
-from evaweb.plans.models import Plan, PlanState
+from evaweb.plans.models import CountsAs, Plan, PlanState
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import Chosen
 from evaweb.results.analysis.integrity import changes_of
-from evaweb.results.models import Judgement, Rating
 from evaweb.results.presentation import facts, listings
 from evaweb.results.presentation.drawings import conditions, courses, rates
 from evaweb.results.presentation.headline import headline, with_planned_letters
@@ -30,7 +30,7 @@ from evaweb.results.presentation.integrity import delays_banner, integrity_docum
 from evaweb.results.reports import bench_photos as laid_out
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.document import analysis_document
-from evaweb.results.reports.tables import COLUMNS, SCORE_COLUMNS, outcome_pages, score_pages
+from evaweb.results.reports.tables import COLUMNS, JUDGED, SCORE_COLUMNS, outcome_pages, score_pages
 from evaweb.statistics.designs import estimated, findings
 from evaweb.statistics.difference import Difference
 from evaweb.tabular_export import csv_lines
@@ -56,21 +56,6 @@ _STYLES = (
 )
 MOST_LINES = 1000  # of a list in the report's page; its data have all
 _PROGRAM = Path(__file__).parent / "recompute"
-_RATINGS = (
-    *("trial", "rater", "success", "score", "milestones", "failure", "failure_phase", "note", "blind", "at"),
-)
-_PREFERENCES = (
-    "first",
-    "second",
-    "first_checkpoint",
-    "second_checkpoint",
-    "outcome",
-    "why",
-    "rater",
-    "blind",
-    "at",
-)
-_JUDGEMENTS = ("trial", "judge", "version", "model", "milestones", "reason", "prompt", "pictures", "at")
 
 
 def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> Path:
@@ -92,12 +77,12 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     _json(data / "integrity.json", record)
     _csv(data / "trials.csv", list(COLUMNS), outcome_pages(plan))
     _csv(data / "scores.csv", SCORE_COLUMNS, score_pages(plan))
-    _csv(data / "ratings.csv", _RATINGS, _ratings(plan))
-    _csv(data / "preferences.csv", _PREFERENCES, _preferences(plan))
-    _csv(data / "judgements.csv", _JUDGEMENTS, _judgements(plan))
+    for name, (columns, rows) in JUDGED.items():
+        _csv(data / f"{name}.csv", columns, iter([rows(plan)]))
     _csv(data / "laid_out.csv", laid_out.COLUMNS, laid_out.as_text(laid_out.laid_out(plan)))
     left = laid_out.write_pictures(plan, data / "pictures", most_pictures)
     shutil.copytree(_PROGRAM, out / "recompute", ignore=shutil.ignore_patterns("__pycache__"))
+    (out / "recompute" / "page.css").write_text(_styles(), "utf-8")
     page = out / "index.html"
     told = {"record": record, "banner": delays_banner(record), "most": MOST_LINES}
     context = {
@@ -172,10 +157,11 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         "document": plan.document,
         "seal": seal_of(plan),
         "analysis": analysis,
-        "styles": "\n".join(_style(name) for name in _STYLES),
+        "styles": _styles(),
         "made": timezone.now(),
+        "ends": _ends(plan.document or {}),
         "changes": changes_of(plan),
-        "headline": headline(plan) if primaries else None,
+        "headline": headline(plan),
         "primaries": [facts.comparison_facts(plan, analysis, found) for found in primaries],
         "table": listings.arm_rows(plan, analysis, Chosen()),
         "others": [
@@ -217,6 +203,12 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
     }
 
 
+def _ends(document: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What a run that did not end by itself counts as, in words."""
+    said = document.get("counts_as", {})
+    return [(words, CountsAs(said[name]).label) for name, words in ENDS.items() if name in said]
+
+
 def _benches(plan: Plan, folder: Path) -> dict[int, list[dict[str, Any]]]:
     """Of each trial what its cameras showed, as far as the pictures are in the report."""
     there = {path.stem for path in folder.glob("*.jpg")}
@@ -228,45 +220,15 @@ def _benches(plan: Plan, folder: Path) -> dict[int, list[dict[str, Any]]]:
     return dict(found)
 
 
+def _styles() -> str:
+    return "\n".join(_style(name) for name in _STYLES)
+
+
 def _style(name: str) -> str:
     found = finders.find(name)
     if not isinstance(found, str):
         raise EvaError(_STYLE_SHEET_NOT_WHERE_INSTALLED(name=name))
     return Path(found).read_text("utf-8")
-
-
-def _ratings(plan: Plan) -> Iterator[list[dict[str, Any]]]:
-    rows = Rating.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
-    yield [
-        {
-            **{name: getattr(row, name) for name in _RATINGS},
-            "trial": row.trial_id,
-            "rater": row.rater.get_username(),
-            "milestones": json.dumps(row.milestones, ensure_ascii=False),
-        }
-        for row in rows
-    ]
-
-
-def _judgements(plan: Plan) -> Iterator[list[dict[str, Any]]]:
-    rows = Judgement.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
-    listed = ("milestones", "pictures")
-    yield [
-        {
-            **{name: getattr(row, name) for name in _JUDGEMENTS},
-            "trial": row.trial_id,
-            **{name: json.dumps(getattr(row, name), ensure_ascii=False) for name in listed},
-        }
-        for row in rows
-    ]
-
-
-def _preferences(plan: Plan) -> Iterator[list[dict[str, Any]]]:
-    fields = ("first_id", "second_id", "first__checkpoint__name", "second__checkpoint__name")
-    rows = plan.preferences.order_by("pk").values_list(
-        *fields, "outcome", "why", "rater__username", "blind", "at"
-    )
-    yield [dict(zip(_PREFERENCES, row, strict=True)) for row in rows]
 
 
 def _json(path: Path, content: Mapping[str, Any]) -> None:

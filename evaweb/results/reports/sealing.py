@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from datetime import datetime
 from typing import Any
 
 from evaweb.canonical import digest
@@ -10,8 +12,9 @@ from evaweb.plans.design import declare_kept
 from evaweb.plans.models import Plan
 from evaweb.results.presentation.caveats import caveats_of
 from evaweb.results.presentation.headline import headline
+from evaweb.results.presentation.integrity import integrity_document
 from evaweb.results.presentation.setting import setting_now
-from evaweb.results.reports.tables import SCORE_COLUMNS, outcome_pages, score_pages
+from evaweb.results.reports.tables import JUDGED, SCORE_COLUMNS, outcome_pages, score_pages
 from evaweb.tabular_export import plain
 from evaweb.trials.models import TrialStatus
 
@@ -20,7 +23,8 @@ ATTEMPT = (
     *("trial", "uuid", "order", "code", "slot", "block", "checkpoint", "scene", "position", "repetition"),
     *("attempt", "why_again", "station", "operator", "started_at", "ended_at"),
 )
-MEASURED = ("trial", "duration_s", "ended_by")
+MEASURED = ("trial", "duration_s", "ended_by", "frames")
+STAYS = ("looks", "voids", "cameras")  # of the integrity page
 LOOKED_AT = ("smoothness", "smoothness_commanded")  # of a recording, by the worker
 
 
@@ -33,6 +37,8 @@ def kept_of(plan: Plan) -> dict[str, Any]:
         "setting": setting_now(plan),
         "record": digest({"attempts": list(_attempts(plan)), "scores": list(_scores(plan))}),
         "measured": _measured(plan),
+        "judged": digest(_judged(plan)),
+        "conduct": digest(_conduct(plan)),
     }
 
 
@@ -47,7 +53,23 @@ def _measured(plan: Plan) -> dict[str, Any]:
         ]
         for row in rows
     ]
-    return {"digest": digest(values), "later": later}
+    return {"digest": digest(values), "later": later, "names": list(MEASURED)}
+
+
+def _judged(plan: Plan) -> dict[str, list[list[str]]]:
+    return {
+        name: [[plain(row[c]) for c in columns] for row in rows(plan)]
+        for name, (columns, rows) in JUDGED.items()
+    }
+
+
+def _conduct(plan: Plan) -> dict[str, Any]:
+    """What of the integrity page no later correction changes, as its JSON says it."""
+    record = integrity_document(plan)
+    found: dict[str, Any] = json.loads(
+        json.dumps({name: record[name] for name in STAYS}, default=datetime.isoformat)
+    )
+    return found
 
 
 def _attempts(plan: Plan) -> Iterator[list[str]]:

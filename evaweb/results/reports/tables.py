@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import datetime
 from typing import Any, get_args
 
@@ -13,6 +13,7 @@ from django.db.models import QuerySet
 from evaweb.plans.counting import end_of
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.filters import Chosen
+from evaweb.results.models import Judgement, Rating
 from evaweb.results.presentation.headline import headline
 from evaweb.tabular_export import in_pages
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
@@ -52,10 +53,15 @@ _ALL = _OF_PLAN | {
     if column.table
 }
 _ORDER = dict.fromkeys((*_FIRST, *_ALL))
-COLUMNS: dict[str, Any] = {name: _ALL[name][0] for name in _ORDER} | {"headline": str, "ended_by": str}
+COLUMNS: dict[str, Any] = {name: _ALL[name][0] for name in _ORDER} | {
+    "headline": str,
+    "ended_by": str,
+    "frames": int | None,
+}
 """The columns of an export with their types; those of the score are empty where there is none.
 
-`ended_by`: estop, interruption or timeout, empty where a run ended by itself or by the operator, or was voided.
+`ended_by`: estop, interruption or timeout, empty where a run ended by itself or by the operator. `frames`: rows of its
+recording.
 `headline`, the same in each row, is what the plan's design says of its comparison: a table that is taken elsewhere
 keeps it.
 """
@@ -109,11 +115,13 @@ def _headline(plan: Plan) -> str:
 
 def _rows(said: str, attempts: QuerySet[Trial]) -> list[dict[str, Any]]:
     found = []
-    for *row, recording in attempts.values_list(*_FIELDS, "episode__status"):
+    for *row, kept, recording, frames in attempts.values_list(
+        *_FIELDS, "ended_by", "episode__status", "episode__frames"
+    ):
         told = dict(zip(_ORDER, row, strict=True))
         voided = told["status"] == TrialStatus.VOIDED  # its reason is a person's
-        end = "" if voided else end_of(told["status"], told["reason"], recording).removeprefix("on_")
-        found.append(told | {"headline": said, "ended_by": end})
+        end = "" if voided and kept is None else end_of(kept, told["status"], told["reason"], recording)
+        found.append(told | {"headline": said, "ended_by": end, "frames": frames})
     reached = milestones_of([row["milestones"] for row in found if row["milestones"]])
     for row in found:
         row["milestones"] = json.dumps(reached.get(row["milestones"], []), ensure_ascii=False)
@@ -141,3 +149,62 @@ def score_pages(plan: Plan) -> Iterator[list[dict[str, Any]]]:
             {**row, "milestones": json.dumps(reached.get(row["milestones"], []), ensure_ascii=False)}
             for row in page
         ]
+
+
+_RATINGS = (
+    *("trial", "rater", "success", "score", "milestones", "failure", "failure_phase", "note", "blind", "at"),
+)
+_PREFERENCES = (
+    "first",
+    "second",
+    "first_checkpoint",
+    "second_checkpoint",
+    "outcome",
+    "why",
+    "rater",
+    "blind",
+    "at",
+)
+_JUDGEMENTS = ("trial", "judge", "version", "model", "milestones", "reason", "prompt", "pictures", "at")
+
+
+def _ratings(plan: Plan) -> list[dict[str, Any]]:
+    rows = Rating.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
+    return [
+        {
+            **{name: getattr(row, name) for name in _RATINGS},
+            "trial": row.trial_id,
+            "rater": row.rater.get_username(),
+            "milestones": json.dumps(row.milestones, ensure_ascii=False),
+        }
+        for row in rows
+    ]
+
+
+def _judgements(plan: Plan) -> list[dict[str, Any]]:
+    rows = Judgement.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
+    listed = ("milestones", "pictures")
+    return [
+        {
+            **{name: getattr(row, name) for name in _JUDGEMENTS},
+            "trial": row.trial_id,
+            **{name: json.dumps(getattr(row, name), ensure_ascii=False) for name in listed},
+        }
+        for row in rows
+    ]
+
+
+def _preferences(plan: Plan) -> list[dict[str, Any]]:
+    fields = ("first_id", "second_id", "first__checkpoint__name", "second__checkpoint__name")
+    rows = plan.preferences.order_by("pk").values_list(
+        *fields, "outcome", "why", "rater__username", "blind", "at"
+    )
+    return [dict(zip(_PREFERENCES, row, strict=True)) for row in rows]
+
+
+JUDGED: dict[str, tuple[tuple[str, ...], Callable[[Plan], list[dict[str, Any]]]]] = {
+    "ratings": (_RATINGS, _ratings),
+    "preferences": (_PREFERENCES, _preferences),
+    "judgements": (_JUDGEMENTS, _judgements),
+}
+"""Tables of what raters and judges said, with their columns."""

@@ -1,4 +1,7 @@
-"""Computes every number of this report again and says which do not come out; exit code 0 where all do."""
+"""Computes every number of this report again and says which do not come out.
+
+Exit code 0 where all do, 1 where one does not, 2 where nothing contradicts but no key shows that nothing was rewritten.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,19 @@ from typing import Any
 from .designs import error, kept_blocks, kept_faults, planned, planned_letters, share_of
 from .judged import agreement, by_words, calibration, on_milestone, preferences, score_alpha
 from .numbers import Drawn, Trial, numbers
+from .page import read, said_faults
 from .record import changes, gaps
 from .scenes import ending_faults, scene_faults
 from .sealed import faults
 from .words import headline_faults, page_faults
 
 _SHOWN = 40
+_DECLARED = ("estop", "interruption", "declared")
+_TABLES = ("trials", "scores", "ratings", "preferences", "judgements", "laid_out")
+_FILES = {f"{name}.json" for name in ("plan", "seal", "numbers", "integrity")} | {
+    f"{name}.csv" for name in _TABLES
+}
+_FILES |= {"pictures"}
 _CLOSE = 1e-6  # relative: both ways to a number end in the last bits of different sums
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # as the export has it
 Rows = list[dict[str, str]]
@@ -34,18 +44,26 @@ _TAIL = 0.015  # of what was drawn anew, how much more or less than 2.5 % may li
 def main() -> int:
     """Compare, tell."""
     data = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "data"
-    plan, seal, shown = (
-        json.loads((data / name).read_text("utf-8")) for name in ("plan.json", "seal.json", "numbers.json")
+    plan, seal, shown, record = (
+        json.loads((data / f"{name}.json").read_text("utf-8"), object_pairs_hook=_once)
+        for name in ("plan", "seal", "numbers", "integrity")
     )
     rows, scores, ratings, preferred, judgements = (
         _rows(data / f"{name}.csv") for name in ("trials", "scores", "ratings", "preferences", "judgements")
     )
-    record = json.loads((data / "integrity.json").read_text("utf-8"))
-    page = (data.parent / "index.html").read_text("utf-8")
+    styles = Path(__file__).with_name("page.css")
+    page, hidden = read(
+        (data.parent / "index.html").read_text("utf-8"),
+        styles.read_text("utf-8") if styles.exists() else None,
+    )
+    judged = {"ratings": ratings, "preferences": preferred, "judgements": judgements}
     wrong = [
+        *hidden,
+        *(f"data/{name} is no part of a report" for name in sorted(_names(data) - _FILES)),
+        *said_faults(page, seal, plan, shown),
         *faults(seal, plan, rows),
         *gaps(rows, scores, record),
-        *changes(rows, scores, seal, record, page),
+        *changes(rows, scores, judged, seal, record),
         *kept_faults(rows, scores, plan, seal["at_reveal"]),
         *_boundary(plan),
     ]
@@ -58,7 +76,7 @@ def main() -> int:
         if seal["at_reveal"]:
             blocks, told = kept_blocks(seal["at_reveal"]), seal["at_reveal"].get("headline", ())
             wrong += headline_faults(said, blocks, plan, told)
-        wrong += page_faults(page, shown, trials)
+        wrong += page_faults(page, shown, trials, _later(scores, seal["at_reveal"]))
         found = numbers(trials, plan, said)
         found |= {
             "letters": planned_letters(trials, plan, seal["at_reveal"]) or found["letters"],
@@ -83,13 +101,70 @@ def main() -> int:
         print(line)
     if len(wrong) > _SHOWN:
         print(f"and {len(wrong) - _SHOWN} others")
+    for line in statement(seal, plan, shown, record):
+        print(line)
     kept = "with its key, schedule and codes" if seal["key"] else "by its digest"
     print(f"frozen under the commitment {seal['commitment']}: hold it against what was published then")
     if seal["at_reveal"]:
         digest = seal["at_reveal"]["digest"]
         print(f"kept at the reveal under the digest {digest}: hold it against what was published then")
     print(f"{seen} numbers from {len(rows)} trials, and the plan {kept}: {len(wrong)} do not come out")
-    return 1 if wrong else 0
+    if wrong:
+        return 1
+    if not seal["key"]:
+        print(
+            "NOT REVEALED: nothing ties plan and scores to what was published before; all of it could be rewritten"
+        )
+    return 0 if seal["key"] else 2
+
+
+def statement(
+    seal: dict[str, Any], plan: dict[str, Any], shown: dict[str, Any], record: dict[str, Any]
+) -> Iterator[str]:
+    """What follows from the data, whatever the page beside them says."""
+    kept = seal["at_reveal"] or {}
+    yield f"What follows from data/, of {plan['title']} v{plan['version']}, {plan['stopping']['rule']}:"
+    for sentence in (*kept.get("headline", ()), kept.get("setting", "")):
+        yield f"  {sentence}" if sentence else "  (no comparison was decided)"
+    for name, arm in shown["arms"].items():
+        low, high = (100 * end for end in arm["wilson"])
+        yield f"  {name}: {arm['successes']} of {arm['n']}, 95 % Wilson {low:.0f} to {high:.0f} %"
+    for row in record.get("checkpoints", ()):
+        counts = (
+            "voided",
+            "repeated",
+            "interrupted",
+            "abandoned",
+            "to_success",
+            "to_failure",
+            "late",
+            *_DECLARED,
+        )
+        seen = [f"{row[name]} {name.replace('_', ' ')}" for name in counts if row.get(name)]
+        if seen:
+            yield f"  {row['checkpoint']}: {row['attempts']} attempts, {', '.join(seen)}"
+    for sentence in kept.get("caveats", ()):
+        yield f"  doubt: {sentence}"
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON in which each key stands once."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError(f"a key stands twice in {sorted(found)[:3]} ...")
+    return found
+
+
+def _names(data: Path) -> set[str]:
+    return {path.name for path in data.iterdir()}
+
+
+def _later(scores: Rows, at_reveal: dict[str, Any] | None) -> bool:
+    """Whether scores came after the reveal."""
+    if not at_reveal:
+        return False
+    then = datetime.fromisoformat(at_reveal["at"])
+    return any(datetime.fromisoformat(score["scored_at"]) > then for score in scores)
 
 
 def _boundary(plan: dict[str, Any]) -> list[str]:
@@ -105,7 +180,10 @@ def _boundary(plan: dict[str, Any]) -> list[str]:
 
 def _rows(path: Path) -> Rows:
     with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+        reader = csv.DictReader(file)
+        rows = list(reader)
+    if len({*(reader.fieldnames or ())}) < len(reader.fieldnames or ()):
+        raise ValueError(f"{path.name}: a column stands twice")
     for number, row in enumerate(rows, start=1):
         if None in row or None in row.values():
             raise ValueError(f"{path.name}: row {number} has another number of cells than the head")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import html
-import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
+from itertools import pairwise
 from typing import Any
 
 from .sealed import digest
@@ -21,10 +20,9 @@ SCORE = (
     *("trial", "rater", "source", "success", "score", "milestones", "failure", "failure_phase", "note"),
     *("reason", "scored_at"),
 )
+ENDED = ("estop", "interruption", "timeout")
+STAYS = ("looks", "voids", "cameras")  # after a reveal
 Rows = Sequence[Mapping[str, str]]
-HIDDEN = re.compile(
-    r"<!--.*?-->|<(script|style|template)\b.*?</\1>", re.DOTALL
-)  # of a page, from who reads it
 
 
 def gaps(rows: Rows, scores: Rows, record: Mapping[str, Any]) -> list[str]:
@@ -51,18 +49,63 @@ def gaps(rows: Rows, scores: Rows, record: Mapping[str, Any]) -> list[str]:
         for trial, told in given.items()
         if len(told) > 1 and trial not in told_of
     ]
-    by = {row["checkpoint"]: row["voided"] for row in record.get("checkpoints", ())}
+    return found + list(_counts(rows, given, record)) + list(_copies(rows, given))
+
+
+def _counts(rows: Rows, given: Mapping[str, Rows], record: Mapping[str, Any]) -> Iterator[str]:
+    """What integrity.json counts of each checkpoint otherwise than the tables."""
+    by = {row["checkpoint"]: row for row in record.get("checkpoints", ())}
     for name in sorted({row["checkpoint"] for row in rows}):
-        voided = sum(row["status"] == "voided" for row in rows if row["checkpoint"] == name)
-        if by.get(name) != voided:
-            found.append(f"{voided} trials of {name} are voided, integrity.json says {by.get(name)}")
-    return found
+        own = [row for row in rows if row["checkpoint"] == name]
+        turned = [
+            (one["success"], other["success"])
+            for row in own
+            for one, other in pairwise(given.get(row["trial"], ()))
+        ]
+        statuses = Counter(row["status"] for row in own)
+        counts = {
+            "attempts": len(own),
+            "counted": statuses["scored"],
+            "voided": statuses["voided"],
+            "asked": statuses["void_asked"],
+            "interrupted": statuses["interrupted"],
+            "abandoned": statuses["abandoned"],
+            "repeated": sum(int(row["attempt"]) > 1 for row in own),
+            "to_success": turned.count(("false", "true")),
+            "to_failure": turned.count(("true", "false")),
+        }
+        said = by.get(name, {})
+        counts |= {what: sum(row.get("ended_by") == what for row in own) for what in ENDED if what in said}
+        for what, number in counts.items():
+            if said.get(what) != number:
+                words = what.replace("_", " ")
+                yield f"{number} trials of {name} are {words}, integrity.json says {said.get(what)}"
+    voided = {row["trial"] for row in rows if row["status"] in ("voided", "void_asked")}
+    told = {str(row["trial_id"]) for row in record.get("voids", ())}
+    yield from (f"integrity.json does not have the void of trial {trial}" for trial in sorted(voided - told))
+    broken = {row["trial"] for row in rows if row["status"] in ("interrupted", "abandoned")}
+    told = {str(row["trial_id"]) for row in record.get("broken_off", ())}
+    yield from (f"integrity.json does not have the end of trial {trial}" for trial in sorted(broken - told))
+
+
+def _copies(rows: Rows, given: Mapping[str, Rows]) -> Iterator[str]:
+    """What trials.csv says of the score that counts otherwise than scores.csv."""
+    for row in rows:
+        if row["status"] == "scored" and (scores := given.get(row["trial"])):
+            for name in SCORE:
+                if name in row and name not in ("trial", "reason") and row[name] != scores[-1][name]:
+                    said, wanted = row[name], scores[-1][name]
+                    yield f"trials.csv says of trial {row['trial']} {name} = {said!r}, its score {wanted!r}"
 
 
 def changes(
-    rows: Rows, scores: Rows, seal: Mapping[str, Any], record: Mapping[str, Any], page: str
+    rows: Rows,
+    scores: Rows,
+    judged: Mapping[str, Rows],
+    seal: Mapping[str, Any],
+    record: Mapping[str, Any],
 ) -> list[str]:
-    """What is not as the reveal kept it; `page` is the report's own. Nothing before a reveal."""
+    """What is not as the reveal kept it; `judged`: the tables of what others said. Nothing before a reveal."""
     kept = seal["at_reveal"]
     if not kept:
         return []
@@ -79,23 +122,32 @@ def changes(
     if digest({"attempts": attempts, "scores": said}) != kept["record"]:
         found.append("attempts, scores, reasons or times are not those of which the reveal kept the digest")
     if "measured" in kept:  # those of before have none
+        names = kept["measured"].get("names", MEASURED)
         later = {str(trial) for trial in kept["measured"]["later"]}
         values = [
-            [row[name] for name in (*MEASURED, *(() if row["trial"] in later else LOOKED_AT))] for row in rows
+            [row[name] for name in (*names, *(() if row["trial"] in later else LOOKED_AT))] for row in rows
         ]
         if digest(values) != kept["measured"]["digest"]:
             found.append(
                 "durations, smoothness or what ended a run are not those of which the reveal kept the digest"
             )
-    text = html.unescape(HIDDEN.sub("", page))
-    found += [f"index.html does not say: {one}" for one in _unsaid(kept, text)]
+    if "judged" in kept:  # from format 7 on
+        told = {
+            name: [[*row.values()] for row in table if datetime.fromisoformat(row["at"]) <= then]
+            for name, table in judged.items()
+        }
+        if digest(told) != kept["judged"]:
+            found.append(
+                "ratings, preferences or judgements are not those of which the reveal kept the digest"
+            )
+        if digest({name: record.get(name) for name in STAYS}) != kept["conduct"]:
+            found.append(
+                "integrity.json is not that of which the reveal kept the digest: " + ", ".join(STAYS)
+            )
+    said = ". ".join(kept.get("headline", ()))
+    if any(row.get("headline", said) != said for row in rows):
+        found.append("trials.csv has another headline than the reveal")
     return found
-
-
-def _unsaid(kept: Mapping[str, Any], page: str) -> Iterator[str]:
-    for sentence in (*kept.get("headline", ()), *kept.get("caveats", ()), kept.get("setting", "")):
-        if sentence not in page:
-            yield sentence
 
 
 def _missing(what: str, numbers: Sequence[int]) -> list[str]:

@@ -41,7 +41,9 @@ def ending_faults(plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) ->
             found.append(f"trial {row['trial']} counts, its end ({by}) is repeated by the plan")
         if rule == "failure" and row["status"] == "scored" and row["success"] == "true":
             found.append(f"trial {row['trial']} is a success, its end ({by}) is a failure by the plan")
-        if rule == "failure" and row["status"] == "interrupted" and int(row["attempt"]) < last[row["slot"]]:
+        nothing = row.get("frames", "1") in ("", "0")  # nobody could have scored it
+        again = row["status"] == "interrupted" and int(row["attempt"]) < last[row["slot"]]
+        if rule == "failure" and again and not nothing:
             found.append(f"trial {row['trial']} was repeated, its end ({by}) is a failure by the plan")
     return found
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from .designs import arms_of
 
+_ALL_KEPT = 7  # format of the plans whose reveals keep what counts also without a comparison
 _IMBALANCE = 3  # trials by which one of two checkpoints in random order may be ahead at a condition
 _KEPT = (
     "pairs",
@@ -20,6 +21,8 @@ _KEPT = (
     "setting",
     "record",
     "measured",
+    "judged",
+    "conduct",
 )  # of a reveal, under its digest
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
 
@@ -120,11 +123,18 @@ def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapp
     )  # from 3 on a reveal kept what counts, from 4 on blocks and sums, from 6 on words
     kinds = () if version < 3 else ("digest",) if version == 3 else ("digest", "blocks", "arms")
     kinds += ("headline", "caveats", "record") if version >= 6 else ()
-    wanted = kinds if arms_of(plan) else ()
+    kinds += ("setting", "measured", "judged", "conduct") if version >= _ALL_KEPT else ()
+    wanted = kinds if arms_of(plan) or version >= _ALL_KEPT else ()
     found += [f"the reveal kept no {name}" for name in wanted if name not in (kept or {})]
     key = bytes.fromhex(seal["key"])
     units = schedule(plan, key)
     committed = hmac.new(key, f"{seal['digest']}\n{digest({'units': units})}".encode(), hashlib.sha256)
+    if (
+        kept
+        and kept.get("key", seal["key"]) == seal["key"]
+        and kept.get("commitment", seal["commitment"]) != seal["commitment"]
+    ):
+        found.append(f"the reveal was of the commitment {kept['commitment']}, shown is {seal['commitment']}")
     if committed.hexdigest() != seal["commitment"]:
         found.append(f"the key makes the commitment {committed.hexdigest()}, shown was {seal['commitment']}")
     shown, names = (

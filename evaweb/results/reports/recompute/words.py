@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
-from html.parser import HTMLParser
 from typing import Any
 
 from .designs import Block, arms_of
 from .numbers import Trial
-from .record import HIDDEN
+from .page import Node, below, cells_fit
 
 _FROM = 6  # of plans, the format whose reveals keep words
 
@@ -90,25 +88,30 @@ def _best(said: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> str:
     return f"No single best of {len(arms)}: "
 
 
-def page_faults(page: str, shown: Mapping[str, Any], trials: Sequence[Trial]) -> list[str]:
-    """What the page's tables of checkpoints and trials say otherwise than numbers.json and trials.csv."""
-    reader = _Tables()
-    reader.feed(HIDDEN.sub("", page))
-    arms = {row[0]: row for row in reader.below("Checkpoint", "Groups")}
-    found = [
-        f"index.html says of {name} {arms.get(name, ['', '', 'nothing'])[2:6]}, numbers.json {wanted}"
-        for name, arm in shown["arms"].items()
-        if not _begin_with(arms.get(name, [])[2:6], wanted := _cells(arm))
-    ]
+def page_faults(root: Node, shown: Mapping[str, Any], trials: Sequence[Trial], later: bool) -> list[str]:
+    """What the page's tables of checkpoints and trials say otherwise than numbers.json and trials.csv.
+
+    `later`: scores came after the reveal.
+    """
+    arms = {row[0]: row[1:] for row in below(root, "Checkpoint", "Groups")}
+    found = []
+    for name, arm in shown["arms"].items():
+        given, wanted = arms.pop(name, []), _cells(arm)
+        letter = shown["letters"].get(name, "")
+        if not given or given[0] != letter or not cells_fit(given[1:], wanted, later):
+            found.append(f"index.html says of {name} {given or 'nothing'}, numbers.json {[letter, *wanted]}")
+    found += [f"index.html has {name} among the checkpoints" for name in arms]
     counted = [trial for trial in trials if trial.status == "scored"]
-    rows = {row[0]: row[1:6] for row in reader.below("#", "Checkpoint", "Condition")}
+    rows = {row[0]: row[1:] for row in below(root, "#", "Checkpoint", "Condition")}
     for trial in counted:
+        row = rows.pop(str(trial.order), [])
         wanted = [trial.checkpoint, trial.condition, "yes" if trial.success else "no"]
-        *given, score, time = rows.pop(str(trial.order), ["", ""])
-        if given != wanted or not (
-            _is_rounded(score, trial.score, 2) and _is_rounded(time, trial.duration, 1)
+        known = (trial.score, 2), (trial.duration, 1)
+        fits = len(row) > 6 and row[:3] == wanted and row[-1] == f"{trial.station}, {trial.operator}"
+        if not fits or not all(
+            _is_rounded(cell, *value) for cell, value in zip(row[3:5], known, strict=True)
         ):
-            said = ", ".join(map(str, (*wanted, trial.score, trial.duration)))
+            said = ", ".join(map(str, (*wanted, trial.score, trial.duration, trial.station, trial.operator)))
             found.append(f"index.html does not say of trial {trial.order}: {said}")
     return found + [f"index.html has a trial {order}, which does not count" for order in rows]
 
@@ -124,48 +127,43 @@ def _is_rounded(cell: str, value: float | None, digits: int) -> bool:
 
 
 def _cells(arm: Mapping[str, Any]) -> list[str]:
-    """Of a checkpoint its rate, its exact interval, its mean score and the mean of its scenes, as the page has them."""
+    """Of a checkpoint all that its row says behind its letters."""
     rate = f"{arm['successes']}/{arm['n']}, {100 * arm['rate']:.0f} % [{_ends(arm['wilson'])}]"
     means = (
         f"{100 * arm[name]['value']:.0f} % [{_ends(arm[name]['gaffke'])}]" for name in ("score", "macro")
     )
-    return [rate, f"[{_ends(arm['clopper_pearson'])}]", *means]
+    smooth = (_average(arm[name], arm["n"]) for name in ("smoothness", "smoothness_commanded"))
+    return [rate, f"[{_ends(arm['clopper_pearson'])}]", *means, _time(arm), _speed(arm), *smooth]
+
+
+def _time(arm: Mapping[str, Any]) -> str:
+    found = (arm.get("time_to_success") or {}).get("restricted_mean")
+    if not found:
+        return "–"
+    low, high = found["gaffke"]
+    return f"{found['value_s']:.1f} s [{low:.1f}, {high:.1f}], up to {found['until_s']:.0f} s"
+
+
+def _speed(arm: Mapping[str, Any]) -> str:
+    found = arm.get("successes_per_hour")
+    if not found:
+        return "–"
+    low, high = found["garwood"]
+    return f"{found['per_hour']:.1f} [{low:.1f}, {high:.1f}]"
+
+
+def _average(found: Mapping[str, Any] | None, of: int) -> str:
+    if not found:
+        return "–"
+    n = f"n {found['n']}" if found["n"] == of else f"{found['n']} of {of} trials"
+    if not found["student"]:
+        return f"{_decimal(found['mean'])}, {n}: no interval"
+    return f"{_decimal(found['mean'])} [{', '.join(map(_decimal, found['student']))}], {n}"
+
+
+def _decimal(value: float) -> str:
+    return f"{value:.2f}".replace("-", "−")
 
 
 def _ends(interval: Sequence[float]) -> str:
     return ", ".join(f"{100 * end:.0f}".replace("-0", "0").replace("-", "−") for end in interval)
-
-
-def _begin_with(given: Sequence[str], wanted: Sequence[str]) -> bool:
-    return len(given) == len(wanted) and all(a.startswith(b) for a, b in zip(given, wanted, strict=True))
-
-
-class _Tables(HTMLParser):
-    """Reads the text of tables' cells."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._tables: list[list[list[str]]] = []
-        self._open = False
-
-    def below(self, *head: str) -> list[list[str]]:
-        """The rows of the tables whose head begins so."""
-        return [row for rows in self._tables if rows and rows[0][: len(head)] == [*head] for row in rows[1:]]
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag == "table":
-            self._tables.append([])
-        elif tag == "tr" and self._tables:
-            self._tables[-1].append([])
-        elif tag in ("td", "th") and self._tables and self._tables[-1]:
-            self._tables[-1][-1].append("")
-            self._open = True
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag in ("td", "th"):
-            self._open = False
-
-    def handle_data(self, data: str) -> None:
-        if self._open:
-            row = self._tables[-1][-1]
-            row[-1] = re.sub(r"\s+", " ", row[-1] + data)

@@ -7,13 +7,15 @@ import pytest
 from django.db import DatabaseError, transaction
 from django.urls import reverse
 
+from evaweb.canonical import digest
 from evaweb.episodes.folders import preview_folder, scores_file
 from evaweb.episodes.publishing import success_of
 from evaweb.episodes.reconcile import reconcile
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import cancel, try_again, work
-from evaweb.plans.documents import scene_of
+from evaweb.plans.commitment import commitment
+from evaweb.plans.documents import scene_of, units_of
 from evaweb.plans.models import Plan, PlanEvent
 from evaweb.plans.services import plan_reveal
 from evaweb.results import job_kinds
@@ -65,8 +67,11 @@ def freeze_as_it_is(plan):
     """As if its scene had been like this when it was frozen."""
     scene = Scene.objects.get()
     document = {**plan.document, "scenes": [scene_of(scene, list(scene.positions.order_by("number")))]}
+    changed = {"document": document, "digest": digest(document)}
+    changed["commitment"] = commitment(changed["digest"], units_of(plan), bytes(plan.key))
     with unguarded("plans"):
-        Plan.objects.filter(pk=plan.pk).update(document=document)
+        Plan.objects.filter(pk=plan.pk).update(**changed)
+    plan.refresh_from_db()
 
 
 @pytest.fixture

@@ -275,6 +275,16 @@ def no_key(report):
     path.write_text(json.dumps(json.loads(path.read_text("utf-8")) | {"key": ""}), "utf-8")
 
 
+def no_reveal(report):
+    path = report / "data" / "seal.json"
+    path.write_text(json.dumps(json.loads(path.read_text("utf-8")) | {"key": "", "at_reveal": None}), "utf-8")
+
+
+def hidden_headline(report):
+    said = json.loads((report / "data" / "seal.json").read_text("utf-8"))["at_reveal"]["headline"][0]
+    of_text("index.html", html.escape(said), f"pi0 won</p><p hidden>{html.escape(said)}")(report)
+
+
 @pytest.fixture
 def steered(plan, owner, bench, carry_out, tmp_path):
     """The report of a plan with a trial that was voided by two operators and one that was corrected, then revealed."""
@@ -302,7 +312,53 @@ TAMPERINGS = {
     ),
     "the key": (no_key, "seal.json has no key"),
     "the headline": (another_headline, "does not say: "),
-    "a caveat": (of_text("index.html", "Attempts voided", "Attempts"), "does not say: Attempts voided"),
+    "a caveat": (of_text("index.html", "Attempts voided", "Attempts"), "does not say: ["),
+    "the key and the reveal": (no_reveal, "says of reveal and key otherwise"),
+    "a headline that is hidden": (hidden_headline, "which no report has"),
+    "a style that hides": (
+        of_text("index.html", "</style>", ".plan-sentence{display:none}</style>"),
+        "another style",
+    ),
+    "one sentence more": (
+        of_text("index.html", "<h3>Reasons", '<p class="plan-sentence">pi0 is best.</p><h3>Reasons'),
+        "index.html does not say: [",
+    ),
+    "a row more": (
+        of_text(
+            "index.html",
+            '<tr><th scope="row">pi0-new</th>',
+            '<tr><th scope="row">pi1</th></tr><tr><th scope="row">pi0-new</th>',
+        ),
+        "index.html has pi1 among the checkpoints",
+    ),
+    "the question": (
+        of_text("index.html", "Is new better?", "Is old better?"),
+        "does not say of the plan: Is new",
+    ),
+    "the number of trials": (
+        of_text("index.html", "from 16 trials", "from 61 trials"),
+        "made from 16 trials",
+    ),
+    "an interruption": (
+        of_table("trials", lambda rows: rows[3].update(status="abandoned")),
+        "abandoned, integrity.json says",
+    ),
+    "why a trial failed": (
+        of_table("trials", lambda rows: rows[4].update(note="odd")),
+        "trials.csv says of trial",
+    ),
+    "the headline of the table": (
+        of_table("trials", lambda rows: rows[2].update(headline="x")),
+        "another headline",
+    ),
+    "a void's author": (
+        of_text("data/integrity.json", '"answered_by_name": "bob"', '"answered_by_name": "ann"'),
+        "integrity.json is not that",
+    ),
+    "a file more": (
+        lambda report: (report / "data" / "more.csv").write_text("x"),
+        "data/more.csv is no part",
+    ),
     "integrity.json": (
         lambda report: (report / "data" / "integrity.json").write_text("{}"),
         "integrity.json says",
@@ -490,8 +546,9 @@ def test_what_is_blind_is_reported_only_where_that_is_meant(plan, tmp_path, carr
     call_command("eval_report", "blocks/1", "--sealed", "--out", str(tmp_path / "report"))
     assert json.loads((tmp_path / "report" / "data" / "seal.json").read_text())["key"] == ""
     found = recompute(tmp_path / "report")
-    assert found.returncode == 0
+    assert found.returncode == 2
     assert "by its digest: 0 do not come out" in found.stdout
+    assert "NOT REVEALED" in found.stdout
 
 
 def test_a_folder_that_is_not_empty_is_not_written_to(revealed, tmp_path):

@@ -1,0 +1,23 @@
+from django.db import migrations, models
+
+from evaweb.append_only import laid_aside
+
+
+class Migration(migrations.Migration):
+    dependencies = [
+        ("trials", "0011_serving"),
+    ]
+
+    operations = [
+        migrations.AddField(
+            model_name="trial",
+            name="ended_by",
+            field=models.CharField(
+                blank=True,
+                help_text="estop, interruption or timeout, as its run ended; empty where it ended by itself.",
+                max_length=14,
+                null=True,
+            ),
+        ),
+        migrations.RunPython(migrations.RunPython.noop, laid_aside),  # backwards this comes first
+    ]
