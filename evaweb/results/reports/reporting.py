@@ -27,6 +27,7 @@ from evaweb.results.presentation import facts, listings
 from evaweb.results.presentation.drawings import conditions, courses, rates
 from evaweb.results.presentation.headline import headline, with_planned_letters
 from evaweb.results.presentation.integrity import delays_banner, integrity_document
+from evaweb.results.presentation.setting import setting_of
 from evaweb.results.reports import bench_photos as laid_out
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.document import analysis_document
@@ -159,6 +160,7 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         "analysis": analysis,
         "styles": _styles(),
         "made": timezone.now(),
+        "setting": setting_of(plan),
         "ends": _ends(plan.document or {}),
         "changes": changes_of(plan),
         "headline": headline(plan),

@@ -7,7 +7,7 @@ from typing import Any
 
 from .designs import Block, arms_of
 from .numbers import Trial
-from .page import Node, below, cells_fit
+from .page import Node, below, cells_fit, plain
 
 _FROM = 6  # of plans, the format whose reveals keep words
 
@@ -96,7 +96,7 @@ def page_faults(root: Node, shown: Mapping[str, Any], trials: Sequence[Trial], l
     arms = {row[0]: row[1:] for row in below(root, "Checkpoint", "Groups")}
     found = []
     for name, arm in shown["arms"].items():
-        given, wanted = arms.pop(name, []), _cells(arm)
+        given, wanted = arms.pop(plain(name), []), _cells(arm)
         letter = shown["letters"].get(name, "")
         if not given or given[0] != letter or not cells_fit(given[1:], wanted, later):
             found.append(f"index.html says of {name} {given or 'nothing'}, numbers.json {[letter, *wanted]}")
@@ -105,9 +105,9 @@ def page_faults(root: Node, shown: Mapping[str, Any], trials: Sequence[Trial], l
     rows = {row[0]: row[1:] for row in below(root, "#", "Checkpoint", "Condition")}
     for trial in counted:
         row = rows.pop(str(trial.order), [])
-        wanted = [trial.checkpoint, trial.condition, "yes" if trial.success else "no"]
+        wanted = [plain(trial.checkpoint), plain(trial.condition), "yes" if trial.success else "no"]
         known = (trial.score, 2), (trial.duration, 1)
-        fits = len(row) > 6 and row[:3] == wanted and row[-1] == f"{trial.station}, {trial.operator}"
+        fits = len(row) > 6 and row[:3] == wanted and row[-1] == plain(f"{trial.station}, {trial.operator}")
         if not fits or not all(
             _is_rounded(cell, *value) for cell, value in zip(row[3:5], known, strict=True)
         ):
