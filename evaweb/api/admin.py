@@ -100,6 +100,10 @@ class AccountAdmin(UserAdmin):
     readonly_fields = ("last_login", "date_joined")
     filter_horizontal = ()
 
+    def get_readonly_fields(self, request: HttpRequest, obj: User | None = None) -> tuple[str, ...]:
+        """An account keeps its name: records name people by it."""
+        return (*self.readonly_fields, "username") if obj else self.readonly_fields
+
     def get_form(self, request: HttpRequest, obj: User | None = None, **named: Any) -> Any:
         """The form knows the user."""
         made = super().get_form(request, obj, **named)

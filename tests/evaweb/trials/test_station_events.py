@@ -87,6 +87,25 @@ def test_what_neither_holds_nor_ends_it_interrupts_it(bench, running, state):
     assert found.duration_s == pytest.approx(3.0)
 
 
+def test_what_ended_its_run_is_kept_when_it_ends(bench, running):
+    assert enter(bench, "faulted", 103.0, "the e-stop was pressed").ended_by == "estop"
+    facts = {"uuid": str(running.episode_id), "status": "finished", "rows": 9, "reason": ""}
+    bench.event("episode_closed", "", 104.0, **facts)
+    running.refresh_from_db()
+    assert running.ended_by == "estop"
+
+
+def test_a_run_that_ended_by_itself_says_so_until_its_recording_is_not_whole(bench, running):
+    assert (
+        bench.event("command", "stop by ann: accepted", 156.5, **{"from": "running"}, to="ready").ended_by
+        == ""
+    )
+    facts = {"uuid": str(running.episode_id), "status": "failed", "rows": 9, "reason": "disk"}
+    bench.event("episode_closed", "", 157.0, **facts)
+    running.refresh_from_db()
+    assert (running.status, running.ended_by) == ("interrupted", "interruption")
+
+
 def test_every_event_twice_and_out_of_order_leaves_the_same_trial(bench, running):
     rows = [
         {
