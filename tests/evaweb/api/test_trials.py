@@ -202,7 +202,7 @@ def test_a_failure_is_corrected_alone_and_not_over_a_score_that_was_not_seen(res
     seen = str(trial.verdict.uuid)
     status, answer = rest.post(f"trials/{trial.pk}/failure", failure="dropped", score=seen)
     assert (status, answer["failure_phase"], answer["failure"]) == (200, "", "dropped")
-    assert answer["scores"][0]["reason"] == "failure was not said, now dropped"
+    assert answer["scores"][0]["reason"] == "failure was not specified, now dropped"
     assert [row["milestones"] for row in answer["scores"]] == [answer["scores"][0]["milestones"]] * 2
     status, answer = rest.post(f"trials/{trial.pk}/failure", failure_phase="grasp", score=seen)
     assert (status, "scored anew" in answer["error"]) == (409, True)
