@@ -78,7 +78,7 @@ def now(*, user: Any, sight: Sight) -> Now:
     running = results.plan_rows(results.plan_list(PlanState.FROZEN)[:MOST])
     return Now(
         work=[] if role_of(user) is Role.VIEWER else list(_work(user)),
-        alarms=list(_alarms()),
+        alarms=list(alarms()),
         plans=[_plan(row, user, sight) for row in running],
         jobs=[row_of(job, sight, having) for job in jobs],
     )
@@ -125,7 +125,8 @@ def _requests(user: Any) -> list[LeaseRequest]:
 # --- of the lab ----------------------------------------------------------------------------------------------
 
 
-def _alarms() -> Iterator[Item]:
+def alarms() -> Iterator[Item]:
+    """What somebody has to see to, of the whole lab."""
     for station in Station.objects.filter(active=True).order_by("name"):
         feed = feeds.of(station.name)
         stands = feed.state.get("state_is", {}) if feed.link.ok else {}

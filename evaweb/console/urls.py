@@ -12,6 +12,7 @@ urlpatterns = [
     path("jobs/", views_jobs.jobs, name="jobs"),
     path("jobs/cancel", views_jobs.job_act, {"what": "cancel"}, name="job-cancel"),
     path("jobs/repeat", views_jobs.job_act, {"what": "repeat"}, name="job-repeat"),
+    path("history/", views.history, name="history"),
     path("stations/<str:name>/", views.station, name="station"),
     path("stations/<str:name>/still", views.still, name="station-still"),
     path("stations/<str:name>/debug/", views.debug, name="station-debug"),

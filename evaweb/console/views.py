@@ -15,7 +15,8 @@ from django.views.decorators.http import require_safe
 from evaweb.blinding import sight_for
 from evaweb.collect import panel as collecting
 from evaweb.console import selectors
-from evaweb.console.home import now
+from evaweb.console.history import histories
+from evaweb.console.home import alarms, now
 from evaweb.console.stills import still_of
 from evaweb.datasets.on_robot import offer, recorded_at
 from evaweb.errors import EvaError, NotFound
@@ -31,15 +32,23 @@ _REMEMBER_S = 0.5
 
 
 def home(request: HttpRequest) -> HttpResponse:
-    """What matters now; with htmx one of its two parts, the stations or all else."""
+    """What matters now; with htmx one of its parts: the stations, the alarms alone, or all but the stations."""
     htmx: Any = request.htmx  # type: ignore[attr-defined]
-    part = "now" if htmx and htmx.target == "now" else "stations" if htmx else ""
+    part = (htmx.target if htmx.target in ("now", "alarms") else "stations") if htmx else ""
     context: dict[str, Any] = {}
-    if part != "now":
+    if part in ("", "stations"):
         context["rows"] = selectors.station_rows()
-    if part != "stations":
+    if part in ("", "now"):
         context["now"] = now(user=request.user, sight=sight_for(request))
+    if part == "alarms":
+        context["now"] = {"alarms": list(alarms())}
     return render(request, f"console/{part or 'home'}.html", context)
+
+
+@require_safe
+def history(request: HttpRequest) -> HttpResponse:
+    """How the stations did in the last week."""
+    return render(request, "console/history.html", {"histories": list(histories(sight_for(request)))})
 
 
 @require_safe

@@ -18,7 +18,6 @@ OPTIONS = {
     "results": {"plans": 2, "trials": 40, "runs": 20},
 }
 FEWER = {
-    "designs": {"designs.SIZES": [50], "designs._RUNS": 50, "designs._RUNS_OF_RATES": 200},
     "lab": {"climb.RUNGS": [1, 2], "climb._MOST_VIEWERS": 10, "lab._CUTS": 2, "lab._UPLOAD_MB": 50},
     "loop": {"loop.RATES": [30.0]},
     "measures": {"measures._VARIANTS": ["", "fifo"]},
@@ -53,8 +52,17 @@ if __name__ == "__main__":  # and not in a process that it starts
 """
 
 
-@pytest.mark.lab
-@pytest.mark.parametrize("name", _BENCHMARKS)
+# What is no lab is made beside other tests; those that another test makes whole are not made twice.
+COMPUTED = ("ik", "moving_target", "partial_credit", "results", "strategies")
+ELSEWHERE = ("coverage", "designs", "soak")  # test_coverage, test_designs, test_fuzzing
+EVERY = [
+    pytest.param(name, marks=pytest.mark.exhaustive if name in COMPUTED else pytest.mark.lab)
+    for name in _BENCHMARKS
+    if name not in ELSEWHERE
+]
+
+
+@pytest.mark.parametrize("name", EVERY)
 def test_it_comes_to_its_end(name, tmp_path):
     told = tmp_path / "figures.json"
     if name in OPTIONS or name in FEWER:

@@ -16,7 +16,7 @@ from tests.evaweb.blind_lab import Lab
 from tests.evaweb.crawling import addresses
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
 
-pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow, pytest.mark.lab]
+pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow, pytest.mark.exhaustive]
 
 
 @pytest.fixture

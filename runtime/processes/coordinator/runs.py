@@ -182,9 +182,14 @@ class Runs:
     def hold(self, reason: str) -> None:
         """Decelerate, hold, stop asking; an open run's clock pauses."""
         self._inference.pause()
-        self._orders.give("hold", run=self.open.number if self.open else 0, reason=reason)
+        self._orders.give("hold", run=self._begun, reason=reason)
         if self.open:
             self.open.hold(self._clock.now())
+
+    @property
+    def _begun(self) -> int:
+        """The number of the open run, whose rows control's ticks are; 0 where none is open, or it has not begun."""
+        return 0 if self.open is None or self.open.begun is None else self.open.number
 
     def resume(self) -> None:
         """Go on with the open run; raises RuntimeFault where there is none, or its recording has failed."""
@@ -253,7 +258,7 @@ class Runs:
 
     def move(self, goal: Float64, speed: float) -> None:
         """Go to `goal` on a limited path, within the open run where there is one."""
-        self._orders.give("motion", run=self.open.number if self.open else 0, goal=goal, speed=speed)
+        self._orders.give("motion", run=self._begun, goal=goal, speed=speed)
 
     def cancel(self) -> None:
         """Leave what is planned or under way, and stand; the run goes on."""

@@ -2,6 +2,7 @@
 
 import { config } from "../live/config.js";
 import { Legend } from "./curve_legend.js";
+import { Beside } from "./curve_beside.js";
 import { Curves } from "./curves.js";
 import { jointOptions } from "../manual/joint_names.js";
 import { GHOSTS } from "../scene/scene_ghosts.js";
@@ -22,25 +23,31 @@ export async function curvePane(store) {
     note.textContent = "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.";
     return { add() {}, joints() {} };
   }
-  const legend = new Legend(document.getElementById("curves-legend"), (name, shown) => curves.reveal(name, shown));
+  const legend = new Legend(document.getElementById("curves-legend"), (name, shown) => every().forEach((one) => one.reveal(name, shown)));
   const markLegend = new MarkLegend(document.getElementById("curves-marks"));
   const curves = new Curves({ element: document.getElementById("curves"), library, legend, markLegend, names: config.joints });
+  const beside = new Beside({ place: document.getElementById("curves-all"), key: `${KEY}-beside`, library, legend });
+  const every = () => [curves, ...beside.all];
+  beside.joints(config.joints, config.grippers);
   const select = joints(curves, config.joints, config.units, config.grippers);
   document.getElementById("joint-next").addEventListener("click", () => {
     select.selectedIndex = (select.selectedIndex + 1) % Math.max(1, select.options.length);
     select.dispatchEvent(new Event("change"));
   });
-  pauseButton(curves);
+  addButton(beside, select);
+  pauseButton(every);
   const tags = new Tags(document.querySelector(".curves-pane"), "curves-tags");
   store.on("second", () => {
     tags.show("paused", curves.paused && `paused ${duration(curves.pausedFor)} ago; data keeps arriving`);
     tags.show("simulated", curves.simulated && "under the bar: executed by the simulated robot", GHOSTS.simulated.colour);
   });
   return {
-    add: (samples) => curves.add(samples),
+    add: (samples) => every().forEach((one) => one.add(samples)),
     joints: (names, units, grippers) => {
       curves.joints(names);
-      if (names.join() !== [...select.options].map((option) => option.title).join()) joints(curves, names, units, grippers);
+      if (names.join() === [...select.options].map((option) => option.title).join()) return;
+      joints(curves, names, units, grippers);
+      beside.joints(names, grippers);
     },
   };
 }
@@ -62,11 +69,24 @@ function joints(curves, names, units, grippers) {
   return select;
 }
 
-function pauseButton(curves) {
+/** One joint more beside those that are drawn, as long as there is room. */
+function addButton(beside, select) {
+  const button = document.getElementById("curves-add");
+  const show = () => button.setAttribute("aria-disabled", String(beside.full));
+  button.addEventListener("click", () => {
+    beside.add(select.selectedIndex);
+    show();
+  });
+  document.getElementById("curves-all").addEventListener("curves", show);
+  show();
+}
+
+function pauseButton(every) {
   const button = document.getElementById("curves-pause");
   button.addEventListener("click", () => {
-    curves.pause(!curves.paused);
-    button.setAttribute("aria-pressed", String(curves.paused));
-    button.textContent = curves.paused ? "Continue" : "Pause";
+    const paused = !every()[0].paused;
+    for (const one of every()) one.pause(paused);
+    button.setAttribute("aria-pressed", String(paused));
+    button.textContent = paused ? "Continue" : "Pause";
   });
 }

@@ -32,6 +32,7 @@ export class Curves {
   #columns = null; // of the samples that are drawn, with their times
   #data = [[], ...KINDS.map(() => [])]; // as uPlot has them
   #addedAt = 0; // on this page's clock [ms]
+  #over = new AbortController();
 
   constructor({ element, library, legend, markLegend, names }) {
     this.#element = element;
@@ -39,10 +40,22 @@ export class Curves {
     this.#legend = legend;
     this.#markLegend = markLegend;
     this.joints(names);
-    new ResizeObserver(() => this.#fit()).observe(element);
-    document.addEventListener("eva:theme", () => this.#build());
-    setInterval(() => this.#draw(), DRAW_MS);
+    const sized = new ResizeObserver(() => this.#fit());
+    sized.observe(element);
+    document.addEventListener("eva:theme", () => this.#build(), { signal: this.#over.signal });
+    const drawing = setInterval(() => this.#draw(), DRAW_MS);
+    this.#over.signal.addEventListener("abort", () => {
+      sized.disconnect();
+      clearInterval(drawing);
+      this.#plot?.destroy();
+      this.#plot = null;
+    });
     this.#build();
+  }
+
+  /** It is drawn no more. */
+  end() {
+    this.#over.abort();
   }
 
   /** The joints' names, in the order of the vectors. */

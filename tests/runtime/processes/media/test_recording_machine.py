@@ -143,6 +143,20 @@ class Recorded(RuleBasedStateMachine):
         self.folder.cleanup()
 
 
+def test_a_run_that_was_halted_before_it_began_leaves_no_row() -> None:
+    """Found at random: it was told as one that never began, and its recording had the rows of standing still."""
+    state = Recorded()
+    try:
+        state.begin("hold")
+        state.run(trial=False, wait=0)
+        state.press("halt", 2)
+        state.what_never_began_is_told_and_nothing_else_is()
+        state.works_again()
+        state.what_never_began_is_told_and_nothing_else_is()
+    finally:
+        state.teardown()
+
+
 TestRecorded = Recorded.TestCase
 TestRecorded.settings = settings(
     max_examples=some(20),

@@ -1,0 +1,89 @@
+// More joints beside the first: a plot each, which joint it is chosen over it; they pause and hide curves together.
+
+import { jointOptions } from "../manual/joint_names.js";
+import { Curves } from "./curves.js";
+
+const MOST = 3; // beside the first: further ones are too small to read
+const QUIET = { show() {} }; // marks are told of the first alone
+
+export class Beside {
+  #place;
+  #key;
+  #make;
+  #cells = []; // {element, curves, select}
+  #names = [];
+  #grippers = [];
+
+  /** `place`: where the plots are; `key`: of the choice in this browser; `make`: {library, legend} of all of them. */
+  constructor({ place, key, ...make }) {
+    this.#place = place;
+    this.#key = key;
+    this.#make = make;
+  }
+
+  get all() {
+    return this.#cells.map(({ curves }) => curves);
+  }
+
+  /** True where no other has room. */
+  get full() {
+    return this.#cells.length >= Math.min(MOST, this.#names.length - 1);
+  }
+
+  /** The robot's joints are these: with those of them that were chosen before. */
+  joints(names, grippers) {
+    this.#names = names;
+    this.#grippers = grippers;
+    for (const { element } of this.#cells) element.remove();
+    this.#cells = [];
+    const kept = JSON.parse(localStorage.getItem(this.#key) ?? "[]");
+    for (const joint of kept.map((name) => names.indexOf(name)).filter((index) => index >= 0)) if (!this.full) this.#draw(joint);
+  }
+
+  /** One plot more, of the joint after `joint` and those that are drawn. */
+  add(joint) {
+    if (this.full) return;
+    const drawn = [joint, ...this.#cells.map(({ select }) => select.selectedIndex)];
+    this.#draw((Math.max(...drawn) + 1) % this.#names.length);
+    this.#keep();
+  }
+
+  #draw(joint) {
+    const element = document.createElement("div");
+    element.className = "curves-cell";
+    const head = document.createElement("div");
+    head.className = "row line small";
+    const select = document.createElement("select");
+    select.setAttribute("aria-label", "Joint of another curve");
+    select.append(...jointOptions(this.#names, this.#grippers));
+    select.selectedIndex = joint;
+    const off = Object.assign(document.createElement("button"), { type: "button", className: "button button-quiet", textContent: "×" });
+    off.setAttribute("aria-label", `Remove the curve of ${this.#names[joint]}`);
+    head.append(select, off);
+    const plot = document.createElement("div");
+    plot.className = "curves-plot";
+    element.append(head, plot);
+    this.#place.append(element);
+    const { library, legend } = this.#make;
+    const curves = new Curves({ element: plot, library, legend: { shown: (name) => legend.shown(name), value() {} }, markLegend: QUIET, names: this.#names });
+    curves.show(joint);
+    const cell = { element, curves, select };
+    this.#cells.push(cell);
+    select.addEventListener("change", () => {
+      curves.show(select.selectedIndex);
+      off.setAttribute("aria-label", `Remove the curve of ${this.#names[select.selectedIndex]}`);
+      this.#keep();
+    });
+    off.addEventListener("click", () => {
+      this.#cells.splice(this.#cells.indexOf(cell), 1);
+      curves.end();
+      element.remove();
+      this.#keep();
+      this.#place.dispatchEvent(new Event("curves"));
+    });
+  }
+
+  #keep() {
+    localStorage.setItem(this.#key, JSON.stringify(this.#cells.map(({ select }) => this.#names[select.selectedIndex])));
+  }
+}
