@@ -1,8 +1,9 @@
 // The wanted layout over a picture of the real bench: live from a camera, or the reference of the position. The corners of
-// the area are dragged to where they lie in the picture; this browser remembers them for each camera.
+// the area are dragged to where they lie in the picture; this browser remembers them for each camera. Then things can be
+// dragged there too. A picture of one's own stays in the browser.
 
 import { get } from "../site/api.js";
-import { n, outline, things } from "./bench.js";
+import { escaped, n, outline, placed, things } from "./bench.js";
 import { projection, seen } from "./plane.js";
 
 const LIVE_MS = 700;
@@ -18,6 +19,8 @@ export class Overlay {
   #addresses;
   #stations;
   #bench = {};
+  #moved = null; // is told of the bench that a person makes by dragging; null: nothing can be moved
+  #own = null; // {name, address} of a picture that was chosen from this computer
   #references = [];
   #corners = FIRST;
   #timer = 0;
@@ -29,6 +32,7 @@ export class Overlay {
     this.#addresses = addresses;
     this.#camera().addEventListener("change", () => this.#chosen());
     this.#part("again").addEventListener("click", () => this.#put(this.#default()));
+    this.#part("file").addEventListener("change", ({ target }) => this.#file(target.files[0]));
     this.#part("density").addEventListener("input", () => this.#draw());
     const svg = this.#part("svg");
     svg.addEventListener("pointerdown", (event) => this.#pressed(event));
@@ -41,9 +45,10 @@ export class Overlay {
     this.#part("picture").addEventListener("error", () => this.#trouble());
   }
 
-  /** The position that is looked at: its bench, and the references that there are of it. */
-  show(bench, references) {
+  /** The position that is looked at: its bench, its references, and who is told where a thing was dragged to. */
+  show(bench, references, moved = null) {
     this.#bench = bench ?? {};
+    this.#moved = moved;
     if (references !== this.#references) this.#offer(references);
     this.#draw();
   }
@@ -61,10 +66,23 @@ export class Overlay {
     const before = this.#camera().value;
     const live = this.#stations.flatMap(({ name, title, cameras }) => cameras.map((camera) => [`live ${name} ${camera}`, `${title}: ${camera}, live`]));
     const kept = references.map(({ station, camera, picture }) => [`kept ${station} ${camera} ${picture}`, `${station}: ${camera}, reference`]);
-    const options = [...kept, ...live].map(([value, text]) => new Option(text, value));
+    const own = this.#own ? [[`file own ${encodeURIComponent(this.#own.name)}`, this.#own.name]] : [];
+    const options = [...own, ...kept, ...live].map(([value, text]) => new Option(text, value));
     this.#camera().replaceChildren(...options);
     if (options.some(({ value }) => value === before)) this.#camera().value = before;
     this.#chosen();
+  }
+
+  #file(file) {
+    if (!file) return;
+    const reader = new FileReader();
+    reader.addEventListener("load", () => {
+      this.#own = { name: file.name, address: reader.result };
+      this.#offer(this.#references);
+      this.#camera().selectedIndex = 0;
+      this.#chosen();
+    });
+    reader.readAsDataURL(file);
   }
 
   #chosen() {
@@ -75,6 +93,7 @@ export class Overlay {
     this.#corners = kept ? JSON.parse(kept) : this.#default();
     this.#part("picture").alt = `${kind === "live" ? "What" : "The reference of"} ${camera} of ${station}${kind === "live" ? " shows now" : ""}`;
     if (kind === "kept") this.#part("picture").src = picture;
+    else if (kind === "file") this.#part("picture").src = this.#own.address;
     else this.#look(this.#address(station, camera));
     this.#draw();
   }
@@ -96,6 +115,10 @@ export class Overlay {
   async #trouble() {
     clearTimeout(this.#timer);
     this.#part("picture").hidden = true;
+    if (this.#camera().value.startsWith("file ")) {
+      this.#told(`${this.#own.name} is no picture that this browser can show.`);
+      return;
+    }
     try {
       await get(this.#part("picture").getAttribute("src"));
     } catch (error) {
@@ -130,31 +153,50 @@ export class Overlay {
     const focused = document.activeElement?.dataset?.corner;
     const [left, right, near, far] = this.#sizes.area.map((side) => 1000 * side);
     const h = projection([[left, near], [right, near], [right, far], [left, far]], this.#corners);
-    const shape = (points, kind) => `<polygon class="${kind}" points="${points.map((point) => seen(h, point).map((share) => n(SIDE * share)).join(" ")).join(", ")}"/>`;
-    const laid = h ? [shape([[left, near], [right, near], [right, far], [left, far]], "area"), ...things(this.#bench, this.#sizes).map((thing) => shape(outline(thing), `over over-${thing.kind}`))] : [];
+    const shape = (points, kind, more = "") => `<polygon class="${kind}" ${more} points="${points.map((point) => seen(h, point).map((share) => n(SIDE * share)).join(" ")).join(", ")}"/>`;
+    const laid = h ? [shape([[left, near], [right, near], [right, far], [left, far]], "area"), ...things(this.#bench, this.#sizes).map((thing) => shape(outline(thing), `over over-${thing.kind}`, `data-over="${escaped(thing.key)}"`))] : [];
     const handles = this.#corners.map(
       ([x, y], index) => `<circle class="corner" data-corner="${index}" cx="${n(SIDE * x)}" cy="${n(SIDE * y)}" r="14" tabindex="0" role="button" aria-label="${NAMES[index]} of the area"/>`,
     );
+    svg.toggleAttribute("data-movable", Boolean(this.#moved && h));
     svg.innerHTML = `<g opacity="${this.#part("density").value}">${laid.join("")}</g>${handles.join("")}`;
     if (focused) svg.querySelector(`[data-corner="${focused}"]`)?.focus({ preventScroll: true });
   }
 
-  #moved(index, x, y) {
+  #cornered(index, x, y) {
     const inside = (share) => Math.min(Math.max(share, 0), 1);
     this.#put(this.#corners.map((corner, other) => (other === index ? [inside(x), inside(y)] : corner)));
   }
 
+  /** A thing follows the pointer over the plane of the table. */
+  #thing(key) {
+    const thing = things(this.#bench, this.#sizes).find((one) => one.key === key);
+    const [left, right, near, far] = this.#sizes.area.map((side) => 1000 * side);
+    const plane = projection(this.#corners, [[left, near], [right, near], [right, far], [left, far]]);
+    const bounds = thing?.kind === "object" ? [-2000, 2000, -2000, 2000] : [left, right, near, far];
+    let from = null;
+    return (x, y) => {
+      const at = seen(plane, [x, y]);
+      from ??= at;
+      const [to, other] = [thing.x + at[0] - from[0], thing.y + at[1] - from[1]].map(Math.round);
+      const inside = { x: Math.min(Math.max(to, bounds[0]), bounds[1]), y: Math.min(Math.max(other, bounds[2]), bounds[3]) };
+      this.#moved(placed(this.#bench, thing, inside));
+    };
+  }
+
   #pressed(event) {
-    const corner = event.target.closest("[data-corner]");
-    if (!corner || event.button !== 0) return;
+    const [corner, over] = [event.target.closest("[data-corner]"), event.target.closest("[data-over]")];
+    if (event.button !== 0 || !(corner || (over && this.#moved))) return;
     event.preventDefault();
     const svg = this.#part("svg");
-    const index = Number(corner.dataset.corner);
-    corner.focus({ preventScroll: true });
+    const index = Number(corner?.dataset.corner);
+    corner?.focus({ preventScroll: true });
+    const move = corner ? (x, y) => this.#cornered(index, x, y) : this.#thing(over.dataset.over);
     const drag = ({ clientX, clientY }) => {
       const { left, top, width, height } = svg.getBoundingClientRect();
-      this.#moved(index, (clientX - left) / width, (clientY - top) / height);
+      move((clientX - left) / width, (clientY - top) / height);
     };
+    if (over) drag(event); // from here on it follows
     const end = () => {
       svg.removeEventListener("pointermove", drag);
       for (const kind of ["pointerup", "pointercancel"]) svg.removeEventListener(kind, end);
@@ -171,6 +213,6 @@ export class Overlay {
     event.preventDefault();
     const step = event.shiftKey ? 0.002 : 0.01;
     const [x, y] = this.#corners[index];
-    this.#moved(Number(index), x + step * along[0], y + step * along[1]);
+    this.#cornered(Number(index), x + step * along[0], y + step * along[1]);
   }
 }

@@ -79,7 +79,11 @@ export class Positions {
   #told() {
     const said = this.#one ? problems(this.#one.bench, this.#bench) : [];
     this.#part("bench-problems").replaceChildren(...said.map((words) => Object.assign(document.createElement("li"), { textContent: words })));
-    this.#overlay.show(this.#one?.bench, this.#references[this.#one?.id] ?? []);
+    const moved = (bench) => {
+      this.#laid(bench);
+      this.#draw();
+    };
+    this.#overlay.show(this.#one?.bench, this.#references[this.#one?.id] ?? [], this.#still ? null : moved);
   }
 
   #thumbnails() {
