@@ -114,7 +114,7 @@ def collecting(ann):
     ann.key("u")
     eventually(lambda: ann.collect["set_up"], "the station is set up to collect")
     ann.reaches("READY")
-    page.locator("#big:not([data-settling])").wait_for()
+    page.locator("#big[data-gate=run]:not([data-settling])").wait_for()
     return ann
 
 
