@@ -92,7 +92,6 @@ def test_arrow_keys_choose_a_failed_trial_letters_say_its_cause_and_each_change_
     assert reasons[0] == "failure was grasp, now grasp: missed"
     assert len(reasons) == 5  # the first score, three changes, one undone
     page.select_option("select[name=group]", "position")
-    page.get_by_role("button", name="Show").click()
     page.wait_for_url(re.compile("group=position"))
     assert page.locator(f"[data-trial='{newer}'] [data-why]").inner_text() == "grasp: missed"
 
