@@ -175,8 +175,8 @@ class Tried:
 class Attempt:
     """An attempt of one of the compared checkpoints that was judged or broken off, of slot `slot` in block `block`.
 
-    `counts`: its score is the one that counts; `outcome` is that of its newest score and `first` of its first one, None
-    where it has none. `attempt` is above 1 where one before it did not count.
+    `counts`: its score is the one that counts; `outcome` is that of its newest score and `first` of its first one
+    before what counts was kept, None where it has none. `attempt` is above 1 where one before it did not count.
     """
 
     block: int
@@ -198,7 +198,10 @@ def attempts_of(plan: Plan) -> list[Attempt]:
     if found is None:
         return []
     value = "success" if found.outcome == SUCCESS else "score"
-    first = Score.objects.filter(trial=OuterRef("trial")).order_by("pk").values(value)[:1]
+    given = Score.objects.filter(trial=OuterRef("trial"))
+    if plan.kept_at:  # what came later is no first score of the evaluation
+        given = given.filter(scored_at__lte=plan.kept_at)
+    first = given.order_by("pk").values(value)[:1]
     rows = plan.handouts.filter(
         trial__status__in=(*JUDGED, TrialStatus.INTERRUPTED),
         slot__checkpoint__name__in=arms_of(compared(document)),
@@ -242,12 +245,12 @@ def blocks_of(found: Design, arms: Sequence[str], attempts: Iterable[Attempt]) -
     at_first: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
     thrown: set[int] = set()
     for each in attempts:
-        if each.outcome is None or each.first is None:
-            thrown.add(each.slot)
-            continue
         arm = arms.index(each.checkpoint)
-        at_first[each.block].setdefault(each.slot, (arm, each.first))
-        if each.counts:
+        if each.first is None:
+            thrown.add(each.slot)
+        else:
+            at_first[each.block].setdefault(each.slot, (arm, each.first))
+        if each.counts and each.outcome is not None:
             counted[each.block][each.slot] = (arm, each.outcome)
 
     def used(rows: Mapping[int, Mapping[int, tuple[int, float]]]) -> list[Block]:

@@ -12,6 +12,7 @@ from evaweb.plans.models import CountsAs, Plan
 from evaweb.plans.selectors import plans_beside
 from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
 from evaweb.preflights.services import preflight_ask
+from evaweb.results.presentation.headline import headline
 from evaweb.results.presentation.integrity import integrity_document
 from evaweb.stations.models import Station
 from evaweb.trials import services, voids
@@ -176,6 +177,17 @@ def test_a_plan_without_a_comparison_keeps_what_counts_at_its_reveal(bench, draf
     assert sum(row["n"] for row in plan.at_reveal["arms"]) == 2
     assert {"record", "measured", "judged", "conduct", "setting", "digest"} <= plan.at_reveal.keys()
     assert sight_of(bench.operator).clear
+
+
+def test_a_first_score_after_the_reveal_makes_no_doubt_about_before(bench, plan, owner):
+    for _ in range(3):
+        score(bench, builders.over(handed(bench, plan)), True)
+    late = ended(bench, plan, "interruption")
+    plan_close(user=owner, plan=plan, reason="enough")
+    plan_reveal(user=owner, plan=plan)
+    before = headline(Plan.objects.get()).caveats
+    score(bench, late, True)
+    assert headline(Plan.objects.get()).caveats == before
 
 
 def test_the_name_of_an_account_stays(bench):
