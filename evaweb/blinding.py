@@ -41,7 +41,7 @@ _HARMLESS = re.compile(
     | (abandoned|chosen\ again)(\ \([\w.@+-]+\))?
     | the\ e-stop\ was\ (pressed|released)[\w .,:@+-]*
     | lease\ [\w .,]*
-    | the\ process\ \w+\ gives\ no\ sign\ of\ life\ yet:\ try\ again\ in\ a\ moment
+    | the\ process\ \w+\ (gives\ no\ sign\ of\ life|does\ not\ answer)\ yet:\ try\ again\ in\ a\ moment
     | nobody\ commands\ the\ station:\ [\w .,;+]*
     | too\ little\ room\ to\ record\ in\ [^\n:]*:\ [\w ,]*\ wanted\ [\w .;()]*
     | disk\ (full|error)\ while\ creating\ [^\n:]*:\ [\w ;]*\ free\ in\ [^\n:]*

@@ -15,8 +15,8 @@ from runtime.safety.collision import Collision, Collisions
 from runtime.safety.limits import Limits
 from runtime.safety.settings import SafetySettings, WorkspaceBox
 
-_JOINTS_OLD = Pattern("safety.joints_old", "joints are {seconds:.2f} s old, allowed {allowed:g}")
-_PICTURE_OLD = Pattern("safety.picture_old", "picture {camera} is {seconds:.2f} s old, allowed {allowed:g}")
+_JOINTS_OLD = Pattern("safety.joints_old", "joint readings are {seconds:.2f} s old (limit {allowed:g} s)")
+_PICTURE_OLD = Pattern("safety.picture_old", "picture {camera} is {seconds:.2f} s old (limit {allowed:g} s)")
 _LEAVES_WORKSPACE = Pattern("safety.leaves_workspace", "{arms} would leave the workspace box")
 _AWAY_FROM_MEASURED = Pattern(
     "safety.away_from_measured",

@@ -107,7 +107,7 @@ def test_places_that_the_bench_does_not_have_end_the_set_up_with_what_the_node_s
     bench.client.command("setup", bench={"seed": 4, "positions": {"block": [9.0, 9.0, 0.0]}})
     status = bench.reach("ready", "idle")
     assert status["state"] == "idle"
-    assert status["reason"].startswith("the bench was not reset within 3 s: the node refused it (")
+    assert status["reason"].startswith("the bench was not reset within 3 s: the robot refused it (")
     set_up(bench, bench={"seed": 4})
 
 

@@ -18,7 +18,7 @@ def test_a_frozen_camera_makes_control_hold_and_is_named(lab):
     status = lab.reach("idle", "ready")
     assert status["state"] == "idle"
     assert "cam_high" in status["reason"]
-    assert "s old, allowed 2" in status["reason"]
+    assert "s old (limit 2" in status["reason"]
 
 
 def test_a_camera_that_may_stand_still_does_not(lab):

@@ -29,7 +29,7 @@ def refusal(ask):
 
 def was_late(reason):
     """Whether a state was refused as too old, which a machine that has too much to do brings about."""
-    return "s old, allowed" in reason or "have not been seen for" in reason
+    return "s old (limit" in reason or "have not been seen for" in reason
 
 
 class Page(LivePage):

@@ -132,18 +132,18 @@ def test_who_has_chosen_is_refused_in_words(german, live, ann):
 
 @pytest.mark.django_db(transaction=True)
 def test_a_stations_event_refusal_and_state_are_shown_in_words(german, live, runtime, ann):
-    runtime.enter(SessionEvent.CONNECTED, fixed("health.connected", "observations arrive: set up"))
+    runtime.enter(SessionEvent.CONNECTED, fixed("health.connected", "the robot is seen: press Set up"))
     (event,) = wire_to(live.name).events_since(0)[1]
     assert (event["text"], event["id"]) == (
-        "disconnected -> idle: observations arrive: set up",
+        "disconnected -> idle: the robot is seen: press Set up",
         "session.changed",
     )
     snapshot = wire_to(live.name).status()
 
     english, there = shown_by_node([event, snapshot])
-    assert english[0] == "disconnected → idle: observations arrive: set up"
+    assert english[0] == "disconnected → idle: the robot is seen: press Set up"
     assert there[0] == "von getrennt nach in Ruhe, weil Bilder kommen an"
-    assert english[1]["reason"] == snapshot["reason"] == "observations arrive: set up"
+    assert english[1]["reason"] == snapshot["reason"] == "the robot is seen: press Set up"
     assert (there[1]["reason"], there[1]["state_is"]["label"]) == ("Bilder kommen an", "in Ruhe")
     assert there[1]["state"] == "idle"
 

@@ -47,10 +47,10 @@ _PANEL_GONE = fixed(
     "health.panel_gone",
     "nobody commands the station: its panel ended as well; claim the lease, then resume or stop",
 )
-_CONNECTED = fixed("health.connected", "observations arrive: set up")
+_CONNECTED = fixed("health.connected", "the robot is seen: press Set up")
 _LINK_LOST = Pattern("health.link_lost", "no observation for {seconds:.1f} s: {who}")
 _ASK_FOR_NODE = fixed("health.ask_for_node", "is the execution node running?")
-_RECEPTION_SILENT = fixed("health.reception_silent", "our process reception gives no sign of life")
+_RECEPTION_SILENT = fixed("health.reception_silent", "our process reception does not answer")
 _TIME_OVER = Pattern("health.time_over", "the run's {seconds:g} s are over")
 _SOURCE_ENDED = fixed("health.source_ended", "the recording that is the source has ended")
 
@@ -110,7 +110,7 @@ class HealthMonitor:
             yield from self._end_of(run)
 
     def absent(self) -> str:
-        """A sibling that gives no sign of life, "" where all do: what it is sent would be lost."""
+        """A sibling that does not answer, "" where all do: what it is sent would be lost."""
         return next((name for name in SIBLINGS if not self._alive(name)), "")
 
     def _alive(self, name: str) -> bool:

@@ -95,7 +95,7 @@ _GRIPPER_IN_SIM = Pattern(
 
 _FAMILY_STARTING = Pattern(
     "operations.family_starting",
-    "the process {process} gives no sign of life yet: try again in a moment",
+    "the process {process} does not answer yet: try again in a moment",
 )
 
 

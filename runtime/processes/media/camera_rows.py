@@ -20,8 +20,8 @@ _STOPPED_FOR = Pattern(
     "camera {camera} has given no new picture for {seconds:.1f} s: rows from {row} on repeat its last one",
 )
 _BACK = Pattern("media.pictures_back", "camera {camera} gives pictures again, from row {row} on")
-_ONCE_MORE = Pattern("media.stopped_once_more", "{what}; it had stopped {more} time more since row {row}")
-_MORE = Pattern("media.stopped_more", "{what}; it had stopped {more} times more since row {row}")
+_ONCE_MORE = Pattern("media.stopped_once_more", "{what}; it stopped {more} more time since row {row}")
+_MORE = Pattern("media.stopped_more", "{what}; it stopped {more} more times since row {row}")
 
 
 QUIET_S = 5.0  # from one pictures_stopped of a camera to its next

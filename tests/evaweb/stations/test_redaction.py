@@ -25,7 +25,7 @@ LINK = Pattern("health.link_lost", "no observation for {seconds:.1f} s: {who}")
 ASK = Pattern("health.ask_for_node", "is the execution node running?")()
 REFUSED = Pattern("control.refused_in_a_row", "{count} actions refused in a row, the last one: {why}")
 JUMPS = Pattern("safety.jumps", "{joint} jumps {distance:.2f} rad, allowed {allowed:g}")
-OLD = Pattern("safety.joints_old", "joints are {seconds:.2f} s old, allowed {allowed:g}")
+OLD = Pattern("safety.joints_old", "joint readings are {seconds:.2f} s old (limit {allowed:g} s)")
 MISSING = Pattern(
     "control.joints_missing",
     "{why}: the run stands, and goes on by itself where they are back before they are {seconds:g} s old",

@@ -52,7 +52,9 @@ def test_it_refuses_a_wrong_dimension():
 
 
 def test_it_refuses_on_old_joints_and_on_old_pictures_each_by_its_own_bound():
-    assert "joints are 0.25 s old, allowed 0.2" in judge([0, 1, 0.05], state(joint_age=0.25)).notes[0]
+    assert (
+        "joint readings are 0.25 s old (limit 0.2 s)" in judge([0, 1, 0.05], state(joint_age=0.25)).notes[0]
+    )
     assert not judge([0, 1, 0.05], state(picture_ages={"cam": 0.25})).refused
     assert "picture cam is 0.60 s old" in judge([0, 1, 0.05], state(picture_ages={"cam": 0.6})).notes[0]
     assert judge([0, 1, 0.05], state(picture_ages={"cam": float("nan")})).refused
@@ -64,7 +66,7 @@ def test_a_motion_of_ours_needs_no_pictures():
 
 def test_a_motion_of_ours_is_not_made_blind_nor_against_a_blocked_arm():
     old = judge([0, 1, 0.05], state(joint_age=0.25), path="motion")
-    assert "joints are 0.25 s old, allowed 0.2" in old.notes[0]
+    assert "joint readings are 0.25 s old (limit 0.2 s)" in old.notes[0]
     blocked = state(previous=(0.5, 1, 0.05), measured=(0.0, 1, 0.05))
     assert "from where it is measured" in judge([0.51, 1, 0.05], blocked, path="motion").notes[0]
     assert not judge([0.45, 1, 0.05], blocked, path="motion").refused
@@ -126,7 +128,7 @@ def test_report_only_sends_the_action_as_it_is_and_lists_what_it_would_have_done
 
 def test_report_only_lists_what_is_beyond_a_limit_also_where_it_would_have_refused():
     verdict = judge([0, 1, 0.103], state(joint_age=9.0), report_only=True)
-    assert "joints are 9.00 s old, allowed 0.2" in verdict.notes
+    assert "joint readings are 9.00 s old (limit 0.2 s)" in verdict.notes
     assert "arm.gripper 0.1030 is outside 0..0.1" in verdict.notes
 
 

@@ -15,7 +15,8 @@ from runtime.core.types import Float64, Observation
 from runtime.ipc.shared_state import SharedState
 
 _NONE_YET = fixed("observation.none_yet", "no observation has arrived yet")
-_STALE = Pattern("observation.stale", "{stream}: {seconds:.2f} s old, allowed {allowed:g}")
+_STALE = Pattern("observation.stale", "{stream}: {seconds:.2f} s old (limit {allowed:g} s)")
+_NOTHING_YET = Pattern("observation.nothing_yet", "{stream}: nothing has arrived yet")
 _NO_PICTURE = Pattern("observation.no_picture", "no picture has arrived from {cameras}")
 
 
@@ -72,6 +73,8 @@ class PolicyObservation:
             if not (pictures or stream in ("joints", "eef")):
                 continue
             allowed = bounds.joint_age if stream in ("joints", "eef") else bounds.picture_age
+            if math.isnan(captured):
+                raise StaleObservationError(_NOTHING_YET(stream=stream))
             if not now - captured <= allowed:
                 raise StaleObservationError(_STALE(stream=stream, seconds=now - captured, allowed=allowed))
         missing = [camera for camera in cameras if camera not in seen.pictures]

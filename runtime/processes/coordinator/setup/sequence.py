@@ -42,7 +42,7 @@ _DRIVES_DISABLED = Pattern(
     "setup.drives_disabled",
     "the robot says that its drives are disabled ({faults}): enable them",
 )
-_SILENT = Pattern("setup.silent", "the process {process} gives no sign of life")
+_SILENT = Pattern("setup.silent", "the process {process} does not answer")
 _NO_DRIVES = Pattern("setup.no_drives", "no ready drives within {seconds:g} s: {why}")
 _NO_OBSERVATION = Pattern("setup.no_observation", "no complete observation within {seconds:g} s: {why}")
 _VALIDATED = Pattern(

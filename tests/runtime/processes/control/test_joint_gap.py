@@ -91,7 +91,7 @@ def test_a_chunk_far_from_where_it_stands_holds_like_a_first_one():
 def test_joints_that_stay_away_for_longer_hold():
     bench = gone(1.2)
     assert bench.behaviour == "hold"
-    assert "actions refused in a row, the last one: joints are 1.0" in bench.said("refusals")[0].text
+    assert "actions refused in a row, the last one: joint readings are 1.0" in bench.said("refusals")[0].text
     assert not goes_on(bench)
 
 

@@ -192,7 +192,7 @@ def test_old_observations_lead_to_holding_with_the_reason(bench):
     bench.feed = False
     bench.run(40)
     assert bench.behaviour == "hold"
-    assert "joints are" in bench.said("refusals")[0].text
+    assert "joint readings are" in bench.said("refusals")[0].text
 
 
 def test_a_dead_main_makes_control_hold_and_keep_sending(bench):

@@ -506,7 +506,7 @@ def test_a_node_that_falls_silent_holds_the_robot(tmp_path: Path) -> None:
     station = Station(stubbed(tmp_path)).running(30)
     station.robot.silent = True
     station.reach(SessionState.HOLDING, 3.0)
-    assert "old, allowed" in station.reason
+    assert "old (limit" in station.reason
     station.close()
 
 

@@ -46,7 +46,7 @@ def test_many_silences_are_one_pair_and_a_number() -> None:
         ("pictures_back", 5.0),
     ]
     assert events[2].text == (
-        "camera cam gives pictures again, from row 47 on; it had stopped 23 times more since row 2"
+        "camera cam gives pictures again, from row 47 on; it stopped 23 more times since row 2"
     )
     assert events[2].data == {"camera": "cam", "row": 47, "more": 23, "since_row": 2}
     assert rest == []
@@ -59,7 +59,7 @@ def test_a_silence_that_began_among_others_and_lasts_is_said_with_its_own_row() 
         ("pictures_back", 0.1, {"camera": "cam", "row": 1}),
         ("pictures_stopped", 5.0, {"camera": "cam", "row": 20, "more": 1, "since_row": 10}),
     ]
-    assert "1 time more since row 10" in events[2].text
+    assert "1 more time since row 10" in events[2].text
 
 
 def test_what_was_counted_is_said_at_the_end_of_the_episode() -> None:

@@ -240,9 +240,9 @@ def test_the_policy_is_shown_the_task_the_pictures_and_poses(desk: Desk) -> None
 @pytest.mark.parametrize(
     ("captured", "sentence"),
     [
-        ({"joints": -0.3, "cam": 0.0}, "joints: 0.30 s old, allowed 0.2"),
-        ({"joints": 0.0, "cam": -0.6}, "cam: 0.60 s old, allowed 0.5"),
-        ({"joints": 0.0, "cam": float("nan")}, "cam: nan s old"),
+        ({"joints": -0.3, "cam": 0.0}, r"joints: 0\.30 s old \(limit 0\.2 s\)"),
+        ({"joints": 0.0, "cam": -0.6}, r"cam: 0\.60 s old \(limit 0\.5 s\)"),
+        ({"joints": 0.0, "cam": float("nan")}, "cam: nothing has arrived yet"),
     ],
 )
 def test_what_is_too_old_is_named_and_not_shown_to_the_policy(

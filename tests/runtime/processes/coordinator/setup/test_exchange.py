@@ -330,7 +330,7 @@ def test_what_the_node_refused_is_the_reason(tmp_path: Path) -> None:
         "node_refused.limits": 3,
     }
     station.prepare(bench=BENCH)
-    assert station.reason == "the bench was not reset within 3 s: the node refused it (scene_reset)"
+    assert station.reason == "the bench was not reset within 3 s: the robot refused it (scene_reset)"
     station.robot.faults = dict  # type: ignore[method-assign]
     station.prepare(bench=BENCH)
     assert station.reason == "the bench was not reset within 3 s: the node does not answer to it"
