@@ -108,7 +108,7 @@ def differences(one: list[tuple[str, int, str]], other: list[tuple[str, int, str
 def _plain(text: str) -> str:
     """Without what is drawn or measured for the answer; bytes of a dataset tell less of a name than of its pictures."""
     return re.sub(
-        r"[\w-]{40,}|nonce[=-][^' >]*|\d\d:\d\d:\d\d\S*|[0-9a-f]{8}-[0-9a-f-]{27}|\d+ (ms|s) ago"
+        r"[\w-]{40,}|drawing-\d+|nonce[=-][^' >]*|\d\d:\d\d:\d\d\S*|[0-9a-f]{8}-[0-9a-f-]{27}|\d+ (ms|s) ago"
         r'|"(clock|sequence|size)": [\d.]+|Content-Length: \d+',
         "",
         text,
