@@ -21,6 +21,7 @@ export class Commands {
   #newest = new Map(); // kind of a stop -> uuid of the one that was pressed last
   #unknown = ""; // uuid of the stop whose unknown outcome the line says
   #asking = null; // the Resume that is asked again
+  #told = 0; // sentences that stood in the line
 
   constructor(store, socket, way) {
     this.#store = store;
@@ -46,7 +47,12 @@ export class Commands {
   /** Send one command, for a trial, a session, an episode to replay or the checkpoint of that id where one is given; resolves to the answer, or null where it was not accepted (and says why on the page). */
   async give(kind, args = {}, { trial = null, checkpoint = "", session = "", replay = null } = {}) {
     const name = verb(kind);
-    this.say(`${name}: pressed …`, "pressed");
+    let told = 0; // when this press last said something
+    const own = (words) => {
+      this.say(`${name}: ${words}`, "pressed");
+      told = this.#told;
+    };
+    own("pressed …");
     const command = { uuid: uuid(), kind, args, page: this.#store.page, epoch: this.#store.epoch };
     Object.assign(command, { boot: this.#store.snapshot?.boot ?? "", sequence: this.#store.snapshot?.sequence ?? 0 });
     if (trial) command.trial = Number(trial);
@@ -56,9 +62,11 @@ export class Commands {
     const stops = STOPPING.includes(kind);
     if (stops) this.#newest.set(kind, command.uuid);
     try {
-      const answer = await (stops ? this.#stops.give(command) : kind === "resume" ? this.#ask(name, command) : post(config.api.commands, command));
+      const answer = await (stops ? this.#stops.give(command) : kind === "resume" ? this.#ask(command, own) : post(config.api.commands, command));
       if (!answer) return null; // another press has ended it, and it was said
-      if (!stops || this.#newest.get(kind) === command.uuid) this.say(`${name}: ${answer.status}`, "accepted");
+      // That it went well does not cover why a later press was refused.
+      const later = this.#told !== told && ["refused", "unknown"].includes(document.getElementById("outcome").dataset.kind);
+      if (stops ? this.#newest.get(kind) === command.uuid : !later) this.say(`${name}: ${answer.status}`, "accepted");
       return answer;
     } catch (error) {
       this.fail(name, error, stops ? STOP_ADVICE : undefined);
@@ -68,13 +76,13 @@ export class Commands {
   }
 
   /** Give a command that is asked again while a process of the station is starting. */
-  async #ask(name, command) {
+  async #ask(command, own) {
     const { boot, sequence, epoch } = command;
     const holds = () => {
       const { fresh, lease, snapshot } = this.#store;
       return fresh && lease === "mine" && this.#store.epoch === epoch && snapshot.boot === boot && snapshot.sequence === sequence;
     };
-    this.#asking = new Asking({ holds, waits: (process) => this.say(`${name}: waiting for the process ${process}, trying again …`, "pressed") });
+    this.#asking = new Asking({ holds, waits: (process) => own(`waiting for the process ${process}, trying again …`) });
     // Under a uuid of its own each time: the station answers one that it knows as it did the first time.
     return this.#asking.answer(() => post(config.api.commands, { ...command, uuid: uuid() }));
   }
@@ -112,6 +120,7 @@ export class Commands {
   /** The one line in which answers stand. */
   say(text, kind) {
     const line = document.getElementById("outcome");
+    this.#told += 1;
     this.#unknown = "";
     line.textContent = text;
     line.dataset.kind = kind;

@@ -280,6 +280,24 @@ def test_an_answer_to_an_earlier_stop_is_not_said_of_the_later_one() -> None:
     ) == ["pressed", "pressed", "unknown", "unknown", "accepted"]
 
 
+@pytest.mark.parametrize(("said", "stands"), [("refused", "refused"), ("pressed", "accepted")])
+def test_that_a_command_was_accepted_does_not_cover_why_a_later_press_was_refused(
+    said: str, stands: str
+) -> None:
+    assert run(
+        "../site/identity.js",
+        STOPS
+        + f"""
+        let answer;
+        globalThis.fetch = () => new Promise((resolve) => {{ answer = resolve; }});
+        commands.give("setup"); await said();
+        commands.say("Start: arm first", "{said}"); await said();
+        answer({{ ok: true, status: 200, text: async () => JSON.stringify({{ status: "accepted" }}) }}); await said();
+        return kinds;
+        """,
+    ) == ["pressed", said, stands]
+
+
 def test_a_button_that_is_pressed_before_its_first_press_is_answered_says_so_and_sends_nothing() -> None:
     assert run(
         "../site/identity.js",
