@@ -92,16 +92,17 @@ ORACLES = (
     ("words", NAMES),
     ("tag", [f"{name}-slips" for name in NAMES]),
 )
+UNCOVERS = re.compile(r"/(reveal|look)/?$")  # for whoever may: what is told after it is theirs to know
 LIST = re.compile(
     r"^/(?!.*(/\d+(/|$)|[0-9a-f]{8}-[0-9a-f]{4}-))"
 )  # an address in which no one thing is named
 
 
-def crawled(lab, client, queries=(), *, posts=False):
+def crawled(lab, client, queries=(), *, posts=False, uncovers=True):
     """(address, status, what it answers) of everything, headers and names of files included.
 
     Each kind of page is asked for one thing that it answers for, and for all where it answers for none; with `posts`
-    those that are only posted to are sent nothing.
+    those that are only posted to are sent nothing, without `uncovers` but a reveal and a look.
     """
     wanted = WANTED.format(lab.dataset, *KEYS, KEYS[0], lab.episode.uuid if lab.episode else "")
     for choices in addresses(lab):
@@ -112,7 +113,8 @@ def crawled(lab, client, queries=(), *, posts=False):
                 address += wanted
                 status, told = answered(client, address)
                 yield address, status, told
-            if status == 405 and posts and not address.endswith("/logout/"):
+            kept = address.endswith("/logout/") or (UNCOVERS.search(address) and not uncovers)
+            if status == 405 and posts and not kept:
                 yield f"POST {address}", *posted(client, address, {})
             if status in NOTHING:
                 continue
@@ -169,11 +171,12 @@ def secrets_in(answers):
         yield from ((asked, secret) for secret in SECRETS if secret in told and secret not in asked)
 
 
-def everything(lab, client, queries=(), *, posts=False):
-    """What is answered to orders, then everything that can be read."""
+def everything(lab, client, queries=(), *, posts=False, uncovers=True):
+    """What is answered to orders, then everything that can be read; without `uncovers` nobody reveals or looks."""
     for path, content in orders(lab) if lab.command is not None else ():
-        yield f"POST {path} {json.dumps(content)}", *posted(client, path, content)
-    yield from crawled(lab, client, queries, posts=posts)
+        if uncovers or not UNCOVERS.search(path):
+            yield f"POST {path} {json.dumps(content)}", *posted(client, path, content)
+    yield from crawled(lab, client, queries, posts=posts, uncovers=uncovers)
 
 
 def orders(lab):
@@ -207,7 +210,9 @@ def told_apart(lab, client):
 
 def _plain(answer, asked):
     status, told = answer
-    return status, re.sub(r"[\w-]{40,}|nonce[=-][^' >]*|\d\d:\d\d:\d\d\S*", "", told.replace(asked, ""))
+    return status, re.sub(
+        r"[\w-]{40,}|drawing-\d+|nonce[=-][^' >]*|\d\d:\d\d:\d\d\S*", "", told.replace(asked, "")
+    )
 
 
 async def heard(lab, user):
