@@ -51,9 +51,12 @@ _KB = """() => [...performance.getEntriesByType("navigation"), ...performance.ge
   .filter(({ initiatorType, name }) => !["video", "img"].includes(initiatorType)
     && !/\\.(stl|dae|obj|jpe?g|png)\\b/i.test(name))
   .reduce((sum, { transferSize }) => sum + transferSize, 0) / 1000"""
-_FOUND = (
-    "async () => (await axe.run(document, { resultTypes: ['violations'] })).violations.map(({ id }) => id)"
-)
+_FOUND = """async (theme) => {
+  document.documentElement.dataset.theme = theme;
+  await new Promise((done) => requestAnimationFrame(() => setTimeout(done, 300))); // colours that fade are there
+  const { violations } = await axe.run(document, { resultTypes: ["violations"] });
+  return violations.map(({ id }) => `${theme}: ${id}`);
+}"""
 _PLAYABLE = """() => {
   const videos = [...document.querySelectorAll("video[data-camera]")];
   return videos.length > 0 && videos.every(({ readyState, seeking }) => readyState >= 2 && !seeking);
@@ -261,7 +264,7 @@ def _login(browser: Any, url: str, password: str) -> Any:
 
 
 def _loads(fresh: Callable[[], Any], url: str, wanted: Page) -> Iterator[dict[str, Any]]:
-    """Five loads of a page; the first warms up the web and is not counted, the last is looked at by axe-core."""
+    """Five loads of a page after one that warms up the web; the last is looked at by axe-core in both themes."""
     for load in range(LOADS + 1):
         page = fresh()
         page.add_init_script(_WATCH)
@@ -274,7 +277,7 @@ def _loads(fresh: Callable[[], Any], url: str, wanted: Page) -> Iterator[dict[st
         row = page.evaluate("seen") | {"page": wanted.name, "draws": wanted.draws, "kb": kb, "axe": []}
         if load == LOADS:
             page.evaluate(_AXE.read_text("utf-8"))
-            row["axe"] = page.evaluate(_FOUND)
+            row["axe"] = [fault for theme in ("dark", "light") for fault in page.evaluate(_FOUND, theme)]
         for selector in wanted.onward:
             with page.expect_event("load"):
                 page.locator(selector).first.click()

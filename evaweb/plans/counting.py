@@ -22,7 +22,7 @@ _FAILURE = Pattern(
     "trial {trial} was ended by {what}: by {plan} that is a failure, whatever was reached",
 )
 _A_FAILURE = Pattern(
-    "plans.counting.a_failure", "Ended by {what}: a failure by the plan, whatever was reached. Tick what was."
+    "plans.counting.a_failure", "Ended by {what}: a failure by the plan, whatever was reached"
 )
 _SCORE_IT_FIRST = Pattern(
     "plans.counting.score_it_first",
@@ -66,17 +66,18 @@ def fails_by(plan: Plan, trial: Trial) -> bool:
     return counts == CountsAs.FAILURE and not nothing
 
 
-def declared_failures(plan: Plan) -> frozenset[int]:
-    """The trials that count as failures by the plan, whatever was reached."""
+def declared_failures(plan: Plan) -> dict[int, str]:
+    """The trials that count as failures by the plan, whatever was reached, with what ended their runs in words."""
     if all(getattr(plan, name) != CountsAs.FAILURE for name in ENDS):
-        return frozenset()
+        return {}
     rows = Trial.objects.filter(handout__plan=plan, status=TrialStatus.SCORED, episode__frames__gt=0)
     ends = ("ended_by", "status", "reason", "episode__status")
-    return frozenset(
-        trial
-        for trial, *end in rows.values_list("pk", *ends)
-        if getattr(plan, f"on_{end_of(*end)}", CountsAs.JUDGED) == CountsAs.FAILURE
-    )
+    ended = {trial: end_of(*end) for trial, *end in rows.values_list("pk", *ends)}
+    return {
+        trial: ENDINGS[by]
+        for trial, by in ended.items()
+        if getattr(plan, f"on_{by}", CountsAs.JUDGED) == CountsAs.FAILURE
+    }
 
 
 def _judged(what: str, trial: Trial, user: Any) -> None:

@@ -90,7 +90,7 @@ def conduct_of(plan: Plan, runs: Sequence[Run], looks: Iterable[Look]) -> dict[s
     """
     given_back = plan.events.filter(what="given back").order_by("pk")
     return {
-        "looks": _looked(plan),
+        "looks": looked_behind(plan),
         "beside": [
             {"plan": row.name, "version": row.version, "state": row.state, "trials": row.trials}
             for row in plans_beside(plan).annotate(trials=Count("handouts", distinct=True))
@@ -111,7 +111,7 @@ def conduct_of(plan: Plan, runs: Sequence[Run], looks: Iterable[Look]) -> dict[s
     }
 
 
-def _looked(plan: Plan) -> list[dict[str, Any]]:
+def looked_behind(plan: Plan) -> list[dict[str, Any]]:
     """Looks behind the blind: of this version, of earlier ones and of plans beside; `before`: it was frozen later."""
     of_the_same = Q(plan__name=plan.name, plan__version__lte=plan.version) | Q(plan__in=plans_beside(plan))
     rows = Behind.objects.filter(of_the_same).order_by("at", "pk")

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 from evaweb.errors import EvaError
+from evaweb.plans.counting import declared_failures
 from evaweb.plans.design import frozen
 from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
@@ -76,6 +77,7 @@ def _summary(plan: Plan, only: Chosen, at: Hashable, order: Mapping[str, tuple[s
         "funnels": [drawn for scene in scenes if (drawn := _funnel(plan, analysis, scene, only))],
         "success_times": courses.success_times(analysis.arms),
         "grid": conditions.grid(analysis.arms, _grid_links(plan, analysis, only)),
+        "declared": declared_failures(plan).keys() & {row.trial for row in only.apply(outcomes)},
         "failures": failure_tables(analysis, order, partial(trials_address, plan, only, success="no")),
         "scenes": [(scene, scene_rows(plan, analysis, scene, only)) for scene in scenes],
         "others": [

@@ -19,6 +19,7 @@ from evaweb.errors import EvaError
 from evaweb.lists import Listing
 from evaweb.plans import services
 from evaweb.plans.blinding_rules import look, may_look
+from evaweb.plans.counting import declared_failures
 from evaweb.plans.design import compared
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results import selectors
@@ -118,6 +119,7 @@ def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
         "listing": listing,
         "page": page,
         "rows": [listings.trial_row(trial) for trial in page],
+        "declared": declared_failures(found),
         **_common(request, found),
     }
     return render(request, "results/trials.html", context)

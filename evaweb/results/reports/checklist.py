@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from django.db.models import Count, F, Min
 
 from evaweb.plans.design import compared, findings_of
-from evaweb.plans.models import Allocation, Look, Plan
+from evaweb.plans.models import Allocation, Plan
 from evaweb.plans.schedule import IMBALANCE
 from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.conduct import looked_behind
 from evaweb.results.analysis.integrity import CATEGORY, VERDICT, with_changes
 from evaweb.results.models import Rating
 from evaweb.trials.models import Score, Trial, TrialStatus
@@ -96,19 +97,19 @@ def _order(plan: Plan) -> Item:
 
 
 def _blind(plan: Plan) -> Item:
-    looks = Look.objects.filter(plan__name=plan.name, plan__version__lte=plan.version).order_by("at")
-    looked = [
-        look.user.get_username() + (f" (version {look.plan.version})" if look.plan_id != plan.pk else "")
-        for look in looks.select_related("user", "plan")
-    ]
     if not plan.blind:
         return Item("Operators blind", "no", "the plan was open")
+    looked = [
+        row["by_name"] + ("" if row["own"] else f" (at {row['name']} v{row['version']})")
+        for row in looked_behind(plan)
+    ]
     words = (
-        f"looked before the reveal, and ran no trial: {', '.join(looked)}"
+        f"looked before the reveal: {', '.join(looked)}; they ran no trial from then on, but nobody is kept from "
+        "standing by or pressing an e-stop"
         if looked
         else "nobody looked before the reveal"
     )
-    return Item("Operators blind", "yes", f"a fresh code for every trial; {words}")
+    return Item("Operators blind", "partly" if looked else "yes", f"a fresh code for every trial; {words}")
 
 
 def _complete(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
@@ -127,8 +128,8 @@ def _complete(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
 def _voids(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
     voided = trials.filter(status=TrialStatus.VOIDED)
     late = voided.filter(voided_at__gte=plan.kept_at).count() if plan.kept_at else 0
-    words = f"{voided.count()} voided, each with a reason, {late} of them after the reveal"
-    return Item("No trial left out after unblinding", _yes(late == 0), words)
+    words = f"{voided.count()} voided in this version, each with a reason, {late} of them after the reveal"
+    return Item("No trial of this version voided after the reveal", _yes(late == 0), words)
 
 
 def _corrections(plan: Plan) -> Item:
@@ -148,10 +149,13 @@ def _corrections(plan: Plan) -> Item:
 
 
 def _versions(plan: Plan) -> Item:
-    before, version = 0, plan.amends
+    before, left, version = 0, 0, plan.amends
     while version is not None:
-        before, version = before + bool(version.document), version.amends
-    words = f"version {plan.version}; {before} frozen before it, each with all of its alpha"
+        before, left = before + bool(version.document), left + version.handouts.count()
+        version = version.amends
+    words = f"version {plan.version}; {before} frozen before it"
+    if before:
+        words += f", each with all of its alpha; their {left} attempts are not in these data"
     return Item("One version of the plan", _yes(before == 0), words)
 
 
@@ -181,7 +185,7 @@ def _recorded(trials) -> Item:  # type: ignore[no-untyped-def]
     counted = trials.filter(status=TrialStatus.SCORED)
     n, recorded = counted.count(), counted.filter(episode__isnull=False).count()
     kept = "yes" if recorded == n else "partly" if recorded else "no"
-    return Item("Every trial on record", kept, f"{recorded} of {n} trials that count have a recording")
+    return Item("Every trial that counts recorded", kept, f"{recorded} of {n} have a recording")
 
 
 def _configurations(trials) -> Item:  # type: ignore[no-untyped-def]

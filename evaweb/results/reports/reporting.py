@@ -15,7 +15,7 @@ from django.template.loader import render_to_string
 from django.utils import timezone
 
 from evaweb.errors import EvaError
-from evaweb.plans.counting import ENDS
+from evaweb.plans.counting import ENDS, declared_failures
 from evaweb.plans.design import blocks_that_count, compared, frozen
 from evaweb.plans.models import CountsAs, Plan, PlanState
 from evaweb.results.analysis import caching
@@ -202,6 +202,7 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         "preferences": preferences_of(plan),
         "checklist": checklist(plan, analysis),
         "runs": runs.outcomes,
+        "declared": declared_failures(plan),
     }
 
 

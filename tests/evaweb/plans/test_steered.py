@@ -1,6 +1,7 @@
 """What an adversary steered: each is refused, or stands in the record."""
 
 import pytest
+from django.template.loader import render_to_string
 from django.test import Client
 
 from evaweb.blinding import sight_of
@@ -12,8 +13,11 @@ from evaweb.plans.models import CountsAs, Plan
 from evaweb.plans.selectors import plans_beside
 from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
 from evaweb.preflights.services import preflight_ask
+from evaweb.results.analysis.caching import analysis_of
 from evaweb.results.presentation.headline import headline
 from evaweb.results.presentation.integrity import integrity_document
+from evaweb.results.reports.checklist import checklist
+from evaweb.results.reports.reporting import report_context
 from evaweb.stations.models import Station
 from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint, Trial
@@ -47,6 +51,10 @@ def ended(bench, plan, by="", frames=375):
     reason = "e-stop by ann: make safe, then release" if by == "estop" else ""
     Trial.objects.filter(pk=trial.pk).update(status=status, ended_by=by, reason=reason)
     return Trial.objects.get(pk=trial.pk)
+
+
+def practices(plan):
+    return {item.practice: item for item in checklist(plan, analysis_of(plan))}
 
 
 @pytest.mark.parametrize("change", [{"active": False}, {"description": "another"}])
@@ -83,6 +91,19 @@ def test_who_looked_at_an_earlier_version_stands_in_the_record_of_the_next(bench
     (row,) = record["looks"]
     assert (row["by_name"], row["version"], row["own"], row["before"]) == ("olga", 1, False, True)
     assert "olga looked behind the blind of blocks v1 before this version was frozen" in record["remarks"]
+    blind = practices(second)["Operators blind"]
+    assert (blind.kept, "olga (at blocks v1)" in blind.record) == ("partly", True)
+
+
+def test_trials_of_an_earlier_version_are_said_to_be_left_out(bench, plan, owner):
+    score(bench, ended(bench, plan), True)
+    second = plan_freeze(user=owner, plan=plan_amend(user=owner, plan=plan, reason="more trials"))
+    one = practices(second)["One version of the plan"]
+    assert (one.kept, one.record) == (
+        "no",
+        "version 2; 1 frozen before it, each with all of its alpha; their 1 attempts are not in these data",
+    )
+    assert "in this version" in practices(second)["No trial of this version voided after the reveal"].record
 
 
 def test_failures_by_the_plan_stand_in_the_record_with_who_pressed(bench, draft, owner):
@@ -102,6 +123,16 @@ def test_failures_by_the_plan_stand_in_the_record_with_who_pressed(bench, draft,
     assert {(row["counts"], row["reason"].partition(":")[0]) for row in pressed} == {(True, "e-stop by ann")}
     ways = {way["what"]: way for way in record["headline"]}
     assert ways["without failures by the plan's declaration"]["sentence"] == "No pair is left"
+    page = render_to_string("results/report.html", report_context(plan, analysis_of(plan)))
+    assert page.count("<td>By the plan: ended by the e-stop") == 6
+    assert "6 trials are failures by the plan, because of what ended the run" in page
+    shown = Client()
+    shown.force_login(owner)
+    listed = shown.get("/result/plans/blocks/1/trials/").content.decode()
+    assert listed.count("<strong>By the plan: ended by the e-stop") == 6
+    assert "6 trials are failures by the plan" in shown.get("/result/plans/blocks/1/").content.decode()
+    one = shown.get(f"/result/trials/{pressed[0]['trial_id']}/").content.decode()
+    assert "Ended by the e-stop: a failure by the plan, whatever was reached.</p>" in one
 
 
 def test_a_failure_by_the_plan_is_voided_by_two_also_where_all_is_open(bench, draft, owner):

@@ -563,7 +563,7 @@ def test_a_folder_that_is_not_empty_is_not_written_to(revealed, tmp_path):
 def test_the_checklist_says_what_the_record_says(revealed):
     kept = {item.practice: item for item in checklist(revealed, analysis_of(revealed))}
     assert kept["As many trials as planned, or a rule to stop"].kept == "yes"
-    assert kept["Every trial on record"].record == "16 of 16 trials that count have a recording"
+    assert kept["Every trial that counts recorded"].record == "16 of 16 have a recording"
     assert kept["A second, blind rater"].kept == "no"
     assert kept["Question and comparison before the first trial"].kept == "yes"
 
