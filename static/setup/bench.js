@@ -1,6 +1,10 @@
 // A position of a bench as drawings have it: from above in millimetres, the arms at the lower edge; markup and no page.
 
 export const ROUND = 32; // corners of what stands for a circle
+const STEP = 10; // mm for an arrow key, 1 with Shift
+const TURN = 5; // degrees for Page Up and Page Down, 1 with Shift
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+const REACH = 2000; // mm in which things of a lab's own may lie, whatever the area is
 
 /** What lies on the bench of a position: [{key, name, kind, x, y, yaw, width, depth}], in millimetres and degrees. */
 export function things(bench, sizes) {
@@ -20,6 +24,28 @@ export function placed(bench, thing, change) {
   if (thing.kind === "plate") return { ...bench, plate: place };
   if (thing.kind === "block") return { ...bench, block: [...place, turned(yaw)] };
   return { ...bench, objects: { ...bench.objects, [thing.name]: [...place, turned(yaw), metres(width), metres(depth)] } };
+}
+
+/** The same, held to where the thing may lie. */
+export function moved(bench, thing, change, sizes) {
+  const { x = thing.x, y = thing.y } = change;
+  const [left, right, near, far] = thing.kind === "object" ? [-REACH, REACH, -REACH, REACH] : sizes.area.map(mm);
+  return placed(bench, thing, { ...change, x: Math.min(Math.max(x, left), right), y: Math.min(Math.max(y, near), far) });
+}
+
+/** What a key does to a thing, {x, y} or {yaw}; null for a key that does nothing. */
+export function stepped(thing, { key, shiftKey, ctrlKey, altKey, metaKey }) {
+  if (ctrlKey || altKey || metaKey) return null;
+  const [along, turns] = [ARROWS[key], { PageUp: 1, PageDown: -1 }[key]];
+  const step = shiftKey ? 1 : STEP;
+  if (along) return { x: thing.x + step * along[0], y: thing.y + step * along[1] };
+  if (turns && thing.kind !== "plate") return { yaw: thing.yaw + turns * (shiftKey ? 1 : TURN) };
+  return null;
+}
+
+/** Where a thing lies, in words. */
+export function whereabouts({ name, kind, x, y, yaw }) {
+  return `${name}: x ${n(x)} mm, y ${n(y)} mm${kind === "plate" ? "" : `, turned by ${n(yaw)}°`}`;
 }
 
 /** The bench without one of its things. */

@@ -3,7 +3,7 @@
 // dragged there too. A picture of one's own stays in the browser.
 
 import { get } from "../site/api.js";
-import { escaped, n, outline, placed, things } from "./bench.js";
+import { escaped, moved, n, outline, stepped, things, whereabouts } from "./bench.js";
 import { projection, seen } from "./plane.js";
 
 const LIVE_MS = 700;
@@ -19,7 +19,7 @@ export class Overlay {
   #addresses;
   #stations;
   #bench = {};
-  #moved = null; // is told of the bench that a person makes by dragging; null: nothing can be moved
+  #changed = null; // is told of each bench that a person makes of the one that is shown; null: nothing can be moved
   #own = null; // {name, address} of a picture that was chosen from this computer
   #references = [];
   #corners = FIRST;
@@ -46,9 +46,9 @@ export class Overlay {
   }
 
   /** The position that is looked at: its bench, its references, and who is told where a thing was dragged to. */
-  show(bench, references, moved = null) {
+  show(bench, references, changed = null) {
     this.#bench = bench ?? {};
-    this.#moved = moved;
+    this.#changed = changed;
     if (references !== this.#references) this.#offer(references);
     this.#draw();
   }
@@ -150,17 +150,19 @@ export class Overlay {
 
   #draw() {
     const svg = this.#part("svg");
-    const focused = document.activeElement?.dataset?.corner;
+    const { corner, over } = svg.contains(document.activeElement) ? document.activeElement.dataset : {};
     const [left, right, near, far] = this.#sizes.area.map((side) => 1000 * side);
     const h = projection([[left, near], [right, near], [right, far], [left, far]], this.#corners);
     const shape = (points, kind, more = "") => `<polygon class="${kind}" ${more} points="${points.map((point) => seen(h, point).map((share) => n(SIDE * share)).join(" ")).join(", ")}"/>`;
-    const laid = h ? [shape([[left, near], [right, near], [right, far], [left, far]], "area"), ...things(this.#bench, this.#sizes).map((thing) => shape(outline(thing), `over over-${thing.kind}`, `data-over="${escaped(thing.key)}"`))] : [];
+    const movable = (thing) => `data-over="${escaped(thing.key)}"${this.#changed ? ` tabindex="0" role="button" aria-roledescription="thing on the bench" aria-label="${escaped(whereabouts(thing))}"` : ""}`;
+    const laid = h ? [shape([[left, near], [right, near], [right, far], [left, far]], "area"), ...things(this.#bench, this.#sizes).map((thing) => shape(outline(thing), `over over-${thing.kind}`, movable(thing)))] : [];
     const handles = this.#corners.map(
       ([x, y], index) => `<circle class="corner" data-corner="${index}" cx="${n(SIDE * x)}" cy="${n(SIDE * y)}" r="14" tabindex="0" role="button" aria-label="${NAMES[index]} of the area"/>`,
     );
-    svg.toggleAttribute("data-movable", Boolean(this.#moved && h));
+    svg.toggleAttribute("data-movable", Boolean(this.#changed && h));
     svg.innerHTML = `<g opacity="${this.#part("density").value}">${laid.join("")}</g>${handles.join("")}`;
-    if (focused) svg.querySelector(`[data-corner="${focused}"]`)?.focus({ preventScroll: true });
+    const focused = corner ? `[data-corner="${corner}"]` : over && `[data-over="${CSS.escape(over)}"]`;
+    if (focused) svg.querySelector(focused)?.focus({ preventScroll: true });
   }
 
   #cornered(index, x, y) {
@@ -168,30 +170,31 @@ export class Overlay {
     this.#put(this.#corners.map((corner, other) => (other === index ? [inside(x), inside(y)] : corner)));
   }
 
-  /** A thing follows the pointer over the plane of the table. */
   #thing(key) {
-    const thing = things(this.#bench, this.#sizes).find((one) => one.key === key);
+    return things(this.#bench, this.#sizes).find((one) => one.key === key);
+  }
+
+  /** A thing follows the pointer over the plane of the table. */
+  #following(thing) {
     const [left, right, near, far] = this.#sizes.area.map((side) => 1000 * side);
     const plane = projection(this.#corners, [[left, near], [right, near], [right, far], [left, far]]);
-    const bounds = thing?.kind === "object" ? [-2000, 2000, -2000, 2000] : [left, right, near, far];
     let from = null;
     return (x, y) => {
       const at = seen(plane, [x, y]);
       from ??= at;
-      const [to, other] = [thing.x + at[0] - from[0], thing.y + at[1] - from[1]].map(Math.round);
-      const inside = { x: Math.min(Math.max(to, bounds[0]), bounds[1]), y: Math.min(Math.max(other, bounds[2]), bounds[3]) };
-      this.#moved(placed(this.#bench, thing, inside));
+      const [to, aside] = [thing.x + at[0] - from[0], thing.y + at[1] - from[1]].map(Math.round);
+      this.#changed(moved(this.#bench, thing, { x: to, y: aside }, this.#sizes));
     };
   }
 
   #pressed(event) {
     const [corner, over] = [event.target.closest("[data-corner]"), event.target.closest("[data-over]")];
-    if (event.button !== 0 || !(corner || (over && this.#moved))) return;
+    if (event.button !== 0 || !(corner || (over && this.#changed))) return;
     event.preventDefault();
     const svg = this.#part("svg");
     const index = Number(corner?.dataset.corner);
-    corner?.focus({ preventScroll: true });
-    const move = corner ? (x, y) => this.#cornered(index, x, y) : this.#thing(over.dataset.over);
+    (corner ?? over).focus({ preventScroll: true });
+    const move = corner ? (x, y) => this.#cornered(index, x, y) : this.#following(this.#thing(over.dataset.over));
     const drag = ({ clientX, clientY }) => {
       const { left, top, width, height } = svg.getBoundingClientRect();
       move((clientX - left) / width, (clientY - top) / height);
@@ -207,10 +210,16 @@ export class Overlay {
   }
 
   #key(event) {
-    const along = ARROWS[event.key];
-    const index = event.target.dataset.corner;
-    if (!along || index === undefined) return;
+    const { corner: index, over } = event.target.dataset;
+    const thing = this.#changed && over && this.#thing(over);
+    const change = thing && stepped(thing, event);
+    const along = index !== undefined && ARROWS[event.key];
+    if (!change && !along) return;
     event.preventDefault();
+    if (change) {
+      this.#changed(moved(this.#bench, thing, change, this.#sizes));
+      return;
+    }
     const step = event.shiftKey ? 0.002 : 0.01;
     const [x, y] = this.#corners[index];
     this.#cornered(Number(index), x + step * along[0], y + step * along[1]);

@@ -1,10 +1,7 @@
 // The bench from above, on which things are moved and turned with mouse, finger and keys. Millimetres and degrees.
 
-import { box, drawn, ground, n, placed, things, turned, windowOf } from "./bench.js";
+import { box, drawn, ground, moved, n, stepped, things, turned, whereabouts, windowOf } from "./bench.js";
 
-const STEP = 10; // mm for an arrow key, 1 with Shift
-const TURN = 5; // degrees for Page Up and Page Down, 1 with Shift
-const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const HANDLE = 26; // mm from a thing's far edge to the handle that turns it
 
 export class Stage {
@@ -49,9 +46,8 @@ export class Stage {
   }
 
   #movable(thing) {
-    const { key, name, kind, x, y, yaw, depth } = thing;
-    const turn = kind === "plate" ? "" : `, turned by ${n(yaw)}°`;
-    const label = `${name}: x ${n(x)} mm, y ${n(y)} mm${turn}`;
+    const { key, name, kind, depth } = thing;
+    const label = whereabouts(thing);
     const named = `data-thing="${attribute(key)}"`;
     if (this.#still) return drawn(thing, { attributes: `${named} role="img" aria-label="${attribute(label)}"`, words: name });
     const far = -depth / 2 - HANDLE;
@@ -71,10 +67,7 @@ export class Stage {
   }
 
   #put(thing, change) {
-    const { x = thing.x, y = thing.y } = change;
-    const [left, right, near, far] = thing.kind === "object" ? [-2000, 2000, -2000, 2000] : this.#sizes.area.map((side) => 1000 * side);
-    const inside = { ...change, x: Math.min(Math.max(x, left), right), y: Math.min(Math.max(y, near), far) };
-    this.#bench = placed(this.#bench, thing, inside);
+    this.#bench = moved(this.#bench, thing, change, this.#sizes);
     this.#draw();
     this.#changed(this.#bench);
   }
@@ -109,14 +102,10 @@ export class Stage {
 
   #key(event) {
     const thing = this.#thing(event.target.closest("[data-thing]")?.dataset.thing);
-    if (!thing || this.#still || event.ctrlKey || event.altKey || event.metaKey) return;
-    const [along, turns] = [ARROWS[event.key], { PageUp: 1, PageDown: -1 }[event.key]];
-    if (along) {
-      const step = event.shiftKey ? 1 : STEP;
-      this.#put(thing, { x: thing.x + step * along[0], y: thing.y + step * along[1] });
-    } else if (turns && thing.kind !== "plate") this.#put(thing, { yaw: thing.yaw + turns * (event.shiftKey ? 1 : TURN) });
-    else return;
+    const change = thing && !this.#still && stepped(thing, event);
+    if (!change) return;
     event.preventDefault();
+    this.#put(thing, change);
   }
 }
 

@@ -1,8 +1,10 @@
 """An administrator lays a scene by sight, with what is on screen alone, and the Eval page offers it."""
 
+import io
 import re
 
 import pytest
+from PIL import Image
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
@@ -38,6 +40,12 @@ def number(page, name):
     return float(page.get_by_label(f"block: {name}", exact=True).input_value())
 
 
+def _picture():
+    file = io.BytesIO()
+    Image.new("RGB", (640, 480), "grey").save(file, "PNG")
+    return file.getvalue()
+
+
 def test_a_scene_is_laid_by_dragging_and_offered_at_the_bench(admin):
     page = admin.page
     page.locator(".bar-user > summary").click()
@@ -64,6 +72,22 @@ def test_a_scene_is_laid_by_dragging_and_offered_at_the_bench(admin):
     for key in ("ArrowLeft", "Shift+ArrowDown", "PageUp"):
         page.keyboard.press(key)
     assert [number(page, name) for name in ("x mm", "y mm", "turn °")] == [x - 10, y - 1, turn + 5]
+
+    page.locator("#overlay > summary").click()  # on a picture of the real bench, with keys and by dragging
+    page.locator("[data-overlay=file]").set_input_files(
+        {"name": "bench.png", "mimeType": "image/png", "buffer": _picture()}
+    )
+    page.locator("[data-overlay=picture]:not([hidden])").wait_for()
+    over = page.locator("[data-overlay=svg] [data-over=block]")
+    over.focus()
+    for key in ("ArrowLeft", "Shift+ArrowUp", "Shift+PageUp"):
+        page.keyboard.press(key)
+    assert [number(page, name) for name in ("x mm", "y mm", "turn °")] == [x - 20, y, turn + 6]
+    assert over.evaluate("(thing) => thing === document.activeElement")
+    assert "turned by" in over.get_attribute("aria-label")
+    drag(page, over, 60, 0)
+    assert number(page, "x mm") > x - 20
+    page.locator("#overlay > summary").click()
 
     for text in ("The block stands", "The gripper holds the block"):
         page.get_by_role("button", name="Add a milestone").click()

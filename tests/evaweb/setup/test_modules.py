@@ -44,6 +44,33 @@ def test_what_lies_there_is_in_millimetres_and_is_put_elsewhere() -> None:
     assert call(BENCH, "without", LAID, block) == {"plate": [0.08, 0.34]}
 
 
+@pytest.mark.parametrize(
+    ("pressed", "change"),
+    [
+        ({"key": "ArrowLeft"}, {"x": -150, "y": 260}),
+        ({"key": "ArrowUp", "shiftKey": True}, {"x": -140, "y": 261}),
+        ({"key": "PageUp"}, {"yaw": 25}),
+        ({"key": "PageDown", "shiftKey": True}, {"yaw": 19}),
+        ({"key": "Enter"}, None),
+        ({"key": "ArrowLeft", "altKey": True}, None),
+    ],
+)
+def test_keys_move_and_turn_what_lies_there(pressed: dict[str, Any], change: dict[str, float] | None) -> None:
+    _, block = call(BENCH, "things", LAID, SIZES)
+    assert call(BENCH, "stepped", block, pressed) == change
+    plate = {**block, "kind": "plate"}
+    assert call(BENCH, "stepped", plate, {"key": "PageUp"}) is None
+
+
+def test_what_is_moved_stays_in_the_area_but_things_of_ones_own() -> None:
+    _, block = call(BENCH, "things", LAID, SIZES)
+    right, far = SIZES["area"][1], SIZES["area"][3]
+    assert call(BENCH, "moved", LAID, block, {"x": 9000, "y": 9000}, SIZES)["block"] == [right, far, 20]
+    cup = {"objects": {"cup": [0.0, 0.3, 0, 0.08, 0.06]}}
+    (thing,) = call(BENCH, "things", cup, SIZES)
+    assert call(BENCH, "moved", cup, thing, {"x": 900}, SIZES)["objects"]["cup"][0] == 0.9
+
+
 def test_corners_of_what_is_turned_are_where_they_are_seen() -> None:
     thing = {"kind": "object", "x": 100, "y": 200, "yaw": 90, "width": 40, "depth": 20}
     corners = call(BENCH, "outline", thing)
