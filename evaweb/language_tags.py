@@ -1,10 +1,13 @@
-"""Template tags for sentences: in the language that the browser has chosen."""
+"""Template tags for words: in the language that the browser has chosen."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from django import template
+from django.template.base import FilterExpression, NodeList, Parser, Token, token_kwargs
+from django.utils.html import conditional_escape
+from django.utils.safestring import SafeString, mark_safe
 
 from evaweb import languages
 
@@ -23,3 +26,37 @@ def language_choice(context: Any) -> dict[str, Any]:
     """The languages that are offered, and the code of the one that is chosen; "" for English."""
     spoken = languages.chosen(context["request"])
     return {"offered": languages.offered(), "chosen": spoken.code if spoken else ""}
+
+
+class TextNode(template.Node):
+    """Markup in English, which a language may replace by its own: `{% t "home.robots" n=count %}...{% endt %}`.
+
+    The words of a language are markup too, with `{n}` for each value that the tag names.
+    """
+
+    def __init__(self, id: str, values: dict[str, FilterExpression], english: NodeList) -> None:
+        self.id, self.values, self.english = id, values, english
+
+    def render(self, context: Any) -> SafeString:
+        """The words of the chosen language, else the English ones."""
+        request = context.get("request")
+        spoken = languages.chosen(request) if request is not None else None
+        words = spoken.templates.get(self.id) if spoken is not None else None
+        if words is None:
+            return self.english.render(context)
+        shown = {name: conditional_escape(value.resolve(context)) for name, value in self.values.items()}
+        return mark_safe(words.format_map(shown))
+
+
+@register.tag("t")
+def text(parser: Parser, token: Token) -> TextNode:
+    """Compile `{% t "id" name=value ... %}English{% endt %}`; TemplateSyntaxError for anything else."""
+    _, id, *rest = (*token.split_contents(), "")
+    values = token_kwargs(bits := [bit for bit in rest if bit], parser)
+    if bits or len(id) < 3 or id[0] != id[-1] or id[0] not in "'\"":
+        raise template.TemplateSyntaxError(
+            f't: expected "an.id" and name=value pairs, given {token.contents}'
+        )
+    english = parser.parse(("endt",))
+    parser.delete_first_token()
+    return TextNode(id[1:-1], values, english)

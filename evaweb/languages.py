@@ -1,6 +1,8 @@
-"""Languages of the lab's sentences: a JSON file each, which says the patterns of other words by the sentences' ids.
+"""Languages of the pages: a JSON file each, which gives the words of another language by id.
 
-English is what the sentences are written in, and what is shown wherever a language has no words for one.
+`sentences` are those of the station, the lab and the scripts, as patterns with named arguments; `templates` are what
+templates write between `{% t "id" %}` and `{% endt %}`. English is what all are written in, and what is shown where a
+language has no words.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ class Language:
     code: str
     name: str
     patterns: Mapping[str, str]
+    templates: Mapping[str, str]
 
 
 def offered() -> list[Language]:
@@ -47,21 +50,30 @@ def language(code: str) -> Language | None:
 
 
 def chosen(request: Any) -> Language | None:
-    """The language that this browser has chosen, None for English."""
-    code = request.COOKIES.get(COOKIE, "")
-    return language(code) if _CODE.fullmatch(code) else None
+    """The language that this browser has chosen, None for English; looked up once per request."""
+    if not hasattr(request, "_eva_language"):
+        code = request.COOKIES.get(COOKIE, "")
+        request._eva_language = language(code) if _CODE.fullmatch(code) else None
+    found: Language | None = request._eva_language
+    return found
 
 
-def parse(content: str) -> tuple[str, dict[str, str]]:
-    """Name and patterns in a file of a language; ValueError where it is none."""
-    said = bounded.from_json(content, "the language", _LARGEST, _MOST)
-    name, patterns = (said.get("name"), said.get("sentences")) if isinstance(said, dict) else (None, None)
-    if not isinstance(name, str) or not isinstance(patterns, dict):
-        raise ValueError('expected {"name": its own name, "sentences": {id: pattern}}')
-    wrong = [key for key, pattern in patterns.items() if not isinstance(pattern, str)]
+def parse(code: str, content: str) -> Language:
+    """The language that a file describes; ValueError where it is none."""
+    given = bounded.from_json(content, "the language", _LARGEST, _MOST)
+    match given:
+        case {"name": str(name), "sentences": dict(patterns), **rest}:
+            templates = rest.get("templates", {})
+        case _:
+            raise ValueError(
+                'expected {"name": its own name, "sentences": {id: pattern}, "templates": {id: words}}'
+            )
+    wrong = [
+        key for part in (patterns, templates) for key, words in part.items() if not isinstance(words, str)
+    ]
     if wrong:
         raise ValueError(f"{', '.join(wrong[:5])}: expected a text")
-    return name, patterns
+    return Language(code, name, patterns, templates)
 
 
 def translated(text: str, spoken: Language | None) -> str:
@@ -96,7 +108,7 @@ def _read(path: Path, written: int) -> Language | None:
     try:
         if path.stat().st_size > _LARGEST:
             raise ValueError(f"more than {_LARGEST} bytes")
-        return Language(path.stem, *parse(path.read_text("utf-8")))
+        return parse(path.stem, path.read_text("utf-8"))
     except (OSError, ValueError) as error:
         log.error("the language %s is not offered: %s", path, error)
         return None

@@ -1,8 +1,15 @@
-"""The catalogue of all sentences, for who writes a language, and what such a language lacks."""
+"""The catalogue of all words that a language can say, for who writes one, and what such a language lacks.
+
+Sentences of Python are declared as patterns; scripts write `t("an.id", "English with {name}", { name })`, templates
+`{% t "an.id" name=value %}English{% endt %}`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,6 +18,18 @@ from runtime.core.sentences import Pattern, known, names_of
 
 _ROOT = Path(__file__).parents[2]
 _IMPORT = "from runtime.core.sentences import"
+_TEMPLATE = re.compile(r'\{% t "([^"]+)"((?:[^%]|%(?!\}))*?) ?%\}(.*?)\{% endt %\}', re.DOTALL)
+_VALUE = re.compile(r"\s(\w+)=")
+_SCRIPT = re.compile(r'(?<![\w.])t\(\s*"([^"]+)",\s*("(?:[^"\\]|\\.)*")')
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What a language is to say: id, English, and the names of what can stand in it."""
+
+    id: str
+    english: str
+    names: frozenset[str]
 
 
 def modules() -> Iterator[str]:
@@ -21,35 +40,81 @@ def modules() -> Iterator[str]:
                 yield ".".join(path.relative_to(_ROOT).with_suffix("").parts)
 
 
-def declared() -> list[Pattern]:
+def of_python() -> list[Entry]:
     """Every pattern that there is, in the order of the ids."""
     for module in modules():
         import_module(module)
-    return list(known())
+    return [_entry(pattern) for pattern in known()]
 
 
-def catalogue(patterns: list[Pattern]) -> list[dict[str, Any]]:
-    """Id, English pattern and names of the arguments of each."""
-    return [{"id": one.id, "english": one.english, "arguments": sorted(one.names)} for one in patterns]
+def of_scripts() -> list[Entry]:
+    """What scripts say; ValueError for an id with two texts, and for what is not written as it is read here."""
+    found: list[Entry] = []
+    for path, source in _sources("static", "*.js"):
+        read = [(id, json.loads(english)) for id, english in _SCRIPT.findall(source)]
+        _require_all(path, source.count(' t("') + source.count('(t("') + source.count("{t("), len(read))
+        found += [Entry(id, english, names_of(english)) for id, english in read]
+    return once(found)
 
 
-def compared(patterns: list[Pattern], translated: Mapping[str, str]) -> dict[str, list[str]]:
-    """Ids that a language lacks ("missing"), that there are none of ("unknown"), and whose patterns do not fit.
+def of_templates() -> list[Entry]:
+    """What templates say; ValueError for an id with two texts, and for what is not written as it is read here."""
+    found: list[Entry] = []
+    for path, source in _sources("templates", "*.html"):
+        read = _TEMPLATE.findall(source)
+        _require_all(path, source.count("{% t "), len(read))
+        found += [
+            Entry(id, " ".join(english.split()), frozenset(_VALUE.findall(values)))
+            for id, values, english in read
+        ]
+    return once(found)
 
-    "other_arguments": a pattern that names what its sentence has not, or cannot be read.
+
+def catalogue(entries: Iterable[Entry]) -> list[dict[str, Any]]:
+    """Id, English and names of the arguments of each."""
+    return [{"id": one.id, "english": one.english, "arguments": sorted(one.names)} for one in entries]
+
+
+def compared(entries: Sequence[Entry], translated: Mapping[str, str]) -> dict[str, list[str]]:
+    """Ids that a language lacks ("missing"), that there are none of ("unknown"), and whose words do not fit.
+
+    "other_arguments": words that name what there is not, or cannot be read.
     """
-    english = {one.id: one for one in patterns}
+    english = {one.id: one for one in entries}
     return {
         "missing": [id for id in english if id not in translated],
         "unknown": [id for id in translated if id not in english],
         "other_arguments": [
-            id for id, pattern in translated.items() if id in english and not _fits(english[id], pattern)
+            id for id, words in translated.items() if id in english and not _fits(english[id], words)
         ],
     }
 
 
-def _fits(english: Pattern, pattern: str) -> bool:
+def once(entries: Iterable[Entry]) -> list[Entry]:
+    """In the order of the ids; ValueError for an id with two texts."""
+    found: dict[str, Entry] = {}
+    for one in entries:
+        if found.setdefault(one.id, one) != one:
+            raise ValueError(f"{one.id} is two texts: {found[one.id].english!r} and {one.english!r}")
+    return [found[id] for id in sorted(found)]
+
+
+def _entry(pattern: Pattern) -> Entry:
+    return Entry(pattern.id, pattern.english, pattern.names)
+
+
+def _sources(folder: str, names: str) -> Iterator[tuple[Path, str]]:
+    for path in sorted((_ROOT / folder).rglob(names)):
+        yield path, path.read_text("utf-8")
+
+
+def _require_all(path: Path, written: int, read: int) -> None:
+    if read < written:
+        raise ValueError(f"{path}: {written} texts with an id are written there, {read} can be read")
+
+
+def _fits(english: Entry, words: str) -> bool:
     try:
-        return names_of(pattern) <= english.names
+        return names_of(words) <= english.names
     except ValueError:
         return False

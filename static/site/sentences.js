@@ -1,7 +1,9 @@
-// Sentences of the station and the lab in the language that this browser has chosen: by their ids, English without one.
-// Nothing waits for a catalogue; when one has come, "eva:language" is told to the document.
+// Words of the pages in the language that this browser has chosen: by their ids, English without one. Nothing waits for a
+// catalogue: the one of the last page is kept in this browser; when a newer one has come, "eva:language" is told to the
+// document.
 
 const COOKIE = "eva_language";
+const KEPT = "eva-language"; // {code, sentences}, as the last page had them
 const PART = /\{\{|\}\}|\{([a-z][a-z0-9_]*)(!r)?(?::([^{}]*))?\}/g;
 
 const root = globalThis.document?.documentElement; // none where tests run it
@@ -15,15 +17,23 @@ export function speak(found) {
 
 /** What {id, arguments, text} says: in the chosen language where that has words for it, else its text. */
 export function sentence({ id = "", arguments: given = {}, text = "" }) {
-  const pattern = Object.hasOwn(patterns, id) ? patterns[id] : null;
-  if (pattern === null) return text;
+  return Object.hasOwn(patterns, id) ? filled(patterns[id], given) ?? text : text;
+}
+
+/** A text of the page: its English, in which {names} stand for what is given, or the words of the chosen language. */
+export function t(id, english, given = {}) {
+  return sentence({ id, arguments: given, text: filled(english, given) ?? english });
+}
+
+/** A pattern with what is given; null where it asks for what there is not. */
+function filled(pattern, given) {
   let whole = true;
   const said = pattern.replace(PART, (part, name, quoted, spec = "") => {
     if (part === "{{" || part === "}}") return part[0];
     if (!Object.hasOwn(given, name)) whole = false;
     return whole ? shown(given[name], quoted, spec) : "";
   });
-  return whole ? said : text; // a pattern that asks for what there is not
+  return whole ? said : null;
 }
 
 /** A message with `reason` and the id and arguments of that, with what it says in the chosen language. */
@@ -71,9 +81,14 @@ function figure(value, spec) {
 async function load(code) {
   const address = root.dataset.languages;
   if (!code || !address) return speak({});
+  const kept = JSON.parse(localStorage.getItem(KEPT) ?? "{}");
+  if (kept.code === code) speak(kept.sentences);
   try {
     const answer = await fetch(address.replace("_", code), { credentials: "same-origin" });
-    if (answer.ok) speak((await answer.json()).sentences);
+    if (!answer.ok) return;
+    const { sentences } = await answer.json();
+    speak(sentences);
+    localStorage.setItem(KEPT, JSON.stringify({ code, sentences }));
   } catch (error) {
     console.error(`the language ${code} did not come: ${error.message}`);
   }
@@ -84,6 +99,6 @@ if (root) {
   document.addEventListener("change", ({ target }) => {
     if (!target.matches("[data-language-choice]")) return;
     document.cookie = `${COOKIE}=${target.value}; path=/; max-age=31536000; samesite=lax`;
-    load(target.value);
+    load(target.value).then(() => location.reload()); // it keeps its lease
   });
 }

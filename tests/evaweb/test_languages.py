@@ -7,10 +7,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from django.template import Context, Template, TemplateSyntaxError
 from django.test import Client
 
 from evaweb import languages
 from evaweb.console.feed import History
+from evaweb.lab import sentences
 from evaweb.stations.runtime_client import wire_to
 from runtime.core.sentences import Pattern, fixed, told
 from runtime.processes.coordinator.session.transitions import SessionEvent
@@ -38,7 +40,10 @@ WORDS = {
 def german(settings, tmp_path):
     """A language of a folder of its own."""
     settings.LANGUAGES_DIR = tmp_path
-    (tmp_path / "de.json").write_text(json.dumps({"name": "Deutsch", "sentences": WORDS}), "utf-8")
+    templates = {"home.n": "<b>{n}</b> hat {who}"}
+    (tmp_path / "de.json").write_text(
+        json.dumps({"name": "Deutsch", "sentences": WORDS, "templates": templates}), "utf-8"
+    )
     (tmp_path / "README.md").write_text("no language")
     return languages.language("de")
 
@@ -91,6 +96,50 @@ def test_server_and_page_say_the_same(german, said, words):
     else:
         assert (here, there[0]) == (words, words)
     assert languages.translated(said, None) == said
+
+
+@pytest.mark.some(2)
+def test_scripts_fill_in_english_as_other_languages_do():
+    script = (
+        f"const s = await import({json.dumps((STATIC / 'site' / 'sentences.js').as_uri())});"
+        "const say = () => [s.t('a.b', '{n} of {{{all:.1f}}}', { n: 3, all: 2 }), s.t('a.c', 'no {n}')];"
+        "const before = say(); s.speak({ 'a.b': '{all} hat {n}' }); console.log(JSON.stringify([before, say()]));"
+    )
+    done = subprocess.run(
+        [NODE, "--input-type=module", "-e", script], capture_output=True, text=True, check=True
+    )
+    assert json.loads(done.stdout) == [["3 of {2.0}", "no {n}"], ["2 hat 3", "no {n}"]]
+
+
+def rendered(source, code="", **values):
+    request = SimpleNamespace(COOKIES={languages.COOKIE: code})
+    return Template(source).render(Context({"request": request, **values}))
+
+
+def test_templates_say_the_words_of_a_language_with_their_values_escaped(german):
+    source = '<p>{% t "home.n" n=found|length who=name %}{{ name }} has {% if found %}some{% endif %}{% endt %}</p>'
+    given = {"found": [1, 2], "name": "<i>"}
+    assert rendered(source, **given) == "<p>&lt;i&gt; has some</p>"
+    assert rendered(source, "de", **given) == "<p><b>2</b> hat &lt;i&gt;</p>"
+    assert rendered('{% t "home.other" %}as it is{% endt %}', "de") == "as it is"
+    assert Template('{% t "home.n" %}no request{% endt %}').render(Context()) == "no request"
+    for wrong in ("{% t home.n %}{% endt %}", '{% t "home.n" 3 %}{% endt %}', "{% t %}{% endt %}"):
+        with pytest.raises(TemplateSyntaxError, match="expected"):
+            Template(wrong)
+
+
+def test_every_language_that_ships_says_all():
+    entries = {
+        "sentences": sentences.once([*sentences.of_python(), *sentences.of_scripts()]),
+        "templates": sentences.of_templates(),
+    }
+    for path in sorted((STATIC / "languages").glob("*.json")):
+        spoken = languages.parse(path.stem, path.read_text("utf-8"))
+        for rows, words in (
+            (entries["sentences"], spoken.patterns),
+            (entries["templates"], spoken.templates),
+        ):
+            assert sentences.compared(rows, words) == {"missing": [], "unknown": [], "other_arguments": []}
 
 
 def test_files_that_are_no_language_are_not_offered(german, tmp_path, caplog):

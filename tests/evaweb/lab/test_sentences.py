@@ -69,7 +69,7 @@ def test_every_sentence_is_said_with_the_arguments_that_it_names():
 def test_the_catalogue_has_all_and_tells_what_a_language_lacks(tmp_path):
     out = StringIO()
     call_command("sentences", stdout=out)
-    rows = {row["id"]: row for row in json.loads(out.getvalue())}
+    rows = {row["id"]: row for row in json.loads(out.getvalue())["sentences"]}
     assert rows["lease.held_by"] == {
         "id": "lease.held_by",
         "english": "{holder} holds the lease",
@@ -80,14 +80,14 @@ def test_the_catalogue_has_all_and_tells_what_a_language_lacks(tmp_path):
     file.write_text(json.dumps({"name": "X", "sentences": words}))
     out = StringIO()
     call_command("sentences", str(file), stdout=out)
-    found = json.loads(out.getvalue())
+    found = json.loads(out.getvalue())["sentences"]
     assert (len(found["missing"]), found["unknown"]) == (len(rows) - 1, [])
     wrong = {"lease.held_by": "{owner} hat sie", "lease.nobody_holds": "{0}", "no.such": "x"}
     file.write_text(json.dumps({"name": "X", "sentences": wrong}))
     out = StringIO()
     with pytest.raises(CommandError, match="unknown"):
         call_command("sentences", str(file), stdout=out)
-    found = json.loads(out.getvalue())
+    found = json.loads(out.getvalue())["sentences"]
     assert (found["unknown"], found["other_arguments"]) == (
         ["no.such"],
         ["lease.held_by", "lease.nobody_holds"],

@@ -28,15 +28,27 @@ class Command(BaseCommand):
 
     def handle(self, *args: Any, file: Path | None = None, **options: Any) -> None:
         """Print the one or the other."""
-        patterns = sentences.declared()
+        entries = {
+            "sentences": sentences.once([*sentences.of_python(), *sentences.of_scripts()]),
+            "templates": sentences.of_templates(),
+        }
         if file is None:
-            self.stdout.write(json.dumps(sentences.catalogue(patterns), indent=1, ensure_ascii=False))
+            self.stdout.write(
+                json.dumps(
+                    {part: sentences.catalogue(rows) for part, rows in entries.items()},
+                    indent=1,
+                    ensure_ascii=False,
+                )
+            )
             return
         try:
-            _, translated = parse(file.read_text("utf-8"))
+            spoken = parse(file.stem, file.read_text("utf-8"))
         except (OSError, ValueError) as error:
             raise CommandError(f"{file}: {error}") from None
-        found = sentences.compared(patterns, translated)
+        found = {
+            "sentences": sentences.compared(entries["sentences"], spoken.patterns),
+            "templates": sentences.compared(entries["templates"], spoken.templates),
+        }
         self.stdout.write(json.dumps(found, indent=1))
-        if found["unknown"] or found["other_arguments"]:
+        if any(part["unknown"] or part["other_arguments"] for part in found.values()):
             raise CommandError(f"{file}: sentences that are unknown, or have other arguments")
