@@ -7,7 +7,7 @@ import importlib
 import sys
 from pathlib import Path
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 
 _BENCHMARKS = (
     "chaos",
@@ -37,7 +37,7 @@ _LONG = ("designs", "recording", "results")
 _SECONDS = 20.0
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main() -> int:
     """Exit code 0 where every wanted figure holds, 1 where one does not."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)

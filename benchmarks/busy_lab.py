@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 
 ROBOT = "agilex_piper"
 _ROOT = Path(__file__).parents[1]
@@ -33,7 +33,7 @@ PATIENT = (
 )
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main() -> int:
     """Stay up until a signal comes."""
     import django
@@ -61,7 +61,7 @@ def _up(lab: Any, given: argparse.Namespace) -> None:
     from evaweb.lab.benches import Bench
     from evaweb.lab.processes import Program
     from evaweb.roles import Role
-    from runtime.sim.standin import announce
+    from runtime.sim.standin import announce_ready
 
     node = lab.processes.start(programs.tabletop(ROBOT, programs.bench(1, 640, 480)))
     serving = ("-m", "runtime.sim.serve", "openpi", *_POLICY)
@@ -76,7 +76,7 @@ def _up(lab: Any, given: argparse.Namespace) -> None:
     url = lab.up([Bench(_ROOT / "deployments" / "tabletop.toml", assignments)])
     login = seed.demo_login(username="operator", role=Role.OPERATOR)
     facts = {"url": url, "passwords": {login.username: login.password}, "node": node["obs_endpoint"]}
-    announce({**facts, "pids": lab.processes.pids()}, given.ready_file)
+    announce_ready({**facts, "pids": lab.processes.pids()}, given.ready_file)
 
 
 if __name__ == "__main__":

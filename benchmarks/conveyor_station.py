@@ -19,16 +19,16 @@ from runtime.core.types import ActionChunk, Conditioning, Float64, Observation, 
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.sim.bench import BenchState, camera_arm
-from runtime.sim.chase import Chase, Places
-from runtime.sim.continuing import Prefix, continued
+from runtime.sim.chase import ChaseScript, PlaceMap
+from runtime.sim.continuing import CommittedPrefix, continue_prefix
 from runtime.sim.conveyor import CONVEYOR, Conveyor
-from runtime.sim.lockstep import linked
+from runtime.sim.lockstep import in_process_peers
 from runtime.sim.node import parser
 from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
-from runtime.sim.surroundings import Surroundings
-from runtime.sim.tabletop import Reset
-from runtime.station.checks import checked_spec
+from runtime.sim.surroundings import Environment
+from runtime.sim.tabletop import ResetRequest
+from runtime.station.checks import check_deployment
 
 HORIZON = 50  # rows of a chunk
 _WIDTH, _HEIGHT = 320, 240
@@ -38,19 +38,19 @@ _KEPT = 4  # frames of which a picture can still be drawn
 @cache
 def _renderer(robot: str) -> Renderer:
     """Draws the overhead camera's pictures of the conveyor; the same for every station of this process."""
-    made = robots.load(robot)
+    made = robots.load_robot(robot)
     above = tuple(camera for camera in made.cameras if camera_arm(made, camera) is None)
     return Renderer(replace(made, cameras=above), CONVEYOR, _WIDTH, _HEIGHT)
 
 
 @cache
-def _places(robot: str) -> Places:
+def _places(robot: str) -> PlaceMap:
     """Joints of a robot for the places of the belt; the same for every station of this process."""
     assert CONVEYOR.belt is not None
-    return Places(robots.load(robot), CONVEYOR.belt)
+    return PlaceMap(robots.load_robot(robot), CONVEYOR.belt)
 
 
-class Gallery(Surroundings):
+class Gallery(Environment):
     """The conveyor, with a stamp for each picture: the number of its frame, of which `develop` draws the picture."""
 
     def __init__(self, robot: Robot, conveyor: Conveyor) -> None:
@@ -81,7 +81,7 @@ class Gallery(Surroundings):
         """Ground truth of the belt's ride, and of how well it is followed."""
         return self.conveyor.truth()
 
-    def reset(self, wish: Reset) -> None:
+    def reset(self, wish: ResetRequest) -> None:
         """Another course."""
         self.conveyor.reset(wish)
 
@@ -89,7 +89,7 @@ class Gallery(Surroundings):
 class Seeing(Policy):
     """A script as a policy in this process, which is shown developed pictures."""
 
-    def __init__(self, script: Chase, gallery: Gallery) -> None:
+    def __init__(self, script: ChaseScript, gallery: Gallery) -> None:
         self._script, self._gallery = script, gallery
         self._answer = script.begin()
 
@@ -102,8 +102,8 @@ class Seeing(Policy):
         pictures = self._gallery.develop(observation.pictures[self._script.overhead.key])
         rows = self._answer(observation.qpos.astype(np.float64), pictures, observation.prompt)
         if conditioning is not None:
-            left = conditioning.left_over.astype(np.float64)
-            rows = continued(rows, Prefix(left, conditioning.predicted_delay, len(left)))
+            left = conditioning.remaining_rows.astype(np.float64)
+            rows = continue_prefix(rows, CommittedPrefix(left, conditioning.predicted_delay, len(left)))
         return ActionChunk(rows)
 
     def reset(self) -> None:
@@ -128,12 +128,14 @@ def station_at(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -
         "recording": {"enabled": False},
         "lockstep": {"delay_ticks": delay},
     }
-    made = checked_spec(loader.resolve(tree, {}, "moving_target"))
+    made = check_deployment(loader.resolve_deployment(tree, {}, "moving_target"))
     gallery = Gallery(made.robot, Conveyor(made.robot, seed))
     clock = VirtualClock()
     options = parser().parse_args(
         ["--robot", made.robot.name, "--bench", "conveyor", "--start-pose", "ready"]
     )
-    script = Chase(made.robot, HORIZON, made.rate, clock=clock, places=_places(made.robot.name))
-    peers = replace(linked(made, clock, gallery, options), policy=lambda spec, clock: Seeing(script, gallery))
+    script = ChaseScript(made.robot, HORIZON, made.rate, clock=clock, places=_places(made.robot.name))
+    peers = replace(
+        in_process_peers(made, clock, gallery, options), policy=lambda spec, clock: Seeing(script, gallery)
+    )
     return gallery.conveyor, Lockstep(made, clock, peers=peers)

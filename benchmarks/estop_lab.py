@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 
 PRESSED, OTHER = "pressed-1", "other-1"
 GUESSED = "guessed"  # a viewer whose password is guessed: other attackers log in while that name is locked
@@ -29,7 +29,7 @@ _SETTINGS = (
 )
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main() -> int:
     """Stay up until a signal comes."""
     import django
@@ -60,7 +60,7 @@ def _limit_files() -> None:
 def _up(lab: Any, ready_file: Path) -> None:
     from evaweb.lab.benches import Bench
     from evaweb.lab.processes import Program
-    from runtime.sim.standin import announce
+    from runtime.sim.standin import announce_ready
 
     small = ("--robot", _ROBOT, "--width", "64", "--height", "48")
     free = ("--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0")
@@ -71,7 +71,7 @@ def _up(lab: Any, ready_file: Path) -> None:
     pressed = _bench("demo.toml", PRESSED, node["obs_endpoint"], node["action_endpoint"], policy["url"])
     other = _bench("tabletop.toml", OTHER, _NOWHERE, _NOWHERE, "ws://127.0.0.1:1")
     url = lab.up([Bench(*pressed), Bench(*other)])
-    announce({"url": url, "stops": lab.stops, **_people(), "pids": lab.processes.pids()}, ready_file)
+    announce_ready({"url": url, "stops": lab.stops, **_people(), "pids": lab.processes.pids()}, ready_file)
 
 
 def _bench(file: str, station: str, observations: str, actions: str, policy: str) -> tuple[Path, list[str]]:

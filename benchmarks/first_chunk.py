@@ -16,7 +16,7 @@ from runtime.core.plugins import variants
 
 def main(kind: str, name: str) -> None:
     """Solves, then prints."""
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     module = variants("runtime.kinematics")[kind]
     kinematics = module.build(module.Config(), robot)
     home = robot.poses["home"]

@@ -43,10 +43,10 @@ def measure(seconds: float) -> Report:
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
     try:
-        rows = [row for name in robots.names() for row in _robot(name, seconds)]
+        rows = [row for name in robots.robot_names() for row in _robot(name, seconds)]
         figures = [figure for row in rows for figure in _figures(row)]
         figures += _compared(rows)
-        figures += [figure for name in robots.names() for figure in _postures(name)]
+        figures += [figure for name in robots.robot_names() for figure in _postures(name)]
         figures.append(
             Figure("limit_violations", sum(row["violations"] for row in rows if _ours(row)), "", "== 0")
         )
@@ -58,7 +58,7 @@ def measure(seconds: float) -> Report:
 
 def _robot(name: str, seconds: float) -> list[dict[str, Any]]:
     """A row per trajectory and backend."""
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     cases = invented(robot)
     folder = os.environ.get(_EPISODE)
     if name == _RECORDED and folder:
@@ -200,7 +200,7 @@ def _postures(name: str) -> list[Figure]:
 
     `far` paths are of one leg anywhere within the limits. In chunks a path is seen no farther than its chunk.
     """
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     module = variants("runtime.kinematics")[_DEFAULT]
     kinematics = module.build(module.Config(), robot)
     paths, far = ([path(robot, i, *legs) for i in range(PATHS)] for legs in ((), (1, np.inf)))
@@ -242,7 +242,7 @@ def _fk() -> list[Figure]:
     if not folder:
         print(f"the recorded episode is not measured: {_EPISODE} is not set", file=sys.stderr)
         return []
-    robot, recording = robots.load(_RECORDED), recorded(Path(folder))
+    robot, recording = robots.load_robot(_RECORDED), recorded(Path(folder))
     module = variants("runtime.kinematics")[_DEFAULT]
     found = module.build(module.Config(), robot).forward(recording.joints)
     away = np.linalg.norm(found[..., :3] - recording.poses[..., :3], axis=-1) * 1e3
@@ -259,7 +259,7 @@ def _starts() -> list[Figure]:
 
     Processor time stands beside it: on a busy machine that is what a start costs.
     """
-    name = _RECORDED if _RECORDED in robots.names() else robots.names()[0]
+    name = _RECORDED if _RECORDED in robots.robot_names() else robots.robot_names()[0]
     with tempfile.TemporaryDirectory() as folder:
         cold = _first_chunk(name, folder)
         warm = [_first_chunk(name, folder) for _ in range(_STARTS)]

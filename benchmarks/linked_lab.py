@@ -9,13 +9,13 @@ from pathlib import Path
 
 from benchmarks.climb import MOST_STATIONS
 from benchmarks.estop_lab import PRESSED
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 
 STATIONS = (PRESSED, *(f"more-{number}" for number in range(1, MOST_STATIONS)))
 _ROBOT = "agilex_piper"
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main() -> int:
     """Bring it up, announce addresses, people and a code for each of STATIONS."""
     import django
@@ -45,7 +45,7 @@ def _announce(ready_file: Path, url: str, stops: str, pids: dict[str, int]) -> N
     from evaweb.lab.seed import demo_login, station_registered
     from evaweb.roles import Role
     from evaweb.stations.enrolment import code_make
-    from runtime.sim.standin import announce
+    from runtime.sim.standin import announce_ready
 
     logins = [demo_login(username=str(role), role=role) for role in (Role.OPERATOR, Role.ADMIN)]
     admin, enrol = User.objects.get(username=Role.ADMIN), {}
@@ -54,7 +54,9 @@ def _announce(ready_file: Path, url: str, stops: str, pids: dict[str, int]) -> N
         shown = code_make(user=admin, station=station)
         enrol[name] = [shown.address, shown.code]
     passwords = {login.username: login.password for login in logins}
-    announce({"url": url, "stops": stops, "passwords": passwords, "enrol": enrol, "pids": pids}, ready_file)
+    announce_ready(
+        {"url": url, "stops": stops, "passwords": passwords, "enrol": enrol, "pids": pids}, ready_file
+    )
 
 
 if __name__ == "__main__":

@@ -130,7 +130,7 @@ def chase(strategy: Mapping[str, Any], delay: int, seed: int) -> Chased:
         delay=delay,
         seed=seed,
         success=course.success,
-        share=escort.share,
+        share=escort.on_target_share,
         mean=1e3 * escort.mean,
         p95=1e3 * escort.quantile(0.95),
         acceleration=_acceleration(commanded) * rate**2,

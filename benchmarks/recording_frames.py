@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.format import open_memmap
 
 from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, WIDTH
-from robots import load
+from robots import load_robot
 from runtime.sim.pictures import Scene
 
 COUNT = 90
@@ -16,7 +16,7 @@ COUNT = 90
 
 def write(path: Path, count: int = COUNT) -> Path:
     """Write `count` frames to `path`, uint8 [count, cameras, H, W, 3], RGB."""
-    robot = load("agilex_piper")
+    robot = load_robot("agilex_piper")
     scene, home = Scene(robot, HEIGHT, WIDTH), robot.poses["home"]
     pictures = open_memmap(path, "w+", np.uint8, (count, len(CAMERAS), HEIGHT, WIDTH, 3))
     for index in range(count):

@@ -69,7 +69,7 @@ def answering(meant: Meant) -> Callable[[int, Conditioning | None], Float64]:
         rows = meant(step)
         if conditioning is None:
             return rows
-        left = conditioning.left_over.astype(np.float64)[: len(rows)]
+        left = conditioning.remaining_rows.astype(np.float64)[: len(rows)]
         kept = min(conditioning.predicted_delay, len(left))
         after, _ = overlap_blend(left[kept:], rows[kept:], _SEAM)
         return np.concatenate([left[:kept], after])

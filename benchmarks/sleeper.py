@@ -17,7 +17,7 @@ from runtime.core.clock import MonotonicClock
 def main() -> None:
     """Print one line of JSON: the class it got, and of each wake-up its time, step and lateness [s]."""
     how, rate, seconds = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
-    scheduling = realtime.enter(int(sys.argv[4])) if len(sys.argv) > 4 else "ordinary"
+    scheduling = realtime.enter_realtime(int(sys.argv[4])) if len(sys.argv) > 4 else "ordinary"
     loop = {"rest": _rest, "deadlines": _deadlines}[how]
     woke, steps, late = loop(1.0 / rate, seconds)
     print(json.dumps({"scheduling": scheduling, "woke": woke, "steps": steps, "late": late}))

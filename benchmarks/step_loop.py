@@ -19,7 +19,7 @@ from runtime.ipc.messages import ChunkMerged
 from runtime.motion.timeline import Contributions, DimensionKinds, Timeline
 from runtime.processes.coordinator.inference.chunk_mixture import Mixture
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
-from runtime.strategies.base import Arrival, Merged, Progress, StrategyParameters, join
+from runtime.strategies.base import ArrivedChunk, MergeResult, Progress, StrategyParameters, join
 
 Policy = Callable[[int, Conditioning | None], Float64]  # observation step, conditioning -> rows [H, D]
 FAR = 0.05  # [rad] that a run's first action may be off without being blended in, as in control
@@ -49,7 +49,7 @@ class Log:
     """Events so far."""
 
     executed: list[Executed] = field(default_factory=list)
-    merged: list[Merged] = field(default_factory=list)
+    merged: list[MergeResult] = field(default_factory=list)
     observed: dict[int, int] = field(default_factory=dict)  # by chunk: the step it was asked about
 
 
@@ -90,7 +90,7 @@ class StepLoop:
         """Go on with this strategy from the next tick on."""
         self._joining = self._joining or self._kind not in ("", strategy.__name__)
         self._kind = strategy.__name__
-        waited = self.step > 0 and self._merge.waits
+        waited = self.step > 0 and self._merge.requests_while_stopped
         self._config = config
         self._query = strategy.query(config)
         self._merge = strategy.merge(config, self._dims)
@@ -105,7 +105,7 @@ class StepLoop:
 
     def tick(self) -> None:
         """One control period."""
-        if self._flight is None and self._query.wants(self._progress()):
+        if self._flight is None and self._query.should_request(self._progress()):
             self._flight = self._ask()
         if self._flight is not None and self.step >= self._flight.due:
             request, self._flight = self._flight, None
@@ -120,11 +120,11 @@ class StepLoop:
     def _ask(self) -> _Request:
         self._number += 1
         self._asked = self.step
-        conditioning = self._conditioning() if self._query.continues else None
+        conditioning = self._conditioning() if self._query.uses_rtc else None
         rows = self._policy(self.step, conditioning)
         self.log.observed[self._number] = self.step
         due = self.step + self._delay(self._number)
-        return _Request(self._number, self.step, due, self._query.waits, rows)
+        return _Request(self._number, self.step, due, self._query.requests_while_stopped, rows)
 
     def _conditioning(self) -> Conditioning | None:
         """The robot's commitment, as the coordinator would tell a policy that continues its chunks."""
@@ -132,10 +132,10 @@ class StepLoop:
         return self._commitment.conditioning(self.step, self._delays, quantile, horizon)
 
     def _arrive(self, request: _Request) -> None:
-        arrival = Arrival(request.number, request.step, request.rows, request.waited)
+        arrival = ArrivedChunk(request.number, request.step, request.rows, request.waited)
         first = self._merge.place(self.timeline, arrival, self.step).rows[:1]
         far = self._waiting and np.abs(first - self.commanded).max(initial=0.0) > FAR
-        held = self.commanded if (self._starved or far) and not self._merge.waits else None
+        held = self.commanded if (self._starved or far) and not self._merge.requests_while_stopped else None
         merged = join(
             self._merge,
             self.timeline,
@@ -151,19 +151,19 @@ class StepLoop:
         self.log.merged.append(merged)
         self._joining = self._joining and bool(merged.dropped)
         chunk = ActionChunk(request.rows.astype(np.float32))
-        self._commitment.answered(request.number, chunk, request.step, request.waited)
-        self._commitment.merged(_as_told(merged))
+        self._commitment.add_chunk(request.number, chunk, request.step, request.waited)
+        self._commitment.on_merged(_as_told(merged))
 
     def _execute(self) -> None:
         planned = self.timeline.at(self.step)
-        self._starved = planned is None and not (self._merge.waits or self._waiting)
+        self._starved = planned is None and not (self._merge.requests_while_stopped or self._waiting)
         if planned is not None:
             self.commanded = planned.action
-        makers = () if planned is None else planned.makers
+        makers = () if planned is None else planned.contributions
         self.log.executed.append(Executed(self.step, self.commanded, makers, self._starved))
 
 
-def _as_told(merged: Merged) -> ChunkMerged:
+def _as_told(merged: MergeResult) -> ChunkMerged:
     """Control's message to the coordinator about it."""
     return ChunkMerged(
         merged.chunk_id,
@@ -174,5 +174,5 @@ def _as_told(merged: Merged) -> ChunkMerged:
         merged.mistimed,
         merged.dropped,
         overlap=merged.overlap,
-        shares=merged.shares,
+        contributions=merged.contributions,
     )

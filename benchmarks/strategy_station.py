@@ -21,8 +21,8 @@ from runtime.core.plugins import variants
 from runtime.core.types import ActionChunk, Conditioning, Float32, Float64, Observation, RobotCommand
 from runtime.ipc.session_state import SessionState
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.processes.lockstep.lockstep import Around, Lockstep, Peers
-from runtime.station.checks import checked_spec
+from runtime.processes.lockstep.lockstep import Lockstep, LockstepEnvironment, Peers
+from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Capabilities, Sink, Source
 
@@ -89,7 +89,11 @@ class Known(Policy):
 
 
 def station_of(
-    spec: StationSpec, robot: Obedient, policy: Policy, clock: VirtualClock, around: Around | None = None
+    spec: StationSpec,
+    robot: Obedient,
+    policy: Policy,
+    clock: VirtualClock,
+    around: LockstepEnvironment | None = None,
 ) -> Lockstep:
     """A station in lockstep with that robot and that policy in the place of its own."""
     spec = replace(spec, capabilities=Capabilities(moves_robot=True))
@@ -189,4 +193,4 @@ def lockstep_deployment(data: Path, robot: str, strategy: dict[str, Any], rate: 
 def _plan(data: Path, case: Case) -> StationSpec:
     tree = lockstep_deployment(data, "agilex_piper", case.section, case.control_hz)
     tree["lockstep"] = {"delay_ticks": case.delay}
-    return checked_spec(loader.resolve(tree, {}, "strategies"))
+    return check_deployment(loader.resolve_deployment(tree, {}, "strategies"))

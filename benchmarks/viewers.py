@@ -15,10 +15,10 @@ from urllib.parse import urlsplit
 from websockets.asyncio.client import ClientConnection, connect
 
 from evaweb.binary_frames import decode
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("url")

@@ -224,7 +224,7 @@ def _file_cameras(stage: Stage) -> Wired:
 
 def _recorded(stage: Stage) -> tuple[dict[str, Any], dict[str, Path]]:
     path = stage.folder / "dataset"
-    videos = record(path, robots.load(stage.robot), int(_SECONDS_OF_VIDEO * FPS), int(FPS), *stage.size)
+    videos = record(path, robots.load_robot(stage.robot), int(_SECONDS_OF_VIDEO * FPS), int(FPS), *stage.size)
     return {"kind": "dataset", "path": str(path)}, videos
 
 
@@ -233,7 +233,7 @@ def _mjpeg_cameras(stage: Stage) -> Wired:
 
     What comes faster than it is decoded is passed over, so that no pictures may come as fast as they go.
     """
-    keys = [camera.key for camera in robots.load(stage.robot).cameras]
+    keys = [camera.key for camera in robots.load_robot(stage.robot).cameras]
     rate, stage.hurried = str(min(stage.rate, _MOST_DECODED_HZ)), False
     transport = _node(stage, "--rate", rate, "--height", "32", "--width", "32")
     height, width = stage.size

@@ -83,8 +83,8 @@ def protocols(robot: Robot) -> list[Protocol]:
 
 def measure(seconds: float) -> list[Row]:
     """A row per protocol, each asked for `seconds`, openpi for twice as long as it shares them with its peer."""
-    heap.keep()  # as the coordinator does
-    robot = robots.load(ROBOT)
+    heap.keep_freed_memory()  # as the coordinator does
+    robot = robots.load_robot(ROBOT)
     return [_case(protocol, robot, seconds) for protocol in protocols(robot)]
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import robots
 from robots import Robot
-from runtime.cameras.attaching import attached
+from runtime.cameras.attaching import attach_cameras
 from runtime.core import malloc as heap
 from runtime.core.clock import Clock, MonotonicClock, VirtualClock
 from runtime.core.plugins import variants
@@ -57,14 +57,14 @@ def source(given: Receiving, robot: Robot, clock: Clock) -> Source:
     kinds = variants("runtime.cameras")
     cameras = {key: kinds[table["kind"]].Config(**table) for key, table in given.cameras.items()}
     told = replace(robot, cameras=tuple(camera for camera in robot.cameras if camera.key not in cameras))
-    return attached(module.source(module.Config(**given.transport), told, clock), cameras, clock)
+    return attach_cameras(module.source(module.Config(**given.transport), told, clock), cameras, clock)
 
 
 def main(text: str) -> None:
     """Receive until the lifeline is cut."""
-    heap.keep()
+    heap.keep_freed_memory()
     given = Receiving(**json.loads(text))
-    robot = robots.load(given.robot)
+    robot = robots.load_robot(given.robot)
     clock = VirtualClock() if given.fast else MonotonicClock()
     player = _Player()
     shared = SharedState.attach(layout(robot), given.shared)
@@ -75,7 +75,7 @@ def main(text: str) -> None:
         opened.connect()
         opened.begin_run()
         while not select.select([sys.stdin], [], [], 0.0)[0]:
-            intake.pump(0.0 if given.fast else _PUMP_S)
+            intake.poll(0.0 if given.fast else _PUMP_S)
             if isinstance(clock, VirtualClock):
                 clock.advance(1.0 / FPS)
             if player.over:

@@ -19,7 +19,7 @@ from threading import Event
 
 import robots
 from benchmarks.wires_receiver import layout
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.clock import Clock
 from runtime.ipc.shared_state import SharedState
 from runtime.sim import node, standin
@@ -79,7 +79,7 @@ class NotingServer(MjpegServer):
         super()._send_picture(client, data)
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(file: str, shared: str, module: str, *arguments: str) -> int:
     """The exit code of the simulated robot."""
     if module == "cameras":
@@ -98,7 +98,7 @@ def main(file: str, shared: str, module: str, *arguments: str) -> int:
 
 
 def _pace(shared: str, arguments: Sequence[str], clock: Clock) -> Pace:
-    robot = robots.load(arguments[arguments.index("--robot") + 1])
+    robot = robots.load_robot(arguments[arguments.index("--robot") + 1])
     attached = SharedState.attach(layout(robot), int(shared))
     return Pace(lambda: int(attached.observation.read()["picture_number"].min()), clock)
 
@@ -106,8 +106,8 @@ def _pace(shared: str, arguments: Sequence[str], clock: Clock) -> Pace:
 def _cameras(file: Path, arguments: Sequence[str]) -> int:
     count, rate, width, height = int(arguments[0]), float(arguments[1]), int(arguments[2]), int(arguments[3])
     servers = [NotingServer(width, height, rate) for _ in range(count)]
-    told = standin.ending(lifeline=True)
-    standin.announce({"urls": [server.start() for server in servers]}, None)
+    told = standin.stop_event(lifeline=True)
+    standin.announce_ready({"urls": [server.start() for server in servers]}, None)
     told.wait()
     for server in servers:
         server.close()

@@ -107,7 +107,7 @@ def _staged(
 ) -> Iterator[tuple[Stage, SharedState]]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        shared, descriptor = SharedState.create(layout(robots.load(case.robot)))
+        shared, descriptor = SharedState.create(layout(robots.load_robot(case.robot)))
         stack.callback(os.close, descriptor)
         yield Stage(stack, folder, rate, size, case.robot, descriptor, hurried), shared
 

@@ -60,7 +60,7 @@ def chosen(request: Any) -> Language | None:
 
 def parse(code: str, content: str) -> Language:
     """The language that a file describes; ValueError where it is none."""
-    given = bounded.from_json(content, "the language", _LARGEST, _MOST)
+    given = bounded.parse_json(content, "the language", _LARGEST, _MOST)
     match given:
         case {"name": str(name), "sentences": dict(patterns), **rest}:
             templates = rest.get("templates", {})

@@ -10,7 +10,7 @@ from django.conf import settings
 from django.http import HttpRequest
 
 from evaweb.origins import at_port
-from runtime.recording.files import write_whole
+from runtime.recording.files import write_atomic
 
 
 class StopPort(NamedTuple):
@@ -21,7 +21,7 @@ class StopPort(NamedTuple):
 
     def start(self) -> None:
         """It listens."""
-        write_whole(_path(), json.dumps(self._asdict()).encode())
+        write_atomic(_path(), json.dumps(self._asdict()).encode())
 
     def end(self) -> None:
         """It ends."""

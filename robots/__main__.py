@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from robots import Robot, RobotError, description, load, names
-from robots.broken_pipe import unread_ends
-from robots.draft import draft
-from robots.inspection import Inspection, inspect
-from robots.loading import folders
+from robots import Robot, RobotError, description, load_robot, robot_names
+from robots.broken_pipe import exit_on_broken_pipe
+from robots.draft import draft_robot
+from robots.inspection import Inspection, inspect_robot
+from robots.loading import robot_folders
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns 0, or 1 where a description or the question is wrong."""
     options = _parser().parse_args(arguments)
@@ -61,9 +61,9 @@ def _parser() -> argparse.ArgumentParser:
 def _list(_: argparse.Namespace) -> int:
     """Every robot with its title; one that cannot be loaded hides none of the others."""
     broken = 0
-    for name in names():
+    for name in robot_names():
         try:
-            robot = load(name)
+            robot = load_robot(name)
         except RobotError as error:
             broken += 1
             print(f"{name}  cannot be loaded: {error}", file=sys.stderr)
@@ -74,7 +74,7 @@ def _list(_: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    return _said(inspect(options.name))
+    return _said(inspect_robot(options.name))
 
 
 def _said(found: Inspection) -> int:
@@ -87,11 +87,11 @@ def _said(found: Inspection) -> int:
 
 def _with_group(name: str, group: str) -> Robot:
     """The robot as it usually is, and with that group where it is an optional one."""
-    robot = load(name)
+    robot = load_robot(name)
     declared = description.read(robot.folder / "robot.toml").groups
     if group not in [entry.name for entry in declared if entry.optional]:
         return robot
-    return load(name, [*(usual.name for usual in robot.groups), group])
+    return load_robot(name, [*(usual.name for usual in robot.groups), group])
 
 
 def _fk(options: argparse.Namespace) -> int:
@@ -123,8 +123,8 @@ def _fk(options: argparse.Namespace) -> int:
 
 def _new(options: argparse.Namespace) -> int:
     """Drafts, then says what the draft comes to as `check` does, and what comes next."""
-    into = options.into or next(iter(folders()), Path())
-    made = draft(options.name, options.urdf, into, options.copies)
+    into = options.into or next(iter(robot_folders()), Path())
+    made = draft_robot(options.name, options.urdf, into, options.copies)
     said = _said(made.inspection)
     if missing := made.pictures.missing:
         print(
@@ -136,7 +136,7 @@ def _new(options: argparse.Namespace) -> int:
     if drawn := made.pictures.drawn:
         print(f"shapes: cylinders from joint to joint stand in for {', '.join(drawn)}")
     print(f"drafted: {made.folder}")
-    if options.name not in names():
+    if options.name not in robot_names():
         print(f"found by name once EVA_ROBOTS={into.resolve()} is set; until then by its folder")
     print(
         f"next: verify what {made.folder / 'README.md'} lists, edit robot.toml, python -m robots check {options.name}"

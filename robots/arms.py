@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from robots.chain import Chain
-from robots.copies import copies, copy_of
+from robots.copies import copy_of, urdf_copies
 from robots.description import GroupTable
 from robots.errors import RobotError
-from robots.refusals import naming
+from robots.refusals import error_context
 from robots.robot import Group
 from robots.urdf import Urdf
 
@@ -33,13 +33,15 @@ def check_arm(key: str, table: GroupTable) -> None:
         raise RobotError(f"{key}.gripper.tip is a frame in eef_link; allowed only with eef_link and frame")
 
 
-def with_chain(file: Path, tree: Urdf, table: GroupTable, group: Group, groups: Sequence[Group]) -> Group:
+def build_arm_chain(
+    file: Path, tree: Urdf, table: GroupTable, group: Group, groups: Sequence[Group]
+) -> Group:
     """The group with the chain of its own joints, and with the chain that carries it where others move it."""
     if table.eef_link is None or table.frame is None:
         return group
     key = f"{file}: groups.{table.name}"
     _check_pinned(f"{key}.pinned", tree, table)
-    with naming(f"{key}: from frame to eef_link"):
+    with error_context(f"{key}: from frame to eef_link"):
         way = tree.between(table.frame, table.eef_link)
     movers = {
         name: int(dim)
@@ -49,7 +51,7 @@ def with_chain(file: Path, tree: Urdf, table: GroupTable, group: Group, groups: 
     }
     carried = [joint.name for joint in way if joint.name in movers]
     if not carried:
-        with naming(key):
+        with error_context(key):
             chain = Chain(tree, table.frame, table.eef_link, table.urdf_joints, table.pinned)
         return replace(group, chain=chain)
     root = next((joint.parent for joint in way if joint.name in table.urdf_joints), None)
@@ -58,7 +60,7 @@ def with_chain(file: Path, tree: Urdf, table: GroupTable, group: Group, groups: 
     pinned = {name: value for name, value in table.pinned.items() if name not in carried}
     if beyond := [joint.name for joint in tree.between(root, table.eef_link) if joint.name in movers]:
         raise RobotError(f"{key}: {', '.join(beyond)} of other groups lie among its own joints")
-    with naming(key):
+    with error_context(key):
         own = Chain(tree, root, table.eef_link, table.urdf_joints, pinned)
         carrier = Chain(tree, table.frame, root, carried, pinned)
     return replace(
@@ -72,7 +74,7 @@ def with_chain(file: Path, tree: Urdf, table: GroupTable, group: Group, groups: 
 def _check_pinned(key: str, tree: Urdf, table: GroupTable) -> None:
     """Pinned are joints that can move and that the group does not move itself."""
     for name in table.pinned:
-        with naming(key):
+        with error_context(key):
             joint = tree.joint(name)
         if joint.kind == "fixed" or name in table.urdf_joints:
             raise RobotError(f"{key}: {name} is fixed or among urdf_joints; allowed: other joints that move")
@@ -81,7 +83,7 @@ def _check_pinned(key: str, tree: Urdf, table: GroupTable) -> None:
 def check_mounts(file: Path, tables: Sequence[GroupTable], groups: Sequence[Group]) -> None:
     """A copy of the URDF stands in one place: that of its first group."""
     mounts = {table.name: table.mount for table in tables}
-    for members in copies(groups):
+    for members in urdf_copies(groups):
         first = members[0].name
         for group in members[1:]:
             if mounts[group.name] is not None and mounts[group.name] != mounts[first]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from robots import urdf
 from robots.chain import motion_table, motions
-from robots.copies import copies
+from robots.copies import urdf_copies
 from robots.errors import RobotError
 from robots.robot import Group, Robot
 from robots.rotations import Float64, transform_of
@@ -42,7 +42,7 @@ class Body:
 
     def __init__(self, robot: Robot) -> None:
         tree = urdf.read(robot.urdf)
-        made = [_Copy(robot, tree, groups) for groups in copies(robot.groups)]
+        made = [_Copy(robot, tree, groups) for groups in urdf_copies(robot.groups)]
         names = [[copy.part(link) for link in copy.links] for copy in made]
         self.parts = tuple(name for part in names for name in part)
         starts = np.cumsum([0, *(len(part) for part in names[:-1])]).tolist()
@@ -51,7 +51,7 @@ class Body:
             {link: start + index for index, link in enumerate(copy.links)} for start, copy in placed
         ]
         self._copy_of = {
-            group.name: index for index, groups in enumerate(copies(robot.groups)) for group in groups
+            group.name: index for index, groups in enumerate(urdf_copies(robot.groups)) for group in groups
         }
         self.jaws = {
             name: tuple(start + copy.links.index(link) for link in links)
@@ -73,7 +73,7 @@ class Body:
             raise RobotError(f"{self._name} has no part {name!r}; it has {', '.join(self.parts)}")
         return self.parts.index(name)
 
-    def parts_of(self, link: str) -> tuple[int, ...]:
+    def parts_showing(self, link: str) -> tuple[int, ...]:
         """The indices of the parts that show a link of the URDF, one per copy; none where it has no such link."""
         return tuple(links[link] for links in self._links if link in links)
 
@@ -84,7 +84,7 @@ class Body:
             raise RobotError(f"{self._name}: {group} has no link {link!r}; it has {', '.join(sorted(links))}")
         return int(links[link])
 
-    def moved(self) -> NDArray[np.bool_]:
+    def moving_mask(self) -> NDArray[np.bool_]:
         """Which numbers of the robot's vector move which part, bool [P, D]: those that any joint above it follows."""
         moved: NDArray[np.bool_] = self._coupling != 0
         for parts, above in self._layers:

@@ -12,15 +12,15 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import ParamSpec, TextIO
 
-UNREAD = 141  # exit code, that of a shell for an end by SIGPIPE
-UNWRITTEN = 74  # exit code, EX_IOERR of sysexits.h
+EXIT_BROKEN_PIPE = 141  # exit code, that of a shell for an end by SIGPIPE
+EXIT_WRITE_ERROR = 74  # exit code, EX_IOERR of sysexits.h
 
 _STREAMS = (0, 1, 2)  # standard input, output and error
 
 Given = ParamSpec("Given")
 
 
-def unread_ends(main: Callable[Given, int]) -> Callable[Given, int]:
+def exit_on_broken_pipe(main: Callable[Given, int]) -> Callable[Given, int]:
     """`main`, with the exit code 141 where standard output or error is a pipe that nobody reads any more.
 
     Where the disk does not take standard output it is 74, and standard error says so. An OSError of anything else
@@ -40,12 +40,12 @@ def unread_ends(main: Callable[Given, int]) -> Callable[Given, int]:
         except BrokenPipeError:
             if not _silenced():
                 raise
-            return UNREAD
+            return EXIT_BROKEN_PIPE
         except OSError as error:
             if not _refused(error):
                 raise
             print(f"standard output cannot be written: {error.strerror}", file=sys.stderr)
-            return UNWRITTEN
+            return EXIT_WRITE_ERROR
         return code
 
     return run

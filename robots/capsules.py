@@ -35,7 +35,7 @@ def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
     Links without shapes, and those that robot.toml leaves out, have none.
     """
     by_link: dict[str, list[Shape]] = {}
-    for shape in shapes.read(robot.urdf):
+    for shape in shapes.read_shapes(robot.urdf):
         by_link.setdefault(shape.link, []).append(shape)
     found = {link: _remembered(shown) for link, shown in by_link.items()}
     found |= {link: tuple(map(_declared, tables)) for link, tables in robot.collision.capsules.items()}
@@ -46,7 +46,7 @@ def _remembered(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
     """`about`, once for each link that looks like this: a station asks for the same robot several times."""
     key = b"".join(_content(shape) for shape in shown)
     if key not in _about:
-        made = about(shown)
+        made = covering_capsules(shown)
         for capsule in made:
             capsule.start.flags.writeable = capsule.end.flags.writeable = False
         _about[key] = made
@@ -60,15 +60,18 @@ def _content(shape: Shape) -> bytes:
     )
 
 
-def about(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
+def covering_capsules(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
     """At most `PIECES` capsules that cover the shapes of one link: one bent round a corner is two, not a fat one.
 
     Each shape begins with a capsule of its own; the two whose common one takes least more room are joined, again
     and again.
     """
     pieces = [[shape] for shape in shown]
-    rooms = [_room(piece) for piece in pieces]
-    grown = {pair: _room(pieces[pair[0]] + pieces[pair[1]]) for pair in combinations(range(len(pieces)), 2)}
+    rooms = [_capsule_volume(piece) for piece in pieces]
+    grown = {
+        pair: _capsule_volume(pieces[pair[0]] + pieces[pair[1]])
+        for pair in combinations(range(len(pieces)), 2)
+    }
     left = set(range(len(pieces)))
     while len(left) > 1:
         one, other = min(
@@ -80,19 +83,19 @@ def about(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
         joined = len(pieces)
         pieces.append(pieces[one] + pieces[other])
         rooms.append(grown[one, other])
-        grown |= {(piece, joined): _room(pieces[piece] + pieces[joined]) for piece in left}
+        grown |= {(piece, joined): _capsule_volume(pieces[piece] + pieces[joined]) for piece in left}
         left.add(joined)
-    return tuple(around(pieces[piece]) for piece in sorted(left))
+    return tuple(smallest_capsule(pieces[piece]) for piece in sorted(left))
 
 
-def _room(shown: Sequence[Shape]) -> float:
+def _capsule_volume(shown: Sequence[Shape]) -> float:
     """The volume [m3] of a capsule about the shapes."""
-    capsule = around(shown, steps=1)
+    capsule = smallest_capsule(shown, steps=1)
     length = float(np.linalg.norm(capsule.end - capsule.start))
     return float(np.pi * capsule.radius**2 * (length + 4 / 3 * capsule.radius))
 
 
-def around(shown: Sequence[Shape], steps: int = _STEPS) -> Capsule:
+def smallest_capsule(shown: Sequence[Shape], steps: int = _STEPS) -> Capsule:
     """A capsule that covers the shapes: along the longest axis of their common box, as thin as covers them all.
 
     Its line goes through the middle of the smallest circle about the shapes as seen along that axis (the better,
@@ -103,7 +106,7 @@ def around(shown: Sequence[Shape], steps: int = _STEPS) -> Capsule:
     lower, upper = (centres - sizes[:, None]).min(axis=0), (centres + sizes[:, None]).max(axis=0)
     axis = int((upper - lower).argmax())
     across = np.delete(np.arange(3), axis)
-    middle = _middle(centres[:, across], sizes, (lower + upper)[across] / 2, steps)
+    middle = _smallest_circle(centres[:, across], sizes, (lower + upper)[across] / 2, steps)
     off = np.linalg.norm(centres[:, across] - middle, axis=1)
     radius = float((off + sizes).max())
     # A ball that is `off` the line is covered by an end that is no farther from it along the line than this.
@@ -143,7 +146,7 @@ def _corners(shape: Shape) -> tuple[Float64, float]:
     return np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i, j, k in np.ndindex(2, 2, 2)]), 0.0
 
 
-def _middle(points: Float64, sizes: Float64, start: Float64, steps: int) -> Float64:
+def _smallest_circle(points: Float64, sizes: Float64, start: Float64, steps: int) -> Float64:
     """The middle of the smallest circle about discs [n, 2] (Badoiu and Clarkson 2003: ever smaller steps outwards)."""
     middle, best, least = start, start, np.inf
     for step in range(1, steps + 1):

@@ -46,7 +46,7 @@ class Clearance:
         found = [
             (part, capsule)
             for link, made in capsules(robot).items()
-            for part in body.parts_of(link)
+            for part in body.parts_showing(link)
             for capsule in made
         ]
         found.sort(key=lambda one: one[0])
@@ -57,7 +57,7 @@ class Clearance:
         self._ends = np.ones((len(found), 4, 2))  # in the link, homogeneous
         for ends, (_, capsule) in zip(self._ends, found, strict=True):
             ends[:3, 0], ends[:3, 1] = capsule.start, capsule.end
-        self._fingers = np.asarray(body.moved()[self._parts][:, list(robot.gripper_dims)].any(axis=1))
+        self._fingers = np.asarray(body.moving_mask()[self._parts][:, list(robot.gripper_dims)].any(axis=1))
         self._look_at(*_candidates(robot, body, self._parts))
         self._look_at(*self._telling(robot))
 
@@ -77,13 +77,13 @@ class Clearance:
         starts = ends[..., 0]
         ways = ends[..., 1] - starts
         one, other = self._first, self._second
-        apart = segments.distances(
+        apart = segments.segment_distances(
             starts[..., one, :], ways[..., one, :], starts[..., other, :], ways[..., other, :]
         )
         lowest = ends[..., self._over, 2, :].min(axis=-1)
         return np.asarray(np.concatenate([apart, lowest], axis=-1) - self._thick)
 
-    def least(self, margin: float) -> Float64:
+    def touch_thresholds(self, margin: float) -> Float64:
         """Distances [K] under which pairs count as touching: `margin`, and for fingers over the table less than 0."""
         least = np.full(len(self.pairs), margin)
         least[len(self._first) :][self._fingers[self._over]] = -_DIP
@@ -111,8 +111,8 @@ class Clearance:
         touching: dict[tuple[str, ...], float] = {}
         for pair, own in columns.items():
             share = float((apart[:, own].min(axis=1) < MARGIN).mean())
-            touching[_alike(pair)] = max(share, touching.get(_alike(pair), 0.0))
-        telling = np.array([touching[_alike(pair)] < _NEARLY_ALWAYS for pair in self.pairs], dtype=bool)
+            touching[_mirror_key(pair)] = max(share, touching.get(_mirror_key(pair), 0.0))
+        telling = np.array([touching[_mirror_key(pair)] < _NEARLY_ALWAYS for pair in self.pairs], dtype=bool)
         for pair, own in columns.items():
             if TABLE in pair and np.ptp(apart[:, own], axis=0).max() <= _LEVEL:
                 telling[own] = False
@@ -121,12 +121,12 @@ class Clearance:
 
 
 @lru_cache(maxsize=32)
-def clearance_of(robot: Robot) -> Clearance:
+def get_clearance(robot: Robot) -> Clearance:
     """That of a robot, found once for all who judge it in a process."""
     return Clearance(robot)
 
 
-def _alike(pair: tuple[str, str]) -> tuple[str, ...]:
+def _mirror_key(pair: tuple[str, str]) -> tuple[str, ...]:
     """Common part of a pair and the same links of another arm like it; the pair itself, if of two arms."""
     (group, _, link), (other_group, _, other) = (name.partition("/") for name in pair)
     return (link, other or other_group) if group == other_group or not other else pair
@@ -134,7 +134,7 @@ def _alike(pair: tuple[str, str]) -> tuple[str, ...]:
 
 def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _Indices, _Indices]:
     """Pairs of capsules that could touch without being neighbours, and capsules that could reach the table."""
-    moved = body.moved()[parts]
+    moved = body.moving_mask()[parts]
     grippers = np.isin(np.arange(robot.dim), robot.gripper_dims)
     reaching = np.zeros(robot.dim, dtype=bool)
     for group in robot.groups:
@@ -173,10 +173,10 @@ def _root(body: Body, part: np.intp) -> int:
     return int(part)
 
 
-def problems(robot: Robot, margin: float = MARGIN) -> list[str]:
+def collision_problems(robot: Robot, margin: float = MARGIN) -> list[str]:
     """Faults of the robot's [collision], in sentences: pairs that touch at a named pose, or no pairs."""
     clearance = Clearance(robot)
-    least = dict(zip(clearance.pairs, clearance.least(margin).tolist(), strict=True))
+    least = dict(zip(clearance.pairs, clearance.touch_thresholds(margin).tolist(), strict=True))
     if not clearance.pairs:
         return ["collision: no two links are looked at; links need shapes, or capsules in robot.toml"]
     found: dict[tuple[str, str, str], float] = {}

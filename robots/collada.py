@@ -17,7 +17,7 @@ _NAMESPACE = "{*}"
 _MOST_NODES = 20_000  # a file of some lines can show one a billion times
 
 
-def points(path: Path) -> Float64:
+def read_points(path: Path) -> Float64:
     """All points [n, 3] of the geometries that the scene shows, units applied; ValueError where it is no COLLADA.
 
     The file's up axis is left as it is, as robots' viewers do.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from robots.robot import Group
 
 
-def copies(groups: Sequence[Group]) -> list[list[Group]]:
+def urdf_copies(groups: Sequence[Group]) -> list[list[Group]]:
     """The groups, sorted into copies of the URDF such that no joint is moved twice in one copy."""
     found: list[tuple[set[str], list[Group]]] = []
     for group in groups:
@@ -24,4 +24,4 @@ def copies(groups: Sequence[Group]) -> list[list[Group]]:
 
 def copy_of(group: Group, groups: Sequence[Group]) -> list[Group]:
     """The groups of the copy that `group` belongs to."""
-    return next(members for members in copies(groups) if group in members)
+    return next(members for members in urdf_copies(groups) if group in members)

@@ -10,7 +10,7 @@ import numpy as np
 
 from robots.description import GripperTable, GroupTable
 from robots.errors import RobotError
-from robots.places import unit
+from robots.places import unit_quaternion
 from robots.refusals import check_movers
 from robots.robot import Gripper
 from robots.rotations import Float64, matrix_of_quaternion
@@ -30,7 +30,7 @@ class GripperChoice:
     close: float | None = None
 
 
-def with_grippers(
+def apply_gripper_choices(
     file: Path, groups: list[GroupTable], choices: Mapping[str, GripperChoice]
 ) -> list[GroupTable]:
     having = [group.name for group in groups if group.gripper is not None]
@@ -104,7 +104,7 @@ def _fingers(key: str, tree: Urdf, table: Mapping[str, list[float]]) -> dict[str
     return {name: (at_lower, at_upper) for name, (at_lower, at_upper) in table.items()}
 
 
-def tip_of(key: str, tree: Urdf, table: GroupTable) -> Float64 | None:
+def tip_frame(key: str, tree: Urdf, table: GroupTable) -> Float64 | None:
     """The frame of the fingertips in `eef_link`: what is declared, else what the URDF's fingers show."""
     if table.eef_link is None or table.gripper is None:
         return None
@@ -113,7 +113,9 @@ def tip_of(key: str, tree: Urdf, table: GroupTable) -> Float64 | None:
         tip = _between_fingers(tree, table.eef_link)
     else:
         tip = np.eye(4)
-        tip[:3, :3] = matrix_of_quaternion(np.array(unit(f"{key}.gripper.tip.wxyz", declared.wxyz)))
+        tip[:3, :3] = matrix_of_quaternion(
+            np.array(unit_quaternion(f"{key}.gripper.tip.wxyz", declared.wxyz))
+        )
         tip[:3, 3] = declared.xyz
     tip.setflags(write=False)
     return tip

@@ -11,10 +11,10 @@ import numpy as np
 
 from robots import description, urdf
 from robots.body import Body
-from robots.clearance import problems
-from robots.copies import copies
+from robots.clearance import collision_problems
+from robots.copies import urdf_copies
 from robots.description import GroupTable, OverrideTable, RobotTable, RosGroupTable
-from robots.loading import load, load_whole
+from robots.loading import load_robot, load_robot_with_optional_groups
 from robots.robot import Group, Robot
 from robots.rotations import Float64
 from robots.urdf import Urdf
@@ -33,12 +33,12 @@ class Inspection:
     errors: tuple[str, ...]
 
 
-def inspect(name: str | Path) -> Inspection:
+def inspect_robot(name: str | Path) -> Inspection:
     """Looks at a robot with all of its groups and without the optional ones; RobotError where it cannot be loaded."""
-    usual = load(name)
+    usual = load_robot(name)
     file = usual.folder / "robot.toml"
     table = description.read(file)
-    whole = load_whole(name)
+    whole = load_robot_with_optional_groups(name)
     tree = urdf.read(whole.urdf)
     scene_of(whole)  # meshes that are missing
     lines = [
@@ -51,7 +51,10 @@ def inspect(name: str | Path) -> Inspection:
     return Inspection(
         tuple(lines),
         tuple(f"{file}: {sentence}" for sentence in _warnings(usual, whole, table, file)),
-        tuple(f"{file}: {sentence}" for sentence in dict.fromkeys([*problems(usual), *problems(whole)])),
+        tuple(
+            f"{file}: {sentence}"
+            for sentence in dict.fromkeys([*collision_problems(usual), *collision_problems(whole)])
+        ),
     )
 
 
@@ -70,7 +73,7 @@ def _heading(robot: Robot, table: RobotTable, whole: Robot) -> Iterator[str]:
 
 def _standing(robot: Robot, tree: Urdf) -> Iterator[str]:
     """The URDF, its copies and where they stand."""
-    members = copies(robot.groups)
+    members = urdf_copies(robot.groups)
     moving = [joint.name for joint in tree.joints.values() if joint.kind != "fixed" and joint.mimic is None]
     yield f"{tree.path.name}: {len(tree.links)} links from {tree.root}, {len(moving)} joints that move by themselves"
     commanded = {name for group in robot.groups for name in _driven(group)}
@@ -184,7 +187,7 @@ def _warnings(usual: Robot, whole: Robot, table: RobotTable, file: Path) -> Iter
         if touching.any():
             on = [joint for joint, at in zip(whole.joint_names, touching, strict=True) if at]
             yield f"poses.{name}: {', '.join(on)}: on a limit, where a robot at rest may be found beyond it"
-    yield from _low(whole)
+    yield from _low_fingertips(whole)
     for entry in table.groups:
         group = whole.group(entry.name)
         yield from _group_warnings(whole, group, entry)
@@ -194,7 +197,7 @@ def _warnings(usual: Robot, whole: Robot, table: RobotTable, file: Path) -> Iter
         yield f"{GUESS} stands in lines {', '.join(map(str, guesses))}: verify each, then delete the word"
 
 
-def _low(robot: Robot) -> Iterator[str]:
+def _low_fingertips(robot: Robot) -> Iterator[str]:
     """Fingertips below the table, which the collision check lets pass: they reach down to it on purpose."""
     body = Body(robot)
     for name, q in robot.poses.items():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from robots.description import GroupTable, OverrideTable
 from robots.errors import RobotError
-from robots.refusals import refuse_twice
+from robots.refusals import reject_duplicates
 from robots.urdf import Urdf
 
 
@@ -19,10 +19,12 @@ class Limits:
     overrides: list[str]
 
 
-def limits_of(file: Path, tree: Urdf, table: GroupTable) -> Limits:
+def group_limits(file: Path, tree: Urdf, table: GroupTable) -> Limits:
     """The limits of a group's joints, of its URDF joints or the override, and of the gripper table."""
     key = f"{file}: groups.{table.name}"
-    refuse_twice(file, f"groups.{table.name}.overrides", [override.joint for override in table.overrides])
+    reject_duplicates(
+        file, f"groups.{table.name}.overrides", [override.joint for override in table.overrides]
+    )
     overrides = {override.joint: override for override in table.overrides}
     wire = list(table.joints)
     if table.gripper is not None:

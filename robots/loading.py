@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from robots import description, urdf
-from robots.arms import check_arm, check_mounts, with_chain
+from robots.arms import build_arm_chain, check_arm, check_mounts
 from robots.description import TABLE, GroupTable, RobotTable
 from robots.errors import RobotError
-from robots.gripping import GripperChoice, gripper_of, tip_of, with_grippers
-from robots.limits import limits_of
-from robots.places import frozen, place
-from robots.refusals import check_movers, refuse_twice
+from robots.gripping import GripperChoice, apply_gripper_choices, gripper_of, tip_frame
+from robots.limits import group_limits
+from robots.places import pose_vector, read_only
+from robots.refusals import check_movers, reject_duplicates
 from robots.robot import Camera, Group, Robot
 from robots.rotations import Float64
 from robots.urdf import Urdf
@@ -24,12 +24,12 @@ _HERE = Path(__file__).resolve().parent
 _FILE = "robot.toml"
 
 
-def names() -> tuple[str, ...]:
+def robot_names() -> tuple[str, ...]:
     """The robots that come with the program, and those in the folders of $EVA_ROBOTS (as in a search path)."""
     return tuple(sorted(_known()))
 
 
-def folders() -> tuple[Path, ...]:
+def robot_folders() -> tuple[Path, ...]:
     """The folders of $EVA_ROBOTS, in which robots of one's own lie."""
     parts = os.environ.get("EVA_ROBOTS", "").split(os.pathsep)
     return tuple(Path(part).expanduser() for part in parts if part)
@@ -38,13 +38,13 @@ def folders() -> tuple[Path, ...]:
 def _known() -> dict[str, Path]:
     """Folders by name; what comes with the program is never replaced by another of the same name."""
     found: dict[str, Path] = {}
-    for root in (_HERE, *folders()):
+    for root in (_HERE, *robot_folders()):
         for file in sorted(root.glob(f"*/{_FILE}")):
             found.setdefault(file.parent.name, file.parent.resolve())
     return found
 
 
-def load(
+def load_robot(
     robot: str | Path,
     groups: Sequence[str] | None = None,
     grippers: Mapping[str, GripperChoice] | None = None,
@@ -58,20 +58,20 @@ def load(
     file = folder / _FILE
     table = description.read(file)
     tree = _tree(file, folder / table.urdf)
-    refuse_twice(file, "groups", [group.name for group in table.groups])
-    refuse_twice(file, "cameras", list(table.cameras.values()))
+    reject_duplicates(file, "groups", [group.name for group in table.groups])
+    reject_duplicates(file, "cameras", list(table.cameras.values()))
     _check_ros(file, table)
     _check_collision(file, table, tree)
-    chosen = with_grippers(file, _chosen(file, table, groups), grippers or {})
+    chosen = apply_gripper_choices(file, _chosen(file, table, groups), grippers or {})
     starts = np.cumsum([0, *(len(entry.joints) for entry in chosen)]).tolist()
     made = tuple(_group(file, tree, entry, start) for entry, start in zip(chosen, starts, strict=False))
     made = tuple(
-        with_chain(file, tree, entry, group, made) for entry, group in zip(chosen, made, strict=True)
+        build_arm_chain(file, tree, entry, group, made) for entry, group in zip(chosen, made, strict=True)
     )
     check_mounts(file, chosen, made)
-    limits = [limits_of(file, tree, entry) for entry in chosen]
+    limits = [group_limits(file, tree, entry) for entry in chosen]
     lower, upper, velocity = (
-        frozen([number for part in limits for number in getattr(part, side)])
+        read_only([number for part in limits for number in getattr(part, side)])
         for side in ("lower", "upper", "velocity")
     )
     return Robot(
@@ -89,15 +89,15 @@ def load(
         limits_source=table.limits_source,
         overrides=tuple(sentence for part in limits for sentence in part.overrides),
         mount_frame=table.mount_frame,
-        stand=place(f"{file}: stand", table.stand),
+        stand=pose_vector(f"{file}: stand", table.stand),
         collision=table.collision,
         ros=table.ros,
     )
 
 
-def load_whole(robot: str | Path) -> Robot:
+def load_robot_with_optional_groups(robot: str | Path) -> Robot:
     """The same robot with the optional groups too."""
-    return load(robot, [group.name for group in description.read(_folder(robot) / _FILE).groups])
+    return load_robot(robot, [group.name for group in description.read(_folder(robot) / _FILE).groups])
 
 
 def _chosen(file: Path, table: RobotTable, groups: Sequence[str] | None) -> list[GroupTable]:
@@ -165,8 +165,8 @@ def _folder(robot: str | Path) -> Path:
 
 def _group(file: Path, tree: Urdf, table: GroupTable, start: int) -> Group:
     key = f"{file}: groups.{table.name}"
-    refuse_twice(file, f"groups.{table.name}.joints", table.joints)
-    refuse_twice(file, f"groups.{table.name}.urdf_joints", list(filter(None, table.urdf_joints)))
+    reject_duplicates(file, f"groups.{table.name}.joints", table.joints)
+    reject_duplicates(file, f"groups.{table.name}.urdf_joints", list(filter(None, table.urdf_joints)))
     check_arm(key, table)
     gripper = None if table.gripper is None else gripper_of(key, tree, table.gripper, len(table.joints))
     movers = len(table.joints) - (gripper is not None)
@@ -190,8 +190,8 @@ def _group(file: Path, tree: Urdf, table: GroupTable, start: int) -> Group:
         chain=None,
         carrier=None,
         carrier_dims=np.empty(0, dtype=np.intp),
-        mount=place(f"{key}.mount", table.mount),
-        tip=tip_of(key, tree, table),
+        mount=pose_vector(f"{key}.mount", table.mount),
+        tip=tip_frame(key, tree, table),
         slice=slice(start, start + len(table.joints)),
     )
 
@@ -222,4 +222,4 @@ def _pose(
         ):
             if not low <= value <= high:
                 raise RobotError(f"{key}.{group.name}: {joint} = {value}; allowed: {low} to {high}")
-    return frozen([value for group in groups for value in parts[group.name]])
+    return read_only([value for group in groups for value in parts[group.name]])

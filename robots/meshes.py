@@ -22,7 +22,7 @@ _SPACE = r"[^\S\n]"  # within a line
 _CORNER = 3 * rf"{_SPACE}+(\S+)"
 
 
-def roots(folder: Path) -> tuple[Path, ...]:
+def mesh_roots(folder: Path) -> tuple[Path, ...]:
     """The folders in which meshes of the robot in `folder` may lie: its own and $EVA_ROBOT_MESHES/<its name>."""
     given = os.environ.get(ENVIRONMENT, "")
     if not given:
@@ -33,14 +33,14 @@ def roots(folder: Path) -> tuple[Path, ...]:
     return folder.resolve(), (meshes / folder.name).resolve()
 
 
-def named(folder: Path, owner: str, filename: str) -> Path:
+def resolve_mesh(folder: Path, owner: str, filename: str) -> Path:
     """The file that a URDF in `folder` names for `owner`: relative to the URDF, package://NAME/... or file://...
 
     It has to lie in one of the `roots`, links followed; RobotError says where it was looked for.
     """
     if Path(filename).suffix.lower() not in SUFFIXES:
         raise RobotError(f"{owner}: mesh {filename!r}; allowed: files {', '.join(SUFFIXES)}")
-    allowed = roots(folder)
+    allowed = mesh_roots(folder)
     try:
         places = [place for root in allowed for place in _places(root, owner, filename)]
         there = [place for place in places if place.is_file()]
@@ -59,9 +59,9 @@ def named(folder: Path, owner: str, filename: str) -> Path:
     )
 
 
-def replacement(folder: Path, link: str) -> Path | None:
+def replacement_mesh(folder: Path, link: str) -> Path | None:
     """$EVA_ROBOT_MESHES/<robot>/<link>.stl, .obj or .dae, which is shown instead of what the URDF says; else None."""
-    for root in roots(folder)[1:]:
+    for root in mesh_roots(folder)[1:]:
         for suffix in SUFFIXES:
             place = (root / f"{link}{suffix}").resolve()
             if place.is_file() and place.is_relative_to(root):
@@ -69,7 +69,7 @@ def replacement(folder: Path, link: str) -> Path | None:
     return None
 
 
-def bounds(path: Path) -> Bounds:
+def mesh_bounds(path: Path) -> Bounds:
     """The least and the greatest corner [3] of what the file shows, in its own axes [m]; RobotError if unreadable."""
     try:
         return _bounds(path, path.stat().st_mtime_ns)
@@ -96,7 +96,7 @@ def _places(root: Path, owner: str, filename: str) -> Iterator[Path]:
 def _bounds(path: Path, _changed: int) -> Bounds:
     suffix = path.suffix.lower()
     if suffix == ".dae":
-        points = collada.points(path)
+        points = collada.read_points(path)
     else:
         points = _stl(path.read_bytes()) if suffix == ".stl" else _obj(path.read_text(errors="replace"))
     if points.size == 0 or not np.isfinite(points).all():

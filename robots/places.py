@@ -11,19 +11,19 @@ from robots.errors import RobotError
 from robots.rotations import Float64
 
 
-def frozen(numbers: Sequence[float]) -> Float64:
+def read_only(numbers: Sequence[float]) -> Float64:
     array = np.array(numbers, dtype=np.float64)
     array.setflags(write=False)
     return array
 
 
-def place(key: str, table: PlaceTable | None) -> Float64:
+def pose_vector(key: str, table: PlaceTable | None) -> Float64:
     if table is None:
-        return frozen([0, 0, 0, 1, 0, 0, 0])
-    return frozen([*table.xyz, *unit(f"{key}.wxyz", table.wxyz)])
+        return read_only([0, 0, 0, 1, 0, 0, 0])
+    return read_only([*table.xyz, *unit_quaternion(f"{key}.wxyz", table.wxyz)])
 
 
-def unit(key: str, wxyz: list[float]) -> list[float]:
+def unit_quaternion(key: str, wxyz: list[float]) -> list[float]:
     norm = float(np.linalg.norm(wxyz))
     if abs(norm - 1) > 1e-6:
         raise RobotError(f"{key} has length {norm}; allowed: 1 within 1e-6")

@@ -11,7 +11,7 @@ from robots.urdf import Urdf
 
 
 @contextmanager
-def naming(key: str) -> Iterator[None]:
+def error_context(key: str) -> Iterator[None]:
     """Name the key that asked for the URDF in errors about it that are raised in here."""
     try:
         yield
@@ -19,7 +19,7 @@ def naming(key: str) -> Iterator[None]:
         raise RobotError(f"{key}: {error}") from error
 
 
-def refuse_twice(file: Path, key: str, given: list[str]) -> None:
+def reject_duplicates(file: Path, key: str, given: list[str]) -> None:
     twice = sorted({name for name in given if given.count(name) > 1})
     if twice:
         raise RobotError(f"{file}: {key}: {', '.join(twice)} more than once; each is allowed once")
@@ -27,7 +27,7 @@ def refuse_twice(file: Path, key: str, given: list[str]) -> None:
 
 def check_movers(key: str, tree: Urdf, names: Iterable[str]) -> None:
     for name in names:
-        with naming(key):
+        with error_context(key):
             joint = tree.joint(name)
         if joint.kind == "fixed" or joint.mimic is not None:
             raise RobotError(f"{key}: {name} is fixed or a mimic; allowed: joints that move by themselves")

@@ -10,7 +10,7 @@ _TINY = 1e-300  # instead of a division by zero
 _PARALLEL = 1e-12  # of the squared sine between two segments: any point of the first is as good to begin with
 
 
-def distances(start: Float64, way: Float64, other: Float64, other_way: Float64) -> Float64:
+def segment_distances(start: Float64, way: Float64, other: Float64, other_way: Float64) -> Float64:
     """Distances of segments [..., 3] from `start` along `way` to those from `other` along `other_way`, [...].
 
     The nearest points of the two lines, brought back into the segments one after the other (Ericson, Real-Time

@@ -36,14 +36,14 @@ class Shape:
 
     def bounds(self) -> tuple[Float64, Float64]:
         """The least and the greatest corner [3] of the shape's box in its own frame [m], before `origin`."""
-        return bounds_of(self.kind, self.size, self.file)
+        return shape_bounds(self.kind, self.size, self.file)
 
 
-def bounds_of(kind: str, size: tuple[float, ...], file: Path | None) -> tuple[Float64, Float64]:
+def shape_bounds(kind: str, size: tuple[float, ...], file: Path | None) -> tuple[Float64, Float64]:
     """The corners [3] of the box around a shape in its own frame [m]; RobotError where a mesh cannot be read."""
     if kind == "mesh":
         assert file is not None  # a mesh is read from a file
-        corners = np.array(meshes.bounds(file)) * size
+        corners = np.array(meshes.mesh_bounds(file)) * size
         return corners.min(axis=0), corners.max(axis=0)
     if kind == "box":
         half = np.array(size) / 2
@@ -53,7 +53,7 @@ def bounds_of(kind: str, size: tuple[float, ...], file: Path | None) -> tuple[Fl
     return -half, half
 
 
-def read(path: Path) -> tuple[Shape, ...]:
+def read_shapes(path: Path) -> tuple[Shape, ...]:
     """The shapes in the file's order; RobotError names the file, the link and what is wrong with it.
 
     They are the same whatever the environment holds, except for links that show meshes, which may lie there.
@@ -61,7 +61,7 @@ def read(path: Path) -> tuple[Shape, ...]:
     return _read(path, everywhere=False)
 
 
-def shown(path: Path) -> tuple[Shape, ...]:
+def displayed_shapes(path: Path) -> tuple[Shape, ...]:
     """The same for drawing: every link with a mesh of its name under $EVA_ROBOT_MESHES shows that and nothing else."""
     return _read(path, everywhere=True)
 
@@ -87,7 +87,7 @@ def _shapes(
 ) -> Iterator[Shape]:
     name = text_of(path, link, "name")
     visuals = link.findall("visual")
-    file = meshes.replacement(path.parent, name) if replaceable else None
+    file = meshes.replacement_mesh(path.parent, name) if replaceable else None
     if file is None:
         yield from (_shape(path, name, visual, materials) for visual in visuals)
     else:
@@ -106,7 +106,7 @@ def _shape(path: Path, link: str, visual: ET.Element, materials: Mapping[str, Co
     size = size_of(path, owner, element)
     file = None
     if element.tag == "mesh":
-        file = meshes.named(path.parent, f"{path}: {owner}", text_of(path, element, "filename"))
+        file = meshes.resolve_mesh(path.parent, f"{path}: {owner}", text_of(path, element, "filename"))
     colour = _material(path, owner, visual, materials)
     return Shape(link, element.tag, size, origin_of(path, owner, visual), colour, file)
 

@@ -33,7 +33,7 @@ class Visual:
 
     def bounds(self) -> tuple[Float64, Float64]:
         """The least and the greatest corner [3] of the shape's box in its own frame [m], before `origin`."""
-        return shapes.bounds_of(self.kind, self.size, self.file)
+        return shapes.shape_bounds(self.kind, self.size, self.file)
 
     def simple(self) -> Visual:
         """The same for those who can draw no mesh: the box around it."""
@@ -53,8 +53,8 @@ class RobotScene(Body):
         super().__init__(robot)
         self.visuals = tuple(
             Visual(part, shape.kind, shape.size, shape.origin, shape.colour, shape.file)
-            for shape in shapes.shown(robot.urdf)
-            for part in self.parts_of(shape.link)
+            for shape in shapes.displayed_shapes(robot.urdf)
+            for part in self.parts_showing(shape.link)
         )
 
 

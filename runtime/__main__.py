@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.config import loader
 from runtime.config.loader import Resolved
 from runtime.core import environment
@@ -22,7 +22,7 @@ from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.ipc.lifeline import Lifeline
 from runtime.processes.coordinator.builders import make_policy
 from runtime.processes.supervisor.supervisor import Supervisor
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from runtime.station.rerun import data_folder, rerun
 from runtime.station.spec import StationSpec
 
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from runtime.processes.lockstep.lockstep import Peers
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where all went well, 1 where the run failed, 2 where the deployment is wrong."""
     given = _parser().parse_args(arguments)
-    log.start("supervisor")
+    log.configure_logging("supervisor")
     try:
-        made = checked_spec(_resolved(given))
+        made = check_deployment(_resolved(given))
         # What does not fit it is said here, not by a coordinator that dies.
         make_policy(made, MonotonicClock()).close()
         _require_encoder(made)
@@ -107,7 +107,7 @@ def _require_encoder(made: StationSpec) -> None:
     from runtime.recording import trial
 
     if made.deployment.recording.enabled:
-        trial.require(made.deployment.recording)
+        trial.require_encoder(made.deployment.recording)
 
 
 def _check(made: StationSpec) -> int:
@@ -131,9 +131,9 @@ def run_in_lockstep(made: StationSpec, peers: Peers | None = None) -> int:
         f"episode  {episode.get('path', 'none')}  {episode.get('rows', 0)} rows, {episode.get('status', '')}"
     )
     if episode:
-        from runtime.recording.export import export
+        from runtime.recording.export import write_export
 
-        print(f"export   {export(Path(episode['path']), made.deployment.data)}")
+        print(f"export   {write_export(Path(episode['path']), made.deployment.data)}")
     # A run that held was ended by nobody's judgement: it is kept, but neither published nor a success.
     well = done.state is SessionState.READY and episode.get("status", "finished") == "finished"
     into = made.deployment.publish
@@ -146,5 +146,5 @@ def run_in_lockstep(made: StationSpec, peers: Peers | None = None) -> int:
 
 
 if __name__ == "__main__":
-    environment.shed()
+    environment.restart_without_web_secrets()
     sys.exit(main())

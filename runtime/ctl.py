@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.clients.client import Refused, StationClient
 from runtime.clients.terminal import aims, watching
 from runtime.clients.terminal.arguments import arguments
-from runtime.clients.terminal.command_follower import LASTING, attend
-from runtime.clients.terminal.figures import line, report, tuning
-from runtime.clients.terminal.settling import settle
+from runtime.clients.terminal.command_follower import LASTING, follow_command
+from runtime.clients.terminal.figures import status_line, status_report, tuning_lines
+from runtime.clients.terminal.settling import wait_until_settled
 from runtime.clients.terminal.syntax import parse
 from runtime.core.errors import RuntimeFault, TransportError
 
@@ -23,13 +23,13 @@ DONE, FAILED, UNKNOWN, INTERRUPTED = 0, 1, 3, 130  # exit codes; 2 is argparse's
 _RELEASE_S = 2.0
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(words: Sequence[str] | None = None) -> int:
     """Exit code 0 where it was done, 1 refused or failed, 3 where no answer came, 141 where nobody reads on."""
     given = parse(sys.argv[1:] if words is None else words)
     client = StationClient(Path(given.data_dir).expanduser().absolute() / "stations" / given.station)
     try:
-        return _do(client, given)
+        return _run_command(client, given)
     except Refused as refusal:
         print(f"refused: {refusal}", file=sys.stderr)
     except TransportError as fault:
@@ -44,24 +44,24 @@ def main(words: Sequence[str] | None = None) -> int:
     return FAILED
 
 
-def _do(client: StationClient, given: argparse.Namespace) -> int:
+def _run_command(client: StationClient, given: argparse.Namespace) -> int:
     if given.command in _OWN_WAYS:
         return _OWN_WAYS[given.command](client, given)
     if given.command in LASTING:
-        return _attended(client, given)
-    return _within(client, given, given.command, arguments(given))
+        return _follow(client, given)
+    return _run_and_wait(client, given, given.command, arguments(given))
 
 
 # --- commands that go on, and commands within a run ----------------------------------------------------------
 
 
-def _attended(client: StationClient, given: argparse.Namespace) -> int:
-    status = attend(client, given.command, arguments(given), _silent if given.json else _say)
+def _follow(client: StationClient, given: argparse.Namespace) -> int:
+    status = follow_command(client, given.command, arguments(given), _silent if given.json else _print)
     _show(status, given.json)
     return _outcome("" if status["state_is"]["ready"] else f"{status['state']}, {status['reason']}")
 
 
-def _within(
+def _run_and_wait(
     client: StationClient, given: argparse.Namespace, kind: str, said: dict[str, Any], wants: str = ""
 ) -> int:
     """Give one command; with --wait stay until it is over. `wants`: the event that then belongs to it."""
@@ -70,7 +70,7 @@ def _within(
     if not getattr(given, "wait", False):
         _show(client.status(), given.json)
         return DONE
-    settled = settle(client, before, _silent if given.json else _tell)
+    settled = wait_until_settled(client, before, _silent if given.json else _tell)
     _show(settled.status, given.json)
     return _outcome(settled.failure(wants))
 
@@ -81,7 +81,7 @@ def _outcome(failure: str) -> int:
     return FAILED if failure else DONE
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     print(text, flush=True)
 
 
@@ -95,7 +95,7 @@ def _silent(what: object) -> None:
 
 
 def _show(status: dict[str, Any], as_json: bool) -> None:
-    print(json.dumps(status, default=str) if as_json else line(status), flush=True)
+    print(json.dumps(status, default=str) if as_json else status_line(status), flush=True)
 
 
 # --- commands with ways of their own -------------------------------------------------------------------------
@@ -103,44 +103,46 @@ def _show(status: dict[str, Any], as_json: bool) -> None:
 
 def _setup(client: StationClient, given: argparse.Namespace) -> int:
     if not given.cancel:
-        return _attended(client, given)
+        return _follow(client, given)
     status = client.status()
     if not status["state_is"]["preparing"]:  # else it would stop a run
         raise Refused(f"there is no set-up to cancel: the station is {status['state']}")
-    return _within(client, given, "stop", {})
+    return _run_and_wait(client, given, "stop", {})
 
 
 def _run(client: StationClient, given: argparse.Namespace) -> int:
     collect = client.status()["collect"] if given.arm else None
     if given.arm and not (collect and collect["armed"]):
         client.command("arm")
-    return _attended(client, given)
+    return _follow(client, given)
 
 
 def _approach(client: StationClient, given: argparse.Namespace) -> int:
     if client.status()["state_is"]["going"]:
-        return _within(client, given, "approach", {}, "motion_done")
-    return _attended(client, given)
+        return _run_and_wait(client, given, "approach", {}, "motion_done")
+    return _follow(client, given)
 
 
 def _move(client: StationClient, given: argparse.Namespace) -> int:
-    return _within(client, given, "move", aims.wanted(client, given) | _speed(given), "motion_done")
+    return _run_and_wait(
+        client, given, "move", aims.aim_arguments(client, given) | _speed(given), "motion_done"
+    )
 
 
 def _jog(client: StationClient, given: argparse.Namespace) -> int:
     """Aim, say what it comes to, and go there: to where the aim is as it was shown, and nowhere else."""
-    aim = client.query("aim", **aims.wanted(client, given)).data
+    aim = client.query("aim", **aims.aim_arguments(client, given)).data
     _show_aim(client, aim, given)
-    short = aims.shortcoming(aim)
+    short = aims.aim_problem(aim)
     if short and not given.nearest:
         raise Refused(f"it cannot go there: {short}; allowed: a smaller step, or --nearest")
-    return _within(client, given, "move", {"joints": aim["joints"]} | _speed(given), "motion_done")
+    return _run_and_wait(client, given, "move", {"joints": aim["joints"]} | _speed(given), "motion_done")
 
 
 def _aim(client: StationClient, given: argparse.Namespace) -> int:
-    aim = client.query("aim", **aims.wanted(client, given)).data
+    aim = client.query("aim", **aims.aim_arguments(client, given)).data
     _show_aim(client, aim, given)
-    return FAILED if aims.shortcoming(aim) else DONE
+    return FAILED if aims.aim_problem(aim) else DONE
 
 
 def _speed(given: argparse.Namespace) -> dict[str, float]:
@@ -154,7 +156,7 @@ def _show_aim(client: StationClient, aim: Any, given: argparse.Namespace) -> Non
     names = client.status()["facts"]["joint_names"]
     commanded = client.query("aim").data["joints"]
     speed = getattr(given, "speed", None) or 1.0
-    print("\n".join(aims.lines(aim, commanded, names, speed)), flush=True)
+    print("\n".join(aims.aim_lines(aim, commanded, names, speed)), flush=True)
 
 
 def _tune(client: StationClient, given: argparse.Namespace) -> int:
@@ -165,13 +167,13 @@ def _tune(client: StationClient, given: argparse.Namespace) -> int:
     if given.json:
         print(json.dumps({"strategy": status["tuning"], "task": status["task"]}))
     else:
-        print("\n  ".join(tuning(status, everything=given.show)))
+        print("\n  ".join(tuning_lines(status, everything=given.show)))
         print(f"task: {status['task'] or 'none'}")
     return DONE
 
 
 def _record(client: StationClient, given: argparse.Namespace) -> int:
-    return _within(client, given, f"record_{given.what}", {})
+    return _run_and_wait(client, given, f"record_{given.what}", {})
 
 
 def _release(client: StationClient, given: argparse.Namespace) -> int:
@@ -193,7 +195,9 @@ def _estop(client: StationClient, given: argparse.Namespace) -> int:
 def _status(client: StationClient, given: argparse.Namespace) -> int:
     status = client.status()
     told = (
-        json.dumps(status, indent=1, default=str) if given.json else "\n".join(report(status, client.holder))
+        json.dumps(status, indent=1, default=str)
+        if given.json
+        else "\n".join(status_report(status, client.holder))
     )
     print(told)
     return DONE

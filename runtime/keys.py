@@ -8,13 +8,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.errors import RuntimeFault
 from runtime.link import codes, key_files
 from runtime.link.enrolment import enrol
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where it was done, 1 where it was not: the sentence says why."""
     given = _parser().parse_args(arguments)

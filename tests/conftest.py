@@ -15,7 +15,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from runtime.core.environment import for_programs
+from runtime.core.environment import program_environment
 from tests.once import SHARED
 from tests.stalls import Stalls, Watch
 
@@ -24,7 +24,7 @@ _LABS = (
     "tests/crash/",
 )  # whole labs and stations in real time: what is there is a lab or a story
 _ALONE = re.compile(r"pytest\.mark\.(?:lab|story)\b")
-os.environ |= for_programs(os.environ)
+os.environ |= program_environment(os.environ)
 _BEGAN = os.sched_getscheduler(0)
 # In the gate the same examples everywhere, what fails is what was changed; and few: others come with `make labs`.
 hypothesis.settings.register_profile(

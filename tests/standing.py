@@ -9,4 +9,4 @@ from runtime.ipc.session_state import SessionState
 
 def standing(state: str) -> dict[str, Any]:
     """Its word, and what it means."""
-    return {"state": state, "state_is": SessionState(state).told()}
+    return {"state": state, "state_is": SessionState(state).meaning_dict()}

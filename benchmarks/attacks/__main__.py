@@ -13,8 +13,8 @@ from pathlib import Path
 
 from benchmarks.attacks import bus, crowds, databases, frames, presses, requests
 from benchmarks.attacks.target import Target
-from robots.broken_pipe import unread_ends
-from runtime.sim.standin import ending
+from robots.broken_pipe import exit_on_broken_pipe
+from runtime.sim.standin import stop_event
 
 ATTACKS = {
     "status_flood": bus.status_flood,
@@ -38,7 +38,7 @@ ATTACKS = {
 _NICE = 19
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main() -> int:
     """Attack until standard input ends."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.attacks", description=__doc__)
@@ -64,7 +64,7 @@ def _target(given: argparse.Namespace) -> Target:
         database=given.database,
         share=given.share,
         begun=lambda: print(json.dumps({"begun": given.name}), flush=True),
-        ended=ending(lifeline=True),
+        ended=stop_event(lifeline=True),
     )
 
 

@@ -30,5 +30,5 @@ def _flood(target: Target, process: str, key: str, sent: Counter[str]) -> None:
     endpoints = Endpoints(target.data / "stations" / PRESSED)
     client = CommandClient(zmq.Context.instance(), endpoints.read(process)[key])
     while not target.ended.is_set():
-        client.post(Command(str(uuid4()), "status"))  # waits where the queue is full
+        client.send(Command(str(uuid4()), "status"))  # waits where the queue is full
         sent[process] += 1

@@ -17,15 +17,15 @@ from runtime.core.plugins import variants
 from runtime.core.types import Observation
 from runtime.policies.base import Policy
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.roboarena_server import Arena, RoboarenaServer
-from runtime.sim.starvla_server import Star, StarvlaServer
+from runtime.sim.roboarena_server import RoboarenaBehaviour, RoboarenaServer
+from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
 from runtime.sim.websocket_server import Frames, WebsocketServer
 
 _QUESTIONS = 12
 _SIZE = (24, 32)  # of pictures
 _NEAR = 0.05  # [rad] of where it was seen, within which a gesture begins
 _ARENA = {"cameras": {"cam_high": "first", "cam_left_wrist": "wrist"}, "cartesian_position": "zeros"}
-_ROBOT = robots.load("dual_franka", ["left_arm"])
+_ROBOT = robots.load_robot("dual_franka", ["left_arm"])
 _VIEWS = [camera.key for camera in _ROBOT.cameras]
 
 
@@ -41,14 +41,16 @@ class Protocol:
 _PROTOCOLS = (
     Protocol("openpi", lambda: OpenpiServer(_ROBOT, Behaviour())),
     Protocol("openpi", lambda: OpenpiServer(_ROBOT, Behaviour(rtc="async_rtc")), {"rtc": "async_rtc"}),
-    Protocol("roboarena", lambda: RoboarenaServer(_ROBOT, Arena(resolution=_SIZE)), _ARENA),
+    Protocol("roboarena", lambda: RoboarenaServer(_ROBOT, RoboarenaBehaviour(resolution=_SIZE)), _ARENA),
     Protocol(
         "roboarena",
-        lambda: RoboarenaServer(_ROBOT, Arena(variant="vllm", reply="dict", resolution=_SIZE)),
+        lambda: RoboarenaServer(_ROBOT, RoboarenaBehaviour(variant="vllm", reply="dict", resolution=_SIZE)),
         _ARENA,
     ),
     Protocol(
-        "starvla", lambda: StarvlaServer(_ROBOT, Star(size=_SIZE)), {"cameras": _VIEWS, "ping_every": None}
+        "starvla",
+        lambda: StarvlaServer(_ROBOT, StarvlaBehaviour(size=_SIZE)),
+        {"cameras": _VIEWS, "ping_every": None},
     ),
 )
 

@@ -19,7 +19,7 @@ _HALF = 0.12  # [m] of each box
 
 @cache
 def _walled(name: str) -> tuple[Workspace, Float64]:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     start = robot.poses["ready"].astype(np.float64)
     boxes = {}
     for arm in robot.arms:
@@ -31,7 +31,7 @@ def _walled(name: str) -> tuple[Workspace, Float64]:
 def once(seed: int) -> list[str]:
     """Violations in the scenario of `seed`, in words; [] where there are none."""
     rng = np.random.default_rng(seed)
-    name = str(rng.choice(sorted(robots.names())))
+    name = str(rng.choice(sorted(robots.robot_names())))
     workspace, start = _walled(name)
     _, limits, dims, _, _ = body(name)
     strategy = str(rng.choice(["async", "naive", "ensemble"]))
@@ -41,7 +41,7 @@ def once(seed: int) -> list[str]:
     for tick in range(_TICKS):
         if tick % 8 == 0:
             here = np.array(bench.status["commanded"], np.float64) if tick else start
-            there = np.where(limits.places, here + rng.uniform(-1.0, 1.0, len(here)), here)
+            there = np.where(limits.position_mask, here + rng.uniform(-1.0, 1.0, len(here)), here)
             bench.chunk(tick + 1, np.linspace(here, there, int(rng.integers(8, 25))))
         if bench.behaviour == "hold":
             bench.say("follow", run=1)

@@ -9,7 +9,7 @@ from benchmarks.fuzzing.faults import FAULTS, KEPT
 from runtime.core.types import Float64
 from runtime.ipc.shared_state import EStop
 from runtime.motion.timeline import difference
-from runtime.spaces.binary_grippers import DWELL_S
+from runtime.spaces.binary_grippers import MIN_SWITCH_INTERVAL_S
 from tests.runtime.tick_bench import PERIOD, Bench
 
 _TICKS = 240
@@ -17,7 +17,7 @@ _NOISE = 2e-5  # [rad] of a sound encoder
 _NEAR = 0.35  # [rad] from the robot that a command may step to: how far it goes while samples agree
 _MARGIN = 1.05
 _SOUND = 12  # ticks
-_RESTS = round(DWELL_S / PERIOD)  # ticks between two switches of a gripper
+_RESTS = round(MIN_SWITCH_INTERVAL_S / PERIOD)  # ticks between two switches of a gripper
 _TURN = 2.0 * np.pi
 _JITTER = 0.05  # [rad] of a noisy encoder
 
@@ -32,7 +32,7 @@ class Scenario(Bench):
         self.rng = np.random.default_rng(seed)
         self.name, limits, dims, switches, ready = drawn(self.rng)
         self.body = ready.copy()
-        self.places, self.speeds = limits.places, list(limits.speeds)
+        self.places, self.speeds = limits.position_mask, list(limits.speeds)
         self.ends = {switch.dim: (switch.open, switch.close) for switch in switches}
         self.wraps = list(dims.wrapping) if self.rng.random() < 0.7 else []
         self.fault, self.since, self.kept = "", 0, self.body
@@ -197,7 +197,7 @@ class Scenario(Bench):
             self.previous, self.velocity = None, np.zeros((2, self.dim))
             return
         told, stopped = sent[0].astype(np.float64), record.source == "estop"
-        if not np.isfinite(told).all() or (self.limits.outside(told) > 1e-5 * self.limits.reach).any():
+        if not np.isfinite(told).all() or (self.limits.excess(told) > 1e-5 * self.limits.radian_scale).any():
             self._wrong(f"beyond the limits or no number: {told.tolist()}")
         if stopped and told[self.speeds].any():
             self._wrong(f"drives under the e-stop: {told[self.speeds].tolist()}")
@@ -223,7 +223,7 @@ class Scenario(Bench):
     def _compare(self, told: Float64, before: Float64, notes: str, stopped: bool) -> None:
         moved = (told - before) / PERIOD
         if "where the robot is" in notes:
-            hardest = 60.0 * self.limits.reach * _MARGIN * PERIOD
+            hardest = 60.0 * self.limits.radian_scale * _MARGIN * PERIOD
             onwards = np.clip(moved, -hardest, hardest)  # it counts as at rest, or has moved on from there
             self.velocity = np.array([np.minimum(onwards, 0.0), np.maximum(onwards, 0.0)])
             apart = np.abs(told - before) > 1e-6
@@ -236,13 +236,13 @@ class Scenario(Bench):
         free = ~self.limits.binary
         if stopped:
             free[self.speeds] = False
-        if (np.abs(moved) > self.limits.velocity * _MARGIN + 1e-3 * self.limits.reach)[free].any():
+        if (np.abs(moved) > self.limits.velocity * _MARGIN + 1e-3 * self.limits.radian_scale)[free].any():
             self._wrong(f"faster than it moves: {moved.tolist()} {notes}")
         least, most = self.velocity
         if stopped:
             least, most = np.minimum(least, 0.0), np.maximum(most, 0.0)
             free = free & self.places
-        gain = 60.0 * self.limits.reach * _MARGIN * PERIOD + 1e-2 * self.limits.reach
+        gain = 60.0 * self.limits.radian_scale * _MARGIN * PERIOD + 1e-2 * self.limits.radian_scale
         edge = (told <= self.limits.lower + 1e-6) | (told >= self.limits.upper - 1e-6)
         if ((moved > most + gain) | (moved < least - gain))[free & ~edge].any():
             self._wrong(f"harder than it accelerates: {notes}")
@@ -264,7 +264,7 @@ class EncoderOff(Bench):
         self.body = ready.copy()
         super().__init__({"kind": "naive"}, limits, dims)
         self.measured = self.body
-        self._joint = int(rng.choice(np.flatnonzero(limits.places)))
+        self._joint = int(rng.choice(np.flatnonzero(limits.position_mask)))
         self._offset, self._scale = rng.uniform(-1.5, 1.5), float(rng.choice([-1.0, 1.0, 1.0, 1.2]))
         self._within = float(rng.choice([PERIOD, 0.5, 2.0]))  # [s] in which the offset grows
         self._comes_and_goes = bool(rng.random() < 0.5)  # never long enough to be believed again
@@ -289,7 +289,7 @@ class EncoderOff(Bench):
             self.run()
             found.update(self._wrong(self.measured))
             self.body += self._lag * (self.sent[-1] - self.body)
-        places = self.limits.places
+        places = self.limits.position_mask
         way = np.abs(np.diff(self.sent[told - 1 :], axis=0))[:, places]
         far = np.ptp(self.sent[told - 1 :], axis=0)[places].max()
         if (way > self.limits.velocity[places] * PERIOD * _MARGIN + 1e-4).any():
@@ -314,13 +314,13 @@ class EncoderOff(Bench):
 
     def _wrong(self, read: Float64) -> set[str]:
         """Violations in the tick in which the joints were `read` [D]."""
-        found, told, places = set[str](), self.sent[-1], self.limits.places
-        if not np.isfinite(told).all() or (self.limits.outside(told) > 1e-5 * self.limits.reach).any():
+        found, told, places = set[str](), self.sent[-1], self.limits.position_mask
+        if not np.isfinite(told).all() or (self.limits.excess(told) > 1e-5 * self.limits.radian_scale).any():
             found.add("told beyond the limits, or no number")
         if self._stopped and self.behaviour != "estop":
             found.add(f"does not stand under the e-stop: {self.behaviour}")
         near = np.abs(difference(read, told, self.dims.wrapping)) <= self.safety.following_error + 1e-4
-        if not self.shared.doubt and not near[places].all():
+        if not self.shared.joint_problem and not near[places].all():
             found.add("a run may begin although the joint is not where it is held")
         return found
 

@@ -28,9 +28,9 @@ from runtime.kinematics.forward import ChainForward
 from runtime.motion.timeline import difference
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.coordinator.inference.worker import LockstepRunner
-from runtime.processes.lockstep.lockstep import Around, Lockstep
+from runtime.processes.lockstep.lockstep import Lockstep, LockstepEnvironment
 from runtime.spaces.end_effectors import EndEffectors
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 
 _TICKS = 240
@@ -165,8 +165,8 @@ class Keeper(Policy):
         """Its rows; PolicyLostError by chance."""
         rows = self._wandering(observation)
         if conditioning is not None:
-            fixed = conditioning.left_over[: conditioning.predicted_delay].astype(np.float64)
-            left = self._joints(conditioning.left_over.astype(np.float64))
+            fixed = conditioning.remaining_rows[: conditioning.predicted_delay].astype(np.float64)
+            left = self._joints(conditioning.remaining_rows.astype(np.float64))
             self.declared.append(Declared(observation.step, self._joints(fixed)))
             if self._made.keeps:
                 rows = self._continued(rows, left, len(fixed))
@@ -265,7 +265,7 @@ class Keeper(Policy):
 def _plan(data: Path, made: Scenario) -> StationSpec:
     tree = lockstep_deployment(data, made.robot, made.strategy, made.control_hz)
     tree["faults"] = {"policy_lost": "slow", "patience_s": 1000.0}
-    planned = checked_spec(loader.resolve(tree, {}, "prefix"))
+    planned = check_deployment(loader.resolve_deployment(tree, {}, "prefix"))
     robot = planned.robot
     if made.endless:
         lower, upper = robot.lower.copy(), robot.upper.copy()
@@ -296,7 +296,7 @@ class Planned:
 
 def _run(spec: StationSpec, made: Scenario, keeper: Keeper, random: np.random.Generator) -> Planned:
     planned = Planned({}, set(), {}, set(), {}, 0)
-    around, clock = Around(runner=Late(*made.delay, random)), VirtualClock()
+    around, clock = LockstepEnvironment(runner=Late(*made.delay, random)), VirtualClock()
     robot = Seldom(spec.robot, clock, keeper.stands.copy(), made.seen_every)
     with closing(station_of(spec, robot, keeper, clock, around)) as station:
         session = station.coordinator.session

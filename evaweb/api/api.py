@@ -109,7 +109,7 @@ def _malformed(request: HttpRequest, fault: ValidationError) -> HttpResponse:
 @api.exception_handler(HttpError)
 def _http(request: HttpRequest, fault: HttpError) -> HttpResponse:
     cause = fault.__cause__  # why a body was not read: Ninja itself says only that it was not
-    if isinstance(cause, Exception) and not isinstance(cause, bounded.Unreadable):
+    if isinstance(cause, Exception) and not isinstance(cause, bounded.UnreadableDocument):
         return api.on_exception(request, cause)
     return _failure(request, str(cause or fault), fault.status_code)
 

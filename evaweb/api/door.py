@@ -181,7 +181,7 @@ async def _answered(scope: dict[str, Any], station: str, what: str, body: bytes)
     """Status and answer; None for a command that stops nothing."""
     if what == "estop":
         return await _estop(scope, station, _said(body))
-    press = pressing.in_json(body, "kind")
+    press = pressing.parse_json_press(body, "kind")
     if press is not None:
         return await _estop(scope, station, press)
     said = _said(body) if len(body) <= _LARGEST else {}
@@ -189,7 +189,7 @@ async def _answered(scope: dict[str, Any], station: str, what: str, body: bytes)
 
 
 async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -> Answered:
-    given, at = EStopIn(uuid=said.get("uuid"), why=pressing.why_in(said)), timezone.now()
+    given, at = EStopIn(uuid=said.get("uuid"), why=pressing.json_reason(said)), timezone.now()
     unverified, username, user = "", UNVERIFIED, None
     try:
         login = await _presser(scope)

@@ -80,12 +80,12 @@ class Bounded(Parser):
     def parse_body(self, request: Any) -> Any:
         """Value of the JSON body, whose text can be kept; NotAllowed, TooLong, Unreadable, EvaError."""
         pressed = request.path.endswith("/estop")
-        if not (request.path.endswith("/commands") and pressing.in_json(request.body, "kind")):
+        if not (request.path.endswith("/commands") and pressing.parse_json_press(request.body, "kind")):
             require(request.auth, post_at(request.path).role)
         try:
             given = _read(request)
             return _without_unknown(given) if request.path.endswith("/commands") else given
-        except (EvaError, bounded.Unreadable):
+        except (EvaError, bounded.UnreadableDocument):
             if pressed:
                 return {}
             raise
@@ -109,7 +109,7 @@ def _read(request: HttpRequest) -> Any:
     post = post_at(request.path)
     if len(request.body) > post.largest:
         raise TooLong(_BODY_TOO_LONG(count=len(request.body), largest=post.largest))
-    given = bounded.from_json(request.body, "the body", most=post.values)
+    given = bounded.parse_json(request.body, "the body", most=post.values)
     if b"\\u" in request.body and not _stops(given):
         for place, text in _texts(given):
             if not is_text(text):

@@ -22,7 +22,7 @@ from evaweb.errors import EvaError
 from evaweb.roles import known_person
 from evaweb.stations.models import Station
 from runtime.core.sentences import Pattern
-from runtime.recording.files import read_document
+from runtime.recording.files import read_json
 
 _SESSION_NO_UUID = Pattern("collect.restoring.session_no_uuid", "its session {named!r:.60} is no uuid")
 _MANIFEST_DOES_NOT_SAY_HOW = Pattern(
@@ -87,7 +87,7 @@ def _closed_at(events: list[EventLine]) -> Any:
 
 
 def _from_manifest(uuid: UUID, episode: Episode) -> CollectSession:
-    manifest: Mapping[str, Any] = read_document(journal_folder(episode.pk) / "manifest.json")
+    manifest: Mapping[str, Any] = read_json(journal_folder(episode.pk) / "manifest.json")
     try:
         setup, dataset = setup_in(manifest), str(manifest["session"]["dataset"])
     except (KeyError, TypeError, AttributeError) as error:

@@ -16,7 +16,7 @@ from evaweb.episodes.manifest import recorded_in
 from evaweb.episodes.models import Episode
 from evaweb.episodes.services import publish_asked
 from runtime.recording.files import RecordingError
-from runtime.recording.labels import newest
+from runtime.recording.labels import latest_label
 
 log = logging.getLogger(__name__)
 TOLD = ("episode_closed", "labelled")
@@ -66,7 +66,7 @@ def label_read(*, demonstration: Demonstration) -> Demonstration:
         .select_related("episode")
         .get(pk=demonstration.pk)
     )
-    label = newest(data_dir(), str(held.pk))
+    label = latest_label(data_dir(), str(held.pk))
     if label is None:
         return held
     before = held.result

@@ -143,7 +143,7 @@ class BoundedRequest(WebRequest):
     def _too_long(self) -> None:
         if self._bound.may_press:
             self.content.seek(0)
-            if pressing.in_json(self.content.read(), "kind") is not None:
+            if pressing.parse_json_press(self.content.read(), "kind") is not None:
                 self._bound, self._over = replace(self._bound, status=0), True
                 return
         self._leave_out()

@@ -21,7 +21,7 @@ from evaweb.errors import StationGone
 from evaweb.stations.runtime_client import StationWire, wire_to
 from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CodecError, Subscriber
-from runtime.ipc.session_state import with_meaning
+from runtime.ipc.session_state import complete_state_meaning
 
 _UNHEARD = Pattern("console.feed.unheard", "{station} has not been heard yet")
 
@@ -173,7 +173,7 @@ def _whole(state: Any) -> dict[str, Any]:
     missing = [key for key in _NEEDED if not isinstance(state, Mapping) or key not in state]
     if missing:
         raise ValueError(f"a snapshot without {', '.join(missing)}: {state!r:.200}")
-    return with_meaning(plain(state))
+    return complete_state_meaning(plain(state))
 
 
 class _Shown(_Reader):

@@ -97,19 +97,19 @@ Request = Watch | Credit | Renew | EStop | Stop | Events | Aim
 
 def may_stop(text: str) -> bool:
     """True if a message that there is no time to read may be one that stops a robot."""
-    if pressing.in_json(text, "type") is not None:
+    if pressing.parse_json_press(text, "type") is not None:
         return True
     return len(text) <= _LONGEST_STOP and any(f'"{kind}"' in text for kind in ("stop", "halt"))
 
 
 def parse(text: str, cameras: Collection[str]) -> Request:
     """The request in a text message; raises BadRequest."""
-    press = pressing.in_json(text, "type")
+    press = pressing.parse_json_press(text, "type")
     if press is not None:  # no press is lost for what else is said with it
-        return EStop(_uuid(press), pressing.why_in(press))
+        return EStop(_uuid(press), pressing.json_reason(press))
     try:
-        said = bounded.from_json(text, "the message", _LARGEST, _MOST_VALUES)
-    except bounded.Unreadable as error:
+        said = bounded.parse_json(text, "the message", _LARGEST, _MOST_VALUES)
+    except bounded.UnreadableDocument as error:
         raise BadRequest(f"{error} (given: {text!r:.60})") from None
     kind = said.get("type") if isinstance(said, dict) else None
     if kind == "watch":

@@ -14,8 +14,8 @@ from evaweb.episodes.dataset_membership import places_read
 from evaweb.episodes.folders import data_dir, datasets_dir, episodes_dir
 from evaweb.errors import EvaError
 from runtime.core.sentences import Pattern
-from runtime.datasets.identities import named_copy
-from runtime.datasets.importing import bring, whose
+from runtime.datasets.identities import copy_with_uuids
+from runtime.datasets.importing import import_episode, resolve_source_robot
 from runtime.datasets.reader import open_dataset
 
 _ALLOWED_NAME_DATASETS_NAME_WHAT = Pattern(
@@ -49,16 +49,16 @@ def imported(
     What was imported before stays as it is, so that one that was cut short is gone on with.
     """
     if not rename:
-        whose(open_dataset(dataset), state, robot)  # before anything is copied
+        resolve_source_robot(open_dataset(dataset), state, robot)  # before anything is copied
     target = _target(dataset, to)
     if target.resolve() != dataset.resolve():
         tell(f"{dataset} is copied to {target}")
-    copied = named_copy(dataset, target, rename=rename, reencode=reencode, tell=tell)
-    told = whose(copied, state, robot)
+    copied = copy_with_uuids(dataset, target, rename=rename, reencode=reencode, tell=tell)
+    told = resolve_source_robot(copied, state, robot)
     uuids, made = [], 0
     for entry in copied.episodes:
         tell(f"episode {entry.index + 1} of {len(copied.episodes)}")
-        uuid, new = bring(copied, entry.index, episodes_dir(), told)
+        uuid, new = import_episode(copied, entry.index, episodes_dir(), told)
         services.episode_read(uuid=UUID(uuid))
         uuids.append(UUID(uuid))
         made += new

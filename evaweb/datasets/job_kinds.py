@@ -48,10 +48,12 @@ def _names(args: Mapping[str, Any]) -> list[str]:
 
 
 def _check(work: Work) -> Found:
-    from runtime.datasets.consistency import examine  # web processes know this kind too, and never do it
+    from runtime.datasets.consistency import (
+        check_with_remarks,
+    )  # web processes know this kind too, and never do it
 
     work.tell("every file is compared with the metadata")
-    found = examine(_source(work))
+    found = check_with_remarks(_source(work))
     return {"problems": found.problems, "remarks": found.remarks}
 
 

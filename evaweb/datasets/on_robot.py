@@ -80,7 +80,7 @@ class Recorded:
             return reverse("replay", args=[self.source])
         name, _, index = self.source.rpartition(":")
         path = reverse("dataset-replay", args=[name, int(index)])
-        said = not self.ours and self.robot in robots.names()
+        said = not self.ours and self.robot in robots.robot_names()
         return f"{path}?{urlencode({'robot': self.robot})}" if said else path
 
 
@@ -264,7 +264,7 @@ def _differences(recorded: Recorded, facts: Mapping[str, Any], space: str) -> li
     """Everything in which the episode's robot is not the station's; [] where it is the same."""
     found = []
     own = str(facts.get("robot", ""))
-    if recorded.robot not in robots.names():
+    if recorded.robot not in robots.robot_names():
         called = f"calls its robot {recorded.robot!r}" if recorded.robot else "names no robot"
         return [f"the episode {called}: choose its robot on its page in Replay, then come back"]
     if recorded.robot != own:

@@ -169,8 +169,8 @@ def asked(*, user: Any, given: Mapping[str, Any]) -> Job:
         args["to"] = _new(order.to, order.parts if isinstance(order, Split) else ())
     if isinstance(order, Delete):
         args |= {"episodes": sorted(set(order.episodes)), "known": _known(names[0])}
-    if isinstance(order, Import) and order.robot and order.robot not in robots.names():
-        raise EvaError(_ROBOT_ALLOWED_NONE(robot=order.robot, names=", ".join(robots.names())))
+    if isinstance(order, Import) and order.robot and order.robot not in robots.robot_names():
+        raise EvaError(_ROBOT_ALLOWED_NONE(robot=order.robot, names=", ".join(robots.robot_names())))
     _require_quiet(names)
     return enqueue(kind=KIND, key=key_of(order.what, names[0], args), args=args)
 

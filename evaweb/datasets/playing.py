@@ -23,7 +23,7 @@ from runtime.core.sentences import Pattern
 from runtime.datasets import layout
 from runtime.datasets.entries import EpisodeEntry, Span
 from runtime.datasets.reader import Dataset
-from runtime.datasets.sides import side_files
+from runtime.datasets.sides import sidecar_paths
 from runtime.recording.files import RecordingError
 from runtime.recording.layout import Layout
 from runtime.recording.reader import Episode
@@ -133,7 +133,7 @@ class Played:
 
     def beside(self) -> dict[str, Path]:
         """The side files of the episode by kind."""
-        return side_files(self.dataset.root, self.uuid) if self.uuid else {}
+        return sidecar_paths(self.dataset.root, self.uuid) if self.uuid else {}
 
 
 def played(name: str, index: int, robot: str = "") -> Played:
@@ -142,8 +142,8 @@ def played(name: str, index: int, robot: str = "") -> Played:
     listed = next((one for one in dataset.episodes if one.index == index), None)
     if listed is None:
         raise NotFound(_HAS_NO_EPISODE_THERE(name=name, index=index, count=len(dataset.episodes)))
-    if robot and robot not in robots.names():
-        raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.names())))
+    if robot and robot not in robots.robot_names():
+        raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.robot_names())))
     own = str(dataset.info.get("robot_type") or "")
     return Played(name, index, dataset, listed, told_of(dataset).get(index, {}), robot or own, bool(robot))
 
@@ -166,7 +166,7 @@ def as_recording(shown: Played) -> Episode:
     table = shown.dataset.table(shown.index)
     joints, measured, commanded = _numbers(shown, table)
     manifest = _manifest(shown, joints)
-    form = Layout.of(manifest)
+    form = Layout.from_manifest(manifest)
     rows = pa.table(
         {
             "tick_time": np.arange(shown.frames) / shown.fps,
@@ -281,7 +281,7 @@ def _with_streams(shown: Played, path: Path, rows: Any) -> Episode:
     try:
         table = pq.read_table(path)
         manifest = json.loads((table.schema.metadata or {})[b"eva.manifest"])
-        form = Layout.of(manifest)
+        form = Layout.from_manifest(manifest)
         by = {
             name: table.filter(pa.compute.equal(table["stream"], name))
             for name in ("raw", "smoothed", "executed")

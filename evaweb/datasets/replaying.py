@@ -66,7 +66,7 @@ def replay(request: HttpRequest, name: str, index: int) -> HttpResponse:
         "recording": _recording(episode),
         "cameras": list(episode.cameras),
         "last": len(episode.dataset.episodes) - 1,
-        "robots": robots.names(),
+        "robots": robots.robot_names(),
         "config": dataset_config(episode) | player(),
     }
     return render(request, "datasets/replay.html", context)

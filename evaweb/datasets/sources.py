@@ -98,7 +98,7 @@ def dataset_address(route: str, episode: Played, *more: Any) -> str:
 
 def dataset_config(episode: Played) -> dict[str, Any]:
     """Settings of the page's modules, as evaweb.episodes.views has them for a recording."""
-    known = episode.robot in robots.names()
+    known = episode.robot in robots.robot_names()
     videos = []
     for camera in episode.cameras:
         span = episode.video(camera)

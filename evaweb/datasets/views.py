@@ -74,7 +74,7 @@ def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
         "checked": None if problem else dataset_jobs.checked(name),
         "page": Paginator(rows, PER_PAGE).get_page(shown.number),
         "listing": shown,
-        "robots": robots.names(),
+        "robots": robots.robot_names(),
         "name": name,
         "chosen": _chosen(request.GET.get("chosen", "")),
         **_work(name),

@@ -13,8 +13,8 @@ from evaweb.jobs.models import JobStatus
 from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.workers import waiting_for
 from runtime.core.sentences import Pattern
-from runtime.recording.export import is_exported, place
-from runtime.recording.files import RecordingError, read_document
+from runtime.recording.export import export_path, is_exported
+from runtime.recording.files import RecordingError, read_json
 
 _TABLE_EPISODE_CANNOT_HAD = Pattern(
     "episodes.exporting.table_episode_cannot_had",
@@ -45,7 +45,7 @@ def job_key(uuid: UUID) -> str:
 def exported(uuid: UUID) -> Path | None:
     """The table of an episode, None where it is not made yet; RecordingError where the folder is damaged."""
     folder = journal_folder(uuid)
-    path = place(read_document(folder / "manifest.json"), data_dir())
+    path = export_path(read_json(folder / "manifest.json"), data_dir())
     return path if is_exported(folder, path) else None
 
 

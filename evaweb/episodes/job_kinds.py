@@ -26,10 +26,10 @@ from evaweb.jobs.kinds import Work, at_start, chore, job_kind
 from evaweb.jobs.services import enqueue
 from evaweb.object_stores import the_store
 from runtime.datasets.published import never_published, publish
-from runtime.recording.export import export
+from runtime.recording.export import write_export
 from runtime.recording.files import RecordingError
-from runtime.recording.labels import newest
-from runtime.recording.scrub import verify
+from runtime.recording.labels import latest_label
+from runtime.recording.scrub import verify_episode
 from runtime.recording.verdict import DamagedError
 
 _AT_ONCE = 20  # asked for in one look
@@ -62,7 +62,7 @@ def store_at_start() -> None:
 @job_kind("export")
 def export_episode(work: Work) -> Mapping[str, Any]:
     """Write its three streams as one parquet table, unless the station has done so; args: uuid."""
-    path = export(journal_folder(UUID(work.args["uuid"])), data_dir())
+    path = write_export(journal_folder(UUID(work.args["uuid"])), data_dir())
     return {"file": str(path.relative_to(data_dir())), "bytes": path.stat().st_size}
 
 
@@ -99,7 +99,7 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     try:
         return _published(work, episode, folder)
     except RecordingError:
-        verdict = verifying.known_better(episode, verify(folder))
+        verdict = verifying.known_better(episode, verify_episode(folder))
         if verdict.state != "damaged":
             raise
         verifying.found(verdict)
@@ -115,7 +115,7 @@ def _published(work: Work, episode: Episode, folder: Path) -> Mapping[str, Any]:
     why = never_published({name: recorded.facts.get(name) for name in ("mode", "kind")})
     if why:
         return {"published": False, "why": f"it {why}"}
-    label = newest(data_dir(), str(episode.uuid))
+    label = latest_label(data_dir(), str(episode.uuid))
     if label is not None and label.discarded:
         return {"published": False, "why": f"it was discarded by {label.by}"}
     success = success_of(scores_file(episode.uuid))

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from evaweb.episodes.models import EpisodeStatus
-from runtime.recording.files import RecordingError, read_document
+from runtime.recording.files import RecordingError, read_json
 from runtime.recording.layout import Layout, simulated
-from runtime.recording.scrub import require_sound
+from runtime.recording.scrub import require_intact
 from runtime.recording.sealing import MANIFEST, OUTCOME, SEAL, read_outcome
 
 CLOSED = (EpisodeStatus.FINISHED, EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED)
@@ -37,8 +37,8 @@ class Recorded:
 
 def recorded_in(folder: Path) -> Recorded:
     """Read it; RecordingError names the file that is absent, damaged, or says what cannot be."""
-    manifest = read_document(folder / "manifest.json")
-    layout = Layout.of(manifest)
+    manifest = read_json(folder / "manifest.json")
+    layout = Layout.from_manifest(manifest)
     if folder.name != layout.uuid:
         raise RecordingError(f"{folder / 'manifest.json'} is of episode {layout.uuid}, not of {folder.name}")
     told = {
@@ -58,7 +58,7 @@ def recorded_in(folder: Path) -> Recorded:
     }
     path = folder / OUTCOME
     if path.exists():
-        require_sound(folder, (MANIFEST,))
+        require_intact(folder, (MANIFEST,))
     outcome = read_outcome(folder) if path.exists() else {}
     return Recorded(
         uuid=layout.uuid,

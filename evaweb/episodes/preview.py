@@ -15,9 +15,9 @@ from PIL import Image
 
 from evaweb.episodes.folders import THUMBNAIL, sheet_name
 from evaweb.episodes.sheets import sheet
-from runtime.datasets.pictures import Pictures
+from runtime.datasets.pictures import VideoFrames
 from runtime.datasets.remux import remux
-from runtime.recording.files import RecordingError, disk_fault, sync_folder, write_whole
+from runtime.recording.files import RecordingError, disk_error, sync_folder, write_atomic
 from runtime.recording.reader import Episode, open_episode
 
 WIDTH = 320  # of the thumbnail
@@ -48,7 +48,7 @@ def make_preview(journal: Path, target: Path, tell: Callable[[str], None]) -> in
             os.replace(draft, target)
         sync_folder(target.parent)
     except OSError as error:
-        raise disk_fault("making a preview in", target, error) from error
+        raise disk_error("making a preview in", target, error) from error
     return episode.frames
 
 
@@ -71,17 +71,17 @@ def _fill(episode: Episode, draft: Path, tell: Callable[[str], None]) -> None:
         remux(source, video, episode.shown(camera), episode.layout.fps)
         _sync(video)
         small = sheet(source, episode.frames, episode.shown(camera))
-        write_whole(draft / sheet_name(camera), small)
+        write_atomic(draft / sheet_name(camera), small)
     shown = [camera for camera in episode.videos if episode.shown(camera)]
     if shown:
         middle = min(episode.frames // 2, episode.shown(shown[0]) - 1)
-        write_whole(draft / THUMBNAIL, thumbnail(episode.videos[shown[0]], middle))
+        write_atomic(draft / THUMBNAIL, thumbnail(episode.videos[shown[0]], middle))
     sync_folder(draft)
 
 
 def thumbnail(video: Path, frame: int) -> bytes:
     """Frame `frame` of the video as a JPEG of WIDTH pixels; RecordingError where it cannot be decoded."""
-    with Pictures(video) as pictures:
+    with VideoFrames(video) as pictures:
         return jpeg_of(pictures[min(frame, len(pictures) - 1)], WIDTH)
 
 

@@ -46,10 +46,10 @@ def looks_in(manifest: Mapping[str, Any]) -> Looks:
 def described_in(manifest: Mapping[str, Any]) -> robots.Robot:
     """The same without its looks, where nothing is drawn."""
     name, groups = str(robot_in(manifest).get("name", "")), groups_in(manifest)
-    if name not in robots.names():
-        raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(name=name, names=", ".join(robots.names())))
+    if name not in robots.robot_names():
+        raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(name=name, names=", ".join(robots.robot_names())))
     try:
-        robot = robots.load(name, groups)
+        robot = robots.load_robot(name, groups)
     except robots.RobotError as error:
         raise NotFound(str(error)) from error
     _require_same(robot, manifest)

@@ -21,7 +21,7 @@ from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.workers import waiting_for
 from evaweb.lists import words_of
 from runtime.core.sentences import Pattern
-from runtime.recording.files import RecordingError, read_document
+from runtime.recording.files import RecordingError, read_json
 from runtime.recording.layout import Layout
 from runtime.recording.tables import read_table, rows_schema
 
@@ -177,7 +177,7 @@ def unrecorded_because(*, episode: Episode | None) -> str:
 def _rows_written(folder: Path) -> int:
     """Rows on the disk of an episode that is not closed yet; 0 where its files cannot be read."""
     try:
-        layout = Layout.of(read_document(folder / "manifest.json"))
+        layout = Layout.from_manifest(read_json(folder / "manifest.json"))
         return int(read_table(folder / "rows.arrow", rows_schema(layout)).table.num_rows)
     except RecordingError:
         return 0

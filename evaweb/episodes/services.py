@@ -24,7 +24,7 @@ from evaweb.stations.models import Station, StationKey
 from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
-from runtime.recording.quarantine import marked
+from runtime.recording.quarantine import marked_damage
 from runtime.recording.sealing import OUTCOME
 
 log = logging.getLogger(__name__)
@@ -139,7 +139,7 @@ def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
         raise RecordingError(f"{journal_folder(uuid)}: {OUTCOME} {why}")
     facts = dict(recorded.facts) | {
         "previewed_at": _previewed_at(uuid),
-        "damage": marked(data_dir(), str(uuid)),
+        "damage": marked_damage(data_dir(), str(uuid)),
         "away_since": None,
     }
     episode, _ = Episode.objects.update_or_create(

@@ -10,7 +10,7 @@ import numpy as np
 import simplejpeg
 from PIL import Image
 
-from runtime.datasets.pictures import Pictures
+from runtime.datasets.pictures import VideoFrames
 from runtime.recording.files import RecordingError
 
 MOST = 100  # tiles
@@ -41,7 +41,7 @@ def sheet(video: Path, frames: int, shown: int) -> bytes:
     So is one whose picture does not decode: the video is played all the same. RecordingError where none of it can be.
     """
     grid = Grid.of(frames)
-    with Pictures(video) as pictures:
+    with VideoFrames(video) as pictures:
         height = max(1, round(pictures.size[0] * WIDTH / pictures.size[1]))
         made = np.zeros((grid.down * height, grid.across * WIDTH, 3), np.uint8)
         for tile, first in enumerate(range(0, shown, grid.every)):

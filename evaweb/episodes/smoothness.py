@@ -23,7 +23,7 @@ from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.smoothness import CUT_OFF, sparc
 from runtime.kinematics.forward import ChainForward
 from runtime.recording.reader import Episode, open_episode
-from runtime.recording.scrub import require_sound
+from runtime.recording.scrub import require_intact
 from runtime.recording.summary import HELD
 
 LEAST_M = 0.02  # an arm that stays within it did not move: its speed is the noise of its sensors
@@ -48,7 +48,7 @@ class Smoothness:
 
 def smoothness_in(folder: Path) -> Smoothness:
     """That of a recording; RecordingError names the file that is absent or damaged."""
-    require_sound(folder, _FILES)
+    require_intact(folder, _FILES)
     return smoothness_of(open_episode(folder))
 
 

@@ -21,10 +21,10 @@ from evaweb.jobs.kinds import Work
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
 from runtime.recording.files import RecordingError
-from runtime.recording.quarantine import keep, marked
-from runtime.recording.scrub import verify
-from runtime.recording.sealing import MANIFEST, OUTCOME, SECOND
-from runtime.recording.verdict import Damage, Verdict
+from runtime.recording.quarantine import marked_damage, update_mark
+from runtime.recording.scrub import verify_episode
+from runtime.recording.sealing import MANIFEST, OUTCOME, OUTCOME_COPY
+from runtime.recording.verdict import Damage, IntegrityCheck
 
 log = logging.getLogger(__name__)
 
@@ -62,21 +62,24 @@ def scrubbed(work: Work) -> Mapping[str, Any]:
     return {**counts, "bytes": read, "found": damaged, "problems": problems}
 
 
-def found(verdict: Verdict) -> Verdict:
+def found(verdict: IntegrityCheck) -> IntegrityCheck:
     """Keep what was found of an episode of this lab, on the disk and in its row; as it then stands."""
     row = Episode.objects.filter(uuid=UUID(verdict.path.name)).first()
     verdict = known_better(row, verdict) if row else verdict
     if verdict.state == "damaged":
         log.error("episode %s is damaged: %s", verdict.path.name, verdict.text)
-    keep(verdict)
-    facts: dict[str, Any] = {"damage": marked(data_dir(), verdict.path.name), "verified_at": timezone.now()}
+    update_mark(verdict)
+    facts: dict[str, Any] = {
+        "damage": marked_damage(data_dir(), verdict.path.name),
+        "verified_at": timezone.now(),
+    }
     if verdict.state == "sound" and not facts["damage"]:
         facts["seal"] = verdict.seal
     Episode.objects.filter(uuid=UUID(verdict.path.name)).update(**facts)
     return verdict
 
 
-def known_better(row: Episode, verdict: Verdict) -> Verdict:
+def known_better(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
     """A closed recording that lost its outcome, or has another one than that with which it was closed, is damaged."""
     if row.status not in CLOSED or verdict.state == "damaged":
         return verdict
@@ -86,12 +89,12 @@ def known_better(row: Episode, verdict: Verdict) -> Verdict:
     return replace(verdict, state="damaged", damage=(Damage(OUTCOME, why),), seal=row.seal)
 
 
-def _looked_at(folder: Path) -> Verdict:
+def _looked_at(folder: Path) -> IntegrityCheck:
     """A folder that has nothing left by which it is an episode is that of a closed one all the same."""
     lost = [Damage(name, "is absent") for name in (MANIFEST, OUTCOME) if not (folder / name).exists()]
-    if folder.is_dir() and len(lost) == 2 and not (folder / SECOND).exists():
-        return Verdict(folder, "damaged", tuple(lost))
-    return verify(folder)
+    if folder.is_dir() and len(lost) == 2 and not (folder / OUTCOME_COPY).exists():
+        return IntegrityCheck(folder, "damaged", tuple(lost))
+    return verify_episode(folder)
 
 
 def unverified() -> tuple[int, int]:

@@ -9,7 +9,7 @@ from uuid import UUID
 from evaweb.episodes.folders import data_dir, preview_folder, preview_video
 from evaweb.object_stores import StoreError, compared, required_store, the_cache, the_store
 from runtime.core.sentences import Pattern
-from runtime.recording.files import write_whole
+from runtime.recording.files import write_atomic
 
 INDEX = "stored.json"  # in the folder of a preview: the digest of each camera's video
 TYPE = "video/mp4"
@@ -45,7 +45,7 @@ def put_videos(uuid: UUID) -> int:
     for digest in found.values():
         compared(store, digest)
     told = json.dumps(_stored(uuid) | found, indent=1, ensure_ascii=False)
-    write_whole(preview_folder(uuid) / INDEX, told.encode())
+    write_atomic(preview_folder(uuid) / INDEX, told.encode())
     for path in videos:
         path.unlink(missing_ok=True)
     return len(found)

@@ -36,7 +36,7 @@ from evaweb.roles import Role, require, role_of
 from evaweb.stations.geometry import geometry
 from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
-from runtime.recording.files import RecordingError, read_document
+from runtime.recording.files import RecordingError, read_json
 from runtime.recording.layout import simulated
 
 _EPISODE_DOES_NOT_EXIST_THIS = Pattern(
@@ -163,7 +163,7 @@ def replay_config(episode: Episode) -> dict[str, Any]:
         }
         for camera in episode.cameras
     ]
-    if episode.kind == IMPORTED and episode.robot not in robots.names():
+    if episode.kind == IMPORTED and episode.robot not in robots.robot_names():
         called = f"calls its robot {episode.robot}" if episode.robot else "names no robot"
         address |= {"geometry": "", "why": f"the dataset {called}: import it with --robot"}
     grid = asdict(Grid.of(episode.frames))
@@ -224,7 +224,7 @@ def episode_geometry(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """Geometry of the robot as it was then, for the 3D scene, as JSON."""
     episode_get(uuid=uuid)
     try:
-        manifest = read_document(journal_folder(uuid) / "manifest.json")
+        manifest = read_json(journal_folder(uuid) / "manifest.json")
     except RecordingError as error:
         raise Conflict(str(error)) from None
     robot = looks_in(manifest).robot

@@ -37,8 +37,8 @@ from evaweb.trials import lifecycle
 from evaweb.trials.models import Trial
 from runtime.config import draft
 from runtime.config.loader import ConfigurationError, Resolved, load, tree_of
-from runtime.core.environment import without_secrets
-from runtime.recording.files import write_whole
+from runtime.core.environment import without_web_secrets
+from runtime.recording.files import write_atomic
 
 _TABLETOP = settings.BASE_DIR / "deployments" / "tabletop.toml"
 _BASE = settings.BASE_DIR / "deployments" / "base.toml"
@@ -118,16 +118,16 @@ def kept_of(name: str) -> Kept | None:
 
 def write_simulated(*, name: str, robot: str) -> Kept:
     """The deployment of a simulated bench with that robot; the lab starts it."""
-    if robot not in robots.names():
-        raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(robots.names())}")
+    if robot not in robots.robot_names():
+        raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(robots.robot_names())}")
     tree = {**tree_of(_TABLETOP), "station": name, "robot": robot}
     return _write(name, tree, _CHOSEN)
 
 
 def write_draft(*, name: str, robot: str, task: str, parts: Mapping[str, Mapping[str, str]]) -> Kept:
     """A draft for a real robot, which the runtime can load; `parts`: transport, policy, and cameras.KEY, as typed."""
-    if robot not in robots.names():
-        raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(robots.names())}")
+    if robot not in robots.robot_names():
+        raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(robots.robot_names())}")
     tree = {**tree_of(_BASE), "station": name, "robot": robot, "task": task}
     try:
         for place, typed in parts.items():
@@ -184,7 +184,7 @@ def faults_of(path: Path) -> str:
                 f'data_dir="{settings.DATA_DIR}"',
             ],
             cwd=settings.BASE_DIR,
-            env=without_secrets(os.environ),
+            env=without_web_secrets(os.environ),
             capture_output=True,
             text=True,
             timeout=_CHECK_S,
@@ -330,7 +330,7 @@ def _put(
     path.parent.mkdir(mode=0o700, exist_ok=True)
     draft_path = path.with_name(f"{path.stem}.{uuid4().hex}.draft")
     try:
-        write_whole(draft_path, draft.text_of(tree, [written, *about]).encode())
+        write_atomic(draft_path, draft.text_of(tree, [written, *about]).encode())
         load(draft_path)
         place(draft_path, path)
     except ConfigurationError as fault:

@@ -76,12 +76,12 @@ class DraftForm:
 
 def form_of(given: Mapping[str, str]) -> DraftForm:
     """The form with what is in its fields; EvaError names a robot or a kind that there is not, and those there are."""
-    known = tuple(robots.names())
+    known = tuple(robots.robot_names())
     robot = given.get("robot", known[0])
     if robot not in known:
         raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(known)}")
     try:
-        cameras = [f"cameras.{camera.key}" for camera in robots.load(robot).cameras]
+        cameras = [f"cameras.{camera.key}" for camera in robots.load_robot(robot).cameras]
     except robots.RobotError as fault:  # of a folder of the lab's own
         raise EvaError(str(fault)) from None
     parts = tuple(_part(place, given) for place in ("transport", "policy", *cameras))

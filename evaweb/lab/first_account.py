@@ -13,7 +13,7 @@ from django.db import Error, transaction
 from evaweb.errors import Conflict
 from evaweb.lab.seed import fresh_password, nobody_can_log_in
 from evaweb.roles import Role, grant
-from runtime.recording.files import write_whole
+from runtime.recording.files import write_atomic
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 def offer() -> str:
     """A new code, good until an account is made with it or the lab ends."""
     code = fresh_password()
-    write_whole(_path(), code.encode())
+    write_atomic(_path(), code.encode())
     _path().chmod(0o600)
     return code
 

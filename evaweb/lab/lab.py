@@ -20,7 +20,7 @@ from evaweb.lab.progress import Progress, silent
 from evaweb.lab.simulated import Benches
 from evaweb.listening import listen
 from evaweb.stop_port import StopPort, forget
-from runtime.core.environment import for_programs
+from runtime.core.environment import program_environment
 
 _WATCH_S = 0.5
 
@@ -90,7 +90,7 @@ def a_lab(
         with told.step("the database"):
             call_command("migrate", verbosity=0, interactive=False)
             lab_folder_named()
-        environment = for_programs(os.environ) | {
+        environment = program_environment(os.environ) | {
             "EVA_DATA_DIR": str(settings.DATA_DIR),
             "PYTHONUNBUFFERED": "1",
         }

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from evaweb.errors import EvaError
-from runtime.core.environment import without_secrets
+from runtime.core.environment import without_web_secrets
 
 log = logging.getLogger(__name__)
 _MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
@@ -199,7 +199,7 @@ class Processes:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE if heard else output,
             stderr=output,
-            env=self._environment if program.of_web else without_secrets(self._environment),
+            env=self._environment if program.of_web else without_web_secrets(self._environment),
             cwd=self._folder,
             pass_fds=program.descriptors,
             start_new_session=True,  # Ctrl-C reaches us alone; we end them in order

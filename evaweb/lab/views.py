@@ -209,7 +209,7 @@ def _steps(request: HttpRequest, name: str = "", *, status: int = 200, **more: A
     context = {
         "walk": found,
         "fresh": "new" in request.GET or "simulated_name" in more or "draft" in more,
-        "robots": robots.names(),
+        "robots": robots.robot_names(),
         "lab_runs": deployments.lab_runs(),
         "scenes": first_steps.scenes_address(),
         "command": deployments.command_of(found.kept.path) if found.kept else "",

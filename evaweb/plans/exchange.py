@@ -194,8 +194,8 @@ def imported(*, user: User, text: str, pictures: Mapping[str, bytes] | None = No
 
 def _read(text: str) -> File:
     try:
-        return File.model_validate(bounded.toml(text, "the file"))
-    except bounded.Unreadable as error:
+        return File.model_validate(bounded.parse_toml(text, "the file"))
+    except bounded.UnreadableDocument as error:
         raise EvaError(str(error)) from None
     except ValidationError as error:
         first = error.errors()[0]

@@ -17,10 +17,12 @@ LONGEST_S = 3600.0
 def preflight(work: Work) -> Mapping[str, Any]:
     """Ask the checkpoint's server by the deployment file of the station; args: preflight."""
     row: Preflight = preflight_get(id=work.args["preflight"])
-    from runtime.station.preflight_child import fly  # web processes know this kind too, and never do it
+    from runtime.station.preflight_child import (
+        run_preflight,
+    )  # web processes know this kind too, and never do it
 
     if row.status != PreflightStatus.RUNNING:
         return {"verdict": row.verdict}
     work.tell(f"asking the server of {row.checkpoint}")
     asked = {"deployment": row.station.deployment, "changes": row.changes}
-    return {"verdict": preflight_ended(row=row, report=fly(asked, LONGEST_S)).verdict}
+    return {"verdict": preflight_ended(row=row, report=run_preflight(asked, LONGEST_S)).verdict}

@@ -30,10 +30,10 @@ from evaweb.stations.runtime_client import NoAnswer, wire_to
 from evaweb.stations.selectors import station_list
 from evaweb.trials.models import Checkpoint
 from runtime.config import loader as deployment
-from runtime.config.loader import ConfigurationError, server_of
+from runtime.config.loader import ConfigurationError, server_address
 from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.messages import Command
-from runtime.ipc.session_state import with_meaning
+from runtime.ipc.session_state import complete_state_meaning
 
 log = logging.getLogger(__name__)
 _NO_STATION_FREE_NONE_HAS = fixed(
@@ -155,7 +155,7 @@ def _require_free(server: str, besides: Station) -> None:
             continue
         if ack.data.get("server") != server:
             continue
-        state_is = with_meaning(ack.data)["state_is"]
+        state_is = complete_state_meaning(ack.data)["state_is"]
         if state_is["at_work"]:
             raise Conflict(_WITH_SAME_POLICY_SERVER_PREFLIGHT(other=other, label=state_is["label"]))
 
@@ -190,8 +190,8 @@ def _of_worker(row: Preflight, gone: StationGone) -> Preflight:
     if not file:
         raise StationGone(_DEPLOYMENT_FILE_NOT_KNOWN_HERE(gone=gone))
     try:
-        resolved = deployment.changed(deployment.load(Path(file)), row.changes, "the checkpoint")
-        _require_free(server_of(resolved.deployment), row.station)
+        resolved = deployment.apply_changes(deployment.load(Path(file)), row.changes, "the checkpoint")
+        _require_free(server_address(resolved.deployment), row.station)
     except ConfigurationError as error:
         log.info("%s: %s", row, error)  # what the report will say
     row.by = Preflight.By.WORKER

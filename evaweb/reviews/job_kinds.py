@@ -19,8 +19,8 @@ from evaweb.reviews import selectors, services
 from evaweb.reviews.dataset_sidecars import said_of, written
 from evaweb.reviews.folders import bounds_file, report_file
 from evaweb.reviews.models import Standing
-from runtime.datasets.sides import attach
-from runtime.recording.files import document, read_document, write_whole
+from runtime.datasets.sides import attach_sidecar
+from runtime.recording.files import read_json, to_json, write_atomic
 
 if TYPE_CHECKING:
     from runtime.quality.report import Report
@@ -39,10 +39,10 @@ def quality(work: Work) -> Mapping[str, Any]:
     bounds = bounds_file()
     settings = read_settings(bounds) if bounds.exists() else QualitySettings()
     work.tell("every frame and picture is looked at")
-    found = _inspected(episode, settings).document()
+    found = _inspected(episode, settings).to_dict()
     path = report_file(episode.uuid)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, document(found, "the report"))
+    write_atomic(path, to_json(found, "the report"))
     services.quality_found(
         episode=episode, document=found, at=datetime.fromtimestamp(path.stat().st_mtime, UTC)
     )
@@ -52,18 +52,18 @@ def quality(work: Work) -> Mapping[str, Any]:
 def _inspected(episode: Episode, settings: QualitySettings) -> Report:
     """One that was imported is judged as its dataset has it: its folder has other times, and pictures coded again."""
     from runtime.datasets.identities import uuids_of
-    from runtime.quality.inspection import inspect, inspect_dataset
+    from runtime.quality.inspection import check_dataset_episode, check_episode
 
     folder = journal_folder(episode.uuid)
-    told = read_document(folder / "manifest.json").get("imported")
+    told = read_json(folder / "manifest.json").get("imported")
     if isinstance(told, Mapping):
         dataset = data_dir() / (episode.dataset or str(told["dataset"]))
         index = next((index for index, uuid in uuids_of(dataset).items() if uuid == str(episode.uuid)), None)
         if index is not None:
-            return inspect_dataset(
+            return check_dataset_episode(
                 dataset, index, settings, state=str(told["state"]), robot=str(told["robot"])
             )
-    return inspect(folder, settings)
+    return check_episode(folder, settings)
 
 
 @job_kind("sides")
@@ -77,7 +77,7 @@ def sides(work: Work) -> Mapping[str, Any]:
     with TemporaryDirectory() as folder:
         said = written(episode.uuid, Path(folder))
         for kind in ("reviews", "annotations"):
-            attach(dataset, str(episode.uuid), kind, said.get(kind))
+            attach_sidecar(dataset, str(episode.uuid), kind, said.get(kind))
     counts = {kind: len(kept) for kind, kept in said_of(episode.uuid).items()}
     return {"attached": True, **counts}
 

@@ -15,7 +15,7 @@ from evaweb.errors import Conflict, NotFound
 from evaweb.reviews.folders import report_file
 from evaweb.reviews.models import Review, Segment, SegmentLabel, Standing
 from runtime.core.sentences import Pattern
-from runtime.recording.files import RecordingError, read_document
+from runtime.recording.files import RecordingError, read_json
 
 _HAVE_EPISODE_CHECKED_AGAIN = Pattern(
     "reviews.selectors.have_episode_checked_again",
@@ -41,7 +41,7 @@ def report_of(*, uuid: UUID) -> Mapping[str, Any] | None:
     """Report of the checks, as written down; None where they were not done. Conflict if it is damaged."""
     path = report_file(uuid)
     try:
-        return read_document(path) if path.exists() else None
+        return read_json(path) if path.exists() else None
     except RecordingError as error:
         raise Conflict(_HAVE_EPISODE_CHECKED_AGAIN(error=error)) from None
 

@@ -109,8 +109,8 @@ def _posted(request: HttpRequest) -> dict[str, Any]:
     if request.content_type != "application/json":
         raise EvaError(_SENT_ALLOWED_APPLICATION_JSON(content_type=request.content_type))
     try:
-        given = bounded.from_json(request.body, "the scene", LONGEST_SCENE)
-    except bounded.Unreadable as error:
+        given = bounded.parse_json(request.body, "the scene", LONGEST_SCENE)
+    except bounded.UnreadableDocument as error:
         raise EvaError(str(error)) from None
     if not isinstance(given, dict):
         raise EvaError(_SENT_ALLOWED_TABLE_WITH_SCENE(given=given))

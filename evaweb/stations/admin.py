@@ -26,7 +26,7 @@ class StationForm(forms.ModelForm):
 
     def __init__(self, *args: Any, **named: Any) -> None:
         super().__init__(*args, **named)
-        self.fields["robot"] = forms.ChoiceField(choices=[(name, name) for name in robots.names()])
+        self.fields["robot"] = forms.ChoiceField(choices=[(name, name) for name in robots.robot_names()])
 
 
 @admin.register(Station)

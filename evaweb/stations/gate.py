@@ -29,7 +29,7 @@ from runtime.link.gate import Gate
 from runtime.link.incoming import Incoming, Owner
 from runtime.link.key_files import ConfigurationError
 from runtime.link.wire import Enrolled
-from runtime.recording.files import write_whole
+from runtime.recording.files import write_atomic
 
 log = logging.getLogger(__name__)
 _LOOK_S = 0.5
@@ -82,7 +82,7 @@ class Keys:
     def _keep(self, found: Allowed) -> None:
         content = {key: sorted(names) for key, names in found.stations.items()}
         try:
-            write_whole(self._path, json.dumps(content).encode())
+            write_atomic(self._path, json.dumps(content).encode())
         except OSError as error:
             log.error("who may connect is not kept in %s: %s", self._path, error)
 
@@ -124,8 +124,8 @@ def _only_one(path: Path) -> Iterator[None]:
 
 
 def _serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
-    logs.start("gate")
-    file_limits.allow_all()
+    logs.configure_logging("gate")
+    file_limits.raise_file_limit()
     sys.setswitchinterval(_TURN_S)
     data = settings.DATA_DIR
     ended = threading.Event()

@@ -79,7 +79,7 @@ def _frames(looks: Looks) -> list[dict[str, Any]]:
 
 def _link(looks: Looks, arm: Group, link: str) -> str:
     """A link's name, behind its arm's where there are several of that name."""
-    return link if len(looks.scene.parts_of(link)) == 1 else f"{arm.name}/{link}"
+    return link if len(looks.scene.parts_showing(link)) == 1 else f"{arm.name}/{link}"
 
 
 def _capsules(looks: Looks) -> list[dict[str, Any]]:
@@ -88,7 +88,7 @@ def _capsules(looks: Looks) -> list[dict[str, Any]]:
         {"part": part, "start": one.start.tolist(), "end": one.end.tolist(), "radius": one.radius}
         for link, made in capsules(looks.robot).items()
         for one in made
-        for part in looks.scene.parts_of(link)
+        for part in looks.scene.parts_showing(link)
     ]
 
 

@@ -15,7 +15,7 @@ import robots
 from evaweb.errors import NotFound
 from robots.units import units_of
 from runtime.core.sentences import Pattern
-from runtime.kinematics.links import Links
+from runtime.kinematics.links import LinkPoses
 
 log = logging.getLogger(__name__)
 _ROBOT_DOES_NOT_EXIST_THERE = Pattern(
@@ -36,7 +36,7 @@ class Looks:
     def __init__(self, robot: robots.Robot, scene: robots.RobotScene) -> None:
         self.robot = robot
         self.scene = scene
-        self._links = _kernels.submit(Links, scene)
+        self._links = _kernels.submit(LinkPoses, scene)
         self._links.add_done_callback(_compiled)
 
     def poses(self, q: NDArray[Any]) -> NDArray[np.float32]:
@@ -90,7 +90,7 @@ class Looks:
         }
 
 
-def _compiled(links: Future[Links]) -> None:
+def _compiled(links: Future[LinkPoses]) -> None:
     if (error := links.exception()) is not None:
         log.error("links are placed by numpy, thirty times slower: %s", error)
 
@@ -110,10 +110,10 @@ def looks_of(robot: str, groups: Sequence[str] | None = None) -> Looks:
 
 @lru_cache(_KEPT)
 def _looks(robot: str, groups: tuple[str, ...] | None) -> Looks:
-    if robot not in robots.names():  # a name, never a path: it may come from an address
-        raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.names())))
+    if robot not in robots.robot_names():  # a name, never a path: it may come from an address
+        raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.robot_names())))
     try:
-        described = robots.load(robot, groups)
+        described = robots.load_robot(robot, groups)
         return Looks(described, robots.scene_of(described))
     except robots.RobotError as error:
         raise NotFound(str(error)) from error

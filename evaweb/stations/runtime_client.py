@@ -25,9 +25,9 @@ from evaweb.stations.models import STATION_NAME
 from runtime.core.sentences import Pattern, checked_row
 from runtime.ipc.bus import CodecError, CommandClient, Endpoints, Key, TransportError
 from runtime.ipc.estop_client import NoAnswer as Unanswered
-from runtime.ipc.estop_client import NotSent, urgent
+from runtime.ipc.estop_client import NotSent, send_urgent
 from runtime.ipc.messages import Ack, Command
-from runtime.ipc.session_state import with_meaning
+from runtime.ipc.session_state import complete_state_meaning
 
 _LATE = Pattern("stations.runtime_client.late", "{name} has not answered {kind} in time")
 _OUTCOME_UNKNOWN = Pattern(
@@ -105,7 +105,7 @@ class StationWire:
         """
         try:
             context = zmq.Context.instance()
-            return urgent(context, self.endpoints, (process, key), command, timeout, self._key)
+            return send_urgent(context, self.endpoints, (process, key), command, timeout, self._key)
         except CodecError as error:
             raise self._unreadable(command, error) from error
         except Unanswered as error:
@@ -117,7 +117,9 @@ class StationWire:
 
     def status(self, timeout: float | None = None) -> dict[str, Any]:
         """The newest snapshot, as JSON may carry it; raises StationGone."""
-        return with_meaning(plain(self.request(Command(str(uuid4()), "status"), timeout=timeout).data))
+        return complete_state_meaning(
+            plain(self.request(Command(str(uuid4()), "status"), timeout=timeout).data)
+        )
 
     def events_since(self, number: int, timeout: float | None = None) -> tuple[str, list[dict[str, Any]]]:
         """The runtime's boot id and its events after `number`, as JSON may carry them; raises StationGone."""

@@ -68,7 +68,7 @@ def answer_of(ack: messages.Ack) -> Answer:
 
 def spoken(why: str) -> str:
     """The beginning of it, with nothing in it that cannot be sent or kept: no press is lost for its words."""
-    return pressing.kept(why)
+    return pressing.sanitize_text(why)
 
 
 _presses: Flights[Answer] = Flights("e-stop")

@@ -93,7 +93,7 @@ def _roots(looks: Looks) -> list[Float64]:
     """Positions of the copies of the robot's tree, [3] each."""
     root = urdf.read(looks.robot.urdf).root
     poses = looks.scene.poses(looks.robot.poses["home"])
-    return [poses[part, :3, 3] for part in looks.scene.parts_of(root)]
+    return [poses[part, :3, 3] for part in looks.scene.parts_showing(root)]
 
 
 def _floor(looks: Looks, home: Sequence[Box]) -> float | None:

@@ -27,7 +27,7 @@ from evaweb.rarely import Rarely
 from evaweb.stations.journal import Journal, take_up
 from evaweb.stations.models import Command, Station
 from evaweb.stations.notes import key_of
-from runtime.recording.files import RecordingError, write_whole
+from runtime.recording.files import RecordingError, write_atomic
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class Unwritten:
         name, content = f"{row.uuid}.{os.getpid()}", json.dumps(_document(row)).encode()
         try:
             _folder().mkdir(parents=True, exist_ok=True)
-            write_whole(_path(name), content)
+            write_atomic(_path(name), content)
         except (RecordingError, OSError) as error:
             log.error("%s is kept in memory alone: %s", name, error)
             while len(self._kept) >= _MOST:

@@ -50,7 +50,7 @@ class Table(forms.JSONField):
         if isinstance(value, str) and value.strip():
             try:
                 self._read(value)
-            except bounded.Unreadable as error:
+            except bounded.UnreadableDocument as error:
                 raise ValidationError(
                     f'{error}. Keys and texts stand in double quotes, as in {{"url": "ws://127.0.0.1:8000"}}.'
                 ) from None
@@ -62,11 +62,11 @@ class Table(forms.JSONField):
             return None
         try:
             return self._read(data)
-        except bounded.Unreadable:
+        except bounded.UnreadableDocument:
             return InvalidJSONInput(data)
 
     def _read(self, value: str) -> Any:
-        return bounded.from_json(value, "The table", LONGEST_TABLE)
+        return bounded.parse_json(value, "The table", LONGEST_TABLE)
 
 
 class PositionForm(forms.ModelForm):

@@ -103,7 +103,7 @@ def _find_trial_of(station: Station, episode: UUID | None) -> None:
 def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | None:
     """The event of an accepted `run`: from its number on the station's events are about this trial."""
     data = event.get("data") or {}
-    before, after = (SessionState.of(str(data.get(end))) for end in ("from", "to"))
+    before, after = (SessionState.meaning_of(str(data.get(end))) for end in ("from", "to"))
     if after is None or not after.going or (before is not None and before.going):
         return None
     command = Command.objects.filter(pk=_uuid(data.get("uuid")), station=station, kind="run").first()
@@ -146,7 +146,7 @@ def _meaning(state: str, unbegun: Mapping[str, Any]) -> Move:
     """A run that never began is no attempt: it is made again as it is where nothing of it was opened, else repeated."""
     if unbegun:
         return Move.GIVE_BACK if unbegun.get("unopened") else Move.INTERRUPT
-    session = SessionState.of(state)
+    session = SessionState.meaning_of(state)
     if session is None or not session.set_up:
         return Move.INTERRUPT
     return Move.END if session.ready else Move.RESUME if session.moving else Move.PAUSE

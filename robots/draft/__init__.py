@@ -1,5 +1,5 @@
 """Drafts a robot folder from a URDF: `python -m robots new`."""
 
-from robots.draft.drafting import Drafted, draft
+from robots.draft.drafting import DraftResult, draft_robot
 
-__all__ = ["Drafted", "draft"]
+__all__ = ["DraftResult", "draft_robot"]

@@ -34,7 +34,7 @@ _SIDEWAYS = 0.01  # m off the middle from which an arm is on a side
 
 
 @dataclass(frozen=True, slots=True)
-class Limb:
+class GroupGuess:
     """A group: `joints` of the URDF outwards, `fingers` of its gripper; `above` is the link that it begins on.
 
     `side` is "left", "right" or "". `wheels` are joints that roll and that nobody commands one by one: a base that
@@ -50,21 +50,21 @@ class Limb:
     wheels: tuple[str, ...] = ()
 
 
-def anatomy(tree: Urdf) -> tuple[Limb, ...]:
+def guess_groups(tree: Urdf) -> tuple[GroupGuess, ...]:
     """The groups that the tree suggests, arms first; RobotError where nothing moves."""
     moving = [joint for joint in tree.outwards() if joint.kind != "fixed" and joint.mimic is None]
     if not moving:
         raise RobotError(f"{tree.path}: no joint moves by itself; needed: at least one")
     skeleton = _Skeleton(tree, moving)
     wheels = [joint.name for joint in moving if _has(joint.name, _WHEELS)]
-    wheels += [name for name in skeleton.names if skeleton.under(name) & set(wheels)]
+    wheels += [name for name in skeleton.names if skeleton.descendants(name) & set(wheels)]
     fingers = skeleton.fingers(set(wheels))
     runs = skeleton.runs({*wheels, *fingers})
     limbs = [limb for run in runs for limb in _limbs(skeleton, run, fingers, alone=len(runs) == 1)]
     limbs += _loose(skeleton, limbs, fingers)
     if wheels:
-        limbs.append(Limb("base", "base", "", (), (), tree.root, tuple(dict.fromkeys(wheels))))
-    return _named(_sided(tree, _joined(limbs)))
+        limbs.append(GroupGuess("base", "base", "", (), (), tree.root, tuple(dict.fromkeys(wheels))))
+    return _named(_assign_sides(tree, _merge_trunks(limbs)))
 
 
 class _Skeleton:
@@ -83,10 +83,10 @@ class _Skeleton:
         """The joints right behind one; behind None those on the root."""
         return [child for child in self.names if self.parent[child] == name and child not in without]
 
-    def under(self, name: str) -> set[str]:
+    def descendants(self, name: str) -> set[str]:
         """All joints that one of them above is `name`."""
         below = self.children(name)
-        return set(below).union(*(self.under(child) for child in below))
+        return set(below).union(*(self.descendants(child) for child in below))
 
     def depth(self, name: str | None) -> int:
         """Count of joints from the root to this one."""
@@ -148,7 +148,7 @@ class _Skeleton:
 
 def _limbs(
     skeleton: _Skeleton, run: tuple[tuple[str, ...], bool], fingers: dict[str, str | None], *, alone: bool
-) -> list[Limb]:
+) -> list[GroupGuess]:
     """Limbs of a run of joints; a torso or base leading to an arm without a branch is a limb of its own."""
     joints, ends = run
     own = tuple(name for name, carrier in fingers.items() if carrier == joints[-1])
@@ -173,10 +173,12 @@ def _trunk(tree: Urdf, joints: tuple[str, ...]) -> int:
     return cut if len(joints) - cut >= (_BEYOND_LIFT if slides else _BEYOND_TURN) else 0
 
 
-def _limb(skeleton: _Skeleton, kind: Kind, joints: tuple[str, ...]) -> Limb:
+def _limb(skeleton: _Skeleton, kind: Kind, joints: tuple[str, ...]) -> GroupGuess:
     above = skeleton.parent[joints[0]]
     tree = skeleton.tree
-    return Limb("", kind, _side(tree, joints), joints, (), tree.joint(above).child if above else _base(tree))
+    return GroupGuess(
+        "", kind, _side(tree, joints), joints, (), tree.joint(above).child if above else _base(tree)
+    )
 
 
 def _base(tree: Urdf) -> str:
@@ -192,7 +194,9 @@ def _one_gripper(skeleton: _Skeleton, fingers: Sequence[str]) -> bool:
     return 0 < len(fingers) <= _FORK and not any(skeleton.parent[name] in fingers for name in fingers)
 
 
-def _loose(skeleton: _Skeleton, limbs: Sequence[Limb], fingers: dict[str, str | None]) -> list[Limb]:
+def _loose(
+    skeleton: _Skeleton, limbs: Sequence[GroupGuess], fingers: dict[str, str | None]
+) -> list[GroupGuess]:
     """Hands: fingers that are no arm's gripper, by what carries them."""
     taken = {name for limb in limbs for name in limb.fingers}
     hands: dict[str | None, list[str]] = {}
@@ -202,9 +206,9 @@ def _loose(skeleton: _Skeleton, limbs: Sequence[Limb], fingers: dict[str, str | 
     return [_limb(skeleton, "hand", tuple(names)) for names in hands.values()]
 
 
-def _joined(limbs: Sequence[Limb]) -> list[Limb]:
+def _merge_trunks(limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
     """One torso and one base, however often they branch."""
-    found: list[Limb] = []
+    found: list[GroupGuess] = []
     for limb in limbs:
         same = next(
             (i for i, other in enumerate(found) if other.kind == limb.kind in ("torso", "base")), None
@@ -217,7 +221,7 @@ def _joined(limbs: Sequence[Limb]) -> list[Limb]:
     return found
 
 
-def _sided(tree: Urdf, limbs: Sequence[Limb]) -> list[Limb]:
+def _assign_sides(tree: Urdf, limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
     """Two arms whose names tell no side are left and right where they begin on different sides (y is left)."""
     arms = [limb for limb in limbs if limb.kind == "arm"]
     if len(arms) != 2 or any(arm.side for arm in arms):
@@ -230,7 +234,7 @@ def _sided(tree: Urdf, limbs: Sequence[Limb]) -> list[Limb]:
     return [replace(limb, side=sides.get(id(limb), limb.side)) for limb in limbs]
 
 
-def _named(limbs: Sequence[Limb]) -> tuple[Limb, ...]:
+def _named(limbs: Sequence[GroupGuess]) -> tuple[GroupGuess, ...]:
     """With names that each occur once: left_arm, torso, other2; arms first, left before right."""
     ordered = sorted(limbs, key=lambda limb: (_ORDER.index(limb.kind), limb.side != "left", limb.side == ""))
     plain = ["_".join(filter(None, (limb.side, limb.kind))) for limb in ordered]

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robots import urdf
-from robots.draft.pictures import Pictures, copy_urdf
-from robots.draft.postures import Postures
-from robots.draft.sheet import Sheet, sheet
-from robots.draft.text import readme, robot_toml
+from robots.draft.pictures import MeshCopyReport, copy_urdf
+from robots.draft.postures import PostureSearch
+from robots.draft.sheet import RobotDraft, build_draft
+from robots.draft.text import render_readme, render_robot_toml
 from robots.errors import RobotError
-from robots.inspection import Inspection, inspect
-from robots.loading import load, names
+from robots.inspection import Inspection, inspect_robot
+from robots.loading import load_robot, robot_names
 from robots.robot import Robot
 from robots.rotations import Float64
 
@@ -24,15 +24,15 @@ _MOST = 8  # copies of one arm
 
 
 @dataclass(frozen=True, slots=True)
-class Drafted:
+class DraftResult:
     """A robot's new `folder`, what was made of its shapes, and what a look at it says."""
 
     folder: Path
-    pictures: Pictures
+    pictures: MeshCopyReport
     inspection: Inspection
 
 
-def draft(name: str, source: Path, into: Path, copies: int = 1) -> Drafted:
+def draft_robot(name: str, source: Path, into: Path, copies: int = 1) -> DraftResult:
     """Drafts the robot `name` from the URDF `source` in a new folder of `into`; RobotError leaves nothing behind.
 
     `copies` is how many of the one arm that the URDF describes stand side by side.
@@ -49,14 +49,14 @@ def draft(name: str, source: Path, into: Path, copies: int = 1) -> Drafted:
         shown = made / f"{name}.urdf"
         try:
             pictures = copy_urdf(tree, shown)
-            guessed = sheet(tree, shown, pictures.drawn, title, copies)
-            (made / "README.md").write_text(readme(name, guessed, pictures), "utf-8")
+            guessed = build_draft(tree, shown, pictures.drawn, title, copies)
+            (made / "README.md").write_text(render_readme(name, guessed, pictures), "utf-8")
             _write(made, guessed)
         except RobotError as error:  # which names files that are gone when it is read
             said = str(error).replace(str(shown), str(source)).replace(str(made), str(folder))
             raise RobotError(said) from None
         made.rename(folder)
-    return Drafted(folder, pictures, inspect(folder))
+    return DraftResult(folder, pictures, inspect_robot(folder))
 
 
 def _free(name: str, into: Path) -> Path:
@@ -67,22 +67,22 @@ def _free(name: str, into: Path) -> Path:
     folder = into / name
     if folder.exists():
         raise RobotError(f"{folder} is there already; allowed: a new folder")
-    if name in names():
-        raise RobotError(f"there is a robot {name!r} already; there are {', '.join(names())}")
+    if name in robot_names():
+        raise RobotError(f"there is a robot {name!r} already; there are {', '.join(robot_names())}")
     return folder
 
 
-def _write(folder: Path, guessed: Sheet) -> None:
+def _write(folder: Path, guessed: RobotDraft) -> None:
     """robot.toml, first with every group at rest, then with postures in which nothing touches."""
     file = folder / "robot.toml"
     home = {group.name: group.rest for group in guessed.groups}
-    file.write_text(robot_toml(guessed, {"home": home}, ()), "utf-8")
-    robot = load(folder, [group.name for group in guessed.groups])
-    postures = Postures(robot, urdf.read(robot.urdf))
+    file.write_text(render_robot_toml(guessed, {"home": home}, ()), "utf-8")
+    robot = load_robot(folder, [group.name for group in guessed.groups])
+    postures = PostureSearch(robot, urdf.read(robot.urdf))
     found = {"home": postures.home()}
     found["ready"] = postures.ready(found["home"])
     poses = {name: _parts(robot, q) for name, q in found.items()}
-    file.write_text(robot_toml(guessed, poses, postures.touching(found)), "utf-8")
+    file.write_text(render_robot_toml(guessed, poses, postures.touching(found)), "utf-8")
 
 
 def _parts(robot: Robot, q: Float64) -> Mapping[str, Sequence[float]]:

@@ -8,7 +8,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from robots.draft.anatomy import Limb
+from robots.draft.anatomy import GroupGuess
 from robots.draft.geometry import places
 from robots.draft.limits import FASTEST
 from robots.rotations import Float64, quaternion_of_matrix
@@ -40,10 +40,10 @@ class GripperDraft:
     fingers: Mapping[str, tuple[float, float]]
     apart: float | None
     tip: Float64
-    doubts: tuple[str, ...]
+    placeholder_notes: tuple[str, ...]
 
 
-def end_link(tree: Urdf, limb: Limb) -> str:
+def end_link(tree: Urdf, limb: GroupGuess) -> str:
     """An arm's end effector: a leaf behind its last joint that is named so, else the link that fingers hang on."""
     last = tree.joint(limb.joints[-1]).child
     if limb.fingers:
@@ -53,7 +53,7 @@ def end_link(tree: Urdf, limb: Limb) -> str:
     return next((link for word in _PREFERRED for link in leaves if word in link.lower()), last)
 
 
-def _hand(tree: Urdf, limb: Limb, last: str) -> str:
+def _hand(tree: Urdf, limb: GroupGuess, last: str) -> str:
     """A frame for grasping behind the last joint, else the link that the fingers hang on."""
     rigid = _rigid(tree, last)
     named = (link for word in _GRASPS for link in rigid if word in link.lower())
@@ -70,7 +70,9 @@ def _rigid(tree: Urdf, link: str) -> list[str]:
     return found
 
 
-def gripper_of(tree: Urdf, limb: Limb, eef_link: str, corners: Mapping[str, Float64]) -> GripperDraft:
+def guess_gripper(
+    tree: Urdf, limb: GroupGuess, eef_link: str, corners: Mapping[str, Float64]
+) -> GripperDraft:
     """The gripper of an arm with fingers; `corners` [n, 3] of the shapes of links that show what they are."""
     followed = {tree.master(joint)[0].name for joint in tree.joints.values() if joint.mimic is not None}
     driver = tree.joint(
@@ -79,7 +81,7 @@ def gripper_of(tree: Urdf, limb: Limb, eef_link: str, corners: Mapping[str, Floa
     doubts: list[str] = []
     lower, upper = _range(driver, doubts)
     jaws = _Jaws(tree, limb, eef_link, corners)
-    fingers = jaws.together(driver.name, (lower, upper), _ways(tree, limb, driver.name))
+    fingers = jaws.closing_values(driver.name, (lower, upper), _ways(tree, limb, driver.name))
     opening, closed, open_at = jaws.opening(fingers, lower, upper)
     if opening is None:
         doubts.append("which end is open cannot be read off the URDF")
@@ -94,7 +96,7 @@ def gripper_of(tree: Urdf, limb: Limb, eef_link: str, corners: Mapping[str, Floa
         fingers=fingers,
         apart=opening,
         tip=jaws.tip(closed, named=any(word in eef_link.lower() for word in _GRASPS)),
-        doubts=tuple(doubts),
+        placeholder_notes=tuple(doubts),
     )
 
 
@@ -114,7 +116,7 @@ def _velocity(joint: Joint, way: float, doubts: list[str]) -> float:
     return round(way / _SECONDS, 4)
 
 
-def _ways(tree: Urdf, limb: Limb, driver: str) -> dict[str, tuple[float, float]]:
+def _ways(tree: Urdf, limb: GroupGuess, driver: str) -> dict[str, tuple[float, float]]:
     """The ends of the fingers that move by themselves beside the driver and that have ends."""
     joints = [tree.joint(name) for name in limb.fingers if name != driver]
     return {joint.name: _range(joint, []) for joint in joints if joint.kind != "continuous"}
@@ -123,7 +125,7 @@ def _ways(tree: Urdf, limb: Limb, driver: str) -> dict[str, tuple[float, float]]
 class _Jaws:
     """The fingers' branches, with a point near the end of each, seen from the end effector."""
 
-    def __init__(self, tree: Urdf, limb: Limb, eef_link: str, corners: Mapping[str, Float64]) -> None:
+    def __init__(self, tree: Urdf, limb: GroupGuess, eef_link: str, corners: Mapping[str, Float64]) -> None:
         self._tree = tree
         self._eef = eef_link
         self._corners = corners
@@ -143,7 +145,7 @@ class _Jaws:
         self._z = self._pointing(at)
         self._ends = [self._end(branch, at) for branch in self._branches]
 
-    def together(
+    def closing_values(
         self, driver: str, ends: tuple[float, float], others: Mapping[str, tuple[float, float]]
     ) -> dict[str, tuple[float, float]]:
         """Every finger's values at the driver's ends: those with which they come together and part most."""

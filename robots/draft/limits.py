@@ -24,7 +24,7 @@ class Placeholder:
     reason: str
 
 
-def placeholder(joint: Joint) -> Placeholder | None:
+def placeholder_limits(joint: Joint) -> Placeholder | None:
     """Substitute for limits of the joint that cannot be used; None where the URDF's can."""
     reasons = [*_positions(joint), *_speeds(joint)]
     if not reasons:

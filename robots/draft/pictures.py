@@ -26,7 +26,7 @@ _COLOUR = "0.55 0.58 0.63 1"
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
+class MeshCopyReport:
     """Results for the shapes: `copied` are files, `missing` are meshes that were not found or cannot be read.
 
     `drawn` are links that stand-ins show, `plain` are links whose material was not declared, or has no colour.
@@ -38,14 +38,14 @@ class Pictures:
     plain: tuple[str, ...]
 
 
-def copy_urdf(tree: Urdf, target: Path) -> Pictures:
+def copy_urdf(tree: Urdf, target: Path) -> MeshCopyReport:
     """Writes the URDF to `target` and its meshes into the folder meshes/ beside it.
 
     It is copied as it is where it shows what can be shown. Otherwise visuals of missing meshes are replaced by
     cylinders from joint to joint, as in all links where none shows anything.
     """
     robot = parsed(tree.path, comments=True)
-    work = _Work(tree, target, robot)
+    work = _UrdfCopy(tree, target, robot)
     work.colours()
     work.meshes()
     work.stand_ins()
@@ -56,11 +56,11 @@ def copy_urdf(tree: Urdf, target: Path) -> Pictures:
         document.write(target, encoding="utf-8", xml_declaration=True)
     else:
         shutil.copyfile(tree.path, target)
-    shapes.read(target)  # what still cannot be shown is refused here, not when it is drawn
-    return Pictures(tuple(work.copied), tuple(work.missing), tuple(work.drawn), tuple(work.plain))
+    shapes.read_shapes(target)  # what still cannot be shown is refused here, not when it is drawn
+    return MeshCopyReport(tuple(work.copied), tuple(work.missing), tuple(work.drawn), tuple(work.plain))
 
 
-class _Work:
+class _UrdfCopy:
     def __init__(self, tree: Urdf, target: Path, robot: ET.Element) -> None:
         self._tree = tree
         self._target = target
@@ -228,7 +228,7 @@ def _readable(place: Path) -> bool:
     if not place.is_file() or place.suffix.lower() not in meshes.SUFFIXES:
         return False
     try:
-        meshes.bounds(place)
+        meshes.mesh_bounds(place)
     except RobotError:
         return False
     return True

@@ -28,13 +28,13 @@ _HEIGHT, _AHEAD, _ASIDE = (
 _NEAR, _ALIKE = 0.02, 1e-3  # m, and of a cosine: within which two arms mirror each other
 
 
-def rest(lower: Float64, upper: Float64) -> Float64:
+def rest_posture(lower: Float64, upper: Float64) -> Float64:
     """Zero, or as near to it as keeps a twentieth of the range to both limits."""
     inside = _INSIDE * (upper - lower)
     return np.clip(np.zeros_like(lower), lower + inside, upper - inside)
 
 
-class Postures:
+class PostureSearch:
     """Looks for postures of the robot's arms; all other groups, and grippers, stay as at home."""
 
     def __init__(self, robot: Robot, tree: Urdf) -> None:

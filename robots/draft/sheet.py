@@ -11,11 +11,11 @@ import numpy as np
 
 from robots import shapes
 from robots.description import Kind
-from robots.draft.anatomy import Limb, anatomy
+from robots.draft.anatomy import GroupGuess, guess_groups
 from robots.draft.geometry import corners, places
-from robots.draft.gripper import GripperDraft, end_link, gripper_of
-from robots.draft.limits import Placeholder, placeholder
-from robots.draft.postures import rest
+from robots.draft.gripper import GripperDraft, end_link, guess_gripper
+from robots.draft.limits import Placeholder, placeholder_limits
+from robots.draft.postures import rest_posture
 from robots.errors import RobotError
 from robots.rotations import Float64
 from robots.urdf import Urdf
@@ -29,7 +29,7 @@ _QUARTER = (0.7071067811865476, 0.0, 0.0, 0.7071067811865476)  # the robot's x l
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class PoseDraft:
     """x, y, z [m] and unit quaternion w, x, y, z."""
 
     xyz: tuple[float, float, float]
@@ -37,7 +37,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class GroupSheet:
+class GroupDraft:
     """One group; `numbers` are names on the wire, the gripper's last. `rest` are its values at home."""
 
     name: str
@@ -49,62 +49,64 @@ class GroupSheet:
     eef_link: str | None
     gripper: GripperDraft | None
     pinned: Mapping[str, float]
-    mount: Place | None
+    mount: PoseDraft | None
     overrides: tuple[Placeholder, ...]
     rest: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Sheet:
+class RobotDraft:
     """A whole draft; `idle` are joints that no group moves, `held` those that are floating or planar."""
 
     title: str
     urdf: str
-    groups: tuple[GroupSheet, ...]
+    groups: tuple[GroupDraft, ...]
     cameras: Mapping[str, str]
-    stand: Place | None
-    idle: tuple[str, ...]
+    stand: PoseDraft | None
+    unassigned_joints: tuple[str, ...]
     held: tuple[str, ...]
 
 
-def sheet(tree: Urdf, shown: Path, drawn: Collection[str], title: str, copies: int) -> Sheet:
+def build_draft(tree: Urdf, shown: Path, drawn: Collection[str], title: str, copies: int) -> RobotDraft:
     """The draft of a robot with that URDF, whose shapes are those of the file `shown`; RobotError if nothing moves.
 
     The shapes of the links `drawn` only stand in for what they are.
     """
-    limbs = anatomy(tree)
+    limbs = guess_groups(tree)
     arms = [limb for limb in limbs if limb.kind == "arm"]
     if copies > 1 and len(arms) != 1:
         raise RobotError(
             f"{tree.path}: {copies} copies of {len(arms)} arms; allowed: copies of a URDF with one arm"
         )
-    real = {link: box for link, box in corners(shapes.read(shown)).items() if link not in drawn}
+    real = {link: box for link, box in corners(shapes.read_shapes(shown)).items() if link not in drawn}
     groups = [_group(tree, real, limb, limbs) for limb in limbs]
     if copies > 1:
         groups = [_copy(group, index, copies) for index in range(copies) for group in groups]
         groups.sort(key=lambda group: (group.kind != "arm", group.optional))
     names = {joint.name for joint in tree.joints.values() if joint.kind != "fixed" and joint.mimic is None}
     moved = set(chain.from_iterable(limb.joints + limb.fingers for limb in limbs))
-    return Sheet(
+    return RobotDraft(
         title=title,
         urdf=shown.name,
         groups=tuple(groups),
         cameras=_cameras([group.name for group in groups if group.kind == "arm"]),
         stand=None if copies > 1 else _stand(tree, limbs),
-        idle=tuple(name for name in tree.joints if name in names - moved),
+        unassigned_joints=tuple(name for name in tree.joints if name in names - moved),
         held=tree.held,
     )
 
 
-def _group(tree: Urdf, real: Mapping[str, Float64], limb: Limb, limbs: Sequence[Limb]) -> GroupSheet:
+def _group(
+    tree: Urdf, real: Mapping[str, Float64], limb: GroupGuess, limbs: Sequence[GroupGuess]
+) -> GroupDraft:
     if limb.wheels and not limb.joints:
         return _speeds(limb)
     eef_link = end_link(tree, limb) if limb.kind == "arm" else None
     gripper = None
     if limb.fingers and eef_link is not None:
-        gripper = gripper_of(tree, limb, eef_link, real)
+        gripper = guess_gripper(tree, limb, eef_link, real)
     values = _rest(tree, limb.joints)
-    return GroupSheet(
+    return GroupDraft(
         name=limb.name,
         kind=limb.kind,
         optional=limb.kind not in ("arm", "hand") and any(other.kind == "arm" for other in limbs),
@@ -115,7 +117,7 @@ def _group(tree: Urdf, real: Mapping[str, Float64], limb: Limb, limbs: Sequence[
         gripper=gripper,
         pinned=_pinned(tree, limb, limbs),
         mount=None,
-        overrides=tuple(filter(None, (placeholder(tree.joint(name)) for name in limb.joints))),
+        overrides=tuple(filter(None, (placeholder_limits(tree.joint(name)) for name in limb.joints))),
         rest=(*values, *([gripper.open] if gripper else [])),
     )
 
@@ -123,14 +125,16 @@ def _group(tree: Urdf, real: Mapping[str, Float64], limb: Limb, limbs: Sequence[
 def _rest(tree: Urdf, joints: Sequence[str]) -> tuple[float, ...]:
     ends = [_ends(tree, name) for name in joints]
     return tuple(
-        rest(np.array([low for low, _ in ends]), np.array([high for _, high in ends])).round(4).tolist()
+        rest_posture(np.array([low for low, _ in ends]), np.array([high for _, high in ends]))
+        .round(4)
+        .tolist()
     )
 
 
 def _ends(tree: Urdf, name: str) -> tuple[float, float]:
     """A joint's position limits as the draft has them."""
     joint = tree.joint(name)
-    instead = placeholder(joint)
+    instead = placeholder_limits(joint)
     if instead is not None and instead.lower is not None and instead.upper is not None:
         return instead.lower, instead.upper
     assert joint.lower is not None  # or there would be a placeholder
@@ -138,7 +142,7 @@ def _ends(tree: Urdf, name: str) -> tuple[float, float]:
     return joint.lower, joint.upper
 
 
-def _pinned(tree: Urdf, limb: Limb, limbs: Sequence[Limb]) -> dict[str, float]:
+def _pinned(tree: Urdf, limb: GroupGuess, limbs: Sequence[GroupGuess]) -> dict[str, float]:
     """Joints of optional groups in drawings while they do not move, if they are not 0; at the first arm."""
     if limb.kind != "arm" or limb is not next(other for other in limbs if other.kind == "arm"):
         return {}
@@ -151,7 +155,7 @@ def _pinned(tree: Urdf, limb: Limb, limbs: Sequence[Limb]) -> dict[str, float]:
     return {name: value for name, value in values.items() if value}
 
 
-def _speeds(limb: Limb) -> GroupSheet:
+def _speeds(limb: GroupGuess) -> GroupDraft:
     """A base on wheels: numbers that move no joint of the URDF."""
     overrides = tuple(
         Placeholder(
@@ -160,7 +164,7 @@ def _speeds(limb: Limb) -> GroupSheet:
         for name, fastest, unit in _SPEEDS
     )
     names = tuple(name for name, _, _ in _SPEEDS)
-    return GroupSheet(
+    return GroupDraft(
         name=limb.name,
         kind="base",
         optional=True,
@@ -176,13 +180,13 @@ def _speeds(limb: Limb) -> GroupSheet:
     )
 
 
-def _copy(group: GroupSheet, index: int, copies: int) -> GroupSheet:
+def _copy(group: GroupDraft, index: int, copies: int) -> GroupDraft:
     """The group of one of several equal arms, side by side, the first on the left."""
     side = ("left", "right")[index] if copies == 2 else ""
     name = f"{side}_{group.name}" if side else f"{group.name}{index + 1}"
     x = round((index - (copies - 1) / 2) * _SPACING, 4)
-    values = {key: getattr(group, key) for key in GroupSheet.__slots__}
-    return GroupSheet(**values | {"name": name, "mount": Place((x, 0.0, 0.0), _QUARTER)})
+    values = {key: getattr(group, key) for key in GroupDraft.__slots__}
+    return GroupDraft(**values | {"name": name, "mount": PoseDraft((x, 0.0, 0.0), _QUARTER)})
 
 
 def _cameras(arms: Sequence[str]) -> dict[str, str]:
@@ -191,15 +195,15 @@ def _cameras(arms: Sequence[str]) -> dict[str, str]:
     return {"front": "cam_high"} | {side: f"cam_{side}" for side in sides}
 
 
-def _stand(tree: Urdf, limbs: Sequence[Limb]) -> Place:
+def _stand(tree: Urdf, limbs: Sequence[GroupGuess]) -> PoseDraft:
     """Place of the root such that arms reach over the table: on it, or on the floor before it."""
     at = places(tree, {})
     shoulders: list[Float64] = [
         at[tree.joint(limb.joints[0]).child][:3, 3] for limb in limbs if limb.kind == "arm" and limb.joints
     ]
     if not shoulders:
-        return Place((0.0, 0.0, 0.0), _QUARTER)
+        return PoseDraft((0.0, 0.0, 0.0), _QUARTER)
     x, _, z = np.mean(shoulders, axis=0).tolist()
     if z <= _HIGHEST and not any(limb.wheels for limb in limbs):
-        return Place((0.0, round(-x, 4) + 0.0, 0.0), _QUARTER)
-    return Place((0.0, round(_BEFORE - x, 4), round(_SHOULDER - z, 4)), _QUARTER)
+        return PoseDraft((0.0, round(-x, 4) + 0.0, 0.0), _QUARTER)
+    return PoseDraft((0.0, round(_BEFORE - x, 4), round(_SHOULDER - z, 4)), _QUARTER)

@@ -6,16 +6,16 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from robots.draft.gripper import GripperDraft
-from robots.draft.pictures import Pictures
-from robots.draft.sheet import GroupSheet, Place, Sheet
+from robots.draft.pictures import MeshCopyReport
+from robots.draft.sheet import GroupDraft, PoseDraft, RobotDraft
 from robots.inspection import GUESS
 from robots.rotations import Float64
 
 _LIMITS = "joints: position and velocity limits of the URDF; placeholders, as overrides, where it has none to believe"
 
 
-def robot_toml(
-    sheet: Sheet, poses: Mapping[str, Mapping[str, Sequence[float]]], touching: Sequence[tuple[str, str]]
+def render_robot_toml(
+    sheet: RobotDraft, poses: Mapping[str, Mapping[str, Sequence[float]]], touching: Sequence[tuple[str, str]]
 ) -> str:
     """The file, whose poses are vectors by group."""
     lines = [
@@ -53,7 +53,7 @@ def _pose_comment(name: str) -> str:
     return f"# {GUESS}: {what}; found by looking at shapes, so try it slowly."
 
 
-def _group(group: GroupSheet) -> Iterator[str]:
+def _group(group: GroupDraft) -> Iterator[str]:
     yield "[[groups]]"
     yield f"name = {_text(group.name)} # {GUESS}: what the node calls this group"
     yield f"kind = {_text(group.kind)}"
@@ -85,7 +85,7 @@ def _group(group: GroupSheet) -> Iterator[str]:
 
 def _gripper(gripper: GripperDraft, index: int) -> Iterator[str]:
     yield "[groups.gripper]"
-    yield from (f"# {GUESS}: {doubt}." for doubt in gripper.doubts)
+    yield from (f"# {GUESS}: {doubt}." for doubt in gripper.placeholder_notes)
     yield f"index = {index}"
     yield f"unit = {_text(gripper.unit)} # {GUESS}: the number is taken to be the position of {gripper.driver}"
     yield f"lower = {gripper.lower}"
@@ -114,16 +114,16 @@ def _unit(wxyz: Sequence[float]) -> list[float]:
     return [value / length for value in wxyz]
 
 
-def _idle(sheet: Sheet) -> Iterator[str]:
-    if sheet.idle or sheet.held:
+def _idle(sheet: RobotDraft) -> Iterator[str]:
+    if sheet.unassigned_joints or sheet.held:
         yield ""
-    if sheet.idle:
-        yield f"# {GUESS}: nobody commands {', '.join(sheet.idle)}."
+    if sheet.unassigned_joints:
+        yield f"# {GUESS}: nobody commands {', '.join(sheet.unassigned_joints)}."
     if sheet.held:
         yield f"# {GUESS}: floating or planar, and held where the URDF draws them: {', '.join(sheet.held)}."
 
 
-def _place(place: Place) -> list[str]:
+def _place(place: PoseDraft) -> list[str]:
     return [f"xyz = {_numbers(place.xyz)}", f"wxyz = {_numbers(place.wxyz)}"]
 
 
@@ -139,7 +139,7 @@ def _numbers(numbers: Iterable[float]) -> str:
     return f"[{', '.join(repr(float(number)) for number in numbers)}]"
 
 
-def readme(name: str, sheet: Sheet, pictures: Pictures) -> str:
+def render_readme(name: str, sheet: RobotDraft, pictures: MeshCopyReport) -> str:
     """List to tick off of what was guessed and has to be verified."""
     numbers = sum(len(group.numbers) for group in sheet.groups if not group.optional)
     lines = [
@@ -163,7 +163,7 @@ def readme(name: str, sheet: Sheet, pictures: Pictures) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _tasks(name: str, sheet: Sheet, pictures: Pictures) -> Iterator[str]:
+def _tasks(name: str, sheet: RobotDraft, pictures: MeshCopyReport) -> Iterator[str]:
     yield "Names of groups and joints, and their order, as the execution node sends and takes them."
     yield "The sign and zero of every joint: move one at a time by hand and watch the console."
     for group in sheet.groups:

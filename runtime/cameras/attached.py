@@ -7,7 +7,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from runtime.cameras.base import Camera, Condition, Health
+from runtime.cameras.base import Camera, CameraCondition, CameraHealth
 from runtime.cameras.complaints import NOT_LIVE
 from runtime.core.clock import Clock
 from runtime.core.sentences import Pattern
@@ -23,7 +23,7 @@ _PLAYS_VIDEO = Pattern(
 )
 
 
-class Attached(Source):
+class SourceWithCameras(Source):
     """Another source, whose observations get the newest picture of each camera with its own time of capture.
 
     A camera without a new picture repeats its last one, with that one's time: by this its age is told, refused and
@@ -34,7 +34,7 @@ class Attached(Source):
         self._source = source
         self._cameras = tuple(cameras)
         self._clock = clock
-        self._said: dict[str, Health] = {}
+        self._said: dict[str, CameraHealth] = {}
 
     def connect(self) -> None:
         """Start the cameras, which nobody waits for, and connect the source."""
@@ -44,14 +44,14 @@ class Attached(Source):
 
     def receive(self, timeout: float) -> Observation | None:
         observation = self._source.receive(timeout)
-        return None if observation is None else self._joined(observation)
+        return None if observation is None else self._add_images(observation)
 
-    def _joined(self, observation: Observation) -> Observation:
+    def _add_images(self, observation: Observation) -> Observation:
         pictures, captured = dict(observation.pictures), dict(observation.captured)
         for camera in self._cameras:
             pictures.pop(camera.key, None)
             captured.pop(camera.key, None)
-            shot = camera.newest()
+            shot = camera.latest()
             if shot is not None:
                 pictures[camera.key], captured[camera.key] = shot.picture, shot.captured
         return replace(observation, pictures=MappingProxyType(pictures), captured=MappingProxyType(captured))
@@ -73,16 +73,16 @@ class Attached(Source):
             counts |= camera.faults()
         return counts
 
-    def why(self, fault: str) -> str:
-        return self._source.why(fault)
+    def describe_fault(self, fault: str) -> str:
+        return self._source.describe_fault(fault)
 
     def camera_health(self) -> dict[str, dict[str, Any]]:
         """Health of each camera: kind, place, condition, since when, why, age of its newest picture [s]."""
-        return {camera.key: self._told(camera) for camera in self._cameras}
+        return {camera.key: self._health_dict(camera) for camera in self._cameras}
 
-    def news(self) -> list[Event]:
+    def pop_events(self) -> list[Event]:
         """That of the source; a camera that was lost, ended or came back, and why one cannot be opened."""
-        events = self._source.news()
+        events = self._source.pop_events()
         for camera in self._cameras:
             health, before = camera.health(), self._said.get(camera.key)
             if before is not None and (before.condition, before.why) == (health.condition, health.why):
@@ -95,29 +95,29 @@ class Attached(Source):
                 events.append(event)
         return events
 
-    def _event(self, camera: Camera, health: Health, before: Health | None) -> Event | None:
+    def _event(self, camera: Camera, health: CameraHealth, before: CameraHealth | None) -> Event | None:
         which = {"camera": camera.key, "source": camera.shown}
-        if health.condition is Condition.LIVE:
-            if before is None or before.condition is Condition.LIVE:
+        if health.condition is CameraCondition.LIVE:
+            if before is None or before.condition is CameraCondition.LIVE:
                 return None
             away = health.since - before.since
             kind, text = "camera_back", _BACK(**which, seconds=away)
-        elif health.condition is Condition.OPENING:
+        elif health.condition is CameraCondition.OPENING:
             if not health.failed:
                 return None
             kind, text = "camera_absent", _ABSENT(**which, why=health.why)
         else:
             kind = f"camera_{health.condition}"
             text = NOT_LIVE(**which, condition=health.condition, why=health.why)
-        return Event(kind, text, self._clock.now(), data={"camera": camera.key, **self._told(camera)})
+        return Event(kind, text, self._clock.now(), data={"camera": camera.key, **self._health_dict(camera)})
 
     def _warning(self, camera: Camera) -> Event:
         """A policy that moves a robot by a video acts on what is not there: whoever stands beside it is told."""
         text = _PLAYS_VIDEO(camera=camera.key, video=camera.shown)
         return Event("camera_is_a_video", text, self._clock.now(), data={"camera": camera.key})
 
-    def _told(self, camera: Camera) -> dict[str, Any]:
-        health, shot = camera.health(), camera.newest()
+    def _health_dict(self, camera: Camera) -> dict[str, Any]:
+        health, shot = camera.health(), camera.latest()
         return {
             "kind": camera.kind,
             "source": camera.shown,
@@ -130,7 +130,7 @@ class Attached(Source):
 
     def close(self) -> None:
         for camera in self._cameras:
-            camera.leave()
+            camera.request_stop()
         for camera in self._cameras:
             camera.close()
         self._source.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from runtime.cameras.attached import Attached
+from runtime.cameras.attached import SourceWithCameras
 from runtime.cameras.base import Address, Camera, CameraSettings
 from runtime.cameras.live import LiveCamera
 from runtime.core.clock import Clock, VirtualClock
@@ -28,7 +28,7 @@ def check(cameras: Mapping[str, Any], robot: Robot) -> None:
         _address(key, cameras[key])
 
 
-def attached(source: Source, cameras: Mapping[str, Any], clock: Clock) -> Source:
+def attach_cameras(source: Source, cameras: Mapping[str, Any], clock: Clock) -> Source:
     """`source` with these cameras; itself where there are none.
 
     On a virtual clock files alone can be played: SetupError for a camera that goes on by itself.
@@ -37,7 +37,7 @@ def attached(source: Source, cameras: Mapping[str, Any], clock: Clock) -> Source
         return source
     virtual = isinstance(clock, VirtualClock)
     made = [_camera(key, settings, clock, virtual) for key, settings in cameras.items()]
-    return Attached(source, made, clock)
+    return SourceWithCameras(source, made, clock)
 
 
 def _camera(key: str, settings: CameraSettings, clock: Clock, virtual: bool) -> Camera:

@@ -63,7 +63,7 @@ class Address:
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class CapturedImage:
     """One picture uint8 [H, W, 3] RGB, when it was taken and when it was here, on our clock [s]."""
 
     picture: UInt8
@@ -71,7 +71,7 @@ class Shot:
     arrived: float
 
 
-class Condition(StrEnum):
+class CameraCondition(StrEnum):
     """Condition of a camera."""
 
     OPENING = "opening"  # no picture yet
@@ -81,10 +81,10 @@ class Condition(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Health:
+class CameraHealth:
     """Condition of a camera, its beginning on our clock [s], and its reason."""
 
-    condition: Condition
+    condition: CameraCondition
     since: float
     why: str = ""
     losses: int = 0  # how often it was lost
@@ -103,15 +103,15 @@ class Camera(ABC):
         """Begin to look; safe to call twice."""
 
     @abstractmethod
-    def newest(self) -> Shot | None:
+    def latest(self) -> CapturedImage | None:
         """The newest picture, the same one until there is another; None before the first."""
 
     @abstractmethod
-    def health(self) -> Health:
+    def health(self) -> CameraHealth:
         """Present health of the camera."""
 
     @abstractmethod
-    def leave(self) -> None:
+    def request_stop(self) -> None:
         """Stop looking, as soon as that is possible; nobody waits."""
 
     @abstractmethod

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from urllib.parse import quote, urlsplit, urlunsplit
 
-from runtime.core.environment import secret
+from runtime.core.environment import read_secret
 from runtime.core.errors import ConfigurationError
 
 
-def checked(key: str, url: str, schemes: tuple[str, ...]) -> str:
+def check_url(key: str, url: str, schemes: tuple[str, ...]) -> str:
     """`url` itself; raises ConfigurationError where it is none of `schemes`, has no host, or a password in it."""
     allowed = " or ".join(f"{scheme}://HOST[:PORT]/PATH" for scheme in schemes)
     try:
@@ -32,6 +32,6 @@ def with_password(url: str, user: str | None, variable: str | None) -> str:
         return url
     name = quote(user, safe="")
     if variable is not None:
-        name += ":" + quote(secret("password_env", variable), safe="")
+        name += ":" + quote(read_secret("password_env", variable), safe="")
     parts = urlsplit(url)
     return urlunsplit(parts._replace(netloc=f"{name}@{parts.netloc}"))

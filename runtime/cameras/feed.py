@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from runtime.cameras.base import Address, CameraError
-from runtime.cameras.finding import ended, found, others
+from runtime.cameras.finding import ended, explain_open_error, others
 from runtime.cameras.jpegs import Jpegs
 from runtime.core.picture_bounds import DECODING, TooLargeError, bound, require_size
 from runtime.core.types import UInt8
@@ -23,7 +23,7 @@ _PARTS = "mpjpeg"  # FFmpeg's name; its reader refuses streams whose parts are n
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class DecodedFrame:
     """A picture uint8 [H, W, 3] RGB and the stream's own time of it [s], None where it has none."""
 
     picture: UInt8
@@ -36,7 +36,7 @@ class Backlog:
     def __init__(self) -> None:
         self._waiting = 0  # packets in a row that nobody had to wait for
 
-    def passes(self, waited: float) -> bool:
+    def should_skip(self, waited: float) -> bool:
         """True if the packet waited for so long [s] is to be passed over, as newer ones are there already.
 
         The first few are not, because two may well come at once; nor is each hundredth: something is shown of a
@@ -46,7 +46,7 @@ class Backlog:
         return self._waiting > _AT_ONCE and self._waiting % _SHOWN != 0
 
 
-class Feed:
+class VideoStream:
     """One stream opened by PyAV; used by one thread, which waits in FFmpeg without the interpreter's lock.
 
     FFmpeg looks at the deadlines while it waits (PyAV's `timeout`); packets that never become a picture are bounded
@@ -78,7 +78,9 @@ class Feed:
                 metadata_errors="replace",  # a camera's title is written as its maker likes
             )
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            raise CameraError(found(error, address, time.monotonic() - begun, open_s, True)) from None
+            raise CameraError(
+                explain_open_error(error, address, time.monotonic() - begun, open_s, True)
+            ) from None
         videos = self._container.streams.video
         if not videos:
             others = "".join(f", but {kind}" for kind in sorted({s.type for s in self._container.streams}))
@@ -100,7 +102,7 @@ class Feed:
         """Pictures per second as the stream says, 25 where it does not [Hz]."""
         return float(self._stream.average_rate or self._stream.guessed_rate or 25.0)
 
-    def read(self) -> Frame | None:
+    def read(self) -> DecodedFrame | None:
         """The next picture, None at the end of a file; CameraError where it does not come in time, or is lost."""
         begun = time.monotonic()
         try:
@@ -112,7 +114,7 @@ class Feed:
                 raise CameraError(ended(self._address, True, self._jpegs.stated)) from None
             too_large = self._too_large()
             raise CameraError(
-                too_large or found(error, self._address, waited, self._read_s, not self._seen)
+                too_large or explain_open_error(error, self._address, waited, self._read_s, not self._seen)
             ) from None
         if frame is None or picture is None:
             if self._jpegs is not None and (not self._seen or self._is_still):
@@ -120,7 +122,7 @@ class Feed:
             return None
         self._seen = True
         stamp = frame.time if self._address.stamped else None
-        return Frame(picture, None if stamp is None else float(stamp))
+        return DecodedFrame(picture, None if stamp is None else float(stamp))
 
     def close(self) -> None:
         """Let it go, with its decoder: the generator and this hold each other, and the collector comes late."""
@@ -178,7 +180,7 @@ class Feed:
             packet = next(packets, None)
             if packet is None:
                 return
-            if not (self._passes_over and backlog.passes(time.monotonic() - begun)):
+            if not (self._passes_over and backlog.should_skip(time.monotonic() - begun)):
                 yield packet
 
     def _parts(self, jpegs: Jpegs) -> Iterator[Any]:

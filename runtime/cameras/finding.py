@@ -13,7 +13,9 @@ from runtime.cameras.base import Address
 _PEEK_S = 1.0
 
 
-def found(error: Exception, address: Address, waited: float, allowed: float, opening: bool) -> str:
+def explain_open_error(
+    error: Exception, address: Address, waited: float, allowed: float, opening: bool
+) -> str:
     """One clause for an error of FFmpeg's after `waited` of `allowed` seconds; never the URL with its password.
 
     `opening`: nothing has come yet; else pictures have, and the stream breaks.

@@ -5,9 +5,17 @@ from __future__ import annotations
 import logging
 import threading
 
-from runtime.cameras.base import Address, Camera, CameraError, CameraSettings, Condition, Health, Shot
-from runtime.cameras.feed import Feed
-from runtime.cameras.shaping import Shaping
+from runtime.cameras.base import (
+    Address,
+    Camera,
+    CameraCondition,
+    CameraError,
+    CameraHealth,
+    CameraSettings,
+    CapturedImage,
+)
+from runtime.cameras.feed import VideoStream
+from runtime.cameras.shaping import ImageTransform
 from runtime.cameras.stamps import StreamTime
 from runtime.core import realtime
 from runtime.core.backoff import BackOff
@@ -25,65 +33,69 @@ class LiveCamera(Camera):
     def __init__(self, key: str, kind: str, settings: CameraSettings, address: Address, clock: Clock) -> None:
         self.key, self.kind, self.shown = key, kind, address.shown
         self._settings, self._address, self._clock = settings, address, clock
-        self._shape = Shaping(settings)
+        self._shape = ImageTransform(settings)
         self._time = StreamTime()
         self._back_off = BackOff()
         self._lock = threading.Lock()
-        self._newest: Shot | None = None
-        self._health = Health(Condition.OPENING, clock.now(), "it is being opened")
+        self._newest: CapturedImage | None = None
+        self._health = CameraHealth(CameraCondition.OPENING, clock.now(), "it is being opened")
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         if self._thread is None:
-            self._thread = threading.Thread(target=self._go_on, name=f"camera-{self.key}", daemon=True)
+            self._thread = threading.Thread(target=self._run, name=f"camera-{self.key}", daemon=True)
             self._thread.start()
 
-    def newest(self) -> Shot | None:
+    def latest(self) -> CapturedImage | None:
         with self._lock:
             return self._newest
 
-    def health(self) -> Health:
+    def health(self) -> CameraHealth:
         with self._lock:
             health, newest = self._health, self._newest
         allowed = self._settings.read_s + _GRACE_S
-        if health.condition is Condition.LIVE and newest and self._clock.now() - newest.arrived > allowed:
+        if (
+            health.condition is CameraCondition.LIVE
+            and newest
+            and self._clock.now() - newest.arrived > allowed
+        ):
             why = f"no picture for over {allowed:g} s, and reading it does not return"
-            return Health(Condition.LOST, newest.arrived, why, health.losses + 1, failed=True)
+            return CameraHealth(CameraCondition.LOST, newest.arrived, why, health.losses + 1, failed=True)
         return health
 
     def faults(self) -> dict[str, int]:
         """`camera_clock_jumped_KEY`: the stream's time broke."""
         return {f"camera_clock_jumped_{self.key}": self._time.jumps} if self._time.jumps else {}
 
-    def leave(self) -> None:
+    def request_stop(self) -> None:
         self._ending.set()
 
     def close(self) -> None:
         """A thread that waits for a mute camera ends by itself within its deadline; nobody waits for that."""
-        self.leave()
+        self.request_stop()
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
 
-    def _go_on(self) -> None:
+    def _run(self) -> None:
         """The thread: nothing that happens in it may end it, because nobody else looks."""
-        realtime.leave()  # decoding comes after who may stop the robot
+        realtime.leave_realtime()  # decoding comes after who may stop the robot
         while not self._ending.is_set():
             try:
-                self._watch()
+                self._read_until_lost()
             except CameraError as error:
-                self._lose(str(error))
+                self._set_lost(str(error))
             except Exception as error:
                 log.exception("camera %s: reading failed", self.key)
-                self._lose(f"reading it failed: {type(error).__name__}: {error}")
-            self._ending.wait(self._back_off.waiting(self._clock.now()))
+                self._set_lost(f"reading it failed: {type(error).__name__}: {error}")
+            self._ending.wait(self._back_off.remaining_delay(self._clock.now()))
 
-    def _watch(self) -> None:
+    def _read_until_lost(self) -> None:
         """Open it and read until it is lost; raises CameraError."""
-        feed = Feed(self._address, self._settings.open_s, self._settings.read_s)
+        feed = VideoStream(self._address, self._settings.open_s, self._settings.read_s)
         try:
-            self._time.begin()
+            self._time.reset()
             settled: float | None = None
             while not self._ending.is_set():
                 frame = feed.read()
@@ -91,25 +103,25 @@ class LiveCamera(Camera):
                     raise CameraError("it closed the connection")
                 arrived = self._clock.now()
                 settled = arrived + SETTLE_S if settled is None else settled
-                captured = self._time.captured(frame.stamp, arrived)
+                captured = self._time.to_monotonic(frame.stamp, arrived)
                 picture = self._shape(frame.picture)
                 if arrived >= settled:
-                    self._show(Shot(picture, captured, arrived))
+                    self._store(CapturedImage(picture, captured, arrived))
         finally:
             feed.close()
 
-    def _show(self, shot: Shot) -> None:
-        self._back_off.forget()
+    def _store(self, shot: CapturedImage) -> None:
+        self._back_off.reset()
         with self._lock:
             self._newest = shot
-            if self._health.condition is not Condition.LIVE:
-                self._health = Health(Condition.LIVE, shot.arrived, losses=self._health.losses)
+            if self._health.condition is not CameraCondition.LIVE:
+                self._health = CameraHealth(CameraCondition.LIVE, shot.arrived, losses=self._health.losses)
 
-    def _lose(self, why: str) -> None:
+    def _set_lost(self, why: str) -> None:
         now = self._clock.now()
-        self._back_off.failed(now)
+        self._back_off.record_failure(now)
         with self._lock:
-            before, lost = self._health, Condition.LOST if self._newest else Condition.OPENING
+            before, lost = self._health, CameraCondition.LOST if self._newest else CameraCondition.OPENING
             since = before.since if before.condition is lost else now
-            losses = before.losses + (before.condition is Condition.LIVE)
-            self._health = Health(lost, since, why, losses, failed=True)
+            losses = before.losses + (before.condition is CameraCondition.LIVE)
+            self._health = CameraHealth(lost, since, why, losses, failed=True)

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import field_validator
 
 from runtime.cameras.base import Address, CameraSettings
-from runtime.cameras.camera_urls import checked, with_password
+from runtime.cameras.camera_urls import check_url, with_password
 
 
 class Config(CameraSettings):
@@ -24,7 +24,7 @@ class Config(CameraSettings):
     @field_validator("url")
     @classmethod
     def _usable(cls, url: str) -> str:
-        return checked("url", url, ("http", "https"))
+        return check_url("url", url, ("http", "https"))
 
 
 def address(config: Config) -> Address:

@@ -8,9 +8,9 @@ import threading
 from collections.abc import Callable
 
 from runtime.cameras import file
-from runtime.cameras.base import Camera, CameraError, Condition, Health, Shot
-from runtime.cameras.feed import Feed, Frame
-from runtime.cameras.shaping import Shaping
+from runtime.cameras.base import Camera, CameraCondition, CameraError, CameraHealth, CapturedImage
+from runtime.cameras.feed import DecodedFrame, VideoStream
+from runtime.cameras.shaping import ImageTransform
 from runtime.core import realtime
 from runtime.core.clock import Clock
 
@@ -20,7 +20,7 @@ _RETRY_S = 2.0
 _JOIN_S = 0.3
 
 
-class Player:
+class FilePlayer:
     """Pictures of a file as they are due; the next one is decoded before that.
 
     Until `begin`, and from `stand` on, the first picture stands, as if taken again and again at the file's own rate.
@@ -28,29 +28,29 @@ class Player:
 
     def __init__(self, config: file.Config) -> None:
         self._config = config
-        self._shape = Shaping(config)
-        self._feed: Feed | None = None
+        self._shape = ImageTransform(config)
+        self._feed: VideoStream | None = None
         self._begun: float | None = None
         self.over = False
         self.due = -math.inf
 
-    def begin(self, now: float) -> None:
+    def start(self, now: float) -> None:
         """Play from the first picture, which is due now."""
         self._begun, self.over = now, False
         self._rewind(now)
 
-    def stand(self, now: float) -> None:
+    def reset(self, now: float) -> None:
         """Show the first picture from now on."""
         self._begun, self.over = None, False
         self._rewind(now)
 
-    def at(self, now: float) -> Shot | None:
+    def frame_at(self, now: float) -> CapturedImage | None:
         """The newest picture that is due and was not given yet; CameraError where the file cannot be read."""
         if self._feed is None:
             self._rewind(now)
         shown = None
         while not self.over and now + _EARLY_S >= self.due:
-            shown = Shot(self._shape(self._next.picture), min(self.due, now), now)
+            shown = CapturedImage(self._shape(self._next.picture), min(self.due, now), now)
             self._advance(now)
         return shown
 
@@ -63,7 +63,7 @@ class Player:
     def _rewind(self, due: float) -> None:
         """The first picture is next, due at `due`."""
         self.close()
-        self._feed = Feed(file.address(self._config), self._config.open_s, self._config.read_s)
+        self._feed = VideoStream(file.address(self._config), self._config.open_s, self._config.read_s)
         first = self._feed.read()
         if first is None:
             self.close()
@@ -85,7 +85,7 @@ class Player:
         else:
             self.over, self.due = True, math.inf
 
-    def _offset(self, frame: Frame, period: float) -> float:
+    def _offset(self, frame: DecodedFrame, period: float) -> float:
         """When it is due after the first one [s]: by its stamp, a period after the one before where it has none."""
         if frame.stamp is None or self._first.stamp is None:
             return self.due - self._since + period
@@ -100,11 +100,11 @@ class FileCamera(Camera):
     def __init__(self, key: str, config: file.Config, clock: Clock, threaded: bool) -> None:
         self.key, self.shown = key, file.address(config).shown
         self._clock = clock
-        self._player = Player(config)
+        self._player = FilePlayer(config)
         self._threaded = threaded
         self._lock = threading.Lock()
-        self._newest: Shot | None = None
-        self._health = Health(Condition.OPENING, clock.now(), "it is being opened")
+        self._newest: CapturedImage | None = None
+        self._health = CameraHealth(CameraCondition.OPENING, clock.now(), "it is being opened")
         self._wake = threading.Event()
         self._ending = False
         self._asked: Callable[[float], None] | None = None  # what the player is to do first
@@ -113,44 +113,44 @@ class FileCamera(Camera):
     def start(self) -> None:
         if self._threaded and self._thread is None:
             self._ending = False
-            self._thread = threading.Thread(target=self._go_on, name=f"camera-{self.key}", daemon=True)
+            self._thread = threading.Thread(target=self._run, name=f"camera-{self.key}", daemon=True)
             self._thread.start()
 
     def begin_run(self) -> None:
-        self._ask(self._player.begin)
+        self._request(self._player.start)
 
     def end_run(self) -> None:
-        self._ask(self._player.stand)
+        self._request(self._player.reset)
 
-    def _ask(self, what: Callable[[float], None]) -> None:
+    def _request(self, what: Callable[[float], None]) -> None:
         with self._lock:
             self._asked = what
         self._wake.set()
 
-    def newest(self) -> Shot | None:
+    def latest(self) -> CapturedImage | None:
         if not self._threaded:
             self._step()
         with self._lock:
             return self._newest
 
-    def health(self) -> Health:
+    def health(self) -> CameraHealth:
         with self._lock:
             return self._health
 
-    def leave(self) -> None:
+    def request_stop(self) -> None:
         self._ending = True
         self._wake.set()
 
     def close(self) -> None:
-        self.leave()
+        self.request_stop()
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
         if not self._threaded:
             self._player.close()
 
-    def _go_on(self) -> None:
-        realtime.leave()  # decoding comes after who may stop the robot
+    def _run(self) -> None:
+        realtime.leave_realtime()  # decoding comes after who may stop the robot
         while not self._ending:
             self._step()
             due = self._player.due if self._healthy() else self._clock.now() + _RETRY_S
@@ -161,7 +161,7 @@ class FileCamera(Camera):
         self._player.close()
 
     def _healthy(self) -> bool:
-        return self.health().condition in (Condition.LIVE, Condition.ENDED)
+        return self.health().condition in (CameraCondition.LIVE, CameraCondition.ENDED)
 
     def _step(self) -> None:
         """Show what is due; what is wrong with the file is its health.
@@ -170,14 +170,14 @@ class FileCamera(Camera):
         """
         with self._lock:
             asked, self._asked = self._asked, None
-            broken = self._health.condition is Condition.LOST
+            broken = self._health.condition is CameraCondition.LOST
         if broken and asked is None:
             return
         try:
             now = self._clock.now()
             if asked is not None:
                 asked(now)
-            shot = self._player.at(now)
+            shot = self._player.frame_at(now)
         except CameraError as error:
             self._fail(str(error))
             return
@@ -189,17 +189,17 @@ class FileCamera(Camera):
             with self._lock:
                 self._newest = shot
         if self._player.over:
-            self._tell(Condition.ENDED, "the file is over")
+            self._set_condition(CameraCondition.ENDED, "the file is over")
         elif shot is not None:
-            self._tell(Condition.LIVE)
+            self._set_condition(CameraCondition.LIVE)
 
     def _fail(self, why: str) -> None:
         self._player.close()
-        self._tell(Condition.LOST if self._newest else Condition.OPENING, why)
+        self._set_condition(CameraCondition.LOST if self._newest else CameraCondition.OPENING, why)
 
-    def _tell(self, condition: Condition, why: str = "") -> None:
+    def _set_condition(self, condition: CameraCondition, why: str = "") -> None:
         with self._lock:
             before = self._health
             if (condition, why) != (before.condition, before.why):
-                losses = before.losses + (condition is Condition.LOST)
-                self._health = Health(condition, self._clock.now(), why, losses, failed=bool(why))
+                losses = before.losses + (condition is CameraCondition.LOST)
+                self._health = CameraHealth(condition, self._clock.now(), why, losses, failed=bool(why))

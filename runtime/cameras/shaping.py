@@ -8,7 +8,7 @@ from runtime.cameras.base import LARGEST, CameraError, CameraSettings
 from runtime.core.types import UInt8
 
 
-class Shaping:
+class ImageTransform:
     """Shapes pictures of one camera, which keep the size of the first one: recordings and policies count on it."""
 
     def __init__(self, settings: CameraSettings) -> None:

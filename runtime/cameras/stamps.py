@@ -19,11 +19,11 @@ class StreamTime:
         self._newest = -math.inf
         self._begin()
 
-    def begin(self) -> None:
+    def reset(self) -> None:
         """The stream was opened anew: its stamps begin anywhere."""
         self._begin()
 
-    def captured(self, stamp: float | None, arrived: float) -> float:
+    def to_monotonic(self, stamp: float | None, arrived: float) -> float:
         """Our time [s] for the stream's `stamp` [s], never after `arrived`; `arrived` where there is no stamp."""
         time = arrived if stamp is None else self._mapped(stamp, arrived)
         if time <= self._newest:

@@ -14,11 +14,11 @@ import zmq
 
 from runtime.core.errors import RuntimeFault, TransportError
 from runtime.ipc.bus import CommandClient, Endpoints, Subscriber
-from runtime.ipc.endpoints import account
-from runtime.ipc.estop_client import urgent
-from runtime.ipc.estop_requests import kept
+from runtime.ipc.endpoints import account_name
+from runtime.ipc.estop_client import send_urgent
+from runtime.ipc.estop_requests import sanitize_text
 from runtime.ipc.messages import Ack, Command
-from runtime.ipc.session_state import with_meaning
+from runtime.ipc.session_state import complete_state_meaning
 
 RENEW_S = 1.0
 
@@ -35,7 +35,7 @@ class StationClient:
     """
 
     def __init__(self, station_dir: Path, holder: str = "") -> None:
-        self.holder = holder or f"terminal:{account(os.getuid())}@{socket.gethostname()}"
+        self.holder = holder or f"terminal:{account_name(os.getuid())}@{socket.gethostname()}"
         self._endpoints = Endpoints(station_dir)
         self._context: zmq.Context[Any] = zmq.Context.instance()
         self._commands: CommandClient | None = None
@@ -49,7 +49,7 @@ class StationClient:
     def status(self, timeout: float = 2.0) -> dict[str, Any]:
         """The station's snapshot; raises TransportError where it does not answer."""
         asked = time.monotonic()
-        data = with_meaning(self._send(Command(str(uuid.uuid4()), "status"), timeout).data)
+        data = complete_state_meaning(self._send(Command(str(uuid.uuid4()), "status"), timeout).data)
         self._boot, self._sequence = data["boot"], data["sequence"]
         self._clock_offset = data["clock"] - asked
         return data
@@ -61,13 +61,13 @@ class StationClient:
 
     def query(self, kind: str, **arguments: Any) -> Ack:
         """Ask what changes nothing and needs no lease; raises Refused, or TransportError."""
-        return self.ask(kind, arguments)
+        return self.query_with(kind, arguments)
 
-    def ask(self, kind: str, arguments: Mapping[str, Any]) -> Ack:
+    def query_with(self, kind: str, arguments: Mapping[str, Any]) -> Ack:
         """`query` with arguments of any name."""
-        return _accepted(self._send(self._question(kind, arguments), 2.0))
+        return _accepted(self._send(self._send_query(kind, arguments), 2.0))
 
-    def _question(self, kind: str, arguments: Mapping[str, Any]) -> Command:
+    def _send_query(self, kind: str, arguments: Mapping[str, Any]) -> Command:
         return Command(str(uuid.uuid4()), kind, arguments, user=self.holder, holder=self.holder)
 
     def claim(self, epoch: int = 0) -> None:
@@ -82,7 +82,7 @@ class StationClient:
             self._command("lease_renew", 2.0, epoch=self._epoch)
             self._renewed = time.monotonic()
 
-    def give_up(self) -> None:
+    def release(self) -> None:
         """End the lease before its time."""
         self._command("lease_give_up", 2.0, epoch=self._epoch)
         self._epoch = 0
@@ -94,9 +94,11 @@ class StationClient:
         """
         self.claim()
         self.status()
-        return self.give(kind, arguments, identity, timeout)
+        return self.send_command(kind, arguments, identity, timeout)
 
-    def give(self, kind: str, arguments: Mapping[str, Any], identity: str = "", timeout: float = 2.0) -> Ack:
+    def send_command(
+        self, kind: str, arguments: Mapping[str, Any], identity: str = "", timeout: float = 2.0
+    ) -> Ack:
         """Give one command under the lease that was claimed, decided by the status that was seen last.
 
         Raises Refused, or TransportError: outcome unknown.
@@ -106,8 +108,8 @@ class StationClient:
     def estop(self, why: str) -> Ack:
         """Press the software e-stop at the guard, which needs neither lease nor the coordinator."""
         try:
-            command = self._question("estop", {"why": kept(why)})
-            return urgent(self._context, self._endpoints, ("guard", "estop"), command, 2.0)
+            command = self._send_query("estop", {"why": sanitize_text(why)})
+            return send_urgent(self._context, self._endpoints, ("guard", "estop"), command, 2.0)
         except TransportError as error:
             raise TransportError(f"USE THE HARDWARE STOP: {error}") from None
 

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.clients.client import StationClient
-from runtime.clients.terminal.figures import figure, line
+from runtime.clients.terminal.figures import format_figure, status_line
 from runtime.config import loader
 from runtime.config.schema import Deployment
 from runtime.core import logs as log
@@ -32,21 +32,21 @@ _SILENT = frozenset(
 RESULT_NAME = "headless.json"
 
 
-def drive(settings: Deployment, client: StationClient) -> dict[str, Any]:
+def run_headless(settings: Deployment, client: StationClient) -> dict[str, Any]:
     """One run from start to published dataset; returns what came of it. Raises RuntimeFault with the reason."""
     check(settings)
-    attended = Attended(client)
+    attended = LeasedStation(client)
     attended.begin()
     status = attended.run()
     how, well = status["reason"], status["state_is"]["ready"]
     if status["state_is"]["held"]:
         client.command("stop")
     try:
-        status = attended.conclude()
+        status = attended.wait_until_closed()
         result = _result(status, how, attended.seconds)
         well = well and status["last_run"].get("status", "finished") == "finished"
         if result["episode_path"]:
-            result |= _keep(settings, Path(result["episode_path"]), well)
+            result |= _export_and_publish(settings, Path(result["episode_path"]), well)
     except RuntimeFault as fault:  # on top of why the run ended
         raise RuntimeFault(f"the run ended ({how}), but then: {fault}") from None
     print("\n".join(summary(result)), flush=True)
@@ -65,7 +65,7 @@ def check(settings: Deployment) -> None:
         )
 
 
-class Attended:
+class LeasedStation:
     """A station under a lease that is kept, its events told as they come."""
 
     def __init__(self, client: StationClient) -> None:
@@ -80,37 +80,39 @@ class Attended:
         """Wait for the station, claim it, set it up; raises RuntimeFault with the reason where it is not ready."""
         self._wait_for_start()
         self._client.claim()
-        self.until(lambda s: s["state_is"]["connected"], _START_S, "the first observation")
+        self.wait_for(lambda s: s["state_is"]["connected"], _START_S, "the first observation")
         self._client.command("setup")
-        status = self.until(lambda s: not s["state_is"]["preparing"], _SETUP_S, "set-up")
+        status = self.wait_for(lambda s: not s["state_is"]["preparing"], _SETUP_S, "set-up")
         if not status["state_is"]["ready"]:
             raise RuntimeFault(f"set-up failed: {status['reason']}")
 
     def run(self) -> dict[str, Any]:
         """One run to its end, however it ends; returns the status then."""
         self._client.command("run")
-        return self.until(lambda s: not s["state_is"]["going"], math.inf, "the end of the run")
+        return self.wait_for(lambda s: not s["state_is"]["going"], math.inf, "the end of the run")
 
-    def conclude(self) -> dict[str, Any]:
+    def wait_until_closed(self) -> dict[str, Any]:
         """Wait until what was recorded, if anything was, is on disk; returns the status then."""
-        status = self.look()
+        status = self.poll_status()
         if self.opened:
-            status = self.until(lambda _: self.closed, _CLOSE_S, "the end of the recording")
+            status = self.wait_for(lambda _: self.closed, _CLOSE_S, "the end of the recording")
         return status
 
-    def until(self, reached: Callable[[dict[str, Any]], bool], seconds: float, what: str) -> dict[str, Any]:
+    def wait_for(
+        self, reached: Callable[[dict[str, Any]], bool], seconds: float, what: str
+    ) -> dict[str, Any]:
         """Look until `reached`, showing figures now and then; raises RuntimeFault after `seconds`."""
         deadline = time.monotonic() + seconds
-        while not reached(status := self.look()):
+        while not reached(status := self.poll_status()):
             if time.monotonic() > deadline:
                 raise RuntimeFault(f"{what}: not within {seconds:g} s; {status['state']}: {status['reason']}")
             if time.monotonic() - self._shown >= _SHOWN_EVERY_S:
                 self._shown = time.monotonic()
-                print(line(status), flush=True)
+                print(status_line(status), flush=True)
             time.sleep(_POLL_S)
         return status
 
-    def look(self) -> dict[str, Any]:
+    def poll_status(self) -> dict[str, Any]:
         """The status, once its events were told."""
         self._client.renew()
         status = self._client.status()
@@ -118,12 +120,12 @@ class Attended:
             self._boot, self._heard = status["boot"], 0
         if status["newest_event"] > self._heard:
             for event in self._client.events_since(self._heard):
-                self._hear(event)
+                self._on_event(event)
         if status["run"]["number"]:
             self.seconds = status["run"]["elapsed"]
         return status
 
-    def _hear(self, event: dict[str, Any]) -> None:
+    def _on_event(self, event: dict[str, Any]) -> None:
         self._heard = event["number"]
         self.opened |= event["kind"] == "episode_opened"
         self.closed |= event["kind"] == "episode_closed"
@@ -156,10 +158,10 @@ def _result(status: dict[str, Any], how: str, seconds: float) -> dict[str, Any]:
         "policy": status["policy"],
         "link": status["link"],
     }
-    return result | (_of_episode(Path(path)) if path else {})
+    return result | (_episode_figures(Path(path)) if path else {})
 
 
-def _of_episode(path: Path) -> dict[str, Any]:
+def _episode_figures(path: Path) -> dict[str, Any]:
     """Figures from its files: how long it is, and of its ticks how many safety refused or limited."""
     from runtime.recording.reader import open_episode
 
@@ -173,11 +175,11 @@ def _of_episode(path: Path) -> dict[str, Any]:
     }
 
 
-def _keep(settings: Deployment, episode: Path, well: bool) -> dict[str, Any]:
+def _export_and_publish(settings: Deployment, episode: Path, well: bool) -> dict[str, Any]:
     """Export the streams of any run; publish what ended well and moved a robot. Raises RuntimeFault."""
-    from runtime.recording.export import export
+    from runtime.recording.export import write_export
 
-    result: dict[str, Any] = {"export_path": str(export(episode, settings.data))}
+    result: dict[str, Any] = {"export_path": str(write_export(episode, settings.data))}
     if well and settings.publish.dataset and settings.run.mode != "sim":
         result |= _publish(settings, episode)
     return result
@@ -204,7 +206,9 @@ def summary(result: dict[str, Any]) -> list[str]:
         rows.append(("recorded", recorded))
     if policy["answers"]:
         latency = f"p50 {policy['latency_p50_ms']:.0f} ms, p90 {policy['latency_p90_ms']:.0f} ms"
-        delay = f"delay {figure(policy['delay_p50'])} ticks, at most {figure(policy['delay_max'])}"
+        delay = (
+            f"delay {format_figure(policy['delay_p50'])} ticks, at most {format_figure(policy['delay_max'])}"
+        )
         rows.append(("policy", f"{latency}, {delay}"))
     late = f"ticks late by p99 {control['lateness_p99_ms']:.2f} ms, {control['missed']} missed"
     rows.append(("control", f"{control['rate']:g} Hz, {late}"))
@@ -221,21 +225,21 @@ def summary(result: dict[str, Any]) -> list[str]:
     return ["", "How it went", *(f"  {name:<9} {text}" for name, text in rows)]
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main() -> int:
     """Drive, print, leave the result in the station's folder; exit code 0 where all went well."""
     parser = argparse.ArgumentParser(prog="runtime.clients.headless", description="started by the supervisor")
     parser.add_argument("--resolved", required=True)
     parser.add_argument("--boot", required=True)
     given = parser.parse_args()
-    log.start("headless")
-    settings = loader.resolve(
+    log.configure_logging("headless")
+    settings = loader.resolve_deployment(
         json.loads(Path(given.resolved).read_text("utf-8")), {}, given.resolved
     ).deployment
     station_dir = settings.station_dir
     client = StationClient(station_dir, holder=f"headless:{given.boot}")
     try:
-        result = drive(settings, client)
+        result = run_headless(settings, client)
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
         (station_dir / RESULT_NAME).write_text(json.dumps({"error": str(fault)}), "utf-8")

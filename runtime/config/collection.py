@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from runtime.core.errors import ConfigurationError
-from runtime.core.plugins import union
+from runtime.core.plugins import kind_union
 from runtime.core.settings import Settings
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
         kind: str
 else:
-    LeaderConfig = union("runtime.teleoperators")
+    LeaderConfig = kind_union("runtime.teleoperators")
 
 Measured = Literal["qvel", "effort", "eef"]
 Column = Literal["qvel", "effort", "eef", "eef_action"]
@@ -71,19 +71,19 @@ class CollectionSettings(Settings):
             )
         return self
 
-    def primary(self, cameras: tuple[str, ...]) -> str:
+    def primary_camera_of(self, cameras: tuple[str, ...]) -> str:
         """The camera that stands for an episode; "" where there is none."""
         kept = self.cameras or list(cameras)
         return self.primary_camera or (kept[0] if kept else "")
 
-    def described(self, cameras: tuple[str, ...]) -> dict[str, Any]:
+    def manifest_entry(self, cameras: tuple[str, ...]) -> dict[str, Any]:
         """It, for a manifest; `cameras` are the station's."""
         kept = [key for key in cameras if self.cameras is None or key in self.cameras]
         return {
             **self.model_dump(mode="json", exclude={"leader", "max_age_s"}),
             "leader": "" if self.leader is None else self.leader.kind,
             "cameras": kept,
-            "primary_camera": self.primary(cameras),
+            "primary_camera": self.primary_camera_of(cameras),
         }
 
 

@@ -16,18 +16,18 @@ from pydantic import ValidationError
 from runtime.config.schema import Deployment
 from runtime.core import bounded_documents as bounded
 from runtime.core.errors import ConfigurationError
-from runtime.core.settings import Key, explanation
+from runtime.core.settings import Key, explain_validation_error
 
 __all__ = [
     "ConfigurationError",
     "Deployment",
     "Resolved",
-    "assigned",
-    "changed",
-    "digest_of",
+    "apply_assignments",
+    "apply_changes",
+    "config_digest",
     "load",
-    "resolve",
-    "server_of",
+    "resolve_deployment",
+    "server_address",
     "tree_of",
 ]
 
@@ -47,7 +47,7 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Resolved:
     A `kind` is assigned before anything else, because a new kind replaces the table it stands in.
     """
     tree, origin = _read(path, ())
-    return assigned(tree, origin, str(path), assignments)
+    return apply_assignments(tree, origin, str(path), assignments)
 
 
 def tree_of(path: Path) -> dict[str, Any]:
@@ -55,21 +55,21 @@ def tree_of(path: Path) -> dict[str, Any]:
     return _read(path, ())[0]
 
 
-def assigned(
+def apply_assignments(
     tree: dict[str, Any], origin: dict[Key, str], source: str, assignments: Sequence[str]
 ) -> Resolved:
     """The deployment in `tree`, which is changed, with `key=value` assignments on top, as in `load`."""
     parsed = [(*_assignment(text), f"--set {text}") for text in assignments]
     for key, value, option in sorted(parsed, key=lambda one: one[0][-1] != "kind"):
-        _put(tree, key, value, option)
+        _set_key(tree, key, value, option)
         origin = {known: where for known, where in origin.items() if known[: len(key)] != key}
         for depth in range(1, len(key)):
             origin.setdefault(key[:depth], option)
         origin[key] = option
-    return resolve(tree, origin, source)
+    return resolve_deployment(tree, origin, source)
 
 
-def resolve(
+def resolve_deployment(
     tree: Mapping[str, Any], origin: Mapping[Key, str], source: str, unread: Collection[str] = ()
 ) -> Resolved:
     """Check a tree of settings; `origin` says which file or option each key came from.
@@ -79,30 +79,32 @@ def resolve(
     try:
         deployment = Deployment.model_validate(tree, context={"unread": unread})
     except ValidationError as invalid:
-        raise ConfigurationError(explanation(invalid, Deployment, tree, source, origin)) from None
+        raise ConfigurationError(
+            explain_validation_error(invalid, Deployment, tree, source, origin)
+        ) from None
     except ConfigurationError as error:  # of a variant's own check, which knows no file
         raise ConfigurationError(f"{source}: {error}") from None
     canonical = deployment.model_dump(mode="json")
-    return Resolved(deployment, canonical, digest_of(canonical))
+    return Resolved(deployment, canonical, config_digest(canonical))
 
 
-def digest_of(canonical: Mapping[str, Any]) -> str:
+def config_digest(canonical: Mapping[str, Any]) -> str:
     """The hash of a deployment in its canonical form, also as it came back from a manifest."""
     text = json.dumps(canonical, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def changed(resolved: Resolved, changes: Mapping[str, Any], source: str) -> Resolved:
+def apply_changes(resolved: Resolved, changes: Mapping[str, Any], source: str) -> Resolved:
     """`resolved` with the tables of `changes` on top, merged as those of a file over what it extends.
 
     Raises ConfigurationError, which names `source` for what came with the changes.
     """
     tree = deepcopy(dict(resolved.tree))
     _merge(tree, deepcopy(dict(changes)))
-    return resolve(tree, dict.fromkeys(_keys(changes), source), source)
+    return resolve_deployment(tree, dict.fromkeys(_keys(changes), source), source)
 
 
-def server_of(settings: Deployment) -> str:
+def server_address(settings: Deployment) -> str:
     """Address of the policy's server in one spelling, host and port; "" for a policy without one.
 
     Two deployments of one machine have the same server where this is the same. What is behind a tunnel is named as
@@ -123,14 +125,14 @@ def _read(path: Path, chain: tuple[Path, ...]) -> tuple[dict[str, Any], dict[Key
     if path in chain:
         raise ConfigurationError(f"{path}: extends itself by way of {' -> '.join(map(str, chain))}")
     try:
-        own = bounded.toml_file(path, str(path))
+        own = bounded.load_toml(path, str(path))
     except OSError as error:
         near = ", ".join(sorted(p.name for p in path.parent.glob("*.toml"))) or "none"
         by = f"which {chain[-1]} extends " if chain else ""
         raise ConfigurationError(
             f"{path}: {by}cannot be read ({error.strerror}); deployment files there: {near}"
         ) from None
-    except bounded.Unreadable as error:
+    except bounded.UnreadableDocument as error:
         raise ConfigurationError(str(error)) from None
     parent = own.pop("extends", None)
     if parent is None:
@@ -172,13 +174,13 @@ def _assignment(text: str) -> tuple[Key, Any]:
     if not separator or not name.strip():
         raise ConfigurationError(f"--set {text}: must be key=value, for example control.rate=30")
     try:
-        value = bounded.toml(f"value = {raw}", f"--set {name}")["value"]
-    except bounded.Unreadable:
+        value = bounded.parse_toml(f"value = {raw}", f"--set {name}")["value"]
+    except bounded.UnreadableDocument:
         value = raw  # a bare word is a string, so that quotes need no escaping in a shell
     return tuple(name.strip().split(".")), value
 
 
-def _put(tree: dict[str, Any], key: Key, value: Any, source: str) -> None:
+def _set_key(tree: dict[str, Any], key: Key, value: Any, source: str) -> None:
     for depth, name in enumerate(key[:-1]):
         tree = tree.setdefault(name, {})
         if not isinstance(tree, dict):

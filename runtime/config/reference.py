@@ -15,9 +15,9 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.config.schema import Deployment
-from runtime.core.plugins import parts
+from runtime.core.plugins import union_members
 
 Schema = Mapping[str, Any]
 
@@ -38,7 +38,7 @@ _BOUNDS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "
 _NAMES = {"string": "string", "integer": "integer", "number": "number", "boolean": "true or false"}
 
 
-def reference() -> str:
+def render_reference() -> str:
     """The whole document."""
     lines = [_INTRODUCTION, *_section("The top of the file", Deployment)]
     for name, field in Deployment.model_fields.items():
@@ -62,7 +62,7 @@ def _models(path: str, annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]
     elif get_origin(annotation) is dict:
         yield from _models(f"{path}.NAME", get_args(annotation)[1])
     else:
-        for part in parts(annotation):
+        for part in union_members(annotation):
             yield from _models(path, part)
 
 
@@ -140,14 +140,14 @@ def _default(field: FieldInfo) -> str:
 def meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
     """What a key of a table means, as the string below it says."""
     for owner in model.__mro__:
-        if name in inspect.get_annotations(owner) and (said := _said_of_keys(owner).get(name)):
+        if name in inspect.get_annotations(owner) and (said := _key_docstrings(owner).get(name)):
             return " ".join(said.split())
     models = [model for _, model in _models(name, field.annotation)]
     return first_line(models[0]) if len(models) == 1 else "One of the kinds below." if models else ""
 
 
 @functools.cache  # cache: of sources, which do not change while this runs
-def _said_of_keys(model: type) -> dict[str, str]:
+def _key_docstrings(model: type) -> dict[str, str]:
     """The strings below a model's own keys. Read here: every process of a station would wait for its sources else."""
     (table,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(table, ast.ClassDef)
@@ -162,10 +162,10 @@ def _said_of_keys(model: type) -> dict[str, str]:
     }
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main() -> int:
     """Print it."""
-    print(reference(), end="")
+    print(render_reference(), end="")
     return 0
 
 

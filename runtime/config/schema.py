@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from runtime.config.collection import CollectionSettings
 from runtime.core.errors import ConfigurationError
-from runtime.core.plugins import parts, union, variants
+from runtime.core.plugins import kind_union, union_members, variants
 from runtime.core.pose_format import PoseFormat
 from runtime.core.settings import Settings
 from runtime.core.types import Space
@@ -43,15 +43,15 @@ if TYPE_CHECKING:
 
         kind: str
 else:
-    TransportConfig = union("runtime.transports")
-    PolicyConfig = union("runtime.policies")
-    StrategyConfig = union("runtime.strategies")
-    CameraConfig = union("runtime.cameras")
-    KinematicsConfig = union("runtime.kinematics")
+    TransportConfig = kind_union("runtime.transports")
+    PolicyConfig = kind_union("runtime.policies")
+    StrategyConfig = kind_union("runtime.strategies")
+    CameraConfig = kind_union("runtime.cameras")
+    KinematicsConfig = kind_union("runtime.kinematics")
 
 
 # Addresses and ports of the bus, from before its sockets had names in a folder.
-GONE_FROM_BUS = ("host", "command_port", "state_port", "camera_port", "estop_port")
+REMOVED_BUS_KEYS = ("host", "command_port", "state_port", "camera_port", "estop_port")
 _NO_PORTS = (
     "the bus has no ports any more, but Unix sockets that this account alone can reach, in $XDG_RUNTIME_DIR/eva-web "
     "(docs/security.md): leave it out"
@@ -60,12 +60,12 @@ _NO_PORTS = (
 
 def policy_tables() -> tuple[type[Settings], ...]:
     """Models that a [policy] table may be: one for each kind."""
-    return parts(PolicyConfig)
+    return union_members(PolicyConfig)
 
 
 def strategy_tables() -> tuple[type[Settings], ...]:
     """The same of a [strategy] table."""
-    return parts(StrategyConfig)
+    return union_members(StrategyConfig)
 
 
 class ControlSettings(Settings):
@@ -115,7 +115,7 @@ class RunSettings(Settings):
     """What the policy is shown as the robot's state in "sim": the robot's own, or that of the simulated one."""
 
 
-Answer = Literal["hold", "slow", "stop"]
+FaultResponse = Literal["hold", "slow", "stop"]
 
 
 class FaultSettings(Settings):
@@ -125,11 +125,11 @@ class FaultSettings(Settings):
     back in time.
     """
 
-    starvation: Answer = "slow"
+    starvation: FaultResponse = "slow"
     """Nothing is planned for a step; after control.starvation_hold_s "slow" holds."""
-    policy_error: Answer = "hold"
+    policy_error: FaultResponse = "hold"
     """The policy answered with an error, or with something unusable."""
-    policy_lost: Answer = "slow"
+    policy_lost: FaultResponse = "slow"
     """The policy did not answer in time, or its connection was lost; it is tried again with back-off."""
     patience_s: float = Field(default=3.0, gt=0)
     """Longest time without an answer before "slow" holds, also for a strategy that waits [s]."""
@@ -274,7 +274,7 @@ class GripperSettings(Settings):
 class Deployment(Settings):
     """One station: a robot, a way to it, a policy, and how they are brought together."""
 
-    GONE: ClassVar[Mapping[str, str]] = {f"bus.{key}": _NO_PORTS for key in GONE_FROM_BUS}
+    GONE: ClassVar[Mapping[str, str]] = {f"bus.{key}": _NO_PORTS for key in REMOVED_BUS_KEYS}
     """Keys that there were, and what is in their place."""
 
     station: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")

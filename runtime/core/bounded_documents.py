@@ -14,9 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-LARGEST = 2_000_000  # characters
-DEEPEST = 40  # tables and lists within each other
-MOST = 100_000  # values, counted by brackets, commas and the = of keys
+MAX_BYTES = 2_000_000  # characters
+MAX_DEPTH = 40  # tables and lists within each other
+MAX_ITEMS = 100_000  # values, counted by brackets, commas and the = of keys
 
 _JSON = re.compile(r'"(?:[^"\\]++|\\.)*+"?|[\[\]{},]', re.DOTALL)
 _TOML = re.compile(
@@ -30,11 +30,11 @@ _TOML = re.compile(
 )
 
 
-class Unreadable(ValueError):
+class UnreadableDocument(ValueError):
     """It cannot be read; the message says what it is, why, and what is allowed."""
 
 
-def toml(text: str, what: str, largest: int = LARGEST) -> dict[str, Any]:
+def parse_toml(text: str, what: str, largest: int = MAX_BYTES) -> dict[str, Any]:
     """The table in `text`; Unreadable, which calls it `what`."""
     _require_small(text, what, largest)
     _require_flat(text, what, _TOML)
@@ -42,26 +42,26 @@ def toml(text: str, what: str, largest: int = LARGEST) -> dict[str, Any]:
     return found
 
 
-def toml_file(path: Path, what: str) -> dict[str, Any]:
+def load_toml(path: Path, what: str) -> dict[str, Any]:
     """The table in a file, which is one; Unreadable, OSError."""
     found = path.stat()
     if not stat.S_ISREG(found.st_mode):
-        raise Unreadable(f"{what}: is no file")
-    if found.st_size > LARGEST:
-        raise Unreadable(f"{what}: {found.st_size} bytes; allowed: at most {LARGEST}")
+        raise UnreadableDocument(f"{what}: is no file")
+    if found.st_size > MAX_BYTES:
+        raise UnreadableDocument(f"{what}: {found.st_size} bytes; allowed: at most {MAX_BYTES}")
     try:
-        return toml(path.read_text("utf-8"), what)
+        return parse_toml(path.read_text("utf-8"), what)
     except UnicodeDecodeError as error:
-        raise Unreadable(f"{what}: is not valid TOML: {error}") from None
+        raise UnreadableDocument(f"{what}: is not valid TOML: {error}") from None
 
 
-def from_json(text: str | bytes, what: str, largest: int = LARGEST, most: int = MOST) -> Any:
+def parse_json(text: str | bytes, what: str, largest: int = MAX_BYTES, most: int = MAX_ITEMS) -> Any:
     """The value in `text`; Unreadable, which calls it `what`."""
     _require_small(text, what, largest)
     try:
         text = text if isinstance(text, str) else text.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise Unreadable(f"{what}: is not valid JSON: {error}") from None
+        raise UnreadableDocument(f"{what}: is not valid JSON: {error}") from None
     _require_flat(text, what, _JSON, most)
     return _parsed(json.loads, text, what, "JSON")
 
@@ -70,22 +70,22 @@ def _parsed(parse: Callable[[str], Any], text: str, what: str, language: str) ->
     try:
         return parse(text)
     except ValueError as error:  # also what Python refuses of long numbers
-        raise Unreadable(f"{what}: is not valid {language}: {error}") from None
+        raise UnreadableDocument(f"{what}: is not valid {language}: {error}") from None
 
 
 def _require_small(text: str | bytes, what: str, largest: int) -> None:
     if len(text) > largest:
-        raise Unreadable(f"{what}: {len(text)} characters; allowed: at most {largest}")
+        raise UnreadableDocument(f"{what}: {len(text)} characters; allowed: at most {largest}")
 
 
-def _require_flat(text: str, what: str, marks: re.Pattern[str], most: int = MOST) -> None:
+def _require_flat(text: str, what: str, marks: re.Pattern[str], most: int = MAX_ITEMS) -> None:
     """Brackets, commas and the dots of keys, outside of strings: never fewer levels than a parser would make."""
     depth = dots = values = 0
     for mark in marks.finditer(text):
         word = mark[0]
         values += word in "[{,="
         if values > most:
-            raise Unreadable(f"{what}: more than {most} values; allowed: at most {most}")
+            raise UnreadableDocument(f"{what}: more than {most} values; allowed: at most {most}")
         if word in "[{":
             depth, dots = depth + 1, 0
         elif word in "]}":
@@ -95,9 +95,9 @@ def _require_flat(text: str, what: str, marks: re.Pattern[str], most: int = MOST
             dots += 1
         elif word in "=,\n":
             dots = 0
-        if depth + dots > DEEPEST:
+        if depth + dots > MAX_DEPTH:
             line = text.count("\n", 0, mark.start()) + 1
-            raise Unreadable(
-                f"{what}: line {line} has more than {DEEPEST} tables or lists within each other; allowed: at most "
-                f"{DEEPEST}"
+            raise UnreadableDocument(
+                f"{what}: line {line} has more than {MAX_DEPTH} tables or lists within each other; allowed: at most "
+                f"{MAX_DEPTH}"
             )

@@ -63,7 +63,7 @@ class VirtualClock(Clock):
         self._now += seconds
 
 
-class _Suspect(NamedTuple):
+class _StepCandidate(NamedTuple):
     """Messages that are as late as each other, and later than one before them."""
 
     first: float  # arrival of the first that was late at all
@@ -73,7 +73,7 @@ class _Suspect(NamedTuple):
     steady: float  # for how long they have to be so [s]
 
 
-class Steps:
+class ClockStepDetector:
     """Tells steps of a peer's clock from delays, by the messages of one stream, which come in their order.
 
     A delay leaves stamps where the stream's period puts them, and moves arrivals; a step does the opposite. A stamp
@@ -87,16 +87,16 @@ class Steps:
         self._tolerance = tolerance
         self._intervals: deque[float] = deque(maxlen=_LEARNT)  # of stamps [s]
         self._noise: deque[float] = deque(maxlen=_LEARNT)  # by how much those of arrivals differed [s]
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Compare what comes with nothing before it; period and jitter stay known."""
         self._newest = -math.inf
         self._began = math.inf
         self._last: tuple[float, float] | None = None  # stamp, arrival
-        self._suspect: _Suspect | None = None
+        self._suspect: _StepCandidate | None = None
 
-    def see(self, stamp: float, arrival: float, least: float) -> float:
+    def update(self, stamp: float, arrival: float, least: float) -> float:
         """By how much the clock was set [s], < 0 back, as found with this message; 0.0 where it was not.
 
         `least` is the least (arrival - stamp) of all streams of the peer.
@@ -115,7 +115,7 @@ class Steps:
             return self._judge(self._suspect, offset, arrival)
         if self._may_be_back(moved, waited):
             steady = _STEADY_S if waited < _SILENCE_S else _SILENCE_S
-            self._suspect = _Suspect(arrival, arrival, offset, last[1] - last[0], steady)
+            self._suspect = _StepCandidate(arrival, arrival, offset, last[1] - last[0], steady)
         else:
             self._intervals.append(moved)
             self._noise.append(abs(waited - moved))
@@ -137,7 +137,7 @@ class Steps:
             return False
         return moved < 0.0 or waited > _SILENCE_S or self._off_more(moved, waited) > jitter
 
-    def _judge(self, suspect: _Suspect, offset: float, arrival: float) -> float:
+    def _judge(self, suspect: _StepCandidate, offset: float, arrival: float) -> float:
         if offset - suspect.before <= self._jitter() or arrival - suspect.first > _UNDECIDED_S:
             self._suspect = None  # a delay, and it is over; or neither is to be had
         elif abs(offset - suspect.offset) > self._jitter():
@@ -174,16 +174,16 @@ class ClockMap:
 
     def __init__(self, window: float = 45.0, tolerance: float = 0.5) -> None:
         self._window = window
-        self._steps = Steps(tolerance)
+        self._steps = ClockStepDetector(tolerance)
         self._minima: deque[tuple[float, float]] = deque()  # (arrival, offset), offsets increasing
         self.restarts = 0
         self.leaps = 0
 
-    def map(self, stamp: float, arrival: float, steps: Steps | None = None) -> float:
+    def map(self, stamp: float, arrival: float, steps: ClockStepDetector | None = None) -> float:
         """The peer's `stamp` in our clock; never later than `arrival`. `steps` are those of the stamp's own stream."""
         offset = arrival - stamp
         least = self._minima[0][1] if self._minima else math.inf
-        step = (steps or self._steps).see(stamp, arrival, least)
+        step = (steps or self._steps).update(stamp, arrival, least)
         if step:
             self._minima.clear()
             self.restarts += step < 0

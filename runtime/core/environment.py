@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from runtime.core.errors import ConfigurationError
 
 # What signs sessions, opens the database, broker and store, and logs in at the hub: no station has a use for it.
-WEB_ALONE = frozenset(
+WEB_ONLY = frozenset(
     (
         *("EVA_SECRET_KEY", "DATABASE_URL", "REDIS_URL", "DJANGO_SUPERUSER_PASSWORD"),
         *("PGPASSWORD", "PGPASSFILE", "PGSERVICEFILE"),
@@ -28,16 +28,16 @@ _OF_SSH = frozenset(
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")  # the first one given counts
 
 
-def without_secrets(given: Mapping[str, str]) -> dict[str, str]:
+def without_web_secrets(given: Mapping[str, str]) -> dict[str, str]:
     """An environment without what is the web's alone."""
     return {name: value for name, value in given.items() if not _web_alone(name)}
 
 
 def _web_alone(name: str) -> bool:
-    return name in WEB_ALONE or name.startswith(_JUDGES)
+    return name in WEB_ONLY or name.startswith(_JUDGES)
 
 
-def for_programs(given: Mapping[str, str]) -> dict[str, str]:
+def program_environment(given: Mapping[str, str]) -> dict[str, str]:
     """An environment for programs that start quickly and are still beside control, where it says nothing else.
 
     One thread of BLAS: a robot's matrices are small, and more threads spin where they wait. No look for plug-ins of
@@ -47,24 +47,24 @@ def for_programs(given: Mapping[str, str]) -> dict[str, str]:
     return {"PYDANTIC_DISABLE_PLUGINS": "__all__", **blas, **given}
 
 
-def for_ssh() -> dict[str, str]:
+def ssh_environment() -> dict[str, str]:
     """Variables of ours that an ssh gets: its configuration may tell it to send on whatever it has."""
     return {
         name: value for name, value in os.environ.items() if name in _OF_SSH or name.startswith("LC_")
     } | {"SSH_ASKPASS_REQUIRE": "never"}
 
 
-def shed() -> None:
+def restart_without_web_secrets() -> None:
     """Start a program that has secrets of the web again without, as the same process.
 
     Else they could be read in /proc for as long as it lives, and every child would have them.
     """
-    kept = without_secrets(os.environ)
+    kept = without_web_secrets(os.environ)
     if len(kept) < len(os.environ):
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], kept)
 
 
-def secret(key: str, name: str) -> str:
+def read_secret(key: str, name: str) -> str:
     """The value of the variable `name`, which `key` of a deployment names; ConfigurationError where there is none."""
     if _web_alone(name):
         raise ConfigurationError(

@@ -37,7 +37,7 @@ class TlsError(PolicyError):
     """There is no encrypted connection to the policy server: no TLS, or a certificate that is not trusted."""
 
 
-class ServerSaysError(PolicyError):
+class ServerReportedError(PolicyError):
     """The policy server answers, and says that it failed."""
 
 
@@ -57,7 +57,7 @@ class PolicyTimeout(PolicyLostError):
     """The server did not answer within the deadline; the connection is dropped."""
 
 
-class PolicyGone(PolicyLostError):
+class PolicyDisconnected(PolicyLostError):
     """The server closed the connection; it may have restarted."""
 
 

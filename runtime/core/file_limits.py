@@ -9,7 +9,7 @@ log = logging.getLogger(__name__)
 _ENOUGH = 4096
 
 
-def allow_all() -> None:
+def raise_file_limit() -> None:
     """Raise the soft limit to the hard one: who runs out of descriptors is ended by ZMQ when somebody connects."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

@@ -15,17 +15,17 @@ _STDERR = 2
 _STACK_BYTES = 256 * 1024  # control locks its memory
 
 
-def start(process: str) -> None:
+def configure_logging(process: str) -> None:
     """Log lines: time, process, level, sentence. EVA_LOG_LEVEL says from which level on."""
-    lines = Lines(_STDERR)
+    lines = NonBlockingHandler(_STDERR)
     lines.setFormatter(
         logging.Formatter(f"%(asctime)s {process:<10} %(levelname)-7s %(message)s", "%H:%M:%S")
     )
     logging.basicConfig(level=os.environ.get("EVA_LOG_LEVEL", "INFO"), handlers=[lines], force=True)
-    sys.excepthook = _last_words
+    sys.excepthook = _log_uncaught
 
 
-class Lines(logging.Handler):
+class NonBlockingHandler(logging.Handler):
     """Hands lines to a thread that writes them to a descriptor.
 
     Where that takes no more (a stopped terminal, a pager, a pipe nobody reads), lines are dropped beyond
@@ -77,7 +77,7 @@ class Lines(logging.Handler):
             self._dropped += 1  # the terminal is gone; it may come back
 
 
-def _last_words(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+def _log_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """Log the error that ends the process: a traceback must not wait for a terminal either."""
     if issubclass(kind, Exception):
         logging.getLogger(__name__).critical("this process ends", exc_info=(kind, error, trace))

@@ -9,7 +9,7 @@ from typing import Annotated, Any, get_args, get_origin
 from pydantic import BaseModel
 
 
-class Names(Enum):
+class HostReference(Enum):
     """Kinds of things that the value of such a key names."""
 
     VARIABLE = "an environment variable"
@@ -18,18 +18,22 @@ class Names(Enum):
     RECORDING = "a recording or a dataset"
 
 
-Variable = Annotated[str, Names.VARIABLE]
-Recording = Annotated[str, Names.RECORDING]
+Variable = Annotated[str, HostReference.VARIABLE]
+Recording = Annotated[str, HostReference.RECORDING]
 
 
-def named(table: BaseModel, prefix: str = "") -> Iterator[tuple[str, Names, str]]:
+def find_host_references(table: BaseModel, prefix: str = "") -> Iterator[tuple[str, HostReference, str]]:
     """The keys of a table, and of those in it, that name something, with what and which."""
     for key, field in type(table).model_fields.items():
         value = getattr(table, key)
         if isinstance(value, BaseModel):
-            yield from named(value, f"{prefix}{key}.")
+            yield from find_host_references(value, f"{prefix}{key}.")
         elif isinstance(value, str):
-            found = [mark for mark in (*field.metadata, *_marks(field.annotation)) if isinstance(mark, Names)]
+            found = [
+                mark
+                for mark in (*field.metadata, *_marks(field.annotation))
+                if isinstance(mark, HostReference)
+            ]
             yield from ((prefix + key, mark, value) for mark in found)
 
 

@@ -16,7 +16,7 @@ _FROM_THE_HEAP = (
 )  # bytes; the most that glibc takes. Larger pieces come from the kernel and go there
 
 
-def keep() -> bool:
+def keep_freed_memory() -> bool:
     """Ask for it; False where the C library has no such setting."""
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -62,7 +62,7 @@ class UnreadSection(BaseModel):
     kind: str
 
 
-class OneOf:
+class KindUnion:
     """The type of a table of one of a package's kinds, told apart by `kind`.
 
     A kind is imported when a table names it. A package that the context of the validation has under `unread` is
@@ -108,13 +108,13 @@ class OneOf:
         return cls.config(kind).model_validate(table)
 
 
-def union(package: str) -> Any:
+def kind_union(package: str) -> Any:
     """The type of a table of one of the package's kinds."""
-    return type("OneOf", (OneOf,), {"package": package, "__doc__": OneOf.__doc__})
+    return type("OneOf", (KindUnion,), {"package": package, "__doc__": KindUnion.__doc__})
 
 
-def parts(annotation: Any) -> tuple[Any, ...]:
+def union_members(annotation: Any) -> tuple[Any, ...]:
     """Parts of an annotation: the models of all kinds of a table that has kinds, else its arguments."""
-    if isinstance(annotation, type) and issubclass(annotation, OneOf):
+    if isinstance(annotation, type) and issubclass(annotation, KindUnion):
         return annotation.configs()
     return get_args(annotation)

@@ -66,7 +66,7 @@ class PoseFormat(Settings):
 CANONICAL = PoseFormat()
 
 
-def refuse_format(pose: PoseFormat, key: str) -> None:
+def reject_pose_format(pose: PoseFormat, key: str) -> None:
     """ConfigurationError where a format is declared for a space that is joints: it would mean nothing."""
     given = pose.model_dump(exclude_defaults=True)
     if given:

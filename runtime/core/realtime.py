@@ -27,7 +27,7 @@ _LARGE = 8 << 20  # bytes of one mapping
 LOCKSTEP = "lockstep"  # the class of ticks that keep no time
 
 
-def enter(priority: int) -> str:
+def enter_realtime(priority: int) -> str:
     """Make this process as punctual as permitted; returns what it got, for the status.
 
     SCHED_FIFO at `priority`, or at the highest that the user's rtprio limit permits; else a scheduler slice of
@@ -42,7 +42,7 @@ def enter(priority: int) -> str:
     return _class(libc, priority, locked)
 
 
-def enter_below(priority: int) -> str:
+def enter_realtime_below(priority: int) -> str:
     """The same for a process that is next after the one at `priority`, and has threads and large, sparse memory.
 
     Threads that are started from now on are of the class that it got, unless they `leave` it. What is mapped by now
@@ -56,17 +56,17 @@ def enter_below(priority: int) -> str:
     return _class(libc, priority, locked, below=1)
 
 
-def leave(thread: int = 0) -> None:
+def leave_realtime(thread: int = 0) -> None:
     """That thread, 0: the calling one, leaves a real-time class; those that it starts from now on are in none."""
     with contextlib.suppress(ProcessLookupError):  # it has ended
         if os.sched_getscheduler(thread) in (os.SCHED_FIFO, os.SCHED_RR):
             os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
 
 
-def leave_all() -> None:
+def leave_realtime_all() -> None:
     """All threads of this process leave it."""
     for thread in os.listdir("/proc/self/task"):
-        leave(int(thread))
+        leave_realtime(int(thread))
 
 
 def advice(scheduling: str, priority: int) -> str:

@@ -11,7 +11,7 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
-from runtime.core.plugins import OneOf, variants
+from runtime.core.plugins import KindUnion, variants
 
 Key = tuple[str, ...]
 _SECRET = re.compile(
@@ -30,7 +30,7 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-def explanation(
+def explain_validation_error(
     invalid: ValidationError,
     root: type[BaseModel],
     tree: Mapping[str, Any],
@@ -125,7 +125,7 @@ def _under(name: str, annotation: Any) -> list[Any]:
 
 def _chosen(annotation: Any, table: Any) -> list[Any]:
     """The annotation, that of the kind that `table` names where there are several; [] where it names none."""
-    if isinstance(annotation, type) and issubclass(annotation, OneOf):
+    if isinstance(annotation, type) and issubclass(annotation, KindUnion):
         kind = table.get("kind") if isinstance(table, Mapping) else None
         return (
             [annotation.config(kind)]

@@ -92,14 +92,14 @@ class Conditioning:
     """
 
     previous: Float32  # [T, W] the chunk that is being executed, whole
-    consumed: int  # its rows that are for steps before the new observation
+    consumed_rows: int  # its rows that are for steps before the new observation
     predicted_delay: int  # rows that will be consumed until the answer is expected to arrive
     execution_horizon: int  # rows of the answer that will be executed at most
 
     @property
-    def left_over(self) -> Float32:
+    def remaining_rows(self) -> Float32:
         """The rows not yet consumed [T - consumed, W]."""
-        return self.previous[self.consumed :]
+        return self.previous[self.consumed_rows :]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,16 +8,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.errors import RecordingError, RuntimeFault
 from runtime.datasets import layout, operations
-from runtime.datasets.assemble import Assembled
-from runtime.datasets.consistency import examine
+from runtime.datasets.assemble import AssemblyResult
+from runtime.datasets.consistency import check_with_remarks
 from runtime.datasets.hub import push
 from runtime.datasets.published import publish
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """0 where all is well, 1 where a check found something or what was asked for was refused."""
     options = _parser().parse_args(arguments)
@@ -184,7 +184,7 @@ def _repair(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    found = examine(options.dataset)
+    found = check_with_remarks(options.dataset)
     for remark in found.remarks:
         print(f"remark: {remark}")
     return _report(options.dataset, found.problems)
@@ -215,7 +215,7 @@ def is_index(text: str) -> bool:
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
-def _say(done: Assembled) -> int:
+def _say(done: AssemblyResult) -> int:
     print(f"written: {done.dataset}, {done.version}, {done.episodes} episodes, {done.frames} frames")
     for video in done.encoded:
         print(f"coded again: {video}")

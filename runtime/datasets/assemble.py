@@ -15,31 +15,31 @@ import numpy as np
 
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
-from runtime.datasets.catalog import Catalog, info_of, own_line
+from runtime.datasets.catalog import Catalog, new_info, single_file_line
 from runtime.datasets.columns import column_statistics
-from runtime.datasets.cut import NotCopyableError, cut, encode, other_streams
+from runtime.datasets.cut import NotCopyableError, copy_segment, encode_segment, other_streams
 from runtime.datasets.entries import entry, episode_lines, own_keys, statistic_lines, task_lines
 from runtime.datasets.features import (
     LANGUAGE,
     WORDS,
     arrow_schema,
-    differences,
+    feature_differences,
     figure_shapes,
     holds_nothing,
     other_shape,
-    stored,
+    stored_features,
 )
 from runtime.datasets.layout import Line
 from runtime.datasets.parquet_lists import EPISODES_FOLDER, is_storable
-from runtime.datasets.pictures import StoredPictures
+from runtime.datasets.pictures import StoredImages
 from runtime.datasets.reader import Dataset, open_dataset
-from runtime.datasets.renaming import Names
-from runtime.datasets.rows import numbers, row_shape, write_table
-from runtime.datasets.sides import FOLDER, side_file, side_files
+from runtime.datasets.renaming import ColumnRenaming
+from runtime.datasets.rows import column_array, row_shape, write_table
+from runtime.datasets.sides import FOLDER, sidecar_path, sidecar_paths
 from runtime.datasets.splits import TRAIN, episodes_of, written
 from runtime.datasets.staging import LOCK, Draft
 from runtime.datasets.stats import Statistic, fault, picture_statistic, video_statistic
-from runtime.recording.files import disk_fault
+from runtime.recording.files import disk_error
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -53,37 +53,37 @@ COPIED_FROM = (
     "copied_from"  # in our line about an episode: the dataset it was copied from, absent where published
 )
 
-Tell = Callable[[str], None]  # hears how far it is
+ProgressCallback = Callable[[str], None]  # hears how far it is
 
 
-def silent(progress: str) -> None:
+def ignore_progress(progress: str) -> None:
     """For those who do not want to know."""
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class EpisodeRef:
     """One episode of a source."""
 
-    source: Source
+    source: SourceDataset
     index: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Source:
+class SourceDataset:
     """A dataset that episodes are taken from, with what its metadata say beside the list of episodes."""
 
     dataset: Dataset
-    names: Names
+    names: ColumnRenaming
     tasks: tuple[str, ...]  # in the order of their numbers
     lines: Mapping[int, Line]  # of the list of episodes, what the format does not know
     statistics: Mapping[int, Mapping[str, Statistic]]
     eva: Mapping[int, Line]
 
     @classmethod
-    def open(cls, root: Path, names: Names | None = None) -> Source:
+    def open(cls, root: Path, names: ColumnRenaming | None = None) -> SourceDataset:
         """Raises RecordingError where there is no dataset, or it cannot be renamed so."""
         dataset = open_dataset(root)
-        names = names or Names({})
+        names = names or ColumnRenaming({})
         names.require(dataset.features)
         eva = layout.read_lines(root / layout.EVA_EPISODES)
         statistics = statistic_lines(root, dataset.info)
@@ -93,24 +93,24 @@ class Source:
             names,
             tuple(str(line["task"]) for line in tasks),
             {int(line["episode_index"]): own_keys(line) for line in episode_lines(root, dataset.info)},
-            {line["episode_index"]: names.keys(line["stats"]) for line in statistics},
+            {line["episode_index"]: names.rename_keys(line["stats"]) for line in statistics},
             _each_once(root, eva),
         )
 
     @property
     def features(self) -> Mapping[str, Mapping[str, Any]]:
         """The features under their new names."""
-        return self.names.keys(self.dataset.features)
+        return self.names.rename_keys(self.dataset.features)
 
-    def parts(self, indices: Sequence[int] | None = None) -> list[Part]:
+    def episode_refs(self, indices: Sequence[int] | None = None) -> list[EpisodeRef]:
         """Its episodes, all or those of `indices`; raises RecordingError for one that is not there."""
         if indices is None:
-            return [Part(self, listed.index) for listed in self.dataset.episodes]
-        return [Part(self, self.dataset.entry(index).index) for index in indices]
+            return [EpisodeRef(self, listed.index) for listed in self.dataset.episodes]
+        return [EpisodeRef(self, self.dataset.entry(index).index) for index in indices]
 
 
 @dataclass(frozen=True, slots=True)
-class Assembled:
+class AssemblyResult:
     """Result. `encoded` are videos whose pictures were coded again, `left_out` is what was not taken on."""
 
     dataset: Path
@@ -124,12 +124,12 @@ class Assembled:
 def assemble(
     target: Path,
     version: str,
-    parts: Sequence[Part],
+    parts: Sequence[EpisodeRef],
     *,
     reencode: bool = False,
     replacing: bool = False,
-    tell: Tell = silent,
-) -> Assembled:
+    tell: ProgressCallback = ignore_progress,
+) -> AssemblyResult:
     """Write the dataset `target` with `parts` as its episodes 0, 1, ...; it appears whole or not at all.
 
     Rows, statistics and tasks are those of the sources; coded pictures are copied, one video per episode. Where they
@@ -145,12 +145,12 @@ def assemble(
         try:
             made = _Assembly(draft.folder, version, parts, reencode, not replacing).write(tell)
         except OSError as error:
-            raise disk_fault("assembling", draft.folder, error) from error
-        draft.place()
+            raise disk_error("assembling", draft.folder, error) from error
+        draft.commit()
     return replace(made, dataset=Path(target))
 
 
-def _require_same(parts: Sequence[Part]) -> None:
+def _require_same(parts: Sequence[EpisodeRef]) -> None:
     first = parts[0].source
     for source in _sources(parts)[1:]:
         one, other = first.dataset, source.dataset
@@ -162,7 +162,7 @@ def _require_same(parts: Sequence[Part]) -> None:
             )
             if stated != given
         ]
-        found += differences(first.features, source.features)
+        found += feature_differences(first.features, source.features)
         found += [
             f"video {key!r} is {mine}, there {theirs}"
             for key in layout.video_keys(first.features)
@@ -184,12 +184,12 @@ def _bytes(dataset: Dataset, name: str) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def _codec(source: Source, key: str) -> Any:
+def _codec(source: SourceDataset, key: str) -> Any:
     info = source.features.get(key, {}).get("info") or {}
     return {name: info.get(name) for name in ("video.codec", "video.pix_fmt")}
 
 
-def _sources(parts: Sequence[Part]) -> list[Source]:
+def _sources(parts: Sequence[EpisodeRef]) -> list[SourceDataset]:
     return list({id(part.source): part.source for part in parts}.values())
 
 
@@ -197,7 +197,7 @@ class _Assembly:
     """One new dataset on its way into the folder `root`."""
 
     def __init__(
-        self, root: Path, version: str, parts: Sequence[Part], reencode: bool, copying: bool
+        self, root: Path, version: str, parts: Sequence[EpisodeRef], reencode: bool, copying: bool
     ) -> None:
         self._root = root
         self._copying = copying
@@ -213,7 +213,7 @@ class _Assembly:
         }
         self._tasks = tuple(dict.fromkeys(task for source in self._sources for task in source.tasks))
         self._fps = first.dataset.fps
-        self._info = info_of(
+        self._info = new_info(
             self._common(),
             robot=first.dataset.info.get("robot_type"),
             fps=self._fps,
@@ -275,7 +275,7 @@ class _Assembly:
             return True
         return False
 
-    def write(self, tell: Tell) -> Assembled:
+    def write(self, tell: ProgressCallback) -> AssemblyResult:
         lines, statistics, eva, first = [], [], [], 0
         for index, part in enumerate(self._parts):
             tell(f"episode {index + 1} of {len(self._parts)}")
@@ -303,7 +303,7 @@ class _Assembly:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
         self._others() if self._copying else self._carry(self._sources[0])
-        return Assembled(
+        return AssemblyResult(
             self._root,
             catalog.version,
             len(lines),
@@ -312,11 +312,11 @@ class _Assembly:
             tuple(self._left_out),
         )
 
-    def _line(self, part: Part, index: int, first: int) -> Line:
+    def _line(self, part: EpisodeRef, index: int, first: int) -> Line:
         listed = part.source.dataset.entry(part.index)
-        return own_line(self._info, index, list(listed.tasks), listed.length, first)
+        return single_file_line(self._info, index, list(listed.tasks), listed.length, first)
 
-    def _episode(self, part: Part, line: Line, first: int) -> dict[str, Statistic]:
+    def _episode(self, part: EpisodeRef, line: Line, first: int) -> dict[str, Statistic]:
         """Write rows and videos of one episode; its statistics."""
         placed = entry(self._root, self._info, line)
         table = self._table(part, line, first)
@@ -331,18 +331,18 @@ class _Assembly:
         for key in layout.image_keys(self._features):
             if key not in statistics:
                 name = f"{part.source.dataset.root}, episode {part.index}, column {key!r}"
-                made = picture_statistic(StoredPictures(name, table.column(key).to_pylist(), self._root))
+                made = picture_statistic(StoredImages(name, table.column(key).to_pylist(), self._root))
                 if made is not None:
                     statistics[key] = made
         if self._info["codebase_version"] == layout.V21:
             statistics |= {key: _of_three(statistics[key]) for key in self._shown if key in statistics}
-        return statistics | _completed(statistics, self._computed(part, table))
+        return statistics | _fill_statistics(statistics, self._computed(part, table))
 
     @property
     def _shown(self) -> list[str]:
         return [*layout.video_keys(self._features), *layout.image_keys(self._features)]
 
-    def _given(self, part: Part) -> dict[str, Statistic]:
+    def _given(self, part: EpisodeRef) -> dict[str, Statistic]:
         """The source's statistics of an episode, but for those that are made anew."""
         found = {}
         for key, statistic in part.source.statistics.get(part.index, {}).items():
@@ -355,25 +355,25 @@ class _Assembly:
                 found[key] = statistic
         return found
 
-    def _computed(self, part: Part, table: pa.Table) -> dict[str, Statistic]:
+    def _computed(self, part: EpisodeRef, table: pa.Table) -> dict[str, Statistic]:
         columns = {}
-        for key, feature in stored(self._features).items():
+        for key, feature in stored_features(self._features).items():
             if feature["dtype"] in WORDS:
                 continue
             if wrong := other_shape(key, feature, row_shape(table, key)):
                 raise RecordingError(f"{part.source.dataset.root}, episode {part.index}: {wrong}")
-            rows = numbers(table, key, math.prod(feature["shape"]))
+            rows = column_array(table, key, math.prod(feature["shape"]))
             columns[key] = rows.reshape(table.num_rows, *feature["shape"])
         return column_statistics(columns, {key: self._features[key] for key in columns})
 
-    def _table(self, part: Part, line: Line, first: int) -> pa.Table:
+    def _table(self, part: EpisodeRef, line: Line, first: int) -> pa.Table:
         """The rows of an episode in their new place, exactly the declared columns."""
         import pyarrow as pa
 
         source, index = part.source, part.index
         table = source.dataset.table(index)
-        table = table.rename_columns([source.names.new(name) for name in table.column_names])
-        columns = stored(self._features)
+        table = table.rename_columns([source.names.new_name(name) for name in table.column_names])
+        columns = stored_features(self._features)
         missing = [key for key in columns if key not in table.column_names]
         if missing:
             raise RecordingError(
@@ -388,7 +388,7 @@ class _Assembly:
         fresh = {
             "episode_index": np.full(rows, line["episode_index"], np.int64),
             "index": np.arange(first, first + rows, dtype=np.int64),
-            "task_index": self._task_numbers(part, numbers(table, "task_index").reshape(-1)),
+            "task_index": self._task_numbers(part, column_array(table, "task_index").reshape(-1)),
         }
         arrays = []
         for field in schema:
@@ -398,7 +398,7 @@ class _Assembly:
                 arrays.append(self._cast(part, table.column(field.name), field))
         return pa.Table.from_arrays(arrays, schema=schema)
 
-    def _task_numbers(self, part: Part, given: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def _task_numbers(self, part: EpisodeRef, given: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
         known = part.source.dataset.tasks
         unknown = sorted(set(given.tolist()) - set(known))
         if unknown:
@@ -409,14 +409,14 @@ class _Assembly:
         numbered = {number: self._tasks.index(task) for number, task in known.items()}
         return np.array([numbered[number] for number in given.tolist()], np.int64)
 
-    def _cast(self, part: Part, column: pa.ChunkedArray, field: pa.Field) -> pa.Array:
+    def _cast(self, part: EpisodeRef, column: pa.ChunkedArray, field: pa.Field) -> pa.Array:
         import pyarrow as pa
         import pyarrow.compute as pc
 
         array = column.combine_chunks()
         root, where = part.source.dataset.root, f"episode {part.index}, column {field.name!r}"
         if pa.types.is_struct(field.type):
-            pictures = StoredPictures(f"{root}, {where}", array.to_pylist(), root)
+            pictures = StoredImages(f"{root}, {where}", array.to_pylist(), root)
             return pa.array([pictures.row(k) for k in range(len(pictures))], field.type)
         nested = pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type)
         if nested and not (pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type)):
@@ -436,23 +436,23 @@ class _Assembly:
             )
         return found
 
-    def _video(self, part: Part, key: str, target: Path, frames: int) -> None:
-        span = part.source.dataset.entry(part.index).videos[part.source.names.old(key)]
+    def _video(self, part: EpisodeRef, key: str, target: Path, frames: int) -> None:
+        span = part.source.dataset.entry(part.index).videos[part.source.names.old_name(key)]
         try:
-            cut(span, target, frames, self._fps)
+            copy_segment(span, target, frames, self._fps)
         except NotCopyableError as error:
             if not self._reencode:
                 raise RecordingError(
                     f"{error}. Code its pictures again with --reencode: they lose a little"
                 ) from error
-            encode(span, target, frames, self._fps)
+            encode_segment(span, target, frames, self._fps)
             self._encoded.append(f"{key} of episode {part.index} of {part.source.dataset.root}")
         for kind in sorted(other_streams(span.path) - other_streams(target)):
             self._left_out[f"{kind} of {span.path}: the video is written without it"] = None
 
-    def _sides(self, part: Part, uuid: str) -> None:
-        for kind, path in side_files(part.source.dataset.root, uuid).items():
-            target = side_file(self._root, kind, uuid)
+    def _sides(self, part: EpisodeRef, uuid: str) -> None:
+        for kind, path in sidecar_paths(part.source.dataset.root, uuid).items():
+            target = sidecar_path(self._root, kind, uuid)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
 
@@ -474,14 +474,14 @@ class _Assembly:
                 else:
                     self._left_out[str(path)] = None
 
-    def _carry(self, source: Source) -> None:
+    def _carry(self, source: SourceDataset) -> None:
         """Take along everything in the folder that is replaced but the format's own files and those of episodes."""
         root = source.dataset.root
         listed = source.dataset.episodes
         known = {root / name for name in _OURS} | {root / LOCK}
         known |= {path for one in listed for path in (one.data, *(span.path for span in one.videos.values()))}
         known |= {
-            path for told in source.eva.values() for path in side_files(root, str(told["uuid"])).values()
+            path for told in source.eva.values() for path in sidecar_paths(root, str(told["uuid"])).values()
         }
         known |= set((root / EPISODES_FOLDER).rglob("*.parquet"))
         for path in sorted(root.rglob("*")):
@@ -557,7 +557,7 @@ def _is_json(values: Sequence[Any]) -> bool:
         return False
 
 
-def _folders(source: Source) -> set[str]:
+def _folders(source: SourceDataset) -> set[str]:
     """The folders of a dataset whose contents belong to episodes."""
     root = source.dataset.root
     listed = source.dataset.episodes
@@ -571,6 +571,8 @@ def _of_three(statistic: Statistic) -> Statistic:
     return statistic | {name: (statistic[name] * 3)[:3] for name in figures}
 
 
-def _completed(given: Mapping[str, Statistic], computed: Mapping[str, Statistic]) -> dict[str, Statistic]:
+def _fill_statistics(
+    given: Mapping[str, Statistic], computed: Mapping[str, Statistic]
+) -> dict[str, Statistic]:
     """The figures that are given, and of each column those that are not."""
     return {key: {**statistic, **given.get(key, {})} for key, statistic in computed.items()}

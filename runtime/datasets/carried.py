@@ -33,7 +33,7 @@ _POSES = ("eef", "eef_action")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Carried:
+class ExtraStreams:
     """`vectors` [N, W] by stream, the `columns` they are from, the names of poses; what is left out, and why."""
 
     vectors: Mapping[str, Float32]
@@ -47,7 +47,7 @@ class Carried:
         return {stream: None if np.isnan(vector).all() else vector for stream, vector in given.items()}
 
 
-def carried(dataset: Dataset, index: int, state: str) -> Carried:
+def read_extra_streams(dataset: Dataset, index: int, state: str) -> ExtraStreams:
     """Streams of episode `index` beside the joints in `state`: as many numbers, or poses written as ours."""
     vectors: dict[str, Float32] = {}
     columns: dict[str, str] = {}
@@ -65,10 +65,10 @@ def carried(dataset: Dataset, index: int, state: str) -> Carried:
             continue
         columns[stream] = column
         names = told or names
-    return Carried(vectors, columns, names, left_out)
+    return ExtraStreams(vectors, columns, names, left_out)
 
 
-def names_of(feature: Mapping[str, Any]) -> list[str]:
+def dimension_names(feature: Mapping[str, Any]) -> list[str]:
     """A feature's names of its numbers; [] where it does not say."""
     names = feature.get("names")
     if isinstance(names, Mapping) and len(names) == 1:  # {"motors": [...]}, as some have it
@@ -77,7 +77,7 @@ def names_of(feature: Mapping[str, Any]) -> list[str]:
 
 
 def _pose_names(dataset: Dataset, column: str, others: Sequence[str]) -> list[str]:
-    told = names_of(dataset.features[column])
+    told = dimension_names(dataset.features[column])
     fields = [name.rpartition(".")[2] for name in told]
     if not told or fields != list(EEF_FIELDS) * (len(told) // len(EEF_FIELDS)):
         raise RecordingError(

@@ -18,10 +18,10 @@ from runtime.datasets.entries import (
     statistic_lines,
     task_lines,
 )
-from runtime.datasets.features import Features, differences, figure_shapes, plain_rate
+from runtime.datasets.features import Features, feature_differences, figure_shapes, whole_rate
 from runtime.datasets.layout import Line
 from runtime.datasets.splits import with_more
-from runtime.datasets.stats import Statistic, aggregate, fault
+from runtime.datasets.stats import Statistic, aggregate_statistics, fault
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,15 +122,15 @@ class Catalog:
             )
             if stated != new
         ]
-        found += differences(self.features, features)
+        found += feature_differences(self.features, features)
         if found:
             raise RecordingError(f"{self.root} holds other data: {'; '.join(found)}. Publish elsewhere")
 
-    def created(self, robot: str, fps: float, features: Features, version: str) -> Catalog:
+    def with_info(self, robot: str, fps: float, features: Features, version: str) -> Catalog:
         """The catalog with an info.json, as it was or for the first time."""
         if self.info:
             return self
-        return replace(self, info=info_of({}, robot=robot, fps=fps, features=features, version=version))
+        return replace(self, info=new_info({}, robot=robot, fps=fps, features=features, version=version))
 
     def line(self, index: int, tasks: Sequence[str], length: int) -> Line:
         """Line of episode `index` in the list of episodes: where it is, or will be, and what it holds."""
@@ -138,7 +138,7 @@ class Catalog:
             return self.episodes[index] | {"tasks": list(tasks), "length": length}
         last = self.episodes[-1] if self.episodes else {}
         lists = {name: last.get(name, 0) for name in (parquet_lists.CHUNK, parquet_lists.FILE)}
-        made = own_line(self.info, self._next_file(), tasks, length, self.first_index(index))
+        made = single_file_line(self.info, self._next_file(), tasks, length, self.first_index(index))
         return made | {"episode_index": index} | (lists if self.version == layout.V30 else {})
 
     def _next_file(self) -> int:
@@ -170,7 +170,7 @@ class Catalog:
                 )
         return made
 
-    def including(self, line: Line, statistics: Mapping[str, Statistic], eva: Line | None) -> Catalog:
+    def with_episode(self, line: Line, statistics: Mapping[str, Statistic], eva: Line | None) -> Catalog:
         """The catalog with the episode of `line` added or replaced, and the totals that follow."""
         index = int(line["episode_index"])
         tasks = self.tasks
@@ -235,7 +235,7 @@ class Catalog:
 
     def _documents(self) -> dict[str, bytes]:
         shared = {
-            layout.STATS: _object(aggregate(line["stats"] for line in self.statistics)),
+            layout.STATS: _object(aggregate_statistics(line["stats"] for line in self.statistics)),
             layout.EVA_EPISODES: _lines(self.eva),
         }
         if self.version == layout.V30:
@@ -249,7 +249,7 @@ class Catalog:
         }
 
 
-def own_line(info: layout.Info, number: int, tasks: Sequence[str], length: int, first: int) -> Line:
+def single_file_line(info: layout.Info, number: int, tasks: Sequence[str], length: int, first: int) -> Line:
     """Line of episode `number` in the list of episodes; its files are its own, its rows begin at `first`."""
     line: Line = {"episode_index": number, "tasks": list(tasks), "length": length}
     if info["codebase_version"] != layout.V30:
@@ -271,7 +271,7 @@ def own_line(info: layout.Info, number: int, tasks: Sequence[str], length: int, 
     return line | {parquet_lists.CHUNK: 0, parquet_lists.FILE: 0}
 
 
-def info_of(
+def new_info(
     given: Mapping[str, Any],
     *,
     robot: str | None,
@@ -295,7 +295,7 @@ def info_of(
     video_path = layout.VIDEO_PATH_V30 if v30 else layout.VIDEO_PATH
     info |= {
         "chunks_size": layout.CHUNKS_SIZE,
-        "fps": plain_rate(fps),
+        "fps": whole_rate(fps),
         "splits": {},
         "data_path": layout.DATA_PATH_V30 if v30 else layout.DATA_PATH,
         "video_path": video_path if layout.video_keys(features) else None,

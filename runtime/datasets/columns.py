@@ -16,10 +16,10 @@ from runtime.datasets.features import (
     Features,
     arrow_schema,
     scalar,
-    stored,
+    stored_features,
     vector,
 )
-from runtime.datasets.journal import RecordedJournal
+from runtime.datasets.journal import FinishedEpisode
 from runtime.datasets.stats import Statistic, column_statistic
 
 if TYPE_CHECKING:
@@ -37,11 +37,11 @@ EXTRA_VECTORS = {
 }
 NOT_FINITE = "not_finite"
 # Flags that datasets have had only since the recorder says them; what ends with a dot stands for one per camera.
-LATER = ("skewed", NOT_FINITE, "lost.", "stale.")
+LATER_FLAGS = ("skewed", NOT_FINITE, "lost.", "stale.")
 TIMESTAMP_TOLERANCE = 1e-4  # of LeRobot: distance of neighbouring timestamps from 1 / fps [s]
 
 
-def column_features(journal: RecordedJournal, with_success: bool) -> Features:
+def column_features(journal: FinishedEpisode, with_success: bool) -> Features:
     """The declared features of the episode's columns, without its videos."""
     robot = journal.manifest["robot"]
     features: Features = {
@@ -62,16 +62,16 @@ def column_features(journal: RecordedJournal, with_success: bool) -> Features:
     return features | {name: scalar(dtype) for name, dtype in INDEX_COLUMNS.items()}
 
 
-def _flags(journal: RecordedJournal) -> list[str]:
+def _flags(journal: FinishedEpisode) -> list[str]:
     flags = ["intervention"]
     flags += ["eef_measured"] if journal.has_stream("eef") else []
     flags += ["eef_action_reported"] if journal.has_stream("eef_action") else []
     return flags + [f"repeated.{camera}" for camera in journal.cameras]
 
 
-def _later(journal: RecordedJournal) -> list[str]:
-    by_camera = [name for name in LATER if name.endswith(".")]
-    plain = [name for name in LATER if name not in by_camera]
+def _later(journal: FinishedEpisode) -> list[str]:
+    by_camera = [name for name in LATER_FLAGS if name.endswith(".")]
+    plain = [name for name in LATER_FLAGS if name not in by_camera]
     return plain + [f"{name}{camera}" for name in by_camera for camera in journal.cameras]
 
 
@@ -81,11 +81,11 @@ def without_later(features: Features, known: Collection[str]) -> Features:
         key: feature
         for key, feature in features.items()
         if key in known
-        or not any(key == name or (name[-1] == "." and key.startswith(name)) for name in LATER)
+        or not any(key == name or (name[-1] == "." and key.startswith(name)) for name in LATER_FLAGS)
     }
 
 
-def recorded_columns(journal: RecordedJournal, features: Mapping[str, Feature]) -> Columns:
+def recorded_columns(journal: FinishedEpisode, features: Mapping[str, Feature]) -> Columns:
     """The columns of `features` that the journal holds or that follow from the grid.
 
     Numbers that are not finite in what was observed are 0, their rows flagged; in an action they are a RecordingError.
@@ -114,7 +114,7 @@ def recorded_columns(journal: RecordedJournal, features: Mapping[str, Feature]) 
     return columns
 
 
-def placed_columns(
+def position_columns(
     columns: Columns, *, episode_index: int, first_index: int, task_index: int, success: bool | None
 ) -> Columns:
     """`columns` and those that depend on the episode's place; `success` None: no such column."""
@@ -166,7 +166,7 @@ def column_statistics(columns: Columns, features: Mapping[str, Feature]) -> dict
     for one of pictures and refuses the dataset where its shape is another.
     """
     statistics = {}
-    for key, feature in stored(features).items():
+    for key, feature in stored_features(features).items():
         if feature["dtype"] in WORDS or "image" in key:
             continue
         statistic = column_statistic(columns[key])

@@ -31,11 +31,11 @@ from runtime.datasets.features import (
     is_language,
     other_shape,
     picture_size,
-    stored,
+    stored_features,
 )
-from runtime.datasets.pictures import Pictures, StoredPictures, Stretch
-from runtime.datasets.rows import numbers, read_rows, row_shape
-from runtime.datasets.sides import strays
+from runtime.datasets.pictures import StoredImages, VideoFrames, VideoSegment
+from runtime.datasets.rows import column_array, read_rows, row_shape
+from runtime.datasets.sides import orphaned_sidecars
 from runtime.datasets.splits import episodes_of
 from runtime.datasets.stats import FIGURES, fault, finite
 
@@ -53,7 +53,7 @@ class _Remark(str):
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
+class CheckResult:
     """One sentence each: `problems` contradict the metadata, `remarks` are no damage."""
 
     problems: list[str]
@@ -62,13 +62,13 @@ class Checked:
 
 def check(dataset: Path) -> list[str]:
     """Everything in `dataset` that contradicts its metadata, one sentence each; [] where it is whole."""
-    return examine(dataset).problems
+    return check_with_remarks(dataset).problems
 
 
-def examine(dataset: Path) -> Checked:
+def check_with_remarks(dataset: Path) -> CheckResult:
     """As `check`, with what is only to be said."""
     said = _said(Path(dataset))
-    return Checked(
+    return CheckResult(
         [one for one in said if not isinstance(one, _Remark)],
         [str(one) for one in said if isinstance(one, _Remark)],
     )
@@ -87,7 +87,7 @@ def _said(root: Path) -> list[str]:
             *(_places(info, lines) if v30 else ()),
             *_declarations(info),
             *_episodes(root, info, entries, statistics, {line["task_index"] for line in tasks}),
-            *_strays(root, info, entries),
+            *_uncounted_files(root, info, entries),
             *_sides(root, lines),
         ]
     except RecordingError as error:
@@ -186,7 +186,7 @@ def _episodes(
 
 
 def _table(table: pa.Table, info: layout.Info, index: int, length: int, first: int) -> Iterator[str]:
-    columns = stored(info["features"])
+    columns = stored_features(info["features"])
     for key in sorted(set(columns) - set(table.column_names)):
         yield f"there is no column {key!r}, though info.json declares it"
     for key in sorted(set(table.column_names) - set(columns)):
@@ -213,7 +213,7 @@ def _table(table: pa.Table, info: layout.Info, index: int, length: int, first: i
     if "next.done" in table.column_names:
         expected["next.done"] = frames == table.num_rows - 1
     for key, values in expected.items():
-        if key in table.column_names and not np.array_equal(numbers(table, key).reshape(-1), values):
+        if key in table.column_names and not np.array_equal(column_array(table, key).reshape(-1), values):
             yield f"{key!r} is not {values[:2].tolist()} to {values[-1:].tolist()}"
 
 
@@ -227,7 +227,7 @@ def _until_unreadable(problems: Iterator[str]) -> Iterator[str]:
 def _timestamps(table: pa.Table, info: layout.Info) -> Iterator[str]:
     if "timestamp" not in table.column_names or not table.num_rows:
         return
-    given = numbers(table, "timestamp").astype(np.float64)[:, :1].reshape(-1)
+    given = column_array(table, "timestamp").astype(np.float64)[:, :1].reshape(-1)
     expected = np.arange(table.num_rows) / float(info["fps"])
     allowed = TOLERANCE + np.spacing(np.float32(expected[-1]))  # that of the format's float32
     near = np.abs(given - expected) <= allowed
@@ -238,7 +238,7 @@ def _timestamps(table: pa.Table, info: layout.Info) -> Iterator[str]:
 
 def _values(table: pa.Table, info: layout.Info) -> Iterator[str]:
     """What no loader makes a number of: null, infinite, something else."""
-    for key, feature in stored(info["features"]).items():
+    for key, feature in stored_features(info["features"]).items():
         if key not in table.column_names or feature["dtype"] in ("image", LANGUAGE):
             continue
         column = table.column(key)
@@ -247,7 +247,7 @@ def _values(table: pa.Table, info: layout.Info) -> Iterator[str]:
         if feature["dtype"] == "string" or holds_nothing(feature):
             continue
         try:
-            values = numbers(table, key)
+            values = column_array(table, key)
             wrong = other_shape(key, feature, row_shape(table, key))
         except RecordingError as error:
             yield str(error)
@@ -262,7 +262,7 @@ def _stored_pictures(table: pa.Table, info: layout.Info, root: Path) -> Iterator
     for key in layout.image_keys(info["features"]):
         if key not in table.column_names:
             continue
-        pictures = StoredPictures(repr(key), table.column(key).to_pylist(), root)
+        pictures = StoredImages(repr(key), table.column(key).to_pylist(), root)
         missing = np.array([pictures.is_missing(k) for k in range(len(pictures))], bool)
         if missing.any():
             yield f"{key!r} has no picture in {_rows(missing)}"
@@ -302,7 +302,7 @@ def _same_type(given: pa.DataType, expected: pa.DataType) -> bool:
 def _task_indices(table: pa.Table, tasks: set[int]) -> Iterator[str]:
     if "task_index" not in table.column_names:
         return
-    unknown = set(numbers(table, "task_index").reshape(-1).tolist()) - tasks
+    unknown = set(column_array(table, "task_index").reshape(-1).tolist()) - tasks
     if unknown:
         yield f"task_index {sorted(unknown)} is not in the list of tasks"
 
@@ -317,11 +317,11 @@ def _statistics(
         return
     for key in (*layout.video_keys(info["features"]), *layout.image_keys(info["features"])):
         yield from _picture_statistic(key, info["features"][key], statistics.get(key))
-    for key, feature in stored(info["features"]).items():
+    for key, feature in stored_features(info["features"]).items():
         if feature["dtype"] in WORDS or key not in table.column_names or holds_nothing(feature):
             continue
         try:
-            values = numbers(table, key).astype(np.float64)
+            values = column_array(table, key).astype(np.float64)
         except RecordingError:
             continue  # `_values` has said it
         known = values[finite(values)]
@@ -363,13 +363,13 @@ def _column_statistic(
         if given.shape == value.shape and np.allclose(given, value, rtol=1e-4, atol=1e-5):
             continue
         text = f"{name} of {key!r} is {given.tolist()}, the rows give {value.tolist()}"
-        if given.shape == value.shape and rounded(name, given, value, known):
+        if given.shape == value.shape and is_rounding_error(name, given, value, known):
             yield _Remark(f"{text}: no more off than sums in single precision")
         else:
             yield text
 
 
-def rounded(
+def is_rounding_error(
     name: str, given: np.ndarray[Any, Any], value: np.ndarray[Any, Any], known: np.ndarray[Any, Any]
 ) -> bool:
     """True if single precision explains it: LeRobot sums float32, and its variance is E[x^2] - E[x]^2.
@@ -388,8 +388,8 @@ def rounded(
 def _video(span: Span, key: str, info: layout.Info, length: int) -> Iterator[str]:
     fps = float(info["fps"])
     try:
-        stretch = None if span.start is None else Stretch(span.start, length, fps)
-        with Pictures(span.path, stretch) as pictures:
+        stretch = None if span.start is None else VideoSegment(span.start, length, fps)
+        with VideoFrames(span.path, stretch) as pictures:
             size, times = pictures.size, np.array(pictures.times)
     except RecordingError as error:
         yield str(error)
@@ -407,7 +407,7 @@ def _video(span: Span, key: str, info: layout.Info, length: int) -> Iterator[str
         yield f"{key!r}: frame {int(off.argmax())} is {off.max():.6f} s off k / fps"
 
 
-def _strays(root: Path, info: layout.Info, entries: list[EpisodeEntry]) -> Iterator[str]:
+def _uncounted_files(root: Path, info: layout.Info, entries: list[EpisodeEntry]) -> Iterator[str]:
     """Data files beyond those that are counted: LeRobot reads every parquet file below data/."""
     cut_off, total = publishing(root), int(info["total_episodes"])
     counted = {listed.data for listed in entries if listed.index != cut_off or listed.index < total}
@@ -418,4 +418,4 @@ def _strays(root: Path, info: layout.Info, entries: list[EpisodeEntry]) -> Itera
 
 def _sides(root: Path, episodes: list[Line]) -> Iterator[str]:
     ours = of_episodes(layout.read_lines(root / layout.EVA_EPISODES), episodes)
-    yield from strays(root, {str(line["uuid"]) for line in ours})
+    yield from orphaned_sidecars(root, {str(line["uuid"]) for line in ours})

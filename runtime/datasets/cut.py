@@ -13,7 +13,7 @@ import numpy as np
 from runtime.core.errors import RecordingError
 from runtime.core.picture_bounds import TooLargeError, open_video
 from runtime.datasets.entries import Span
-from runtime.datasets.pictures import Pictures, Stretch
+from runtime.datasets.pictures import VideoFrames, VideoSegment
 from runtime.datasets.remux import copied_stream
 
 if TYPE_CHECKING:
@@ -27,14 +27,14 @@ class NotCopyableError(RecordingError):
     """The coded pictures of the episode cannot be had without those of others."""
 
 
-def cut(span: Span, target: Path, frames: int, fps: float) -> None:
+def copy_segment(span: Span, target: Path, frames: int, fps: float) -> None:
     """Put the `frames` coded pictures of `span` into `target`, frame k at k / fps, index at the front.
 
     A file that is all of that already is copied as it is. Raises NotCopyableError where the first is no key frame or
     other pictures lie between them in coded order, RecordingError where pictures are missing.
     """
-    stretch = None if span.start is None else Stretch(span.start, frames, fps)
-    with Pictures(span.path, stretch) as scan:
+    stretch = None if span.start is None else VideoSegment(span.start, frames, fps)
+    with VideoFrames(span.path, stretch) as scan:
         times, ticks = scan.times, scan.stamps
     if len(times) < frames:
         raise RecordingError(f"{span.path} has {len(times)} frames for {frames} rows")
@@ -50,15 +50,15 @@ def cut(span: Span, target: Path, frames: int, fps: float) -> None:
     _copy(span.path, target, ticks[:frames], fps)
 
 
-def encode(span: Span, target: Path, frames: int, fps: float) -> None:
+def encode_segment(span: Span, target: Path, frames: int, fps: float) -> None:
     """As `cut`, but with the pictures decoded and coded again as H.264: they lose a little."""
     import av
 
-    stretch = None if span.start is None else Stretch(span.start, frames, fps)
+    stretch = None if span.start is None else VideoSegment(span.start, frames, fps)
     rate = Fraction(fps).limit_denominator(10_000)
     try:
         with (
-            Pictures(span.path, stretch) as pictures,
+            VideoFrames(span.path, stretch) as pictures,
             av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
         ):
             if pictures.is_deep:
@@ -86,7 +86,7 @@ def other_streams(path: Path) -> set[str]:
 
 def _is_ready(path: Path, frames: int, fps: float) -> bool:
     """True if the whole file is what is wanted: these frames at these times, its index at the front."""
-    with Pictures(path) as whole:
+    with VideoFrames(path) as whole:
         times = whole.times
     if len(times) != frames or np.abs(np.array(times) - np.arange(frames) / fps).max() > TOLERANCE:
         return False

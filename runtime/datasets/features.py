@@ -50,19 +50,19 @@ def video(height: int, width: int, fps: float, codec: str, pixels: str) -> Featu
             "video.codec": codec,
             "video.pix_fmt": pixels,
             "video.is_depth_map": False,
-            "video.fps": plain_rate(fps),
+            "video.fps": whole_rate(fps),
             "video.channels": 3,
             "has_audio": False,
         },
     }
 
 
-def plain_rate(fps: float) -> int | float:
+def whole_rate(fps: float) -> int | float:
     """A whole rate as int, as other readers expect it."""
     return int(fps) if float(fps).is_integer() else float(fps)
 
 
-def stored(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+def stored_features(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
     """The features that have a parquet column: all but the videos."""
     return {key: feature for key, feature in features.items() if feature["dtype"] != "video"}
 
@@ -164,7 +164,7 @@ def arrow_schema(
     """
     import pyarrow as pa
 
-    columns = stored(features)
+    columns = stored_features(features)
     worded = {key: (given or {})[key] for key, feature in columns.items() if feature["dtype"] == LANGUAGE}
     declared = {key: _hugging_face(feature) for key, feature in columns.items() if key not in worded}
     metadata = {"huggingface": json.dumps({"info": {"features": declared}})}
@@ -187,7 +187,9 @@ def _hugging_face(feature: Mapping[str, Any]) -> dict[str, Any]:
     return value if shape in ([], [1]) else {"feature": value, "length": shape[0], "_type": "Sequence"}
 
 
-def differences(stated: Mapping[str, Mapping[str, Any]], new: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def feature_differences(
+    stated: Mapping[str, Mapping[str, Any]], new: Mapping[str, Mapping[str, Any]]
+) -> list[str]:
     """Differences between the features of a dataset and those of a new episode, one sentence each."""
     found = [f"the dataset has no {key!r}" for key in new if key not in stated]
     found += [f"the episode has no {key!r}" for key in stated if key not in new]

@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from runtime.core.errors import RecordingError
-from runtime.datasets.assemble import Tell, silent
+from runtime.datasets.assemble import ProgressCallback, ignore_progress
 from runtime.datasets.consistency import check
 from runtime.datasets.layout import read_info
 from runtime.datasets.staging import LOCK
@@ -16,7 +16,9 @@ _REPLACED = ("data", "videos", "images", "meta", "eva")  # there, what is not he
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}", re.ASCII)
 
 
-def push(dataset: Path, repository: str, *, private: bool = True, tell: Tell = silent) -> str:
+def push(
+    dataset: Path, repository: str, *, private: bool = True, tell: ProgressCallback = ignore_progress
+) -> str:
     """Upload `dataset` as `repository` ("owner/name"), tagged with the version of the format; its address.
 
     What the repository had of an older one in the folders of datasets is replaced. The client logs in with what its own

@@ -17,27 +17,27 @@ import pyarrow.compute as pc
 
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
-from runtime.datasets.assemble import Tell, silent
+from runtime.datasets.assemble import ProgressCallback, ignore_progress
 from runtime.datasets.catalog import Catalog
 from runtime.datasets.entries import EpisodeEntry
 from runtime.datasets.operations import convert
-from runtime.datasets.pictures import Pictures, StoredPictures, Stretch
+from runtime.datasets.pictures import StoredImages, VideoFrames, VideoSegment
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.datasets.rows import is_list
-from runtime.datasets.staging import locked
+from runtime.datasets.staging import lock_dataset
 from runtime.recording.base import IMPORTED
-from runtime.recording.files import disk_fault, sync_folder, write_whole
+from runtime.recording.files import disk_error, sync_folder, write_atomic
 
 _PLACES = ("index", "episode_index", "task_index")  # of a dataset, not of the episode
 
 
-def named_copy(
+def copy_with_uuids(
     dataset: Path,
     target: Path,
     *,
     rename: Mapping[str, str] | None = None,
     reencode: bool = False,
-    tell: Tell = silent,
+    tell: ProgressCallback = ignore_progress,
 ) -> Dataset:
     """The dataset at `target`, with a uuid for each episode: a copy, or itself where both are one folder.
 
@@ -50,7 +50,7 @@ def named_copy(
         if rename:
             raise RecordingError(f"{dataset} keeps its names: import it under another one to rename features")
         Catalog.read(dataset)  # what our own tools cannot go on with is copied first
-        with locked(dataset):
+        with lock_dataset(dataset):
             _name(dataset)
     elif target.exists():
         _require_same(dataset, target, tell)
@@ -64,7 +64,7 @@ def uuids_of(dataset: Path) -> dict[int, str]:
     return {int(line["episode_index"]): str(line["uuid"]) for line in _told(dataset)}
 
 
-def identity(dataset: Dataset, index: int, place: int | None = None) -> str:
+def content_uuid(dataset: Dataset, index: int, place: int | None = None) -> str:
     """A uuid of what the episode holds: each column by its name, its tasks, its coded pictures; RecordingError.
 
     `place`: the index that the episode has in a copy without gaps.
@@ -75,12 +75,12 @@ def identity(dataset: Dataset, index: int, place: int | None = None) -> str:
         name: _digest_column(table[name]) for name in table.column_names if name not in (*_PLACES, *stored)
     }
     for key in stored:
-        pictures = StoredPictures(f"{entry.data}, {key!r}", table[key].to_pylist(), dataset.root)
+        pictures = StoredImages(f"{entry.data}, {key!r}", table[key].to_pylist(), dataset.root)
         rows = (pictures.row(row) for row in range(len(pictures)))
         held[key] = _digest(b"" if row is None else row["bytes"] for row in rows)
     for key, span in entry.videos.items():
-        stretch = None if span.start is None else Stretch(span.start, entry.length, dataset.fps)
-        with Pictures(span.path, stretch) as video:
+        stretch = None if span.start is None else VideoSegment(span.start, entry.length, dataset.fps)
+        with VideoFrames(span.path, stretch) as video:
             held[key] = _digest(video.coded())
     told = [index if place is None else place, dataset.fps, table.num_rows, sorted(entry.tasks), held]
     content = json.dumps(told, sort_keys=True, ensure_ascii=True).encode()
@@ -125,7 +125,9 @@ def _identity_of_numbers(dataset: Dataset, index: int, place: int) -> str:
     return str(uuid5(NAMESPACE_URL, f"eva-imported:{hashlib.sha256(told.encode()).hexdigest()}"))
 
 
-def _copy(dataset: Path, target: Path, rename: Mapping[str, str], reencode: bool, tell: Tell) -> None:
+def _copy(
+    dataset: Path, target: Path, rename: Mapping[str, str], reencode: bool, tell: ProgressCallback
+) -> None:
     version = str(layout.read_info(dataset)["codebase_version"])
     draft = target.with_name(f".{target.name}.{IMPORTED}")
     try:
@@ -144,7 +146,7 @@ def _copy(dataset: Path, target: Path, rename: Mapping[str, str], reencode: bool
         for thing in made.left_out:
             tell(f"left out: {thing}")
     except OSError as error:
-        raise disk_fault("importing into", target, error) from error
+        raise disk_error("importing into", target, error) from error
     finally:
         shutil.rmtree(draft, ignore_errors=True)
 
@@ -155,9 +157,9 @@ def _name(root: Path, sources: Mapping[int, tuple[Dataset, int]] | None = None) 
     lines = []
     for entry in dataset.episodes:
         source, index = (sources or {}).get(entry.index, (dataset, entry.index))
-        lines.append(told.get(entry.index) or _line(entry, identity(source, index, entry.index)))
+        lines.append(told.get(entry.index) or _line(entry, content_uuid(source, index, entry.index)))
     content = "".join(json.dumps(line, ensure_ascii=False) + "\n" for line in lines)
-    write_whole(root / layout.EVA_EPISODES, content.encode())
+    write_atomic(root / layout.EVA_EPISODES, content.encode())
 
 
 def _line(entry: EpisodeEntry, uuid: str) -> dict[str, Any]:
@@ -172,14 +174,14 @@ def _line(entry: EpisodeEntry, uuid: str) -> dict[str, Any]:
     }
 
 
-def _require_same(dataset: Path, target: Path, tell: Tell) -> None:
+def _require_same(dataset: Path, target: Path, tell: ProgressCallback) -> None:
     source, known, there = open_dataset(dataset), uuids_of(dataset), uuids_of(target)
     other = RecordingError(f"{target} is there and holds other episodes: import {dataset} under another name")
     if len(there) != len(source.episodes):
         raise other
     by_numbers = 0
     for place, entry in enumerate(source.episodes):
-        uuid = known.get(entry.index) or identity(source, entry.index, place)
+        uuid = known.get(entry.index) or content_uuid(source, entry.index, place)
         if there.get(place) == uuid:
             continue
         by_numbers += 1

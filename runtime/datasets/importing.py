@@ -20,15 +20,15 @@ import robots
 from runtime.core.errors import RecordingError
 from runtime.core.types import Float32
 from runtime.datasets import layout
-from runtime.datasets.carried import Carried, carried, names_of
+from runtime.datasets.carried import ExtraStreams, dimension_names, read_extra_streams
 from runtime.datasets.identities import uuids_of
 from runtime.datasets.mapping import ColumnMapping, video_key
-from runtime.datasets.pictures import PictureSequence
+from runtime.datasets.pictures import ImageSequence
 from runtime.datasets.reader import Dataset, RecordedEpisode
 from runtime.recording.base import IMPORTED, ExecutedTick, Outcome, Row
 from runtime.recording.episode import EpisodeJournal
-from runtime.recording.files import disk_fault, sync_folder
-from runtime.recording.scrub import require_sound
+from runtime.recording.files import disk_error, sync_folder
+from runtime.recording.scrub import require_intact
 from runtime.recording.settings import RecordingSettings
 
 STATES = ("observation.state", "observation.qpos")  # measured joints, the first that there is
@@ -36,7 +36,7 @@ ACTION = "action"
 
 
 @dataclass(frozen=True, slots=True)
-class Whose:
+class SourceRobot:
     """Facts missing in a dataset: `state`, the column of measured joints; `robot`, whose numbers they are."""
 
     state: str = ""
@@ -47,17 +47,17 @@ class Whose:
         feature = dataset.features[self.state]
         width = int(feature["shape"][0])
         if self.robot:
-            joints = list(robots.load(self.robot).joint_names)
+            joints = list(robots.load_robot(self.robot).joint_names)
             if len(joints) != width:
                 raise RecordingError(
                     f"{dataset.root}: {self.state} has {width} numbers, {self.robot} has {len(joints)} joints"
                 )
             return joints
-        told = names_of(feature)
+        told = dimension_names(feature)
         return told if len(told) == width else [f"{self.state}[{k}]" for k in range(width)]
 
 
-def whose(dataset: Dataset, state: str = "", robot: str = "") -> Whose:
+def resolve_source_robot(dataset: Dataset, state: str = "", robot: str = "") -> SourceRobot:
     """Checked: the column is there, the robot is known; RecordingError names what there is."""
     vectors = [name for name, feature in dataset.features.items() if _is_vector(feature)]
     found = state or next((name for name in STATES if name in vectors), "")
@@ -66,12 +66,12 @@ def whose(dataset: Dataset, state: str = "", robot: str = "") -> Whose:
             f"{dataset.root} has no column {found or ' or '.join(STATES)} of measured joints: name one of "
             f"{', '.join(vectors) or 'none, it has no vectors'}"
         )
-    if robot and robot not in robots.names():
-        raise RecordingError(f"robot {robot!r} does not exist; there are: {', '.join(robots.names())}")
-    return Whose(found, robot)
+    if robot and robot not in robots.robot_names():
+        raise RecordingError(f"robot {robot!r} does not exist; there are: {', '.join(robots.robot_names())}")
+    return SourceRobot(found, robot)
 
 
-def bring(dataset: Dataset, index: int, episodes: Path, told: Whose) -> tuple[str, bool]:
+def import_episode(dataset: Dataset, index: int, episodes: Path, told: SourceRobot) -> tuple[str, bool]:
     """Make the folder of episode `index` in `episodes`; its uuid, and whether it was not there. RecordingError.
 
     It appears whole or not at all; DamagedError where it is there and is not what was imported. The dataset lies in the
@@ -80,7 +80,7 @@ def bring(dataset: Dataset, index: int, episodes: Path, told: Whose) -> tuple[st
     uuid = uuids_of(dataset.root)[index]
     folder, drafts = episodes / uuid, episodes.parent / f".{IMPORTED}"
     if folder.exists():
-        require_sound(folder)
+        require_intact(folder)
         return uuid, False
     try:
         shutil.rmtree(drafts / uuid, ignore_errors=True)  # what a crash left
@@ -89,18 +89,18 @@ def bring(dataset: Dataset, index: int, episodes: Path, told: Whose) -> tuple[st
         os.rename(made, folder)
         sync_folder(episodes)
     except OSError as error:
-        raise disk_fault("importing into", folder, error) from error
+        raise disk_error("importing into", folder, error) from error
     finally:
         shutil.rmtree(drafts / uuid, ignore_errors=True)
     return uuid, True
 
 
-def _recorded(dataset: Dataset, index: int, uuid: str, root: Path, told: Whose, name: str) -> Path:
+def _recorded(dataset: Dataset, index: int, uuid: str, root: Path, told: SourceRobot, name: str) -> Path:
     keys = [*layout.video_keys(dataset.features), *layout.image_keys(dataset.features)]
     cameras = {key.removeprefix(video_key("")).replace("/", "."): key for key in keys}
     action = ACTION if _is_vector(dataset.features.get(ACTION, {})) else None
     episode = dataset.episode(index, ColumnMapping(state=told.state, action=action, videos=cameras))
-    beside = carried(dataset, index, told.state)
+    beside = read_extra_streams(dataset, index, told.state)
     settings = RecordingSettings(min_free_bytes=0)
     with ExitStack() as stack:
         pictures = {camera: stack.enter_context(episode.pictures(camera)) for camera in cameras}
@@ -117,7 +117,7 @@ def _recorded(dataset: Dataset, index: int, uuid: str, root: Path, told: Whose, 
             raise
         reason = "; ".join([f"imported: episode {index} of {name}", *beside.left_out])
         journal.end(Outcome("finished", reason, time.time()))
-    if losses := journal.losses():
+    if losses := journal.pop_lost_cameras():
         raise RecordingError(f"{dataset.root}, episode {index}: {'; '.join(loss.text for loss in losses)}")
     return root / uuid
 
@@ -126,10 +126,10 @@ def _manifest(
     dataset: Dataset,
     episode: RecordedEpisode,
     uuid: str,
-    told: Whose,
+    told: SourceRobot,
     name: str,
     sizes: Mapping[str, Any],
-    beside: Carried,
+    beside: ExtraStreams,
 ) -> dict[str, Any]:
     joints = told.names(dataset)
     own = str(dataset.info.get("robot_type") or "")
@@ -165,13 +165,13 @@ def _manifest(
     }
 
 
-def _sizes(pictures: Mapping[str, PictureSequence], settings: RecordingSettings) -> dict[str, Any]:
+def _sizes(pictures: Mapping[str, ImageSequence], settings: RecordingSettings) -> dict[str, Any]:
     given = {camera: (each[0].shape[0], each[0].shape[1]) for camera, each in pictures.items()}
     sizes = settings.sizes(given)
     return {camera: {"width": width, "height": height} for camera, (height, width) in sizes.items()}
 
 
-def _row(episode: RecordedEpisode, row: int, pictures: Mapping[str, Any], beside: Carried) -> Row:
+def _row(episode: RecordedEpisode, row: int, pictures: Mapping[str, Any], beside: ExtraStreams) -> Row:
     return Row(
         index=row,
         step=row,

@@ -16,7 +16,7 @@ from runtime.recording.reader import Episode, open_episode
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RecordedJournal:
+class FinishedEpisode:
     """A finished episode: what its manifest and outcome say, and its rows column by column."""
 
     episode: Episode
@@ -101,7 +101,7 @@ class RecordedJournal:
         return self.episode.rows.column(name).combine_chunks()
 
 
-def read_journal(folder: Path) -> RecordedJournal:
+def read_finished_episode(folder: Path) -> FinishedEpisode:
     """The finished episode in `folder`; raises RecordingError where it is none, or not yet finished."""
     episode = open_episode(folder)
     if episode.outcome is None:
@@ -116,4 +116,4 @@ def read_journal(folder: Path) -> RecordedJournal:
             raise RecordingError(
                 f"{folder / 'manifest.json'}: robot.{key} is {names!r}, must be {width} names"
             )
-    return RecordedJournal(episode, episode.manifest, episode.outcome)
+    return FinishedEpisode(episode, episode.manifest, episode.outcome)

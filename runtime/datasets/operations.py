@@ -14,12 +14,19 @@ from pathlib import Path
 
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
-from runtime.datasets.assemble import Assembled, Part, Source, Tell, assemble, silent
+from runtime.datasets.assemble import (
+    AssemblyResult,
+    EpisodeRef,
+    ProgressCallback,
+    SourceDataset,
+    assemble,
+    ignore_progress,
+)
 from runtime.datasets.consistency import check
 from runtime.datasets.entries import episode_lines
-from runtime.datasets.renaming import Names
-from runtime.datasets.staging import LOCK, locked, recover, remove_drafts
-from runtime.recording.files import disk_fault
+from runtime.datasets.renaming import ColumnRenaming
+from runtime.datasets.staging import LOCK, lock_dataset, recover, remove_drafts
+from runtime.recording.files import disk_error
 
 
 def convert(
@@ -29,12 +36,12 @@ def convert(
     *,
     rename: Mapping[str, str] | None = None,
     reencode: bool = False,
-    tell: Tell = silent,
-) -> Assembled:
+    tell: ProgressCallback = ignore_progress,
+) -> AssemblyResult:
     """Write `dataset` as the new dataset `target` of `version`, v2.1 or v3.0; features may get new names."""
-    with _undisturbed([dataset]):
-        source = Source.open(Path(dataset), Names(dict(rename or {})))
-        return assemble(target, version, source.parts(), reencode=reencode, tell=tell)
+    with _locked_datasets([dataset]):
+        source = SourceDataset.open(Path(dataset), ColumnRenaming(dict(rename or {})))
+        return assemble(target, version, source.episode_refs(), reencode=reencode, tell=tell)
 
 
 def merge(
@@ -43,8 +50,8 @@ def merge(
     version: str | None = None,
     *,
     reencode: bool = False,
-    tell: Tell = silent,
-) -> Assembled:
+    tell: ProgressCallback = ignore_progress,
+) -> AssemblyResult:
     """Write the episodes of `datasets`, in this order, as the new dataset `target`.
 
     `version` is that of the first, or the one it can be written as, where None. Raises RecordingError with every
@@ -52,9 +59,9 @@ def merge(
     """
     if not datasets:
         raise RecordingError("no datasets to merge")
-    with _undisturbed(datasets):
-        sources = [Source.open(Path(dataset)) for dataset in datasets]
-        parts = [part for source in sources for part in source.parts()]
+    with _locked_datasets(datasets):
+        sources = [SourceDataset.open(Path(dataset)) for dataset in datasets]
+        parts = [part for source in sources for part in source.episode_refs()]
         return assemble(target, version or _kept(sources[0]), parts, reencode=reencode, tell=tell)
 
 
@@ -64,22 +71,22 @@ def split(
     version: str | None = None,
     *,
     reencode: bool = False,
-    tell: Tell = silent,
-) -> list[Assembled]:
+    tell: ProgressCallback = ignore_progress,
+) -> list[AssemblyResult]:
     """Write the episodes with these indices as new datasets; an episode may be in several, or in none.
 
     Raises RecordingError for a target that is there, or an episode that is not, before anything is written.
     """
     if not targets:
         raise RecordingError(f"{dataset} is to be split into nothing")
-    with _undisturbed([dataset]):
-        source = Source.open(Path(dataset))
-        wanted = {target: source.parts(_each_once(indices)) for target, indices in targets.items()}
+    with _locked_datasets([dataset]):
+        source = SourceDataset.open(Path(dataset))
+        wanted = {target: source.episode_refs(_unique(indices)) for target, indices in targets.items()}
         for target in wanted:
             if target.exists() and any(target.iterdir()):
                 raise RecordingError(f"{target} is there already and not empty")
         made = version or _kept(source)
-        done: list[Assembled] = []
+        done: list[AssemblyResult] = []
         try:
             for target, parts in wanted.items():
                 said = partial(_of_part, tell, target.name)
@@ -91,7 +98,7 @@ def split(
         return done
 
 
-def _of_part(tell: Tell, name: str, progress: str) -> None:
+def _of_part(tell: ProgressCallback, name: str, progress: str) -> None:
     tell(f"{name}: {progress}")
 
 
@@ -101,8 +108,8 @@ def delete(
     *,
     reencode: bool = False,
     known: str = "",
-    tell: Tell = silent,
-) -> Assembled:
+    tell: ProgressCallback = ignore_progress,
+) -> AssemblyResult:
     """Take episodes out of `dataset`; those behind them move up. It is the old one or the new one at any moment.
 
     With `known`, the `fingerprint` of the dataset that the indices are about, they are never taken from another one.
@@ -110,15 +117,15 @@ def delete(
     """
     root = Path(dataset).resolve()  # a link to it stays
     _require_dataset(root)
-    with locked(root):
+    with lock_dataset(root):
         recover(root)
         if known and fingerprint(root) != known:
             raise RecordingError(
                 f"{root} has other episodes now than when this was asked for: nothing was deleted; look again"
             )
-        source = Source.open(root)
-        gone = {part.index for part in source.parts(_each_once(indices))}
-        left: list[Part] = [part for part in source.parts() if part.index not in gone]
+        source = SourceDataset.open(root)
+        gone = {part.index for part in source.episode_refs(_unique(indices))}
+        left: list[EpisodeRef] = [part for part in source.episode_refs() if part.index not in gone]
         if not gone:
             raise RecordingError(f"no episodes of {root} to delete")
         return assemble(root, _kept(source), left, reencode=reencode, replacing=True, tell=tell)
@@ -141,7 +148,7 @@ def repair(dataset: Path) -> list[str]:
     root = Path(dataset).resolve()
     remove_drafts(root)
     _require_dataset(root)
-    with locked(root):
+    with lock_dataset(root):
         recover(root)
     return check(root)
 
@@ -151,13 +158,13 @@ def _require_dataset(root: Path) -> None:
         raise RecordingError(f"there is no dataset folder {root}")
 
 
-def _kept(source: Source) -> str:
+def _kept(source: SourceDataset) -> str:
     """The version of a dataset, or the one that v2.0 is written as."""
     version = source.dataset.version
     return version if version in layout.WRITABLE_VERSIONS else layout.DEFAULT_VERSION
 
 
-def _each_once(indices: Sequence[int]) -> Sequence[int]:
+def _unique(indices: Sequence[int]) -> Sequence[int]:
     twice = sorted({index for index in indices if list(indices).count(index) > 1})
     if twice:
         raise RecordingError(f"episodes {twice} are named twice")
@@ -165,7 +172,7 @@ def _each_once(indices: Sequence[int]) -> Sequence[int]:
 
 
 @contextmanager
-def _undisturbed(datasets: Sequence[Path]) -> Iterator[None]:
+def _locked_datasets(datasets: Sequence[Path]) -> Iterator[None]:
     """Keep publishers out of `datasets` meanwhile; one that nobody publishes to has no lock, and gets none."""
     with ExitStack() as stack:
         for path in sorted({Path(dataset).absolute() / LOCK for dataset in datasets}):
@@ -176,5 +183,5 @@ def _undisturbed(datasets: Sequence[Path]) -> Iterator[None]:
                 stack.callback(os.close, descriptor)
                 fcntl.flock(descriptor, fcntl.LOCK_SH)
             except OSError as error:
-                raise disk_fault("locking", path, error) from error
+                raise disk_error("locking", path, error) from error
         yield

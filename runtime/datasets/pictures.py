@@ -29,7 +29,7 @@ KEPT_BYTES = (
 )  # decoded frames that are kept of a video: going backwards decodes a group of pictures once
 
 
-class PictureSequence(ABC):
+class ImageSequence(ABC):
     """Picture k of one camera and episode as RGB uint8 [H, W, 3], read-only; not safe to share between threads."""
 
     @abstractmethod
@@ -54,7 +54,7 @@ class PictureSequence(ABC):
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
+class VideoSegment:
     """The part of a video that is one episode: frame k at `start` + k / `fps` seconds."""
 
     start: float
@@ -66,7 +66,7 @@ class Stretch:
         return self.start + self.frames / self.fps
 
 
-class Pictures(PictureSequence):
+class VideoFrames(ImageSequence):
     """The frames of a video, or of a stretch of one.
 
     Frames are numbered in order of presentation from a scan of the packets, never from rounded times. Reading
@@ -74,7 +74,7 @@ class Pictures(PictureSequence):
     forward from there. The newest decoded frames are kept. Raises RecordingError, naming the file.
     """
 
-    def __init__(self, path: Path, stretch: Stretch | None = None) -> None:
+    def __init__(self, path: Path, stretch: VideoSegment | None = None) -> None:
         import av
 
         self._path = path
@@ -129,7 +129,7 @@ class Pictures(PictureSequence):
                 return
             yield packet
 
-    def _cut(self, stretch: Stretch) -> None:
+    def _cut(self, stretch: VideoSegment) -> None:
         half, base = 0.5 / stretch.fps, float(self._stream.time_base)
         first, last = stretch.start - half, stretch.end - half
         self._times = [time for time in self._times if first <= time * base < last]
@@ -269,7 +269,7 @@ def _depth(image: Image.Image) -> NDArray[np.float64] | None:
     return np.asarray(image, np.float64) / 65535 if image.mode.startswith("I") else None
 
 
-class StoredPictures(PictureSequence):
+class StoredImages(ImageSequence):
     """The pictures of an image column: coded as PNG, JPEG or TIFF in the rows, or in files that the rows name.
 
     Depth is shown in shades of grey, the most distant of a picture white, what is not known (0) black.

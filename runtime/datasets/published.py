@@ -16,23 +16,23 @@ from runtime.datasets.columns import (
     Columns,
     column_features,
     column_statistics,
-    placed_columns,
+    position_columns,
     recorded_columns,
     table,
     without_later,
 )
-from runtime.datasets.journal import RecordedJournal, read_journal
+from runtime.datasets.journal import FinishedEpisode, read_finished_episode
 from runtime.datasets.mapping import video_key
-from runtime.datasets.remux import VideoFacts, coded, remux
+from runtime.datasets.remux import VideoFacts, codec_of, remux
 from runtime.datasets.rows import write_table
-from runtime.datasets.sides import STREAMS, read_sides, side_file
-from runtime.datasets.staging import Staging, locked, recover, require_empty
+from runtime.datasets.sides import STREAMS, read_sidecars, sidecar_path
+from runtime.datasets.staging import Staging, lock_dataset, recover, require_empty
 from runtime.datasets.stats import Statistic, video_statistic
 from runtime.recording.base import IMPORTED
-from runtime.recording.export import exported
-from runtime.recording.labels import newest
+from runtime.recording.export import export_table
+from runtime.recording.labels import latest_label
 from runtime.recording.layout import simulated
-from runtime.recording.scrub import require_sound
+from runtime.recording.scrub import require_intact
 
 if TYPE_CHECKING:
     import numpy as np
@@ -74,20 +74,20 @@ def publish(
     """
     if version not in (None, *layout.WRITABLE_VERSIONS):
         raise RecordingError(f"version is {version!r}, published are {layout.WRITABLE_VERSIONS}")
-    given = read_sides(sides or {})
-    verdict = require_sound(Path(episode))
-    journal = read_journal(Path(episode))
+    given = read_sidecars(sides or {})
+    verdict = require_intact(Path(episode))
+    journal = read_finished_episode(Path(episode))
     _require_publishable(journal, include_interrupted)
     if success is None and isinstance(journal.outcome.get("success"), bool):
         success = journal.outcome["success"]
     result: Result | None = None if success is None else "success" if success else "fail"
     if success is None and (
-        label := newest(journal.folder.absolute().parent.parent, str(journal.manifest["uuid"]))
+        label := latest_label(journal.folder.absolute().parent.parent, str(journal.manifest["uuid"]))
     ):
         result = label.result
         success = None if result is None else result == "success"
     root = Path(dataset)
-    with locked(root):
+    with lock_dataset(root):
         recover(root)
         catalog = Catalog.read(root)
         if not catalog.info:
@@ -96,7 +96,7 @@ def publish(
             raise RecordingError(
                 f"{root} is of version {catalog.version}, not {version}: publish to another folder, or convert it"
             )
-        beside = {STREAMS: exported(journal.folder), **given}
+        beside = {STREAMS: export_table(journal.folder), **given}
         done = _publish(journal, catalog, (success, result), version or layout.DEFAULT_VERSION, beside)
     return replace(done, remark=verdict.text if verdict.state == "unsealed" else "")
 
@@ -113,15 +113,15 @@ def never_published(manifest: Mapping[str, object]) -> str:
     )
 
 
-def _discarded(journal: RecordedJournal) -> str:
+def _discarded(journal: FinishedEpisode) -> str:
     """Sentence on the discarding of an episode of a data folder, with its author; "" if not discarded."""
-    label = newest(journal.folder.absolute().parent.parent, str(journal.manifest["uuid"]))
+    label = latest_label(journal.folder.absolute().parent.parent, str(journal.manifest["uuid"]))
     if label is None or not label.discarded:
         return ""
     return f"was discarded by {label.by}: what is discarded is never published"
 
 
-def _require_publishable(journal: RecordedJournal, include_interrupted: bool) -> None:
+def _require_publishable(journal: FinishedEpisode, include_interrupted: bool) -> None:
     why = never_published(journal.manifest) or _discarded(journal)
     if why:
         raise RecordingError(f"{journal.folder} {why}")
@@ -144,7 +144,7 @@ def _require_publishable(journal: RecordedJournal, include_interrupted: bool) ->
 
 
 def _publish(
-    journal: RecordedJournal,
+    journal: FinishedEpisode,
     catalog: Catalog,
     said: tuple[bool | None, Result | None],
     version: str,
@@ -155,11 +155,11 @@ def _publish(
     if catalog.info:
         features = without_later(features, catalog.features)
     catalog.require_same(journal.robot, journal.fps, features)
-    catalog = catalog.created(journal.robot, journal.fps, features, version)
+    catalog = catalog.with_info(journal.robot, journal.fps, features, version)
     index, created = _place(journal, catalog)
     line = catalog.line(index, [journal.task], journal.frames)
     entry = catalog.entry(line)
-    sides = {side_file(root, kind, journal.uuid): content for kind, content in beside.items()}
+    sides = {sidecar_path(root, kind, journal.uuid): content for kind, content in beside.items()}
     files = [*(span.path for span in entry.videos.values()), *sides, entry.data]
     with Staging(root, index, files) as staging:
         for path, content in sides.items():
@@ -168,7 +168,7 @@ def _publish(
         for camera in journal.cameras:
             key = video_key(camera)
             statistics[key] = _stage_video(journal, camera, staging.path(entry.videos[key].path))
-        columns = placed_columns(
+        columns = position_columns(
             recorded_columns(journal, features),
             episode_index=index,
             first_index=catalog.first_index(index),
@@ -177,12 +177,12 @@ def _publish(
         )
         write_table(table(columns, features), staging.path(entry.data))
         statistics |= column_statistics(columns, features)
-        catalog = catalog.including(line, statistics, _eva(journal, columns, *said))
-        staging.place(catalog.documents_before_data(), catalog.documents_after_data())
+        catalog = catalog.with_episode(line, statistics, _eva(journal, columns, *said))
+        staging.commit(catalog.documents_before_data(), catalog.documents_after_data())
     return Published(root, index, journal.frames, created)
 
 
-def _with_success(journal: RecordedJournal, catalog: Catalog, success: bool | None) -> bool:
+def _with_success(journal: FinishedEpisode, catalog: Catalog, success: bool | None) -> bool:
     """True if the episode gets a success column: as the dataset has it, or, in a new one, if it is known."""
     if not catalog.info:
         return success is not None
@@ -195,19 +195,19 @@ def _with_success(journal: RecordedJournal, catalog: Catalog, success: bool | No
     return wanted
 
 
-def _features(journal: RecordedJournal, with_success: bool) -> declared.Features:
+def _features(journal: FinishedEpisode, with_success: bool) -> declared.Features:
     columns = column_features(journal, with_success)
     leading = {key: columns.pop(key) for key in ("observation.state", "action")}
     videos = {
         video_key(camera): declared.video(
-            height, width, journal.fps, coded(journal.episode.videos[camera]), PIXELS
+            height, width, journal.fps, codec_of(journal.episode.videos[camera]), PIXELS
         )
         for camera, (height, width) in journal.cameras.items()
     }
     return leading | videos | columns
 
 
-def _place(journal: RecordedJournal, catalog: Catalog) -> tuple[int, bool]:
+def _place(journal: FinishedEpisode, catalog: Catalog) -> tuple[int, bool]:
     """The index of the episode, and whether it is new; refuses a change of length: it would shift others."""
     index = catalog.index_of(journal.uuid)
     if index is None:
@@ -221,7 +221,7 @@ def _place(journal: RecordedJournal, catalog: Catalog) -> tuple[int, bool]:
     return index, False
 
 
-def _stage_video(journal: RecordedJournal, camera: str, staged: Path) -> Statistic:
+def _stage_video(journal: FinishedEpisode, camera: str, staged: Path) -> Statistic:
     source = journal.episode.videos[camera]
     facts = remux(source, staged, journal.frames, journal.fps)
     expected = VideoFacts(*journal.cameras[camera], facts.codec, PIXELS)
@@ -231,7 +231,7 @@ def _stage_video(journal: RecordedJournal, camera: str, staged: Path) -> Statist
 
 
 def _eva(
-    journal: RecordedJournal, columns: Columns, success: bool | None, result: Result | None
+    journal: FinishedEpisode, columns: Columns, success: bool | None, result: Result | None
 ) -> dict[str, Any]:
     """Our own line about the episode: what LeRobot's files have no place for, as that a success was a partial one."""
     manifest = journal.manifest

@@ -14,7 +14,7 @@ from runtime.core.types import Float32, Float64
 from runtime.datasets import layout
 from runtime.datasets.entries import EpisodeEntry, Span, entry, episode_lines, task_lines
 from runtime.datasets.mapping import ColumnMapping, video_key
-from runtime.datasets.pictures import Pictures, PictureSequence, StoredPictures, Stretch
+from runtime.datasets.pictures import ImageSequence, StoredImages, VideoFrames, VideoSegment
 from runtime.datasets.rows import read_rows
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class RecordedEpisode:
     action_eef: Float32 | None
     captured: Mapping[str, Float64]
     videos: Mapping[str, Span]  # by camera key
-    images: Mapping[str, StoredPictures]  # by camera key: those that are stored in columns
+    images: Mapping[str, StoredImages]  # by camera key: those that are stored in columns
 
     @property
     def length(self) -> int:
@@ -54,7 +54,7 @@ class RecordedEpisode:
         """The keys of the cameras that there are pictures of."""
         return (*self.videos, *self.images)
 
-    def pictures(self, camera: str) -> PictureSequence:
+    def pictures(self, camera: str) -> ImageSequence:
         """The pictures of one camera; raises RecordingError where its video is absent or too short."""
         if camera in self.images:
             return self.images[camera]
@@ -64,8 +64,8 @@ class RecordedEpisode:
             )
         span = self.videos[camera]
         if span.start is not None:
-            return Pictures(span.path, Stretch(span.start, self.length, self.fps))
-        pictures = Pictures(span.path)
+            return VideoFrames(span.path, VideoSegment(span.start, self.length, self.fps))
+        pictures = VideoFrames(span.path)
         if len(pictures) < self.length:
             frames = len(pictures)
             pictures.close()
@@ -194,7 +194,7 @@ class _Columns:
             raise RecordingError(f"{self._path}: column {name!r} holds vectors, expected one number per row")
         return np.asarray(flat, dtype=np.float64)
 
-    def images(self, name: str, root: Path) -> StoredPictures:
+    def images(self, name: str, root: Path) -> StoredImages:
         """Image column `name`."""
         import pyarrow as pa
 
@@ -206,7 +206,7 @@ class _Columns:
         alone = pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or pa.types.is_string(kind)
         if not (alone or {"bytes", "path"} <= fields):
             raise RecordingError(f"{self._path}: column {name!r} is {column.type}, expected coded pictures")
-        return StoredPictures(f"{self._path}, {name!r}", _Rows(column), root)
+        return StoredImages(f"{self._path}, {name!r}", _Rows(column), root)
 
     def _flat(self, name: str) -> np.ndarray[Any, Any]:
         import pyarrow as pa

@@ -25,7 +25,7 @@ class VideoFacts:
     pixels: str
 
 
-def coded(video: Path) -> str:
+def codec_of(video: Path) -> str:
     """The format of its pictures, "h264" for example; raises RecordingError where it cannot be read."""
     import av
 

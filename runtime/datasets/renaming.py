@@ -13,7 +13,7 @@ Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, slots=True)
-class Names:
+class ColumnRenaming:
     """New name by old one; whatever is not in it keeps its name."""
 
     new_by_old: Mapping[str, str]
@@ -23,17 +23,17 @@ class Names:
         """True if everything keeps its name."""
         return not self.new_by_old
 
-    def new(self, old: str) -> str:
+    def new_name(self, old: str) -> str:
         """The new name of `old`."""
         return self.new_by_old.get(old, old)
 
-    def old(self, new: str) -> str:
+    def old_name(self, new: str) -> str:
         """The name that `new` had."""
         return next((old for old, name in self.new_by_old.items() if name == new), new)
 
-    def keys(self, mapping: Mapping[str, Value]) -> dict[str, Value]:
+    def rename_keys(self, mapping: Mapping[str, Value]) -> dict[str, Value]:
         """`mapping` under the new names, in its order."""
-        return {self.new(key): value for key, value in mapping.items()}
+        return {self.new_name(key): value for key, value in mapping.items()}
 
     def require(self, features: Mapping[str, object]) -> None:
         """Raise RecordingError where such features cannot be renamed so."""
@@ -44,5 +44,5 @@ class Names:
                 raise RecordingError(f"{old!r} cannot be renamed {new!r}: {sorted(INDEX_COLUMNS)} are fixed")
             if not new or "/" in new:
                 raise RecordingError(f"{new!r} is no name of a feature: it is empty or has a slash")
-        if len(self.keys(features)) != len(features):
+        if len(self.rename_keys(features)) != len(features):
             raise RecordingError(f"two features would have the same name: {dict(self.new_by_old)}")

@@ -48,7 +48,7 @@ def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -
     return table.filter(pc.equal(table.column(EPISODE), episode))
 
 
-def numbers(table: pa.Table, name: str, width: int = 1) -> np.ndarray[Any, Any]:
+def column_array(table: pa.Table, name: str, width: int = 1) -> np.ndarray[Any, Any]:
     """Column `name` as an array [N, W], whatever lists it is nested in; NaN where it is null.
 
     `width`: W of a column that is null everywhere.

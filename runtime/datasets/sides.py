@@ -10,8 +10,8 @@ from uuid import UUID
 from runtime.core.errors import RecordingError
 from runtime.datasets.catalog import Catalog
 from runtime.datasets.layout import read_lines
-from runtime.datasets.staging import locked, recover
-from runtime.recording.files import write_whole
+from runtime.datasets.staging import lock_dataset, recover
+from runtime.recording.files import write_atomic
 
 FOLDER = (
     "eva"  # beside data, videos and meta: LeRobot takes every parquet file below data/ and meta/episodes/
@@ -20,7 +20,7 @@ STREAMS = "streams"
 SUFFIXES = {STREAMS: ".parquet", "annotations": ".jsonl", "reviews": ".jsonl"}
 
 
-def side_file(root: Path, kind: str, uuid: str) -> Path:
+def sidecar_path(root: Path, kind: str, uuid: str) -> Path:
     """Path of the side file of the episode `uuid`; RecordingError for a kind or a uuid that is none."""
     if kind not in SUFFIXES:
         raise RecordingError(f"{kind!r} is no kind of side file, there are {sorted(SUFFIXES)}")
@@ -31,28 +31,28 @@ def side_file(root: Path, kind: str, uuid: str) -> Path:
     return root / FOLDER / kind / f"{name}{SUFFIXES[kind]}"
 
 
-def side_files(root: Path, uuid: str) -> dict[str, Path]:
+def sidecar_paths(root: Path, uuid: str) -> dict[str, Path]:
     """The side files of one episode that there are, by kind."""
-    there = {kind: side_file(root, kind, uuid) for kind in SUFFIXES}
+    there = {kind: sidecar_path(root, kind, uuid) for kind in SUFFIXES}
     return {kind: path for kind, path in there.items() if path.is_file()}
 
 
-def read_sides(given: Mapping[str, Path]) -> dict[str, bytes]:
+def read_sidecars(given: Mapping[str, Path]) -> dict[str, bytes]:
     """Publication's side files of an episode by kind ("annotations", "reviews"); JSON Lines are checked."""
     return {kind: _content(kind, Path(path)) for kind, path in given.items()}
 
 
-def attach(dataset: Path, uuid: str, kind: str, source: Path | None) -> Path:
+def attach_sidecar(dataset: Path, uuid: str, kind: str, source: Path | None) -> Path:
     """Put the file `source` beside the published episode `uuid`, in place of an older one; None removes it.
 
     Raises RecordingError where the episode is not in the dataset, or the file is not JSON Lines.
     """
     root = Path(dataset)
-    target = side_file(root, kind, uuid)
+    target = sidecar_path(root, kind, uuid)
     if not root.is_dir():
         raise RecordingError(f"there is no dataset folder {root}")
     content = None if source is None else _content(kind, Path(source))
-    with locked(root):
+    with lock_dataset(root):
         recover(root)
         if Catalog.read(root).index_of(uuid) is None:
             raise RecordingError(f"{root} has no episode {uuid}")
@@ -60,7 +60,7 @@ def attach(dataset: Path, uuid: str, kind: str, source: Path | None) -> Path:
             target.unlink(missing_ok=True)
         else:
             target.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(target, content)
+            write_atomic(target, content)
     return target
 
 
@@ -74,7 +74,7 @@ def _content(kind: str, source: Path) -> bytes:
     return b"".join(json.dumps(line, ensure_ascii=False).encode() + b"\n" for line in lines)
 
 
-def strays(root: Path, uuids: set[str]) -> Iterator[str]:
+def orphaned_sidecars(root: Path, uuids: set[str]) -> Iterator[str]:
     """Side files of episodes that are not in the dataset, one sentence each."""
     for path in sorted((root / FOLDER).glob("*/*")):
         if path.parent.name in SUFFIXES and path.stem not in uuids and not path.name.startswith("."):

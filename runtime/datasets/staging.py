@@ -18,7 +18,7 @@ from types import TracebackType
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog
-from runtime.recording.files import disk_fault, read_document, sync_folder, write_whole
+from runtime.recording.files import disk_error, read_json, sync_folder, write_atomic
 
 FOLDER = layout.PUBLISHING
 LOCK = ".lock"
@@ -26,13 +26,13 @@ _HERE, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and the flag of renameat2(2)
 
 
 @contextmanager
-def locked(root: Path) -> Iterator[None]:
+def lock_dataset(root: Path) -> Iterator[None]:
     """Hold the dataset for one writer, waiting for another one to finish; creates the folder."""
     try:
         root.mkdir(parents=True, exist_ok=True)
         descriptor = _lock(root)
     except OSError as error:
-        raise disk_fault("locking", root, error) from error
+        raise disk_error("locking", root, error) from error
     try:
         yield
     finally:
@@ -61,7 +61,7 @@ def recover(root: Path) -> None:
         return
     plan = root / layout.PUBLISHING_PLAN
     if plan.exists():
-        content = read_document(plan)
+        content = read_json(plan)
         index, files = content.get("episode_index"), content.get("files")
         if not isinstance(index, int) or not isinstance(files, list):
             raise RecordingError(f"{plan} is not ours: {content}. Remove {staging} by hand")
@@ -80,7 +80,7 @@ def _take_back(root: Path, index: int, files: list[Path]) -> None:
     documents = catalog.documents_before_data() | catalog.documents_after_data()
     for name in documents:
         if name not in (layout.MODALITY, layout.INFO):
-            write_whole(root / name, documents[name])
+            write_atomic(root / name, documents[name])
 
 
 def require_empty(root: Path) -> None:
@@ -118,7 +118,7 @@ class Draft:
             self.folder.chmod(0o755)
             self._descriptor = _lock(self.folder)
         except OSError as error:
-            raise disk_fault("creating", self._target, error) from error
+            raise disk_error("creating", self._target, error) from error
         return self
 
     def __exit__(
@@ -134,7 +134,7 @@ class Draft:
         if not self._target.is_dir() or any(self._target.iterdir()):
             raise RecordingError(f"{self._target} is there already and not empty: give a folder that is not")
 
-    def place(self) -> None:
+    def commit(self) -> None:
         """Sync everything and put it at the target; what was there before is in `folder` then, and is removed."""
         try:
             for path in sorted(self.folder.rglob("*")):
@@ -149,7 +149,7 @@ class Draft:
                 os.rename(self.folder, self._target)
             sync_folder(self._target.absolute().parent)
         except OSError as error:
-            raise disk_fault("putting in place", self._target, error) from error
+            raise disk_error("putting in place", self._target, error) from error
 
 
 def remove_drafts(target: Path) -> list[Path]:
@@ -167,7 +167,7 @@ def remove_drafts(target: Path) -> list[Path]:
             finally:
                 os.close(descriptor)
         except OSError as error:
-            raise disk_fault("removing", folder, error) from error
+            raise disk_error("removing", folder, error) from error
     return removed
 
 
@@ -205,7 +205,7 @@ class Staging:
             "episode_index": self._index,
             "files": [str(path.relative_to(self._root)) for path in self._data],
         }
-        write_whole(self._root / layout.PUBLISHING_PLAN, json.dumps(plan).encode())
+        write_atomic(self._root / layout.PUBLISHING_PLAN, json.dumps(plan).encode())
         return self
 
     def __exit__(
@@ -222,9 +222,9 @@ class Staging:
         try:
             self.path(final).write_bytes(content)
         except OSError as error:
-            raise disk_fault("publishing to", self._root, error) from error
+            raise disk_error("publishing to", self._root, error) from error
 
-    def place(self, before: dict[str, bytes], after: dict[str, bytes]) -> None:
+    def commit(self, before: dict[str, bytes], after: dict[str, bytes]) -> None:
         """Write the documents, sync everything, then rename: `before`, the data, `after` in their order."""
         try:
             for name, content in (before | after).items():
@@ -238,7 +238,7 @@ class Staging:
             self._rename(order[:-1])
             self._rename(order[-1:])
         except OSError as error:
-            raise disk_fault("publishing to", self._root, error) from error
+            raise disk_error("publishing to", self._root, error) from error
 
     def _rename(self, order: list[Path]) -> None:
         for final in order:

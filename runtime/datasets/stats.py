@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from runtime.core.errors import RecordingError
 from runtime.core.picture_bounds import open_video
 from runtime.core.types import UInt8
-from runtime.datasets.pictures import StoredPictures
+from runtime.datasets.pictures import StoredImages
 
 # min, max, mean, std and the quantiles: lists of the feature's shape; count: [n]
 Statistic = dict[str, list[Any]]
@@ -101,7 +101,7 @@ def video_statistic(path: Path, frames: int) -> Statistic:
     return statistic
 
 
-def picture_statistic(pictures: StoredPictures) -> Statistic | None:
+def picture_statistic(pictures: StoredImages) -> Statistic | None:
     """As `video_statistic`, of pictures that are stored one by one; None where there is none of them.
 
     Those that are missing do not count. Depth of 16 bits counts as shares of 65535, floats as they are.
@@ -140,7 +140,7 @@ class _Deep:
         """The one channel three times, as LeRobot wants it; None where no number is known."""
         if not self._each:
             return None
-        together = _together(self._each)
+        together = _merge_statistics(self._each)
         return {
             name: [self._pictures] if name == "count" else [[list(figure)]] * 3
             for name, figure in together.items()
@@ -179,7 +179,7 @@ class _Histogram:
         return {**scaled, "count": [self._pictures]}
 
 
-def aggregate(episodes: Iterable[Mapping[str, Statistic]]) -> dict[str, Statistic]:
+def aggregate_statistics(episodes: Iterable[Mapping[str, Statistic]]) -> dict[str, Statistic]:
     """The statistics of all episodes together, each episode weighted by its count.
 
     Source: the parallel form of the variance (Chan, Golub, LeVeque 1979). Quantiles are the mean of those of the
@@ -189,10 +189,10 @@ def aggregate(episodes: Iterable[Mapping[str, Statistic]]) -> dict[str, Statisti
     for statistics in episodes:
         for key, statistic in statistics.items():
             collected.setdefault(key, []).append(statistic)
-    return {key: _together(parts) for key, parts in collected.items()}
+    return {key: _merge_statistics(parts) for key, parts in collected.items()}
 
 
-def _together(parts: list[Statistic]) -> Statistic:
+def _merge_statistics(parts: list[Statistic]) -> Statistic:
     means, deviations = (np.array([part[name] for part in parts], np.float64) for name in ("mean", "std"))
     counts = np.array([part["count"][0] for part in parts], np.float64)
     if not (counts > 0).all():

@@ -21,7 +21,7 @@ import zmq
 from runtime.core.errors import CodecError, ConfigurationError, TransportError
 from runtime.core.msgpack_arrays import pack, unpack
 from runtime.core.sentences import Pattern
-from runtime.ipc.endpoints import LOOK_S, Endpoints, account, fresh_path, identity
+from runtime.ipc.endpoints import LOOK_S, Endpoints, account_name, file_identity, new_socket_path
 from runtime.ipc.identity import Key
 from runtime.ipc.messages import Ack, Command, Event, decode, encode, told_by
 from runtime.ipc.readable import readable
@@ -36,12 +36,12 @@ _TOO_LARGE = Pattern("bus.too_large", "{kind} has {given} bytes; allowed: {most}
 
 # What a client needs to talk to a station, with the errors that it may meet: this module is a door.
 __all__ = [
-    "Call",
     "CodecError",
     "CommandClient",
     "CommandServer",
     "Endpoints",
     "EventLog",
+    "IncomingMessage",
     "Key",
     "Publisher",
     "Subscriber",
@@ -69,9 +69,9 @@ _QUEUED = 256  # commands of one connection, before it has to wait
 _UNREAD = (
     2000  # answers that a connection has not read, beyond which it loses them: more than those of one turn
 )
-GREEDY = 32  # requests of one connection that may wait; what is beyond is refused
-TURN = 1000  # messages that are taken from a socket in one turn
-TOO_MANY = _TOO_MANY(most=GREEDY)
+MAX_WAITING_PER_CONNECTION = 32  # requests of one connection that may wait; what is beyond is refused
+MAX_MESSAGES_PER_TURN = 1000  # messages that are taken from a socket in one turn
+TOO_MANY = _TOO_MANY(most=MAX_WAITING_PER_CONNECTION)
 
 
 class Listener:
@@ -88,7 +88,7 @@ class Listener:
     ) -> None:
         self._station_dir, self._name = station_dir, name
         self._looked = time.monotonic()
-        path = fresh_path(station_dir, name)
+        path = new_socket_path(station_dir, name)
         self.socket = context.socket(kind)
         self.socket.set(zmq.RCVHWM, incoming)
         self.socket.set(zmq.SNDHWM, outgoing)
@@ -107,9 +107,9 @@ class Listener:
         except zmq.ZMQError as error:
             raise TransportError(f"cannot listen at {path}: {error.strerror}") from None
         self._path, self.endpoint = path, f"ipc://{path}"
-        self._identity = identity(path)
+        self._identity = file_identity(path)
 
-    def moved(self) -> bool:
+    def rebind_if_unreachable(self) -> bool:
         """Listen anew where clients cannot connect, or others could; True where it has another endpoint now.
 
         A session's folder goes with the last logout of its account, and its mode or owner may change. Who is connected
@@ -118,10 +118,10 @@ class Listener:
         if time.monotonic() - self._looked < _LOOK_S:
             return False
         self._looked = time.monotonic()
-        if identity(self._path) == self._identity != (0, 0):
+        if file_identity(self._path) == self._identity != (0, 0):
             return False
         try:
-            self._bind(fresh_path(self._station_dir, self._name))
+            self._bind(new_socket_path(self._station_dir, self._name))
         except (TransportError, OSError) as error:
             if self._told != str(error):
                 self._told = str(error)
@@ -139,7 +139,7 @@ class Listener:
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class IncomingMessage:
     """One message as it came: from whom, what, signed how (empty: not at all), and of which account and process.
 
     None where the kernel does not say which.
@@ -152,7 +152,7 @@ class Call:
     pid: int | None
 
 
-def _call(frames: list[zmq.Frame]) -> Call:
+def _call(frames: list[zmq.Frame]) -> IncomingMessage:
     """A message of a ROUTER: the connection, the empty frame of those that have one, content, signature.
 
     What has more frames than that has a signature of all of them, which is none.
@@ -161,7 +161,7 @@ def _call(frames: list[zmq.Frame]) -> Call:
     address = [frame.bytes for frame in frames[:body]]
     payload = frames[body].bytes if len(frames) > body else b""
     signature = b"".join(frame.bytes for frame in frames[body + 1 :])
-    return Call(address, payload, signature, *_peer(frames[-1]))
+    return IncomingMessage(address, payload, signature, *_peer(frames[-1]))
 
 
 def _peer(frame: zmq.Frame) -> tuple[int | None, int | None]:
@@ -184,17 +184,17 @@ class CommandServer(Listener):
     def __init__(self, context: zmq.Context[Any], station_dir: Path, name: str) -> None:
         super().__init__(context, zmq.ROUTER, station_dir, name, _QUEUED, _UNREAD)
 
-    def receive(self) -> tuple[Call, Command] | None:
+    def receive(self) -> tuple[IncomingMessage, Command] | None:
         """The next command, and how it came; None where there is none.
 
         What cannot be read is answered with a refusal that says why, and never ends the caller.
         """
-        while (call := self.next()) is not None:
-            if (command := self.read(call)) is not None:
+        while (call := self.receive_raw()) is not None:
+            if (command := self.decode(call)) is not None:
                 return call, command
         return None
 
-    def next(self) -> Call | None:
+    def receive_raw(self) -> IncomingMessage | None:
         """The next message, unread; None where there is none."""
         if not readable(self.socket):
             return None
@@ -203,31 +203,31 @@ class CommandServer(Listener):
         except zmq.Again:
             return None
 
-    def read(self, call: Call) -> Command | None:
+    def decode(self, call: IncomingMessage) -> Command | None:
         """The command that came; where it is none, that is answered with the reason."""
         try:
             message = decode(call.payload)
         except CodecError as error:
-            self.refuse(call, str(error))
+            self.reject(call, str(error))
             return None
         if isinstance(message, Command):
             return message
-        self.refuse(call, _NO_COMMAND(kind=type(message).__name__))
+        self.reject(call, _NO_COMMAND(kind=type(message).__name__))
         return None
 
-    def refuse(self, call: Call, reason: str) -> None:
+    def reject(self, call: IncomingMessage, reason: str) -> None:
         """Refuse what nobody has read, so that its uuid is not known."""
         self._send(call, _refusal(reason))
 
-    def answer(self, call: Call, ack: Ack) -> None:
+    def answer(self, call: IncomingMessage, ack: Ack) -> None:
         """Send the answer; a client that is gone, or reads none of them, loses it."""
         self._send(call, encode(ack))
 
-    def pass_on(self, call: Call, payload: bytes) -> None:
+    def pass_on(self, call: IncomingMessage, payload: bytes) -> None:
         """Send an answer as another station has packed it."""
         self._send(call, payload)
 
-    def _send(self, call: Call, payload: bytes) -> None:
+    def _send(self, call: IncomingMessage, payload: bytes) -> None:
         self.socket.send_multipart([*call.address, payload], zmq.NOBLOCK)
 
 
@@ -258,24 +258,24 @@ class CommandClient:
         self._socket.linger = 200
         self._socket.connect(self._endpoint)
 
-    def post(self, command: Command) -> None:
+    def send(self, command: Command) -> None:
         """Send it; its answer, if one comes, is nobody's. Raises CodecError for too large a one.
 
         It is signed where there is a key; one that is of no use keeps nothing from being sent.
         """
-        self._socket.send_multipart(self._sealed(command))
+        self._socket.send_multipart(self._signed(command))
 
     def request(self, command: Command, timeout: float) -> Ack:
         """Its answer, as `post`; raises TransportError "outcome unknown" where none came in time."""
-        self.post(command)
-        answer = self.heard(command, timeout)
+        self.send(command)
+        answer = self.receive_answer(command, timeout)
         if answer is not None:
             return answer
         self._socket.close(linger=0)
         self._connect()
         raise TransportError(_NO_ANSWER(kind=command.kind, seconds=timeout))
 
-    def heard(self, command: Command, timeout: float) -> Ack | None:
+    def receive_answer(self, command: Command, timeout: float) -> Ack | None:
         """The answer to what was posted; None where none came in time."""
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
@@ -305,12 +305,14 @@ class CommandClient:
             return None
         uid, pid = _peer(frame)
         if uid is not None and uid not in self._believed:
-            self.strangers = f"the process {pid} of {account(uid)} answers at {self._endpoint}: not believed"
+            self.strangers = (
+                f"the process {pid} of {account_name(uid)} answers at {self._endpoint}: not believed"
+            )
             return None
         packed: bytes = frame.bytes
         return packed
 
-    def _sealed(self, command: Command) -> list[bytes]:
+    def _signed(self, command: Command) -> list[bytes]:
         payload = encode(command)
         if len(payload) > LARGEST:
             raise CodecError(_TOO_LARGE(kind=command.kind, given=len(payload), most=LARGEST))

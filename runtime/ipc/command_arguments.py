@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, JsonValue, ValidationError
 
 from runtime.core.errors import RuntimeFault
 from runtime.core.sentences import Pattern
-from runtime.core.settings import Settings, explanation
+from runtime.core.settings import Settings, explain_validation_error
 from runtime.core.types import Result
 from runtime.ipc.messages import Mode
 
@@ -252,4 +252,4 @@ def read(kind: str, model: type[Request], arguments: Mapping[str, Any]) -> Reque
     try:
         return model.model_validate(dict(arguments))
     except ValidationError as invalid:
-        raise RuntimeFault(explanation(invalid, model, arguments, kind)) from None
+        raise RuntimeFault(explain_validation_error(invalid, model, arguments, kind)) from None

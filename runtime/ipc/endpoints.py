@@ -65,13 +65,13 @@ def _usable(folder: Path, station_dir: Path) -> Path:
             "to a folder of this account's own with a shorter name, mode 0700"
         )
     if folder.parent.name == _IN_SESSION:
-        _own(folder.parents[1], _OTHERS_WRITE)
+        _require_owned(folder.parents[1], _OTHERS_WRITE)
     if folder.parent != station_dir:
-        _made(folder.parent)
-    return _made(folder)
+        _ensure_folder(folder.parent)
+    return _ensure_folder(folder)
 
 
-def _made(folder: Path) -> Path:
+def _ensure_folder(folder: Path) -> Path:
     try:
         folder.mkdir(0o700, parents=True, exist_ok=True)
     except OSError as error:
@@ -79,10 +79,10 @@ def _made(folder: Path) -> Path:
             f"the folder of the sockets, {folder}, cannot be made ({error.strerror}): set XDG_RUNTIME_DIR to a "
             "folder of this account's own with mode 0700"
         ) from None
-    return _own(folder, _OTHERS)
+    return _require_owned(folder, _OTHERS)
 
 
-def _own(folder: Path, forbidden: int) -> Path:
+def _require_owned(folder: Path, forbidden: int) -> Path:
     """`folder`, which is this account's and gives none of the rights `forbidden`; else TransportError."""
     try:
         found = folder.lstat()
@@ -94,8 +94,8 @@ def _own(folder: Path, forbidden: int) -> Path:
         raise TransportError(f"{folder} is to hold the sockets of stations: it must be a folder, and no link")
     if found.st_uid != os.geteuid():
         raise TransportError(
-            f"{folder} is to hold the sockets of stations, and belongs to {account(found.st_uid)}: who has it can "
-            f"command them; allowed: a folder of {account(os.geteuid())}, in XDG_RUNTIME_DIR or at home"
+            f"{folder} is to hold the sockets of stations, and belongs to {account_name(found.st_uid)}: who has it can "
+            f"command them; allowed: a folder of {account_name(os.geteuid())}, in XDG_RUNTIME_DIR or at home"
         )
     if found.st_mode & forbidden:
         raise TransportError(
@@ -105,7 +105,7 @@ def _own(folder: Path, forbidden: int) -> Path:
     return folder
 
 
-def account(uid: int) -> str:
+def account_name(uid: int) -> str:
     """The name of the account with that number; `uid N` where it has none."""
     try:
         return pwd.getpwuid(uid).pw_name
@@ -113,7 +113,7 @@ def account(uid: int) -> str:
         return f"uid {uid}"
 
 
-def fresh_path(station_dir: Path, name: str) -> Path:
+def new_socket_path(station_dir: Path, name: str) -> Path:
     """Path for the socket `name`; what dead processes left of that name is removed.
 
     No two have the same path, so that an end never removes the socket of a successor. Where the first folder is of no
@@ -135,17 +135,17 @@ def fresh_path(station_dir: Path, name: str) -> Path:
     raise refusal
 
 
-def identity(path: Path) -> tuple[int, int]:
+def file_identity(path: Path) -> tuple[int, int]:
     """Which file that is; (0, 0) where it is gone, cannot be reached, or lies where others have a part."""
     try:
-        _own(path.parent, _OTHERS)
+        _require_owned(path.parent, _OTHERS)
         found = path.lstat()
     except (TransportError, OSError):
         return 0, 0
     return found.st_dev, found.st_ino
 
 
-def trouble(endpoint: str) -> str:
+def connection_problem(endpoint: str) -> str:
     """Why nobody can connect to a socket, and what to do; "" where somebody listens there."""
     path = Path(endpoint.removeprefix("ipc://"))
     mend = "where the station runs, it listens elsewhere within a second: press again; else start it again"
@@ -156,9 +156,7 @@ def trouble(endpoint: str) -> str:
     except BlockingIOError:  # more wait there than it takes at once
         return ""
     except PermissionError:
-        return (
-            f"{path} cannot be reached: give {path.parent} back to {account(os.geteuid())}, mode 0700; {mend}"
-        )
+        return f"{path} cannot be reached: give {path.parent} back to {account_name(os.geteuid())}, mode 0700; {mend}"
     except OSError as error:
         return f"nobody listens at {path} ({error.strerror}): {mend}"
     finally:
@@ -177,7 +175,7 @@ class Endpoints:
         self._lock = threading.Lock()
         self._looked = time.monotonic()
 
-    def lost(self, process: str) -> bool:
+    def is_missing(self, process: str) -> bool:
         """True if the file that this process wrote is gone, or says nothing; looks five times a second.
 
         What a successor wrote is left as it is.
@@ -202,7 +200,7 @@ class Endpoints:
             retried = bool(self._wanted)
             self._said[process] = set(endpoints)
             self._wanted[process] = json.dumps({**endpoints, "pid": os.getpid()})
-            failure = self._try()
+            failure = self._write_now()
         if failure is not None:
             log.error(
                 "clients cannot find the process %s until the disk takes its file: %s", process, failure
@@ -225,10 +223,10 @@ class Endpoints:
         while True:
             time.sleep(RETRY_S)
             with self._lock:
-                if self._try() is None:
+                if self._write_now() is None:
                     return
 
-    def _try(self) -> OSError | None:
+    def _write_now(self) -> OSError | None:
         """Write what is wanted; the error that kept some of it from the disk."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -271,11 +269,11 @@ class Endpoints:
             raise ValueError(f"{self._file(process)} holds a {type(found).__name__}; allowed: an object")
         return found
 
-    def listens(self, name: str) -> bool:
+    def is_listening(self, name: str) -> bool:
         """True if a process listens at a socket of that name, whatever the files say; False if unknown."""
         for folder in _folders(self._station_dir):
             with suppress(OSError):  # it is not there, or nobody can get at it
-                if any(not trouble(f"ipc://{path}") for path in folder.glob(f"{name}-*")):
+                if any(not connection_problem(f"ipc://{path}") for path in folder.glob(f"{name}-*")):
                     return True
         return False
 
@@ -290,7 +288,7 @@ class Endpoints:
     def _file(self, process: str) -> Path:
         return self._folder / f"{process}.json"
 
-    def begin(self) -> None:
+    def prepare(self) -> None:
         """As `clear`, of a station that starts; TransportError where its folder of sockets is not its own."""
         socket_folder(self._station_dir)
         self.clear()

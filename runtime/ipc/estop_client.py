@@ -10,7 +10,7 @@ import zmq
 from runtime.core.errors import TransportError
 from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CommandClient, Endpoints, Key
-from runtime.ipc.endpoints import LOOK_S, trouble
+from runtime.ipc.endpoints import LOOK_S, connection_problem
 from runtime.ipc.messages import Ack, Command
 
 _NO_ANSWER = Pattern(
@@ -35,7 +35,7 @@ class NoAnswer(TransportError):
         super().__init__(_NO_ANSWER(kind=kind, seconds=seconds, why=self.why))
 
 
-def urgent(
+def send_urgent(
     context: zmq.Context[Any],
     endpoints: Endpoints,
     where: tuple[str, str],
@@ -53,9 +53,9 @@ def urgent(
     try:
         while True:
             try:
-                there = _now(endpoints, where, place)
+                there = _current_endpoint(endpoints, where, place)
             except TransportError:
-                if time.monotonic() >= deadline or not endpoints.listens(where[1]):
+                if time.monotonic() >= deadline or not endpoints.is_listening(where[1]):
                     raise
                 time.sleep(_AGAIN_S)  # its process writes the file anew within two looks
                 continue
@@ -63,10 +63,10 @@ def urgent(
                 if client is not None:
                     client.close()
                 client, place = CommandClient(context, there, key, endpoints.owner), there
-                client.post(command)
-            why = trouble(place)
+                client.send(command)
+            why = connection_problem(place)
             heard = heard or not why
-            answer = client.heard(command, min(LOOK_S, max(0.0, deadline - time.monotonic())))
+            answer = client.receive_answer(command, min(LOOK_S, max(0.0, deadline - time.monotonic())))
             if answer is not None:
                 return answer
             why = client.strangers or why
@@ -80,7 +80,7 @@ def urgent(
     raise NoAnswer(command.kind, timeout, why)
 
 
-def _now(endpoints: Endpoints, where: tuple[str, str], before: str) -> str:
+def _current_endpoint(endpoints: Endpoints, where: tuple[str, str], before: str) -> str:
     """Endpoint of a socket now: the one `before` as long as no file names another."""
     process, name = where
     try:

@@ -17,7 +17,7 @@ import msgpack  # type: ignore[import-untyped]
 from runtime.ipc.messages import Command
 
 NAME = "estop"
-WHY = "pressed"  # where no reason is given
+DEFAULT_REASON = "pressed"  # where no reason is given
 LONGEST = 240  # characters that are kept of a reason, a name, or what was wrong
 _LONGEST_UUID = 64
 _TEXTS = ("uuid", "user", "holder", "role")
@@ -29,15 +29,15 @@ _WORD = re.compile(r"\s*(?:web:)?estop\s*(?::.*)?", re.DOTALL)
 _LOOSE = r"""\b(?:%s)["']?\s{0,9}[:=]\s{0,9}["']?\s{0,9}(?:web:)?estop\b"""
 
 
-def kept(text: str) -> str:
+def sanitize_text(text: str) -> str:
     """As much of it as is kept, with nothing in it that cannot be sent or written down."""
     return text[:LONGEST].encode("utf-8", "replace").decode().replace("\x00", "")
 
 
-def why_of(command: Command) -> str:
+def reason_of(command: Command) -> str:
     """Why it was pressed, whatever stands there."""
     why = command.args.get("why")
-    return why if isinstance(why, str) and why else WHY
+    return why if isinstance(why, str) and why else DEFAULT_REASON
 
 
 # --- the bus: msgpack ----------------------------------------------------------------------------------------
@@ -51,7 +51,7 @@ def kind_of(payload: bytes) -> str:
         return ""
 
 
-def in_packed(payload: bytes) -> Command | None:
+def parse_packed_press(payload: bytes) -> Command | None:
     """The press that a message of the bus is, made of what can be read of it; None where it is none."""
     if b"estop" not in payload or _PACKED.search(payload) is None:
         return None
@@ -80,22 +80,22 @@ def _press(found: Mapping[str, bytes], wrong: list[str]) -> Command:
     uuid = given if 0 < len(given) <= _LONGEST_UUID else str(uuid4())
     why = _why(found.get("args"), wrong)
     said = f" (message: {'; '.join(wrong)})" if wrong else ""
-    user, holder, role = (kept(texts.get(key) or "") for key in ("user", "holder", "role"))
-    return Command(uuid, NAME, {"why": kept(why) + said[:LONGEST]}, user, holder, role=role)
+    user, holder, role = (sanitize_text(texts.get(key) or "") for key in ("user", "holder", "role"))
+    return Command(uuid, NAME, {"why": sanitize_text(why) + said[:LONGEST]}, user, holder, role=role)
 
 
 def _why(args: bytes | None, wrong: list[str]) -> str:
     if args is None:
-        return WHY
+        return DEFAULT_REASON
     try:
         given = [value for key, value in _pairs(args, ("why",)) if key == "why"]
     except _UNREADABLE:
         wrong.append("args is no map")
-        return WHY
-    why = _text(given[-1]) if given else WHY
+        return DEFAULT_REASON
+    why = _text(given[-1]) if given else DEFAULT_REASON
     if why is None:
         wrong.append("why is no text")
-    return why or WHY
+    return why or DEFAULT_REASON
 
 
 def _pairs(packed: bytes, wanted: frozenset[str] | tuple[str, ...] = _READ) -> Iterator[tuple[str, bytes]]:
@@ -140,7 +140,7 @@ _JSON = json.JSONDecoder(object_pairs_hook=_Table)
 _READ_WHOLE, _WINDOW = 8192, 4096  # characters
 
 
-def in_json(said: str | bytes, *keys: str) -> dict[str, Any] | None:
+def parse_json_press(said: str | bytes, *keys: str) -> dict[str, Any] | None:
     """Fields of a press in JSON, {} where they cannot be read; None where the message is no press.
 
     `keys` are those under which such a message names what it is: {"type": "estop"}. "web:estop" and "estop:REASON" are
@@ -179,12 +179,12 @@ def _loosely(text: str, keys: Sequence[str]) -> bool:
     return re.search(_LOOSE % "|".join(keys), bare) is not None
 
 
-def why_in(said: Mapping[str, Any], default: str = WHY) -> str:
+def json_reason(said: Mapping[str, Any], default: str = DEFAULT_REASON) -> str:
     """The reason that stands in a press in JSON, beside its name or among its arguments."""
     args = [said.get(key) for key in ("args", "arguments")]
     for table in (said, *(one for one in args if isinstance(one, dict))):
         if isinstance(why := table.get("why"), str) and why:
-            return kept(why)
+            return sanitize_text(why)
     return default
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from runtime.core.errors import ConfigurationError
 from runtime.core.sentences import Pattern, fixed
-from runtime.ipc.endpoints import account
+from runtime.ipc.endpoints import account_name
 from runtime.ipc.messages import Command
 
 _NEEDS_OPERATOR = Pattern("rights.needs_operator", "{kind} needs an operator; {user} is {role}")
@@ -32,7 +32,7 @@ PANEL = "panel:"  # of holders at the station's own panel, which this account's 
 SCRIPTS = "channel:"  # of holders who are scripts: the channel passes on what they say, and cannot know who they are
 # Roles of those who have none of the web's: programs of this account, scripts that these pass on, everybody else.
 LOCAL, SCRIPT, UNVERIFIED = "local", "script", "unverified"
-_MAY = ("operator", "admin", LOCAL, SCRIPT)
+_ROLE_COMMANDS = ("operator", "admin", LOCAL, SCRIPT)
 # For which no role is needed: what changes nothing, and what keeps or ends what a role was needed for.
 _OPEN = (
     *("status", "events_since", "aim", "preflight_report", "policy_server"),
@@ -82,7 +82,7 @@ class Key:
             )
         if found.st_uid not in (os.geteuid(), _ROOT):
             raise ConfigurationError(
-                f"the key {self.path} belongs to {account(found.st_uid)}; allowed: {account(os.geteuid())}"
+                f"the key {self.path} belongs to {account_name(found.st_uid)}; allowed: {account_name(os.geteuid())}"
             )
         secret = self.path.read_bytes()
         if len(secret) != _KEY_BYTES:
@@ -110,7 +110,7 @@ class Key:
             raise ConfigurationError(f"the key {self.path} cannot be made: {error.strerror}") from None
 
 
-def identified(command: Command, payload: bytes, signature: bytes, uid: int | None, key: Key) -> Command:
+def authenticate(command: Command, payload: bytes, signature: bytes, uid: int | None, key: Key) -> Command:
     """The command with user and role as they are known, whatever it says of itself.
 
     `signature` is empty where there is none, `uid` the account that connects, None where nobody knows it. The role is
@@ -122,12 +122,12 @@ def identified(command: Command, payload: bytes, signature: bytes, uid: int | No
         return _unverified(command, UNVERIFIED)
     if command.holder.startswith(SCRIPTS):
         return _unverified(command, SCRIPT)
-    user = command.holder if command.holder.startswith(PANEL) else f"account:{account(uid)}"
+    user = command.holder if command.holder.startswith(PANEL) else f"account:{account_name(uid)}"
     return replace(command, user=user, role=LOCAL)
 
 
 def at_the_panel(command: Command) -> bool:
-    """True if what was `identified` comes from the station's own panel."""
+    """True if what was `authenticate` comes from the station's own panel."""
     return command.role == LOCAL and command.holder.startswith(PANEL)
 
 
@@ -137,21 +137,21 @@ def _unverified(command: Command, role: str) -> Command:
     return replace(command, user=f"{name} (unverified)", role=role)
 
 
-def forged(command: Command) -> str:
-    """Why what was `identified` is obeyed in nothing but stops; "" where it may be."""
+def unverified_reason(command: Command) -> str:
+    """Why what was `authenticate` is obeyed in nothing but stops; "" where it may be."""
     if command.role != UNVERIFIED:
         return ""
     return _FORGED(kind=command.kind)
 
 
-def lacking(command: Command) -> str:
+def missing_role(command: Command) -> str:
     """Why the role of who gave the command is too little for it; "" where it will do."""
-    if command.kind in _OPEN or command.role in _MAY:
+    if command.kind in _OPEN or command.role in _ROLE_COMMANDS:
         return ""
     return _NEEDS_OPERATOR(kind=command.kind, user=command.user, role=command.role or _WITHOUT_ROLE)
 
 
-def named(command: Command) -> str:
+def display_name(command: Command) -> str:
     """Name of the command's giver, for the record: with the role that the web has signed."""
     name = command.user or command.holder or "unknown"
     return name if command.role in ("", LOCAL, SCRIPT, UNVERIFIED) else f"{name} ({command.role})"

@@ -13,7 +13,7 @@ class Lifeline:
         self.descriptor = descriptor
 
     @property
-    def cut(self) -> bool:
+    def is_cut(self) -> bool:
         """True if the supervisor is gone."""
         readable, _, _ = select.select([self.descriptor], [], [], 0)
         return bool(readable) and os.read(self.descriptor, 4096) == b""

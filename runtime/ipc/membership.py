@@ -25,6 +25,6 @@ class Membership:
     boot: str
     lifeline: Lifeline
 
-    def needed(self, now: float) -> bool:
+    def is_needed(self, now: float) -> bool:
         """True while a process that outlives control is needed: until then the supervisor may be gone."""
-        return not self.lifeline.cut or self.shared.alive("control", now, _OUTLIVES_S)
+        return not self.lifeline.is_cut or self.shared.alive("control", now, _OUTLIVES_S)

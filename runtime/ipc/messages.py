@@ -22,7 +22,7 @@ from runtime.core.msgpack_arrays import pack, unpack
 from runtime.core.types import Float32, Float64, UInt8
 
 # Kinds of events that control gives and the coordinator reads: whether anybody listens to commands.
-UNHEARD, HEARD = "commands_unheard", "commands_heard"
+NO_SUBSCRIBER, ALL_SUBSCRIBED = "commands_unheard", "commands_heard"
 
 
 def _complete(message: Any, name: str) -> None:
@@ -72,8 +72,8 @@ class PostedChunk:
     run: int
     observation_step: int
     rows: Float64
-    waited: bool = False
-    meant: Float64 | None = None
+    requested_while_stopped: bool = False
+    intended_start: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,7 @@ class ChunkMerged:
     dropped: str
     strategy: str = ""  # the kind that merged it
     overlap: int = 0  # steps from the arrival on that were blended with what was planned before
-    shares: Float64 | None = None
+    contributions: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)

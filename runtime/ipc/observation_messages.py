@@ -18,11 +18,11 @@ class SlotPictures(Mapping[str, UInt8]):
     """Pictures by camera, copied out of their slots when they are asked for: one that was overwritten is a KeyError."""
 
     def __init__(self, shared: SharedState, numbers: Mapping[str, int]) -> None:
-        self._page = shared
+        self._shared_state = shared
         self._numbers = numbers
 
     def __getitem__(self, camera: str) -> UInt8:
-        picture = self._page.pictures[camera].read(self._numbers[camera])
+        picture = self._shared_state.pictures[camera].read(self._numbers[camera])
         if picture is None:
             raise KeyError(camera)
         return picture

@@ -20,11 +20,11 @@ class LatestObservation:
     joints_captured: float
     pictures_captured: tuple[tuple[str, float], ...]  # by camera; NaN for a picture that never came
     measured: bool  # there is a number for every joint
-    doubt: str = ""  # why these numbers cannot be true
+    implausible_reason: str = ""  # why these numbers cannot be true
 
-    def fresh(self, now: float, allowed: float) -> bool:
+    def is_fresh(self, now: float, allowed: float) -> bool:
         """True if the joints are known, believed, and not older than `allowed` seconds."""
-        return self.measured and not self.doubt and now - self.joints_captured <= allowed
+        return self.measured and not self.implausible_reason and now - self.joints_captured <= allowed
 
     def picture_ages(self, now: float) -> dict[str, float]:
         """Age of each camera's newest picture [s]."""
@@ -35,19 +35,19 @@ class ObservationReader:
     """Reads the shared state; an observation that is still the newest is not read again."""
 
     def __init__(self, shared: SharedState) -> None:
-        self._page = shared
+        self._shared_state = shared
         self._version = -1
         self._seen: LatestObservation
 
-    def look(self) -> LatestObservation:
+    def read_latest(self) -> LatestObservation:
         """The newest observation."""
-        version = self._page.observation.version
+        version = self._shared_state.observation.version
         if version != self._version:
             self._seen, self._version = self._read(), version
         return self._seen
 
     def _read(self) -> LatestObservation:
-        record = self._page.observation.read()
+        record = self._shared_state.observation.read()
         qpos = record["qpos"].copy()
         sequence = int(record["sequence"])
         captured = record["picture_captured"].tolist()
@@ -56,6 +56,6 @@ class ObservationReader:
             qpos=qpos,
             joints=qpos.astype(np.float64),
             joints_captured=float(record["joints_captured"]),
-            pictures_captured=tuple(zip(self._page.layout.cameras, captured, strict=False)),
+            pictures_captured=tuple(zip(self._shared_state.layout.cameras, captured, strict=False)),
             measured=sequence > 0 and bool(np.isfinite(qpos).all()),
         )

@@ -13,7 +13,7 @@ Tone = Literal["neutral", "ok", "active", "warn", "danger"]  # the colours of pa
 
 
 @dataclass(frozen=True, slots=True)
-class Meaning:
+class StateMeaning:
     """What a state says: clients ask these, so that a state that they have never heard of is read right."""
 
     label: str  # a Sentence where it is one of ours
@@ -50,7 +50,7 @@ class Meaning:
         """Whether a run waits until it is resumed or stopped."""
         return self.run_open and not self.moving
 
-    def told(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """The row and what follows from it, as the snapshot has it under "state_is"."""
         return asdict(self) | {
             name: getattr(self, name) for name in ("at_work", "idle", "ready", "going", "held")
@@ -74,16 +74,16 @@ class SessionState(StrEnum):
         return _NAMES[self]
 
     @property
-    def meaning(self) -> Meaning:
+    def meaning(self) -> StateMeaning:
         """Its row."""
         return MEANINGS[self]
 
-    def told(self) -> dict[str, Any]:
+    def meaning_dict(self) -> dict[str, Any]:
         """What it means, as the snapshot has it under "state_is"."""
-        return self.meaning.told()
+        return self.meaning.to_dict()
 
     @classmethod
-    def of(cls, word: str) -> Meaning | None:
+    def meaning_of(cls, word: str) -> StateMeaning | None:
         """What a state of that name means; None for one that there is not."""
         return cls(word).meaning if word in cls._value2member_map_ else None
 
@@ -93,28 +93,28 @@ def _label(state: SessionState, english: str) -> Sentence:
 
 
 S = SessionState
-MEANINGS: dict[SessionState, Meaning] = {
-    S.DISCONNECTED: Meaning(_label(S.DISCONNECTED, "disconnected"), "neutral", connected=False),
-    S.IDLE: Meaning(_label(S.IDLE, "idle"), "neutral"),
-    S.SETTING_UP: Meaning(_label(S.SETTING_UP, "setting up"), "active", preparing=True, moving=True),
-    S.READY: Meaning(_label(S.READY, "ready"), "active", set_up=True),
-    S.RUNNING: Meaning(_label(S.RUNNING, "running"), "ok", set_up=True, run_open=True, moving=True),
-    S.HOLDING: Meaning(_label(S.HOLDING, "holding"), "warn", set_up=True, run_open=True),
-    S.FAULTED: Meaning(_label(S.FAULTED, "faulted"), "danger", latched=True),
+MEANINGS: dict[SessionState, StateMeaning] = {
+    S.DISCONNECTED: StateMeaning(_label(S.DISCONNECTED, "disconnected"), "neutral", connected=False),
+    S.IDLE: StateMeaning(_label(S.IDLE, "idle"), "neutral"),
+    S.SETTING_UP: StateMeaning(_label(S.SETTING_UP, "setting up"), "active", preparing=True, moving=True),
+    S.READY: StateMeaning(_label(S.READY, "ready"), "active", set_up=True),
+    S.RUNNING: StateMeaning(_label(S.RUNNING, "running"), "ok", set_up=True, run_open=True, moving=True),
+    S.HOLDING: StateMeaning(_label(S.HOLDING, "holding"), "warn", set_up=True, run_open=True),
+    S.FAULTED: StateMeaning(_label(S.FAULTED, "faulted"), "danger", latched=True),
 }
 _NAMES = {state: fixed(f"state.{state}", state.value) for state in SessionState}
 
 
-def with_meaning(said: Mapping[str, Any]) -> dict[str, Any]:
+def complete_state_meaning(said: Mapping[str, Any]) -> dict[str, Any]:
     """`said` of a station of whatever version, its "state_is" whole: what it leaves out follows from its "state".
 
     Of its "sentences" those are kept that are some.
     A state that is not known here is neutral: nothing goes on, and that it is idle only the station may say.
     """
     word, told = str(said["state"]), said.get("state_is") or {}
-    row = SessionState.of(word)
+    row = SessionState.meaning_of(word)
     unknown = {} if row else {"idle": False}
-    row = row or Meaning(word.replace("_", " "), "neutral")
+    row = row or StateMeaning(word.replace("_", " "), "neutral")
     row = replace(row, **{field.name: told[field.name] for field in fields(row) if field.name in told})
     known = {"sentences": checked(said["sentences"])} if "sentences" in said else {}
-    return {**said, "state_is": {**row.told(), **unknown, **told}, **known}
+    return {**said, "state_is": {**row.to_dict(), **unknown, **told}, **known}

@@ -22,7 +22,7 @@ _LENGTH_CRC = struct.Struct("<II")
 _ALIGN = 64  # one cache line, so that two writers never share one
 
 
-def word(memory: mmap.mmap, offset: int) -> memoryview[int]:
+def int64_view(memory: mmap.mmap, offset: int) -> memoryview[int]:
     """One aligned 8-byte integer that is always seen whole.
 
     Not struct.pack_into: it clears the bytes before it writes them, and a reader can see the zeros.
@@ -30,12 +30,12 @@ def word(memory: mmap.mmap, offset: int) -> memoryview[int]:
     return memoryview(memory)[offset : offset + 8].cast("q")
 
 
-def real(memory: mmap.mmap, offset: int) -> memoryview[float]:
+def float64_view(memory: mmap.mmap, offset: int) -> memoryview[float]:
     """One aligned 8-byte float, likewise."""
     return memoryview(memory)[offset : offset + 8].cast("d")
 
 
-def aligned(size: int) -> int:
+def align_size(size: int) -> int:
     """`size` rounded up to whole cache lines."""
     return (size + _ALIGN - 1) // _ALIGN * _ALIGN
 
@@ -66,15 +66,15 @@ class Record:
 
     def __init__(self, memory: mmap.mmap, offset: int, dtype: np.dtype[np.void]) -> None:
         self._memory = memory
-        self._version = word(memory, offset)
+        self._version = int64_view(memory, offset)
         self._offset = offset
         self._dtype = dtype
-        self._slot = aligned(dtype.itemsize + 4)
+        self._slot = align_size(dtype.itemsize + 4)
 
     @staticmethod
     def size(dtype: np.dtype[np.void]) -> int:
         """Bytes that a record of `dtype` takes in the shared file."""
-        return _ALIGN + 2 * aligned(dtype.itemsize + 4)
+        return _ALIGN + 2 * align_size(dtype.itemsize + 4)
 
     @property
     def version(self) -> int:
@@ -122,8 +122,8 @@ class Ring:
 
     def __init__(self, memory: mmap.mmap, offset: int, capacity: int) -> None:
         self._memory = memory
-        self._head = word(memory, offset)
-        self._tail = word(memory, offset + _ALIGN)
+        self._head = int64_view(memory, offset)
+        self._tail = int64_view(memory, offset + _ALIGN)
         self._data = offset + 2 * _ALIGN
         self._capacity = capacity
         self.refused = 0
@@ -132,7 +132,7 @@ class Ring:
     @staticmethod
     def size(capacity: int) -> int:
         """Bytes that a ring for `capacity` bytes of messages takes in the shared file."""
-        return 2 * _ALIGN + aligned(capacity)
+        return 2 * _ALIGN + align_size(capacity)
 
     @property
     def waiting(self) -> bool:

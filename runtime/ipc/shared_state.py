@@ -19,7 +19,7 @@ from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Observation, UInt8
 from runtime.ipc import shared_memory as memory
 from runtime.ipc.bells import Bell
-from runtime.ipc.shared_memory import Record, Ring, aligned
+from runtime.ipc.shared_memory import Record, Ring, align_size
 
 _FOR_SECONDS = Pattern("shared.for_seconds", "for {seconds:.1f} s")
 _FOR_SECONDS_WHILE = Pattern("shared.for_seconds_while", "for {seconds:.1f} s, while {stage}")
@@ -46,7 +46,7 @@ WOKEN = {
     "media": ("minutes", "observations"),
     "guard": ("presses",),
 }
-DOUBT_BYTES = 200
+JOINT_PROBLEM_BYTES = 200
 PROCESSES = ("control", "coordinator", "reception", "media", "guard")
 
 
@@ -140,7 +140,10 @@ class SharedStateLayout:
                 ("starved", "u1"),  # a run is open, nothing is planned, and something should be
                 ("simulated", "f4", self.dim),  # the robot of a run in simulation; NaN where there is none
                 ("believed", "u1"),  # the joints are measured, fresh and plausible
-                ("doubt", f"S{DOUBT_BYTES}"),  # why they cannot be true, or are not where they are held
+                (
+                    "doubt",
+                    f"S{JOINT_PROBLEM_BYTES}",
+                ),  # why they cannot be true, or are not where they are held
                 ("locked", "f4", self.dim),  # grippers that are locked, and where; NaN for the rest
                 ("ticks", "i8"),
                 ("missed", "i8"),
@@ -163,15 +166,17 @@ class SharedState:
         self._shared = shared
         self.bells: dict[str, Bell] = {}  # of processes that sleep; none where all of them are one
         offset = 0
-        self._beats = {name: memory.real(shared, _LINE * index) for index, name in enumerate(PROCESSES)}
+        self._beats = {
+            name: memory.float64_view(shared, _LINE * index) for index, name in enumerate(PROCESSES)
+        }
         offset += _LINE * len(PROCESSES)
         self._generations = {
-            name: memory.word(shared, _LINE * index + 8) for index, name in enumerate(PROCESSES)
+            name: memory.int64_view(shared, _LINE * index + 8) for index, name in enumerate(PROCESSES)
         }
-        self._stage = memory.word(shared, _LINE * PROCESSES.index("media") + 16)
+        self._stage = memory.int64_view(shared, _LINE * PROCESSES.index("media") + 16)
         self._estop = offset
-        self._release = memory.word(shared, offset + 8)
-        self._unrecorded = memory.word(shared, offset + 16)
+        self._release = memory.int64_view(shared, offset + 8)
+        self._unrecorded = memory.int64_view(shared, offset + 16)
         offset += _LINE
         self.observation = Record(shared, offset, layout.observation_dtype())
         offset += Record.size(layout.observation_dtype())
@@ -232,7 +237,7 @@ class SharedState:
         """True if `process` has said so in the last `within` seconds."""
         return now - self.last_beat(process) <= within
 
-    def silence(self, process: str, now: float) -> str:
+    def describe_silence(self, process: str, now: float) -> str:
         """For how long `process` has given no sign of life at `now`, as a sentence ends with it."""
         beat = self.last_beat(process)
         if not beat:
@@ -267,8 +272,8 @@ class SharedState:
         """Number of times that the coordinator has asked the guard to release the latch."""
         return int(self._release[0])
 
-    def ask_release(self) -> None:
-        """Main's half of a release; the guard does it and clears the flag."""
+    def request_release(self) -> None:
+        """The coordinator's half of a release; the guard does it and clears the flag."""
         self._release[0] = self.releases + 1
         self._wake("guard")
 
@@ -292,7 +297,7 @@ class SharedState:
         self._wake("coordinator")
 
     @property
-    def doubt(self) -> str:
+    def joint_problem(self) -> str:
         """Why nothing may begin to move, by what control says of the joints; "" where it may."""
         status = self.control.read()
         doubt = bytes(status["doubt"]).decode(errors="ignore")
@@ -372,15 +377,15 @@ class PictureSlots:
     def __init__(self, shared: mmap.mmap, offset: int, picture_bytes: int) -> None:
         self._shared = shared
         self._bytes = picture_bytes
-        stride = _LINE + aligned(picture_bytes)
+        stride = _LINE + align_size(picture_bytes)
         self._at = [offset + slot * stride for slot in range(PICTURE_SLOTS)]
-        self._begun = [memory.word(shared, at) for at in self._at]
-        self._done = [memory.word(shared, at + 8) for at in self._at]
+        self._begun = [memory.int64_view(shared, at) for at in self._at]
+        self._done = [memory.int64_view(shared, at + 8) for at in self._at]
 
     @staticmethod
     def size(picture_bytes: int) -> int:
         """Bytes that the slots of one camera take in the shared file."""
-        return PICTURE_SLOTS * (_LINE + aligned(picture_bytes))
+        return PICTURE_SLOTS * (_LINE + align_size(picture_bytes))
 
     @property
     def newest(self) -> int:

@@ -8,21 +8,24 @@ import time
 from collections.abc import Sequence
 
 import robots
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.errors import RuntimeFault
 from runtime.kinematics import compiled
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compiles for the named robots, else for all that there are; returns 1 where one cannot be."""
     parser = argparse.ArgumentParser(prog="python -m runtime.kinematics", description=__doc__)
     parser.add_argument("robots", metavar="ROBOT", nargs="*", help="a robot's name or a folder")
-    wanted = parser.parse_args(arguments).robots or robots.names()
+    wanted = parser.parse_args(arguments).robots or robots.robot_names()
     try:
         for name in wanted:
             begun = time.perf_counter()
-            for robot in (robots.load(name), robots.load_whole(name)):  # another torso is another solver
+            for robot in (
+                robots.load_robot(name),
+                robots.load_robot_with_optional_groups(name),
+            ):  # another torso is another solver
                 compiled.build(compiled.Config(), robot)
             print(f"{name}: ready after {time.perf_counter() - begun:.1f} s")
     except (robots.RobotError, RuntimeFault) as error:

@@ -15,8 +15,14 @@ from runtime.core.errors import SetupError
 from runtime.core.types import Float64
 from runtime.kinematics import kernel_cache
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsError, KinematicsSettings
-from runtime.kinematics.replanning import CRAMPED, ROOMIER, missed, postures, replanned
-from runtime.kinematics.tables import POSED, Record, Records, Way, chains_of
+from runtime.kinematics.replanning import (
+    MIN_LIMIT_MARGIN,
+    ROOMIER,
+    arms_missing_targets,
+    replan,
+    sample_postures,
+)
+from runtime.kinematics.tables import POSED, ChainSequence, Record, Records, chain_records
 
 _WRONG = {  # by what runtime.kinematics.kernels.chunks says
     1: "a target, the seed or the anchor holds a number that is not finite",
@@ -59,15 +65,15 @@ class CompiledKinematics(Kinematics):
         config = config or Config()
         self._dim = robot.dim
         own = [(group, chain) for group in robot.arms if (chain := group.chain) is not None]
-        self._whole = chains_of([_whole(group, chain) for group, chain in own])
+        self._whole = chain_records([_full_chain(group, chain) for group, chain in own])
         self._arms = _arms_of(robot, own, config.velocity_scale)
         self._postures = [
-            postures(robot.poses["home"][dims], robot.lower[dims], robot.upper[dims], _TRIED)
+            sample_postures(robot.poses["home"][dims], robot.lower[dims], robot.upper[dims], _TRIED)
             for dims in (group.joint_dims for group, _ in own)
         ]
         self._robot = robot
-        self._poses_of, self._solve_chunk = chains.poses_of, chunks.solve_chunk
-        self._reach_type = chains.reach_type(self._whole["drive"].shape[1])
+        self._poses_of, self._solve_chunk = chains.compute_poses, chunks.solve_chunk
+        self._reach_type = chains.fk_buffer_type(self._whole["drive"].shape[1])
         self._scratch_type = chunks.scratch_type(*_lengths(self._arms))
         self._costs = frames.Costs(
             config.position_weight,
@@ -137,12 +143,12 @@ class CompiledKinematics(Kinematics):
             raise KinematicsError(f"anchor_row = {anchor_row} was given; allowed: 0 or above")
         held = seed if anchor is None else self._vector("an anchor", anchor)
         row = -1 if anchor is None else int(anchor_row)
-        found = self._sweep(self._arms, targets, seed, dt, held, row)
+        found = self._solve_rows(self._arms, targets, seed, dt, held, row)
         if dt is not None:
-            self._replan(found, targets, seed, dt, held, row)
+            self._replan_missed(found, targets, seed, dt, held, row)
         return found
 
-    def _replan(
+    def _replan_missed(
         self, found: IkResult, targets: Float64, seed: Float64, dt: float, held: Float64, row: int
     ) -> None:
         """Puts another plan into `found` for arms that meet the first pose, and miss a later one or end cramped.
@@ -152,11 +158,11 @@ class CompiledKinematics(Kinematics):
         begin = row if row >= 0 else 1
         if begin >= len(targets):
             return
-        late = missed(found, begin)
+        late = arms_missing_targets(found, begin)
         for index, arm in enumerate(self._arms):
-            room = partial(_room, arm)
+            room = partial(_limit_margin, arm)
             spare = room(found.q[-1])
-            cramped = spare < CRAMPED and found.reached[begin:, index].all()
+            cramped = spare < MIN_LIMIT_MARGIN and found.reached[begin:, index].all()
             if index not in late and not cramped:
                 continue
             least = spare + ROOMIER if cramped else -np.inf
@@ -164,8 +170,8 @@ class CompiledKinematics(Kinematics):
             start = seed.copy()
             start[dims] = (held if row >= 0 else found.q[0])[dims]
             poses = np.ascontiguousarray(targets[begin:, index : index + 1])
-            sweep = partial(self._sweep, self._arms[index : index + 1])
-            plan = replanned(sweep, poses, start, dt, dims, self._postures[index], room, least)
+            sweep = partial(self._solve_rows, self._arms[index : index + 1])
+            plan = replan(sweep, poses, start, dt, dims, self._postures[index], room, least)
             if plan is None and index in late and arm["joints"] > POSED:
                 # Going home may be what leads away from later poses: the posture stays as it is.
                 plan = sweep(poses, start, dt, start, 0, home_rate=0.0)
@@ -176,7 +182,7 @@ class CompiledKinematics(Kinematics):
                 found.rotation_error[begin:, index] = plan.rotation_error[:, 0]
                 found.flags[begin:, index] = plan.flags[:, 0]
 
-    def _sweep(
+    def _solve_rows(
         self,
         arms: Records,
         targets: Float64,
@@ -227,19 +233,19 @@ class CompiledKinematics(Kinematics):
         return vector
 
 
-def _whole(group: Group, chain: Chain) -> Way:
+def _full_chain(group: Group, chain: Chain) -> ChainSequence:
     """From the arm's frame to its end effector, driven by the robot's vector."""
     if group.carrier is None:
-        return Way([chain], [group.joint_dims.tolist()])
-    return Way([group.carrier, chain], [group.carrier_dims.tolist(), group.joint_dims.tolist()])
+        return ChainSequence([chain], [group.joint_dims.tolist()])
+    return ChainSequence([group.carrier, chain], [group.carrier_dims.tolist(), group.joint_dims.tolist()])
 
 
 def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: float) -> Records:
     """The arms as records; where they differ in length, shorter ones are filled up with what stands still."""
     from runtime.kinematics.kernels.chunks import arm_type
 
-    chains = chains_of([Way([chain], [range(chain.size)]) for _, chain in own])
-    carriers = chains_of([_carrying(group) for group, _ in own])
+    chains = chain_records([ChainSequence([chain], [range(chain.size)]) for _, chain in own])
+    carriers = chain_records([_carrier_chain(group) for group, _ in own])
     size = max((chain.size for _, chain in own), default=1)
     arms = np.zeros(len(own), dtype=arm_type(chains["drive"].shape[1], carriers["drive"].shape[1], size))
     arms["own"], arms["carrier"] = chains, carriers
@@ -256,7 +262,7 @@ def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: f
     return arms
 
 
-def _room(arm: Record, q: Float64) -> float:
+def _limit_margin(arm: Record, q: Float64) -> float:
     """Distance of joints [D] to the nearest limit, as a part of what is kept; inf without a choice.
 
     Sides to which home itself is nearer do not count: there is no more room to go to.
@@ -270,10 +276,10 @@ def _room(arm: Record, q: Float64) -> float:
     return float(rooms[kept >= _ROOM].min(initial=np.inf) / _ROOM)
 
 
-def _carrying(group: Group) -> Way:
+def _carrier_chain(group: Group) -> ChainSequence:
     if group.carrier is None:
-        return Way([], [])
-    return Way([group.carrier], [group.carrier_dims.tolist()])
+        return ChainSequence([], [])
+    return ChainSequence([group.carrier], [group.carrier_dims.tolist()])
 
 
 def _lengths(arms: Records) -> tuple[int, int, int]:

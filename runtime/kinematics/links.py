@@ -12,10 +12,10 @@ from runtime.core.types import Float32
 from runtime.kinematics.base import KinematicsError
 
 if TYPE_CHECKING:
-    from runtime.kinematics.kernels.bodies import Parts
+    from runtime.kinematics.kernels.bodies import LinkTable
 
 
-class Links:
+class LinkPoses:
     """The parts of a body, in its order; compiled or loaded from disk when it is made.
 
     Raises KinematicsError where numba is not installed.
@@ -23,10 +23,10 @@ class Links:
 
     def __init__(self, body: Body) -> None:
         try:
-            from runtime.kinematics.kernels.bodies import place_parts
+            from runtime.kinematics.kernels.bodies import compute_link_poses
         except ImportError as error:
             raise KinematicsError(str(error)) from error
-        self._place = place_parts
+        self._place = compute_link_poses
         self._parts = _parts_of(body)
         self._dim = body.tables.coupling.shape[1]
         self.poses(np.zeros(self._dim))
@@ -42,13 +42,13 @@ class Links:
         return placed
 
 
-def _parts_of(body: Body) -> Parts:
-    from runtime.kinematics.kernels.bodies import Parts
+def _parts_of(body: Body) -> LinkTable:
+    from runtime.kinematics.kernels.bodies import LinkTable
 
     tables = body.tables
     motions = tables.motions.reshape(-1, 4, 4, 4)
     drive = np.where(tables.coupling.any(axis=1), np.argmax(tables.coupling != 0, axis=1), -1)
-    return Parts(
+    return LinkTable(
         motions=np.concatenate([motions[:, :, :3, :3].reshape(-1, 4, 9), motions[:, :, :3, 3]], axis=2),
         drive=drive.astype(np.int64),
         factor=tables.coupling[np.arange(len(drive)), np.maximum(drive, 0)],

@@ -13,7 +13,7 @@ from runtime.kinematics.base import Forward, IkResult, Kinematics
 Make = Callable[[], Kinematics]
 
 
-class Loading(Kinematics):
+class LazyKinematics(Kinematics):
     """The kinematics that `make` makes, once and where `aside` has it done; joints become poses from the start.
 
     A station whose policy speaks joints starts without a compiler, and never loads one.
@@ -34,13 +34,13 @@ class Loading(Kinematics):
 
     def prepare(self) -> bool:
         """Begin to load, where nobody has; whether `solve` would not have to wait for that."""
-        return self._begun().done()
+        return self._start_loading().done()
 
     def compile(self) -> Future[Kinematics] | None:
         """Begin to compile what a run could need; None where there is nothing to compile, and nothing is loaded."""
         if self._made is None and self._compiled():
             return None
-        return self._begun()
+        return self._start_loading()
 
     def forward(self, q: Float64) -> Float64:
         """Poses [..., arms, 7] for joint vectors [..., D]; KinematicsError for another width. Waits for nothing."""
@@ -58,15 +58,15 @@ class Loading(Kinematics):
         anchor_row: int = 0,
     ) -> IkResult:
         """As the backend's, once it is there; SetupError where it cannot be made."""
-        return self._begun().result().solve(targets, seed, dt, anchor, anchor_row)
+        return self._start_loading().result().solve(targets, seed, dt, anchor, anchor_row)
 
-    def _begun(self) -> Future[Kinematics]:
+    def _start_loading(self) -> Future[Kinematics]:
         with self._once:
             if self._made is None:
-                self._made = self._aside(self._told)
+                self._made = self._aside(self._result)
             return self._made
 
-    def _told(self) -> Kinematics:
+    def _result(self) -> Kinematics:
         try:
             return self._make()
         except RuntimeFault:

@@ -13,7 +13,7 @@ from runtime.kinematics.base import IkFlag, IkResult, KinematicsSettings
 _RESTS = 1e-6  # rad (m) within which a joint rests on a bound
 
 
-def measured(
+def evaluate_solution(
     robot: Robot, settings: KinematicsSettings, q: Float64, targets: Float64, bounds: tuple[Float64, Float64]
 ) -> IkResult:
     """The result for joints q [T, D] that were solved for poses [T, arms, 7].

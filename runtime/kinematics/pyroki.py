@@ -20,7 +20,7 @@ from runtime.core.errors import SetupError
 from runtime.core.types import Float64
 from runtime.kinematics import compiled
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsSettings
-from runtime.kinematics.measuring import measured
+from runtime.kinematics.measuring import evaluate_solution
 
 _BUCKET = 64  # rows: chunks are filled up to a multiple, so that few lengths are compiled
 _BOX_WEIGHT = 100.0  # per rad beyond the box; what is left beyond it is cut off
@@ -89,7 +89,7 @@ class PyrokiKinematics(Kinematics):
         for index, arm in enumerate(self._arms):
             asked = _Asked(targets[:, index], seed, dt, anchor, anchor_row)
             q[:, arm.dims], low[:, arm.dims], high[:, arm.dims] = arm.follow(asked)
-        return measured(self._robot, self._config, q, targets, (low, high))
+        return evaluate_solution(self._robot, self._config, q, targets, (low, high))
 
 
 class _Asked(NamedTuple):

@@ -16,20 +16,21 @@ _HOPELESS = 4  # postures without a solution after which the last pose is taken 
 _FOLLOWED = 12  # ends at most that are followed back
 _ENDLESS = np.pi  # rad to either side in which joints without limits are tried
 
-CRAMPED = 0.3  # of the room that joints with a choice keep; what ends with less may have none left for the next chunk
+# Share of the range that redundant joints keep: a solution with less may leave none for the next chunk.
+MIN_LIMIT_MARGIN = 0.3
 ROOMIER = 0.1  # of it that another posture must have more
 
-Sweep = Callable[
+SolveRows = Callable[
     ..., IkResult
 ]  # poses [T, 1, 7], seed [D], dt, anchor [D], anchor_row, guide [T, D]: frame by frame
 
 
-Room = Callable[
+LimitMargin = Callable[
     [Float64], float
 ]  # joints [D]: how far the one nearest to a limit is from it, where it has a choice
 
 
-def postures(home: Float64, lower: Float64, upper: Float64, count: int) -> Float64:
+def sample_postures(home: Float64, lower: Float64, upper: Float64, count: int) -> Float64:
     """Joints [1 + count, n] to look for ends from: home, and others anywhere within the limits.
 
     The same ones each time, so that the same question has the same answer.
@@ -38,20 +39,20 @@ def postures(home: Float64, lower: Float64, upper: Float64, count: int) -> Float
     return np.vstack([home, np.random.default_rng(1).uniform(low, high, (count, len(home)))])
 
 
-def missed(result: IkResult, begin: int) -> NDArray[np.intp]:
+def arms_missing_targets(result: IkResult, begin: int) -> NDArray[np.intp]:
     """The arms that meet the pose of row `begin`, and not all of those behind it."""
     reached = result.reached[begin:]
     return np.flatnonzero(reached[0] & ~reached.all(axis=0)) if len(reached) else np.empty(0, np.intp)
 
 
-def replanned(
-    sweep: Sweep,
+def replan(
+    sweep: SolveRows,
     poses: Float64,
     start: Float64,
     dt: float,
     dims: NDArray[np.intp],
     starts: Float64,
-    room: Room,
+    room: LimitMargin,
     least: float = -np.inf,
 ) -> IkResult | None:
     """A plan for poses [T, 1, 7] of the arm at `dims`, from `start` [D] on, that misses none; None if none is found.
@@ -72,7 +73,7 @@ def replanned(
 
 
 def _ends(
-    sweep: Sweep, last: Float64, start: Float64, dims: NDArray[np.intp], starts: Float64
+    sweep: SolveRows, last: Float64, start: Float64, dims: NDArray[np.intp], starts: Float64
 ) -> Iterator[Float64]:
     """Joints [D] for the last pose [1, 1, 7], the nearest to `start` first, none twice."""
     found: list[Float64] = []

@@ -39,14 +39,14 @@ def chain_type(moving: int) -> np.dtype[np.void]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Way:
+class ChainSequence:
     """Chains one behind the other, each driven by its `dims` of a vector."""
 
     chains: Sequence[Chain]
     dims: Sequence[Sequence[int]]
 
 
-def chains_of(ways: Sequence[Way]) -> Records:
+def chain_records(ways: Sequence[ChainSequence]) -> Records:
     """Records [A] of ways of any length, all as long as the longest."""
     longest = max((sum(len(chain.moving) for chain in way.chains) for way in ways), default=0)
     records = np.zeros(len(ways), dtype=chain_type(max(1, longest)))
@@ -57,7 +57,7 @@ def chains_of(ways: Sequence[Way]) -> Records:
     return records
 
 
-def _fill(record: Record, way: Way) -> None:
+def _fill(record: Record, way: ChainSequence) -> None:
     place, before = 0, np.eye(4)
     for chain, dims in zip(way.chains, way.dims, strict=True):
         for joint in chain.moving:

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core import logs
 from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.ipc.bus import Endpoints
@@ -27,11 +27,11 @@ log = logging.getLogger(__name__)
 _LOOK_S = 0.2
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Link until a signal or the end of standard input; exit code 1 where a part of it failed, 2 without keys."""
     given = _parser().parse_args(arguments)
-    logs.start("link")
+    logs.configure_logging("link")
     data = Path(given.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
     station_dir = data / "stations" / given.station
     ended: list[int] = []
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(number, lambda number, frame: ended.append(number))
     lifeline = Lifeline() if given.lifeline else None
     try:
-        return _linked(data, station_dir, lambda: bool(ended) or (lifeline is not None and lifeline.cut))
+        return _linked(data, station_dir, lambda: bool(ended) or (lifeline is not None and lifeline.is_cut))
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
         return 2

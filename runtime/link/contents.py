@@ -16,7 +16,7 @@ from typing import Any
 from uuid import UUID
 
 from runtime.core.errors import CodecError, RecordingError
-from runtime.recording.files import disk_fault
+from runtime.recording.files import disk_error
 
 MANIFEST, OUTCOME = "manifest.json", "outcome.json"
 LARGEST_LIST = 1 << 20  # bytes of a list as it is sent
@@ -114,7 +114,7 @@ def contents_in_steps(folder: Path) -> Generator[None, None, Contents]:
                     yield
             files.append(File(path.name, size, digest.hexdigest()))
     except OSError as error:
-        raise disk_fault("reading", folder, error) from error
+        raise disk_error("reading", folder, error) from error
     return Contents(tuple(files))
 
 

@@ -16,8 +16,8 @@ import zmq
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from runtime.core.errors import TransportError
-from runtime.ipc.bus import Call, CommandServer
-from runtime.ipc.fair_queue import Asked
+from runtime.ipc.bus import CommandServer, IncomingMessage
+from runtime.ipc.fair_queue import QueuedCommand
 from runtime.ipc.messages import Ack, Command, encode
 from runtime.link.admission import Admission, AllowList, Seldom
 from runtime.link.door import Arrival, Door
@@ -152,7 +152,7 @@ class Gate:
         """Everything that has come at the socket for the e-stop."""
         if (mirror := remote.mirror) is None:
             return
-        presses, others = mirror.estop_turns.take()
+        presses, others = mirror.estop_turns.take_turn()
         for call, command in presses:
             payload, verified = _payload(mirror, call, command)
             held = Held(call, command, payload, verified, self._clock())
@@ -168,7 +168,7 @@ class Gate:
         if remote.mirror is None or remote.mirror.command_turns is None or remote.mirror.commands is None:
             return
         server = remote.mirror.commands
-        urgent, others = remote.mirror.command_turns.take()
+        urgent, others = remote.mirror.command_turns.take_turn()
         for asked in (*urgent, *others):
             self._pass_command(remote, asked, (COORDINATOR, "commands"), server)
 
@@ -186,7 +186,7 @@ class Gate:
         return bool(number)
 
     def _pass_command(
-        self, remote: Remote, asked: Asked, place: tuple[str, str], server: CommandServer
+        self, remote: Remote, asked: QueuedCommand, place: tuple[str, str], server: CommandServer
     ) -> None:
         assert remote.mirror is not None
         (call, command), now = asked, self._clock()
@@ -466,7 +466,7 @@ class Gate:
                 log.warning("%s: %s", remote.name, what)
 
 
-def _payload(mirror: Mirror, call: Call, command: Command) -> tuple[bytes, bool]:
+def _payload(mirror: Mirror, call: IncomingMessage, command: Command) -> tuple[bytes, bool]:
     """The command as it is passed on, and whether the web has signed it: else only what was understood of it."""
     if call.signature and mirror.key.verifies(call.payload, call.signature):
         return call.payload, True

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from runtime.core.errors import RecordingError
 from runtime.link.contents import MANIFEST, OUTCOME, Contents, is_episode
-from runtime.recording.files import disk_fault, read_document, sync_folder, write_whole
+from runtime.recording.files import disk_error, read_json, sync_folder, write_atomic
 from runtime.recording.labels import FOLDER as LABELS
 
 log = logging.getLogger(__name__)
@@ -144,7 +144,7 @@ class Home:
         except OSError:
             return
         try:
-            station = read_document(self._root / name / MANIFEST).get("station")
+            station = read_json(self._root / name / MANIFEST).get("station")
         except RecordingError as error:
             log.warning("episode %s is not offered to the lab: %s", name, error)
             station = None
@@ -173,8 +173,8 @@ class Home:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise disk_fault("creating", folder, error) from error
-        write_whole(folder / f"{receipt.episode}.json", json.dumps(asdict(receipt), indent=1).encode())
+            raise disk_error("creating", folder, error) from error
+        write_atomic(folder / f"{receipt.episode}.json", json.dumps(asdict(receipt), indent=1).encode())
         self._receipts[receipt.episode] = receipt
 
     # --- retention -----------------------------------------------------------------------------------------------
@@ -205,7 +205,7 @@ class Home:
             sync_folder(self._root)
             shutil.rmtree(leaving)
         except OSError as error:
-            raise disk_fault("removing", folder, error) from error
+            raise disk_error("removing", folder, error) from error
         self._keep(replace(receipt, removed=self._wall()))
         log.info("episode %s is removed here: the lab has it", receipt.episode)
 

@@ -27,7 +27,7 @@ from runtime.core.errors import CodecError, RecordingError
 from runtime.link.contents import MANIFEST, Contents, File, contents_of, is_episode, unpacked
 from runtime.link.wire import PIECE, Arrived, Declined, Labels, Message, Offer, Piece, Want
 from runtime.link.yielding import give_way
-from runtime.recording.files import disk_fault, read_document, sync_folder, write_whole
+from runtime.recording.files import disk_error, read_json, sync_folder, write_atomic
 from runtime.recording.labels import FOLDER as LABELS
 
 log = logging.getLogger(__name__)
@@ -219,7 +219,7 @@ class Shelf:
         except RecordingError as error:
             yield self._declined(episode, str(error), _LATER_S)
         except OSError as error:
-            yield self._declined(episode, str(disk_fault("writing", self._root, error)), _SOON_S)
+            yield self._declined(episode, str(disk_error("writing", self._root, error)), _SOON_S)
 
     def drop(self) -> None:
         """What is under way does not come any more; what is here of it stays, to go on from."""
@@ -346,7 +346,7 @@ class Shelf:
     def _require_named(self, begun: _Begun) -> None:
         """The episode's own manifest says what it was offered as: one that does not is thrown away."""
         try:
-            manifest = read_document(begun.folder / MANIFEST)
+            manifest = read_json(begun.folder / MANIFEST)
         except RecordingError as error:
             manifest, why = {}, str(error)
         else:
@@ -378,7 +378,7 @@ class Shelf:
         for path in folder.iterdir():
             if path.name not in {file.name for file in contents.files}:
                 path.unlink()
-        write_whole(known, sent)
+        write_atomic(known, sent)
         begun = sorted((path for path in self._root.iterdir() if path.is_dir()), key=_changed)
         for path in [path for path in begun if path != folder][: max(0, len(begun) - _MOST_BEGUN)]:
             self._forget(path.name)
@@ -395,7 +395,7 @@ class Shelf:
         if is_episode(episode):
             with suppress(OSError, RecordingError):  # a disk that is full: the station is told all the same
                 self._root.mkdir(parents=True, exist_ok=True)
-                write_whole(_beside(self._root, episode, "declined"), why.encode())
+                write_atomic(_beside(self._root, episode, "declined"), why.encode())
                 for path in sorted(self._root.glob("*.declined"), key=_changed)[:-_MOST_DECLINED]:
                     path.unlink()
         return Declined(episode, why[:500], again_s)
@@ -404,7 +404,7 @@ class Shelf:
         """Have the worker make rows of it."""
         folder = self._data / ARRIVALS
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / episode, self.station.encode())
+        write_atomic(folder / episode, self.station.encode())
 
     # --- labels --------------------------------------------------------------------------------------------------
 
@@ -414,7 +414,7 @@ class Shelf:
             raise _Unwanted(
                 f"{len(lines)} bytes of labels; allowed: {LARGEST_LABELS}, of an episode", _NEVER_S
             )
-        manifest = read_document(self._episodes / episode / MANIFEST)
+        manifest = read_json(self._episodes / episode / MANIFEST)
         if manifest.get("station") != self.station:
             raise _Unwanted(f"episode {episode} is of another station of this lab", _NEVER_S)
         path = self._data / LABELS / f"{episode}.jsonl"
@@ -423,7 +423,7 @@ class Shelf:
             raise _Unwanted("the lab has other labels of it: nothing is overwritten", _NEVER_S)
         if lines != here:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, lines)
+            write_atomic(path, lines)
             self._tell(episode)
         return Arrived(episode, _digest(lines))
 

@@ -21,7 +21,7 @@ import zmq
 import zmq.utils.z85
 
 from runtime.core.errors import ConfigurationError
-from runtime.ipc.endpoints import account
+from runtime.ipc.endpoints import account_name
 
 _KEY_BYTES = 32
 _ROOT = 0
@@ -152,7 +152,7 @@ def _read(path: Path) -> bytes:
             )
         if found.st_uid not in (os.geteuid(), _ROOT):
             raise ConfigurationError(
-                f"the key {path} belongs to {account(found.st_uid)}; allowed: {account(os.geteuid())}"
+                f"the key {path} belongs to {account_name(found.st_uid)}; allowed: {account_name(os.geteuid())}"
             )
         secret = path.read_bytes()
     except OSError as error:

@@ -154,7 +154,7 @@ class LabStreams:
         self._door.gone.clear()
         self._door.look()
         for (station, _), flow in self._flows.items():
-            if flow.published.moved():
+            if flow.published.rebind_if_unreachable():
                 self._tell(station)
             if flow.route and not self._allowed.now.may_be(self._door.key_of(flow.route), station):
                 self._leave(flow, "the lab has withdrawn or replaced this station's key")

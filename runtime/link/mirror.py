@@ -16,7 +16,7 @@ import zmq
 from runtime.core.errors import TransportError
 from runtime.ipc.bus import CommandServer, Endpoints, Key
 from runtime.ipc.endpoints import socket_folder
-from runtime.ipc.fair_queue import LONGEST_STOP, Turns
+from runtime.ipc.fair_queue import LONGEST_STOP, FairQueue
 from runtime.ipc.station_lock import Taken, take
 from runtime.link.wire import COORDINATOR, GUARD, MEDIA
 
@@ -41,16 +41,16 @@ class Mirror:
         self._endpoints = Endpoints(station_dir)
         self.key = Key(station_dir)
         self.commands: CommandServer | None = None
-        self.command_turns: Turns | None = None
+        self.command_turns: FairQueue | None = None
         self._streams: tuple[str, str] = ("", "")
         self._cameras = False
         try:
-            self._endpoints.begin()
+            self._endpoints.prepare()
             self.estops = CommandServer(context, station_dir, "estop")
         except (TransportError, OSError, zmq.ZMQError) as error:
             self._lock.close()
             raise TransportError(f"the folder of {station_dir.name} cannot be used: {error}") from None
-        self.estop_turns = Turns(self.estops, (), _SHARE, LONGEST_STOP)
+        self.estop_turns = FairQueue(self.estops, (), _SHARE, LONGEST_STOP)
         self._endpoints.write(GUARD, {"estop": self.estops.endpoint})
 
     def raise_up(self, streams: tuple[str, str]) -> None:
@@ -60,7 +60,7 @@ class Mirror:
         """
         self._lower()
         self.commands = CommandServer(self._context, self.station_dir, "commands")
-        self.command_turns = Turns(self.commands, STOPPING, _SHARE)
+        self.command_turns = FairQueue(self.commands, STOPPING, _SHARE)
         self._streams = streams
         self._tell_where()
         self._endpoints.withdraw(LINK)
@@ -78,15 +78,19 @@ class Mirror:
 
     def look(self) -> None:
         """Listen anew where clients cannot connect any more."""
-        if self.estops.moved() or self._endpoints.lost(GUARD):
+        if self.estops.rebind_if_unreachable() or self._endpoints.is_missing(GUARD):
             self._endpoints.write(GUARD, {"estop": self.estops.endpoint})
-        if self.commands is not None and (self.commands.moved() or self._endpoints.lost(COORDINATOR)):
+        if self.commands is not None and (
+            self.commands.rebind_if_unreachable() or self._endpoints.is_missing(COORDINATOR)
+        ):
             self._tell_where()
 
     @property
     def waiting(self) -> bool:
         """True if there is something to look into, without any further message."""
-        return self.estop_turns.waiting or (self.command_turns is not None and self.command_turns.waiting)
+        return self.estop_turns.has_waiting or (
+            self.command_turns is not None and self.command_turns.has_waiting
+        )
 
     def moved_streams(self, streams: tuple[str, str]) -> None:
         """They are published elsewhere now."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from runtime.ipc.bus import Call, CommandServer
+from runtime.ipc.bus import CommandServer, IncomingMessage
 from runtime.ipc.messages import Command
 from runtime.link.mirror import Mirror
 from runtime.link.wire import LOST_S
@@ -24,7 +24,7 @@ class Pending:
     """A command under way: who asked, and over which socket the answer goes."""
 
     server: CommandServer
-    call: Call
+    call: IncomingMessage
     command: Command
     until: float
     press: Held | None = None
@@ -34,7 +34,7 @@ class Pending:
 class Held:
     """A press of the e-stop; `told` once its sender has an answer."""
 
-    call: Call
+    call: IncomingMessage
     command: Command
     payload: bytes
     verified: bool

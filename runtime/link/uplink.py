@@ -37,7 +37,7 @@ class Telling:
         lost = before is not None and before.why
         since = 0.0 if not trouble else before.since if lost and before else self._clock()
         now = Uplink(self._lab, since, trouble)
-        if now != before or self._endpoints.lost(UPLINK):
+        if now != before or self._endpoints.is_missing(UPLINK):
             self._said = now
             self._endpoints.write(UPLINK, {"lab": now.lab, "since": repr(now.since), "why": now.why})
 

@@ -19,7 +19,7 @@ import zmq
 
 from runtime.core.errors import CodecError, ConfigurationError, RecordingError
 from runtime.ipc.bus import Subscriber
-from runtime.ipc.session_state import with_meaning
+from runtime.ipc.session_state import complete_state_meaning
 from runtime.link.contents import Contents, contents_in_steps
 from runtime.link.home import Home
 from runtime.link.line import Dial, Line
@@ -105,7 +105,7 @@ class Runs:
             said = self._subscriber.receive(0.0).get("state") if self._subscriber else None
             if said:
                 self._going = (
-                    with_meaning(said)["state_is"]["at_work"]
+                    complete_state_meaning(said)["state_is"]["at_work"]
                     or (said.get("recording") or {}).get("uuid") is not None
                 )
                 self._heard = now

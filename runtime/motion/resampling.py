@@ -12,7 +12,7 @@ from robots.rotations import slerp
 from runtime.core.types import Float64
 
 
-def length(count: int, rate: float, wanted_rate: float) -> int:
+def resampled_length(count: int, rate: float, wanted_rate: float) -> int:
     """Number of rows at `wanted_rate` Hz for `count` rows of `rate` Hz: first to last, at least 1."""
     return math.floor((count - 1) * wanted_rate / rate + 1e-9) + 1
 
@@ -32,7 +32,7 @@ def resample(
     """
     if rate == wanted_rate or not len(rows):
         return rows, np.arange(len(rows), dtype=np.int64)
-    steps = np.arange(length(len(rows), rate, wanted_rate))
+    steps = np.arange(resampled_length(len(rows), rate, wanted_rate))
     position = np.minimum(steps * (rate / wanted_rate), len(rows) - 1)
     lower = np.floor(position + 1e-9).astype(np.int64)
     before, after = rows[lower], rows[np.minimum(lower + 1, len(rows) - 1)]

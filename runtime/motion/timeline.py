@@ -30,7 +30,7 @@ class Planned:
     """The action meant for one step: float64 [D], and the chunks it was made from."""
 
     action: Float64
-    makers: Contributions
+    contributions: Contributions
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +53,11 @@ class Fade:
 
     first: int
     rows: Float64
-    makers: tuple[Contributions, ...]
+    contributions: tuple[Contributions, ...]
     weights: Float64
     dims: DimensionKinds
 
-    def over(self, step: int, plan: Planned) -> Planned:
+    def blend(self, step: int, plan: Planned) -> Planned:
         """`plan` for `step`, as far as it has taken over by then."""
         index = step - self.first
         if not 0 <= index < len(self.rows) or not self.weights[index] > 0.0:
@@ -66,7 +66,7 @@ class Fade:
         action = plan.action + weight * difference(self.rows[index], plan.action, self.dims.wrapping)
         switched = list(self.dims.switched)
         action[switched] = plan.action[switched]
-        return Planned(action, mixed(self.makers[index], plan.makers, weight))
+        return Planned(action, mix_contributions(self.contributions[index], plan.contributions, weight))
 
 
 class Timeline:
@@ -95,7 +95,7 @@ class Timeline:
         if not 0 <= index < len(self.rows):
             return None
         plan = Planned(self.rows[index], self.makers[index])
-        return plan if self.fade is None else self.fade.over(step, plan)
+        return plan if self.fade is None else self.fade.blend(step, plan)
 
     def remaining(self, step: int) -> int:
         """Number of steps planned from `step` on."""
@@ -108,15 +108,15 @@ class Timeline:
             return self.rows[:0], []
         return self.rows[index:], self.makers[index:]
 
-    def span(self, step: int) -> tuple[Float64, list[Contributions]]:
+    def executed_rows(self, step: int) -> tuple[Float64, list[Contributions]]:
         """Actions to be executed from `step` on: rows [N, D] and their makers."""
         rows, makers = self.plan(step)
         if self.fade is None:
             return rows, makers
         rows = rows.copy()
         for index in range(min(len(rows), max(0, self.fade.first + len(self.fade.rows) - step))):
-            shown = self.fade.over(step + index, Planned(rows[index], makers[index]))
-            rows[index], makers[index] = shown.action, shown.makers
+            shown = self.fade.blend(step + index, Planned(rows[index], makers[index]))
+            rows[index], makers[index] = shown.action, shown.contributions
         return rows, makers
 
     def replace(
@@ -136,12 +136,12 @@ class Timeline:
         self.fade = fade
 
 
-def single(chunk_id: int, count: int) -> list[Contributions]:
+def single_contribution(chunk_id: int, count: int) -> list[Contributions]:
     """The makers of `count` rows that come from one chunk alone."""
     return [((chunk_id, 1.0),)] * count
 
 
-def mixed(old: Contributions, new: Contributions, weight: float) -> Contributions:
+def mix_contributions(old: Contributions, new: Contributions, weight: float) -> Contributions:
     """The makers of one step that is `weight` of `old` and the rest of `new`."""
     shares: dict[int, float] = {}
     for makers, part in ((old, weight), (new, 1.0 - weight)):
@@ -159,7 +159,7 @@ def difference(old: Float64, new: Float64, wrapping: Sequence[int] = ()) -> Floa
     return apart
 
 
-def on_branch(rows: Float64, before: Float64 | None, wrapping: Sequence[int]) -> Float64:
+def unwrap_onto(rows: Float64, before: Float64 | None, wrapping: Sequence[int]) -> Float64:
     """`rows` [N, D] with angles that wrap made continuous, and starting within half a turn of `before` [D]."""
     if not len(wrapping) or not len(rows):
         return rows
@@ -171,7 +171,7 @@ def on_branch(rows: Float64, before: Float64 | None, wrapping: Sequence[int]) ->
     return continuous
 
 
-def fading(count: int, shape: str = "linear") -> Float64:
+def fade_weights(count: int, shape: str = "linear") -> Float64:
     """Weights [count] of what is blended over from: 1 at the first row, 0 at the last; of one row 0.
 
     "linear", "cosine" (no kink at either end), or "exponential": c (e^c - 1) / (e - 1) of the linear weight c,
@@ -195,10 +195,10 @@ def overlap_blend(
     """`new` with its first rows blended over from `old`, and the weight of `old` in each blended row.
 
     `old` [M, D] and `new` [N, D] start at the same step. L = min(M, N, window) rows are blended with the weights
-    of `fading`; `window` None is the whole overlap. Binary grippers take the new value at once. Written as
+    of `fade_weights`; `window` None is the whole overlap. Binary grippers take the new value at once. Written as
     new + w (old - new), so that equal inputs stay equal.
     """
-    weights = fading(min(len(old), len(new), len(new) if window is None else window), shape)
+    weights = fade_weights(min(len(old), len(new), len(new) if window is None else window), shape)
     blended, count, switched = new.copy(), len(weights), list(dims.switched)
     blended[:count] += weights[:, None] * difference(old[:count], new[:count], dims.wrapping)
     blended[:, switched] = new[:, switched]

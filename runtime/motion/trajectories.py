@@ -65,7 +65,7 @@ class Brake(Motion):
             velocity[self._speeds] = np.where(elapsed < stop, -self._q[self._speeds] / stop, 0.0)
         return np.asarray(velocity)
 
-    def way(self, spacing: float, most: int) -> Float64:
+    def sample_path(self, spacing: float, most: int) -> Float64:
         """Positions [N, D] on the way to the stand, which ends it, `spacing` apart at most and `most` of them."""
         farthest = np.abs(0.5 * self._velocity * self._stop).max(initial=0.0)
         count = int(min(max(np.ceil(farthest / spacing), 1), most))

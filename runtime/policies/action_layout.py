@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Literal
 
 from runtime.core.pose_format import PoseFormat
 from runtime.core.types import ActionChunk, Float32, Space
-from runtime.policies.answers import AnswerSettings
+from runtime.policies.answers import ActionFormatSettings
 from runtime.policies.pictures import Resize
-from runtime.policies.request import RequestLayout, RequestSettings, Size, poses_of
+from runtime.policies.request import RequestLayout, RequestSettings, Size, pose_rows_for
 
 if TYPE_CHECKING:
     from robots import Robot
 
 
-class MeaningSettings(AnswerSettings):
+class ActionLayoutSettings(ActionFormatSettings):
     """Meaning of the numbers of state and rows, and form of pictures."""
 
     observation_space: Space = "joint"
@@ -51,8 +51,8 @@ class MeaningSettings(AnswerSettings):
 
     def widths(self, robot: Robot) -> tuple[int, int]:
         """Widths of the state and of a row; ConfigurationError where a format does not fit the robot."""
-        state = poses_of(self.observation_space, self.observation_pose, robot, "observation_pose")
-        rows = poses_of(self.action_space, self.action_pose, robot, "action_pose")
+        state = pose_rows_for(self.observation_space, self.observation_pose, robot, "observation_pose")
+        rows = pose_rows_for(self.action_space, self.action_pose, robot, "action_pose")
         return robot.dim if state is None else state.width, robot.dim if rows is None else rows.width
 
     def chunk(self, rows: Float32, timing: Mapping[str, float]) -> ActionChunk:

@@ -42,7 +42,7 @@ _COMPARED = frozenset(
 
 
 @dataclass(frozen=True, slots=True)
-class Declared:
+class DeclaredPolicy:
     """A deployment's statement of a policy: its request, and the rows of its answers (`rate` in Hz)."""
 
     request: RequestSettings
@@ -54,7 +54,7 @@ class Declared:
     rate: float
 
 
-def agreed(said: Mapping[str, Any], declared: Declared, where: str) -> Space | None:
+def check_server_claims(said: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Space | None:
     """The action space that the server names in its `where` (metadata or an answer), None where it names none.
 
     Compared are action_mode and action_space, action_dim, action_rate, relative_frame, action_orientation (or
@@ -71,7 +71,7 @@ def agreed(said: Mapping[str, Any], declared: Declared, where: str) -> Space | N
     return space
 
 
-def _pairs(said: Mapping[str, Any], declared: Declared) -> Iterator[tuple[str, Any, str, Any]]:
+def _pairs(said: Mapping[str, Any], declared: DeclaredPolicy) -> Iterator[tuple[str, Any, str, Any]]:
     """Key and value of the server, key and value of the deployment, where the server says something."""
     if said.get("action_dim") is not None:
         what = "joints" if declared.space == "joint" else f"poses ({declared.pose})"
@@ -113,7 +113,7 @@ def _orientation(said: object, here: str) -> object:
     return here if here in meant else meant[0]
 
 
-def _space(said: Mapping[str, Any], declared: Declared, where: str) -> Space | None:
+def _space(said: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Space | None:
     """The space named by action_space or action_mode, which some servers use for the mode instead."""
     found: Space | None = None
     for key, words in (("action_space", [*_SPACES]), ("action_mode", [*_SPACES, *_MODES])):

@@ -13,7 +13,7 @@ from runtime.core.types import ActionMode, RelativeFrame, Space
 Rate = Annotated[float, Field(ge=1, le=1000)]
 
 
-class AnswerSettings(Settings):
+class ActionFormatSettings(Settings):
     """Space, format, mode and rate of the rows of an answer."""
 
     action_space: Space = "joint"

@@ -31,15 +31,15 @@ class Policy(ABC):
     """
 
     observation_eef: Literal["measured", "fk"] = "measured"
-    sees_poses: bool = False  # its answers depend on the poses of an observation
-    glances_s: float | None = (
+    uses_poses: bool = False  # its answers depend on the poses of an observation
+    observe_period_s: float | None = (
         None  # how often it is to be shown what is seen, between requests too [s]; None: never
     )
-    sees_pictures: bool = True  # it is shown those of an observation
-    answers: bool = True  # False where nobody is asked, because the robot is driven by its own node
+    uses_images: bool = True  # it is shown those of an observation
+    is_queried: bool = True  # False where nobody is asked, because the robot is driven by its own node
     # Where a server is connected to in the place of its url's host and port, as the near end of a tunnel; asked before
     # each connection, raises PolicyError where there is none. All else, names of certificates included, is of the url.
-    dial: Dial | None = None
+    address_override: Dial | None = None
 
     @abstractmethod
     def connect(self) -> PolicyInfo:
@@ -49,7 +49,7 @@ class Policy(ABC):
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         """The chunk for this observation; raises PolicyError. A connection that timed out is dropped, not reused."""
 
-    def glance(self, observation: Observation) -> None:  # noqa: B027  # most see only what they are asked about
+    def observe(self, observation: Observation) -> None:  # noqa: B027  # most see only what they are asked about
         """Take in an observation, every `glances_s` of a run, without waiting even for a pending request."""
 
     @abstractmethod
@@ -59,7 +59,7 @@ class Policy(ABC):
     def resume(self) -> None:  # noqa: B027  # most answer what they are shown
         """The episode goes on after a hold in which nothing was asked; called before the next inference."""
 
-    def rest(self) -> None:  # noqa: B027  # most servers keep nothing of a rollout
+    def end_episode(self) -> None:  # noqa: B027  # most servers keep nothing of a rollout
         """The rollout is over: end what the server keeps of it; raises PolicyError. `reset` comes before the next."""
 
     @abstractmethod

@@ -22,7 +22,7 @@ Dial = Callable[[], Place]
 _SPELL_MS = 20  # how soon a connection that is being made notices that nobody wants it any more
 
 
-def reached(
+def open_connection(
     url: str, host: str, port: int, deadline: float, seconds: float, require_wanted: Callable[[], None]
 ) -> socket.socket:
     """As `reach`, with errors that name `url`, and the `seconds` that there were until the deadline.
@@ -30,7 +30,7 @@ def reached(
     PortClosedError where the machine answers and nobody listens, UnreachableError where nothing answers.
     """
     try:
-        return reach(host, port, deadline, require_wanted)
+        return connect_any(host, port, deadline, require_wanted)
     except ConnectionRefusedError as error:
         raise PortClosedError(
             f"no policy server listens at {url}: start it, or correct policy.url"
@@ -48,7 +48,7 @@ def reached(
         ) from error
 
 
-def reach(host: str, port: int, deadline: float, require_wanted: Callable[[], None]) -> socket.socket:
+def connect_any(host: str, port: int, deadline: float, require_wanted: Callable[[], None]) -> socket.socket:
     """A connection to the first address of the host that takes one; OSError of the last one else.
 
     `deadline` is on the monotonic clock, past it TimeoutError. `require_wanted` raises where the caller was told
@@ -59,7 +59,7 @@ def reach(host: str, port: int, deadline: float, require_wanted: Callable[[], No
         with contextlib.ExitStack() as stack:
             wire = stack.enter_context(socket.socket(family, kind, protocol))
             try:
-                _knock(wire, address, deadline, require_wanted)
+                _try_address(wire, address, deadline, require_wanted)
             except OSError as error:
                 refusal = error
             else:
@@ -68,7 +68,7 @@ def reach(host: str, port: int, deadline: float, require_wanted: Callable[[], No
     raise refusal
 
 
-def _knock(
+def _try_address(
     wire: socket.socket, address: Address, deadline: float, require_wanted: Callable[[], None]
 ) -> None:
     wire.setblocking(False)

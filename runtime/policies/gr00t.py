@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from runtime.core.clock import Clock
-from runtime.core.environment import secret
+from runtime.core.environment import read_secret
 from runtime.core.errors import (
     CodecError,
     PolicyError,
     RefusedError,
-    ServerSaysError,
+    ServerReportedError,
     WrongProtocolError,
 )
 from runtime.core.machine_names import Variable
@@ -30,9 +30,9 @@ from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.groot import arrays
 from runtime.policies.groot.link import ReqLink
-from runtime.policies.groot.modality import modalities
+from runtime.policies.groot.modality import parse_modalities
 from runtime.policies.groot.request import Gr00tRequest, RequestSettings
-from runtime.policies.link import headline
+from runtime.policies.link import error_headline
 from runtime.policies.tunnel.settings import TunnelSettings
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class Gr00tPolicy(Policy):
         self._token = _token(config)
         self._request = Gr00tRequest(config, robot, control_rate)
         self.observation_eef = config.observation_eef
-        self.sees_poses = config.sees_poses
+        self.uses_poses = config.sees_poses
         self._link = self._new_link()
         self._lock = threading.Lock()  # of the wire: held through every wait
         self._turning = threading.Lock()  # between open and closed: held for a moment
@@ -120,10 +120,10 @@ class Gr00tPolicy(Policy):
         """
         if conditioning is not None:
             raise PolicyError("the GR00T protocol has no real-time chunking; choose another strategy")
-        moment = self._request.moment(observation)
+        moment = self._request.model_input(observation)
         with self._lock:
             self._require_open()
-            data = self._request.of(moment, observation.prompt)
+            data = self._request.build(moment, observation.prompt)
             seconds = self._config.inference_deadline if self._warm else self._config.first_inference_deadline
             self._warm = self._asked = True
             started = time.monotonic()
@@ -135,7 +135,7 @@ class Gr00tPolicy(Policy):
     def reset(self) -> None:
         """Forget what was seen, here and on the server, which N1.5 has no word for."""
         with self._lock:
-            self._request.forget()
+            self._request.reset()
             if not self._asked or self._config.dialect == "n1.5":
                 return
             self._require_open()
@@ -158,7 +158,7 @@ class Gr00tPolicy(Policy):
                 self._lock.release()
 
     def _new_link(self) -> ReqLink:
-        return ReqLink(self._config.url, self._config.connect_deadline, ANSWER_LIMIT, self.dial)
+        return ReqLink(self._config.url, self._config.connect_deadline, ANSWER_LIMIT, self.address_override)
 
     def _require_open(self) -> None:
         if self._closed:
@@ -169,18 +169,18 @@ class Gr00tPolicy(Policy):
     def _open(self) -> PolicyInfo:
         left = self._link.open()
         try:
-            wanted = modalities(self._call("get_modality_config", left))
-            self._request.agree(wanted)
+            wanted = parse_modalities(self._call("get_modality_config", left))
+            self._request.configure(wanted)
             self._mnp, self._guessed = bool(wanted.reads_mnp), wanted.reads_mnp is None
         except PolicyError:
             self._link.drop()
             raise
         return PolicyInfo(
-            name="GR00T N1.5" if wanted.early else "GR00T",
+            name="GR00T N1.5" if wanted.is_n15 else "GR00T",
             action_space=None,
             horizon=self._request.horizon,
             rate=self._config.action_rate,
-            metadata={"modality": wanted.plain()},
+            metadata={"modality": wanted.to_dict()},
         )
 
     def _act(self, data: Mapping[str, Any], seconds: float) -> Any:
@@ -189,13 +189,13 @@ class Gr00tPolicy(Policy):
         guessed, self._guessed = self._guessed, False
         try:
             return self._call("get_action", seconds, data)
-        except ServerSaysError as error:
+        except ServerReportedError as error:
             if not guessed:
                 raise
             self._mnp = not self._mnp
             try:
                 return self._call("get_action", max(0.1, until - time.monotonic()), data)
-            except ServerSaysError:
+            except ServerReportedError:
                 self._mnp = not self._mnp
                 raise error from None
 
@@ -206,7 +206,7 @@ class Gr00tPolicy(Policy):
         message |= {} if self._token is None else {"api_token": self._token}
         reply = self._link.exchange(arrays.pack(message, self._mnp), seconds, f"an answer to {endpoint}")
         if reply == b"ERROR":
-            raise ServerSaysError(
+            raise ServerReportedError(
                 f"{self._config.url} answers {endpoint} with ERROR: see the server's own output"
             )
         try:
@@ -226,7 +226,7 @@ class Gr00tPolicy(Policy):
             return UnknownEndpoint(
                 f"the policy server at {url} has no endpoint {endpoint!r} ({text}): it is of another version"
             )
-        kind = RefusedError if text.startswith("Unauthorized") else ServerSaysError
+        kind = RefusedError if text.startswith("Unauthorized") else ServerReportedError
         return kind(self._told(text))
 
     def _told(self, text: str) -> str:
@@ -237,7 +237,7 @@ class Gr00tPolicy(Policy):
                 f"the policy server at {url} wants an API token, {given} ({text}): set policy.api_token_env to the "
                 "name of the environment variable that holds it"
             )
-        said = f"the policy server at {url} reports an error: {headline(text)}"
+        said = f"the policy server at {url} reports an error: {error_headline(text)}"
         for pattern, allowed in _HINTS:
             if re.search(pattern, text):
                 return (
@@ -254,4 +254,4 @@ class Gr00tPolicy(Policy):
 
 
 def _token(config: Config) -> str | None:
-    return None if config.api_token_env is None else secret("policy.api_token_env", config.api_token_env)
+    return None if config.api_token_env is None else read_secret("policy.api_token_env", config.api_token_env)

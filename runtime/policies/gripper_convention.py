@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 Convention = Literal["droid", "robot"]
 
 
-class Grip:
+class GripperConvention:
     """The numbers of all grippers of a robot, [..., G]; the convention "robot" leaves them as they are.
 
     `poses` are the rows of the answers where these are poses, None for joints.
@@ -32,18 +32,18 @@ class Grip:
         arms = [(arm, group.gripper_dim) for arm, group in enumerate(robot.arms)]
         self._gripped = [(EEF_WIDTH * arm + EEF_WIDTH - 1, dim) for arm, dim in arms if dim is not None]
 
-    def shown(self, numbers: Float64) -> Float64:
+    def to_policy(self, numbers: Float64) -> Float64:
         """As the policy is shown them; a gripper a little beyond its ends is at them."""
         if not self._converts:
             return numbers
         return np.clip((numbers - self._open) / self._travel, 0.0, 1.0)
 
-    def observed(self, observation: Observation) -> Observation:
+    def convert_observation(self, observation: Observation) -> Observation:
         """The observation with the grippers of its joints and poses as the policy is shown them."""
         if not self._converts:
             return observation
         qpos = observation.qpos.copy()
-        qpos[self._dims] = self.shown(qpos[self._dims].astype(np.float64))
+        qpos[self._dims] = self.to_policy(qpos[self._dims].astype(np.float64))
         eef = observation.eef
         if eef is not None:
             eef = eef.copy()
@@ -51,7 +51,7 @@ class Grip:
                 eef[place] = qpos[dim]
         return replace(observation, qpos=qpos, eef=eef)
 
-    def meant(self, rows: Float32) -> Float32:
+    def to_robot(self, rows: Float32) -> Float32:
         """Rows of an answer [T, W] with the robot's numbers; beyond 0 and 1 there is nothing to close or open."""
         if not self._converts:
             return rows

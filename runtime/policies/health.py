@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from urllib.parse import urlsplit
 
 from runtime.core.errors import PolicyLostError, PolicyTimeout, RefusedError, TlsError, WrongProtocolError
-from runtime.policies.connection import Dial, reached
+from runtime.policies.connection import Dial, open_connection
 
 _STATUS = re.compile(rb"HTTP/1\.[01] ([0-9]{3})([^\r\n]*)\r?\n")
 _LONGEST = 4096  # bytes of a first line
@@ -28,7 +28,7 @@ def require_healthy(
     another PolicyError where it answers anything else, because then another server is there, or the path is wrong.
     """
     try:
-        status, reason = _asked(url, path, headers, time.monotonic() + seconds, seconds, dial)
+        status, reason = _get_status(url, path, headers, time.monotonic() + seconds, seconds, dial)
     except TimeoutError as error:
         raise PolicyTimeout(
             f"{url}: {path} gave no answer within {seconds:g} s: the server is stuck, or no web server"
@@ -55,7 +55,7 @@ def require_healthy(
         )
 
 
-def _asked(
+def _get_status(
     url: str, path: str, headers: Mapping[str, str], deadline: float, seconds: float, dial: Dial | None
 ) -> tuple[int, str]:
     """Status and reason; TimeoutError at the deadline on the monotonic clock however slowly the server speaks."""
@@ -66,7 +66,7 @@ def _asked(
     lines += [f"{name}: {value}" for name, value in headers.items()]
     with contextlib.ExitStack() as stack:
         there = dial() if dial else (host, port)
-        wire = stack.enter_context(reached(url, *there, deadline, seconds, lambda: None))
+        wire = stack.enter_context(open_connection(url, *there, deadline, seconds, lambda: None))
         wire.settimeout(_left(deadline))
         if secure:
             wire = stack.enter_context(ssl.create_default_context().wrap_socket(wire, server_hostname=host))

@@ -20,16 +20,16 @@ from runtime.core.clock import Clock
 from runtime.core.errors import (
     CodecError,
     ConfigurationError,
+    PolicyDisconnected,
     PolicyError,
-    PolicyGone,
     PolicyTimeout,
-    ServerSaysError,
+    ServerReportedError,
     WrongProtocolError,
 )
 from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.async_inference import messages
 from runtime.policies.async_inference.link import Channel
-from runtime.policies.async_inference.pickles import MODULES, TimedAction, read_actions
+from runtime.policies.async_inference.pickles import MODULES, TimedAction, load_actions
 from runtime.policies.async_inference.request import AsyncRequest, RequestSettings
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.tunnel.settings import TunnelSettings
@@ -98,7 +98,7 @@ class LerobotPolicy(Policy):
         self._config = config
         self._request = AsyncRequest(config, robot, control_rate)
         self.observation_eef = config.observation_eef
-        self.sees_poses = config.sees_poses
+        self.uses_poses = config.sees_poses
         self._link = self._new_link()
         self._lock = threading.Lock()  # of the wire: held through every wait
         self._turning = threading.Lock()  # between open and closed: held for a moment
@@ -139,7 +139,7 @@ class LerobotPolicy(Policy):
             if self._ended.is_set():
                 raise PolicyError(f"the policy at {self._config.url} is closed; connect first")
             self._timestep += 1
-            shown = self._request.of(observation, self._timestep)
+            shown = self._request.build(observation, self._timestep)
             if not self._link.is_open:
                 self._open()
             seconds = self._config.inference_deadline if self._warm else self._config.first_inference_deadline
@@ -147,7 +147,7 @@ class LerobotPolicy(Policy):
             started = time.monotonic()
             try:
                 answer = self._answer(shown, seconds)
-            except PolicyGone:
+            except PolicyDisconnected:
                 self._loaded = False
                 raise
             round_trip = 1e3 * (time.monotonic() - started)
@@ -173,21 +173,21 @@ class LerobotPolicy(Policy):
                 self._lock.release()
 
     def _new_link(self) -> Channel:
-        return Channel(self._config.url, self._config.connect_deadline, ANSWER_LIMIT, self.dial)
+        return Channel(self._config.url, self._config.connect_deadline, ANSWER_LIMIT, self.address_override)
 
     def _open(self) -> None:
         left = self._link.open()
         try:
             self._link.call(messages.READY, messages.EMPTY, left)
             if not self._loaded:
-                told = messages.setup(self._request.instructions())
+                told = messages.encode_setup(self._request.setup_message())
                 self._link.call(messages.INSTRUCT, told, self._config.load_deadline)
                 self._loaded = True
         except PolicyError as error:
             self._link.drop()
             if "No module named 'lerobot" not in str(error):
                 raise
-            raise ServerSaysError(
+            raise ServerReportedError(
                 f"{error}\nThe server's LeRobot has its classes in another place: policy.server_version is "
                 f"{self._config.server_version!r}, allowed: {', '.join(MODULES)}"
             ) from error
@@ -215,10 +215,10 @@ class LerobotPolicy(Policy):
             pause = min(2 * pause, _PAUSES[1])
 
     def _asked_once(self, shown: bytes, deadline: float) -> bytes:
-        self._link.call(messages.OBSERVE, messages.observations(shown), self._left(deadline))
+        self._link.call(messages.OBSERVE, messages.encode_observations(shown), self._left(deadline))
         answer = self._link.call(messages.ACT, messages.EMPTY, self._left(deadline))
         try:
-            return messages.actions(answer)
+            return messages.decode_actions(answer)
         except CodecError as error:
             self._link.drop()
             raise WrongProtocolError(
@@ -228,7 +228,7 @@ class LerobotPolicy(Policy):
     def _nothing(self, asked: int, seconds: float) -> PolicyError:
         self._loaded = False  # perhaps it came back without it
         self._link.drop()
-        return ServerSaysError(
+        return ServerReportedError(
             f"{self._config.url} answered with nothing, {asked} times within {seconds:g} s: its inference fails, which "
             "it tells its own log alone. What fails most: the model has other images, another number of states, or "
             "another kind than policy.images, policy.state and policy.policy_type say"
@@ -245,7 +245,7 @@ class LerobotPolicy(Policy):
 
     def _read(self, data: bytes) -> list[TimedAction]:
         try:
-            return read_actions(data, ANSWER_LIMIT)
+            return load_actions(data, ANSWER_LIMIT)
         except CodecError as error:
             self._link.drop()
             raise WrongProtocolError(

@@ -16,19 +16,19 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from runtime.core.errors import (
+    PolicyDisconnected,
     PolicyError,
-    PolicyGone,
     PolicyLostError,
     PolicyTimeout,
     RefusedError,
-    ServerSaysError,
+    ServerReportedError,
     TlsError,
     UnsolicitedError,
     WrongProtocolError,
 )
 from runtime.core.sentences import Pattern, fixed
 from runtime.core.tls import allow_two_threads
-from runtime.policies.connection import Dial, Place, reached
+from runtime.policies.connection import Dial, Place, open_connection
 from runtime.policies.watchdog import Watchdog
 
 if TYPE_CHECKING:
@@ -104,15 +104,15 @@ _CLOSED = Pattern(
 
 ANSWER_LIMIT = 64 * 1024 * 1024  # bytes of a message, metadata too; a chunk of 50 rows is some kilobytes
 _TOO_BIG = 1009  # the close code for it
-LEAVING = "websocket-leave"  # threads that say goodbye to a server
+CLOSING = "websocket-leave"  # threads that say goodbye to a server
 _CLOSE_TIMEOUT = 0.5  # seconds for the closing handshake; a server busy with inference does not answer it
 
 
-def await_left(seconds: float) -> None:
+def wait_closed(seconds: float) -> None:
     """Wait until all servers that are being left have been told, at most so long: for a process that is to end."""
     until = time.monotonic() + seconds
     for thread in threading.enumerate():
-        if thread.name == LEAVING:
+        if thread.name == CLOSING:
             thread.join(max(0.0, until - time.monotonic()))
 
 
@@ -141,7 +141,7 @@ class WebsocketLink:
         return self._connection is not None
 
     @property
-    def was_left(self) -> bool:
+    def closed_by_peer(self) -> bool:
         """True if the peer is known to have ended the held connection, as servers do with idle ones."""
         from websockets.protocol import State
 
@@ -177,7 +177,7 @@ class WebsocketLink:
             self._send(connection, request, seconds)
             return self._receive(connection, deadline, _AN_ANSWER, seconds)
 
-    def acknowledged(self, request: bytes, seconds: float, text: str) -> bytes | None:
+    def exchange_ack(self, request: bytes, seconds: float, text: str) -> bytes | None:
         """Answer to a request: None if it is `text`, with which some servers acknowledge it, else the bytes.
 
         Any other text is the server's error; so is every text that answers an `exchange`.
@@ -201,23 +201,23 @@ class WebsocketLink:
         for connection in (self._shaking, self._connection):
             if connection is not None:
                 _end(connection.socket)
-        self._watchdog.end()
+        self._watchdog.stop()
 
     def _require_not_aborted(self) -> None:
         if self._aborted:
             raise PolicyError(_CLOSED_BY_US(url=self._url))
 
-    def leave(self) -> None:
+    def close_gracefully(self) -> None:
         """End the connection with a close frame, without which servers print a traceback; waits for nothing."""
-        self._watchdog.end()
+        self._watchdog.stop()
         connection, self._connection = self._connection, None
         held = self._stack.pop_all()
         if connection is not None:
-            threading.Thread(target=held.close, name=LEAVING).start()
+            threading.Thread(target=held.close, name=CLOSING).start()
 
     def drop(self) -> None:
         """End the connection without waiting for the server's consent; safe to call twice."""
-        self._watchdog.end()
+        self._watchdog.stop()
         connection, self._connection = self._connection, None
         if connection is not None:
             _end(connection.socket)
@@ -251,7 +251,7 @@ class WebsocketLink:
         try:
             seconds = self._connect_deadline
             wire = self._stack.enter_context(
-                reached(self._url, *self._place(), deadline, seconds, self._require_not_aborted)
+                open_connection(self._url, *self._place(), deadline, seconds, self._require_not_aborted)
             )
             secure = self._url.lower().startswith("wss:")
             return self._stack.enter_context(
@@ -302,7 +302,7 @@ class WebsocketLink:
         """Send, but not for ever: a server that stopped reading leaves our socket full."""
         from websockets.exceptions import ConnectionClosed
 
-        with self._watchdog.watching(seconds) as was_cut:
+        with self._watchdog.deadline(seconds) as was_cut:
             try:
                 connection.send(request)
             except ConnectionClosed as error:
@@ -331,7 +331,7 @@ class WebsocketLink:
 
     def _binary(self, answer: str | bytes) -> bytes:
         if isinstance(answer, str):
-            raise ServerSaysError(_SERVER_SAYS(url=self._url, error=headline(answer)))
+            raise ServerReportedError(_SERVER_SAYS(url=self._url, error=error_headline(answer)))
         return answer
 
     def _frame(self, connection: ClientConnection, deadline: float, what: str, seconds: float) -> str | bytes:
@@ -350,7 +350,7 @@ class WebsocketLink:
         sent = getattr(error, "sent", None)
         if sent is not None and sent.code == _TOO_BIG:
             return WrongProtocolError(_TOO_LARGE(url=self._url, why=sent.reason))
-        return PolicyGone(_CLOSED(url=self._url, error=error))
+        return PolicyDisconnected(_CLOSED(url=self._url, error=error))
 
     @contextlib.contextmanager
     def _dropping_on_error(self) -> Iterator[None]:
@@ -367,7 +367,7 @@ def _end(wire: socket.socket) -> None:
         wire.shutdown(socket.SHUT_RDWR)
 
 
-def headline(text: str) -> str:
+def error_headline(text: str) -> str:
     """A traceback's last line first, because that is the sentence, then the whole of it; of JSON what it says."""
     try:
         said = json.loads(text)

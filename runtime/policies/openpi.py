@@ -18,15 +18,15 @@ from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.errors import CodecError, ConfigurationError, PolicyError, WrongProtocolError
 from runtime.core.types import ActionChunk, Conditioning, Float32, Observation
-from runtime.policies.agreement import Declared, agreed
-from runtime.policies.answers import AnswerSettings
+from runtime.policies.agreement import DeclaredPolicy, check_server_claims
+from runtime.policies.answers import ActionFormatSettings
 from runtime.policies.base import PolicyInfo
-from runtime.policies.gripper_convention import Convention, Grip
+from runtime.policies.gripper_convention import Convention, GripperConvention
 from runtime.policies.link import ANSWER_LIMIT
-from runtime.policies.request import RequestLayout, RequestSettings, poses_of
-from runtime.policies.rows import action_rows
+from runtime.policies.request import RequestLayout, RequestSettings, pose_rows_for
+from runtime.policies.rows import parse_action_rows
 from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
-from runtime.policies.rtc.base import Dialect, Plain
+from runtime.policies.rtc.base import Dialect, NoRtc
 from runtime.policies.rtc.kai0 import Kai0
 from runtime.policies.rtc.openpi_rtc import EnvelopeKeys, OpenpiRtc, Rows
 from runtime.policies.rtc.prev_action import PrevAction
@@ -45,7 +45,7 @@ _MARKS = {
 }
 
 
-class Config(ServerSettings, RequestSettings, AnswerSettings):
+class Config(ServerSettings, RequestSettings, ActionFormatSettings):
     """A policy server that speaks the openpi websocket protocol."""
 
     kind: Literal["openpi"] = "openpi"
@@ -87,11 +87,11 @@ class OpenpiPolicy(WebsocketPolicy):
         super().__init__(config)
         self._config = config
         self._layout = RequestLayout(config, robot)
-        poses = poses_of(config.action_space, config.action_pose, robot, "action_pose")
+        poses = pose_rows_for(config.action_space, config.action_pose, robot, "action_pose")
         self._width = robot.dim if poses is None else poses.width
-        self._grip = Grip(config.gripper, robot, poses)
+        self._grip = GripperConvention(config.gripper, robot, poses)
         self._scale = _scale(config.action_scale, self._width)
-        self._declared = Declared(
+        self._declared = DeclaredPolicy(
             config,
             config.action_space,
             config.action_mode,
@@ -101,7 +101,7 @@ class OpenpiPolicy(WebsocketPolicy):
             config.action_rate or control_rate,
         )
         self.observation_eef = config.observation_eef
-        self.sees_poses = config.observation_space == "eef" or (
+        self.uses_poses = config.observation_space == "eef" or (
             config.action_space == "eef" and config.action_mode != "absolute"
         )
         self._dialect = _dialect(config)
@@ -117,10 +117,10 @@ class OpenpiPolicy(WebsocketPolicy):
         """
         shown, continued = self.request(observation), self._as_served(conditioning)
         with self._lock:
-            request = msgpack_arrays.pack(self._dialect.request(shown, continued))
+            request = msgpack_arrays.pack(self._dialect.wrap(shown, continued))
             self._require_open()
             answer, round_trip = self._exchange(request)
-            result = self._result(self._unpacked(answer, "an answer"))
+            result = self._result(self._decode(answer, "an answer"))
         return self._chunk(result, round_trip)
 
     def reset(self) -> None:
@@ -128,12 +128,12 @@ class OpenpiPolicy(WebsocketPolicy):
 
     def request(self, observation: Observation) -> dict[str, object]:
         """The request map for an observation, in the declared layout, without what a dialect adds."""
-        return self._layout.of(self._grip.observed(observation))
+        return self._layout.build(self._grip.convert_observation(observation))
 
-    def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
+    def _check_metadata(self, metadata: dict[str, Any]) -> PolicyInfo:
         _refuse_others(metadata)
-        space = agreed(metadata, self._declared, "metadata")
-        supports_rtc = self._dialect.supported(metadata)
+        space = check_server_claims(metadata, self._declared, "metadata")
+        supports_rtc = self._dialect.check_supported(metadata)
         horizon = metadata.get("action_horizon")
         return PolicyInfo(
             name=str(metadata.get("name", "openpi")),
@@ -146,30 +146,31 @@ class OpenpiPolicy(WebsocketPolicy):
 
     def _result(self, reply: dict[str, Any]) -> dict[str, Any]:
         try:
-            return self._dialect.result(reply)
+            return self._dialect.unwrap(reply)
         except PolicyError:
-            self._link.leave()  # after an error the server closes, after another's answer all would be another's
+            # After an error the server closes; after another's answer all that follow would be another's.
+            self._link.close_gracefully()
             raise
 
-    def _doubt(self, request: bytes, answer: bytes, took: float) -> str:
+    def _mismatch_reason(self, request: bytes, answer: bytes, took: float) -> str:
         """Also where it came sooner than the server says that it took: then it was under way before the question."""
         with contextlib.suppress(CodecError):  # `infer` says so
             reply = msgpack_arrays.unpack(answer, ANSWER_LIMIT)
             said = _timing(reply).get("server.infer_ms", 0.0) if isinstance(reply, dict) else 0.0
             if took < _SOONER * said:
                 return "the answer came sooner than the server says that its inference took"
-        return super()._doubt(request, answer, took)
+        return super()._mismatch_reason(request, answer, took)
 
     def _chunk(self, reply: Mapping[str, Any], round_trip: float) -> ActionChunk:
         if "actions" not in reply:
             raise WrongProtocolError(
                 f"the answer has no 'actions'; it has {', '.join(map(str, reply)) or 'nothing'}"
             )
-        agreed(reply, self._declared, "answer")
-        given = action_rows("actions", reply["actions"], self._width)
+        check_server_claims(reply, self._declared, "answer")
+        given = parse_action_rows("actions", reply["actions"], self._width)
         own = self._model_rows(reply)
         return ActionChunk(
-            actions=self._grip.meant(given if self._scale is None else given * self._scale),
+            actions=self._grip.to_robot(given if self._scale is None else given * self._scale),
             space=self._config.action_space,
             rate=self._config.action_rate,
             mode=self._config.action_mode,
@@ -182,7 +183,7 @@ class OpenpiPolicy(WebsocketPolicy):
 
     def _model_rows(self, reply: Mapping[str, Any]) -> Float32 | None:
         origin = reply.get("origin_actions") if self._dialect.continues_model_rows else None
-        return None if origin is None else action_rows("origin_actions", origin)
+        return None if origin is None else parse_action_rows("origin_actions", origin)
 
     def _as_served(self, conditioning: Conditioning | None) -> Conditioning | None:
         """Rows of the robot's numbers as the server counts them; absolute ones are kept as it gave them."""
@@ -221,7 +222,7 @@ def _dialect(config: Config) -> Dialect:
         return Kai0(config.rtc_rows, 0.5 if weight is None else weight)
     if config.rtc == "openpi_rtc":
         return OpenpiRtc(config.rtc_envelope, config.rtc_rows)
-    return PrevAction() if config.rtc == "prev_action" else Plain()
+    return PrevAction() if config.rtc == "prev_action" else NoRtc()
 
 
 def _timing(reply: Mapping[str, Any]) -> dict[str, float]:

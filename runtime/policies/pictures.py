@@ -12,7 +12,7 @@ Resize = Literal["pad", "stretch"]
 Layout = Literal["chw", "hwc"]
 
 
-def fitted(
+def resize_image(
     picture: UInt8, height: int, width: int, how: Resize, by: Literal["bilinear", "lanczos"] = "bilinear"
 ) -> UInt8:
     """RGB uint8 [height, width, 3] from [H, W, 3], with Pillow because policies are trained with it.
@@ -37,7 +37,7 @@ def fitted(
     return canvas
 
 
-def laid_out(picture: UInt8, layout: Layout) -> UInt8:
+def to_layout(picture: UInt8, layout: Layout) -> UInt8:
     """The picture in memory order: [H, W, 3] for "hwc", [3, H, W] for "chw"."""
     if layout == "hwc":
         return np.ascontiguousarray(picture)

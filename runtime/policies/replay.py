@@ -19,7 +19,7 @@ from runtime.core.settings import Settings
 from runtime.core.types import ActionChunk, Conditioning, Float32, Observation, Space
 from runtime.datasets.mapping import ColumnMapping
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.policies.request import poses_of
+from runtime.policies.request import pose_rows_for
 from runtime.recording.base import IMPORTED
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class ReplayPolicy(Policy):
     def __init__(self, config: Config, robot: Robot, clock: Clock, control_rate: float) -> None:
         self._config = config
         self._robot = robot
-        poses = poses_of(config.space, config.action_pose, robot, "action_pose")
+        poses = pose_rows_for(config.space, config.action_pose, robot, "action_pose")
         self._width = robot.dim if poses is None else poses.width
         self._clock = clock
         self._control_rate = control_rate
@@ -123,15 +123,15 @@ class ReplayPolicy(Policy):
         )
 
     def _recording(self) -> _Recorded:
-        from runtime.datasets.journal import read_journal
-        from runtime.recording.scrub import require_sound
+        from runtime.datasets.journal import read_finished_episode
+        from runtime.recording.scrub import require_intact
 
         if self._config.episode:
             raise PolicyError(
                 f"policy.episode = {self._config.episode}, but {self._config.path} is one recorded episode; allowed: 0"
             )
-        state = require_sound(Path(self._config.path)).state
-        journal = read_journal(Path(self._config.path))
+        state = require_intact(Path(self._config.path)).state
+        journal = read_finished_episode(Path(self._config.path))
         poses = self._config.space == "eef"
         column, key = ("eef_action", "eef_names") if poses else ("action", "joint_names")
         if poses and not journal.has_stream(column):
@@ -150,7 +150,7 @@ class ReplayPolicy(Policy):
     def _require_same_robot(self, recorded: _Recorded) -> None:
         """Numbers of another robot of ours, or in another order, would move this one nonsensically."""
         own = self._robot
-        if recorded.robot in robots.names() and recorded.robot != own.name:
+        if recorded.robot in robots.robot_names() and recorded.robot != own.name:
             raise PolicyError(
                 f"{self._config.path} is of the robot {recorded.robot}, the station's is {own.name}"
             )

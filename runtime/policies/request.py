@@ -8,10 +8,10 @@ import numpy as np
 from pydantic import Field
 
 from runtime.core.errors import ConfigurationError, PolicyError
-from runtime.core.pose_format import PoseFormat, refuse_format
+from runtime.core.pose_format import PoseFormat, reject_pose_format
 from runtime.core.settings import Settings
 from runtime.core.types import EEF_WIDTH, Float32, Observation, Space
-from runtime.policies.pictures import Layout, Resize, fitted, laid_out
+from runtime.policies.pictures import Layout, Resize, resize_image, to_layout
 from runtime.spaces.pose_rows import PoseRows
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class RequestLayout:
     def __init__(self, settings: RequestSettings, robot: Robot) -> None:
         self._settings = settings
         self._cameras = _cameras(settings, robot)
-        self._poses = poses_of(
+        self._poses = pose_rows_for(
             settings.observation_space, settings.observation_pose, robot, "observation_pose"
         )
         self._poses_given = robot.eef_dim
@@ -68,7 +68,7 @@ class RequestLayout:
                     f"policy.state_parts.{key} = {dims} leaves the state; allowed: 0 to {self._state_width - 1}"
                 )
 
-    def of(self, observation: Observation) -> dict[str, Any]:
+    def build(self, observation: Observation) -> dict[str, Any]:
         """The request map; PolicyError where the observation lacks what belongs into it."""
         settings = self._settings
         state = self._state(observation)
@@ -82,12 +82,12 @@ class RequestLayout:
         return request
 
     def _state(self, observation: Observation) -> Float32:
-        state = observation.qpos if self._poses is None else self._written(self._poses, observation)
+        state = observation.qpos if self._poses is None else self._encode_poses(self._poses, observation)
         if state.shape != (self._state_width,):
             raise PolicyError(f"the state has shape {list(state.shape)}; expected [{self._state_width}]")
         return np.ascontiguousarray(state, dtype=np.float32)
 
-    def _written(self, poses: PoseRows, observation: Observation) -> Float32:
+    def _encode_poses(self, poses: PoseRows, observation: Observation) -> Float32:
         """The observation's poses as the policy was trained with them; a single row is in the usual range."""
         if observation.eef is None:
             raise PolicyError('policy.observation_space is "eef" but the observation has no poses')
@@ -106,15 +106,15 @@ class RequestLayout:
             raise PolicyError(f"the observation has no picture {camera!r}; it has {given}")
         settings = self._settings
         if settings.image_size is not None and settings.resize != "none":
-            picture = fitted(picture, settings.image_size[0], settings.image_size[1], settings.resize)
-        return laid_out(picture, settings.image_layout)
+            picture = resize_image(picture, settings.image_size[0], settings.image_size[1], settings.resize)
+        return to_layout(picture, settings.image_layout)
 
 
-def poses_of(space: Space, pose: PoseFormat, robot: Robot, key: str) -> PoseRows | None:
+def pose_rows_for(space: Space, pose: PoseFormat, robot: Robot, key: str) -> PoseRows | None:
     """The rows of a space that is poses, None for joints; ConfigurationError where the format does not fit."""
     if space == "eef":
         return PoseRows(pose, robot, f"policy.{key}")
-    refuse_format(pose, f"policy.{key}")
+    reject_pose_format(pose, f"policy.{key}")
     return None
 
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
-from runtime.core.errors import ContradictionError, PolicyError, ServerSaysError, WrongProtocolError
+from runtime.core.errors import ContradictionError, PolicyError, ServerReportedError, WrongProtocolError
 from runtime.core.types import ActionChunk, Conditioning, Observation
-from runtime.policies.arena.actions import Meant, MeantSettings
-from runtime.policies.arena.request import Shown, ShownSettings
-from runtime.policies.arena.wants import Wants, wanted
+from runtime.policies.arena.actions import ArenaActions, ArenaActionSettings
+from runtime.policies.arena.request import ArenaRequest, ArenaRequestSettings
+from runtime.policies.arena.wants import ServerRequirements, parse_requirements
 from runtime.policies.base import PolicyInfo
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 ACKNOWLEDGED = "reset successful"
 
 
-class Config(ServerSettings, ShownSettings, MeantSettings):
+class Config(ServerSettings, ArenaRequestSettings, ArenaActionSettings):
     """A policy server of the RoboArena family: RoboArena, DreamZero, or vLLM-Omni with its path in the url."""
 
     kind: Literal["roboarena"] = "roboarena"
@@ -55,12 +55,12 @@ class RoboarenaPolicy(WebsocketPolicy):
     def __init__(self, config: Config, robot: Robot) -> None:
         super().__init__(config)
         self._config = config
-        self._shown = Shown(config, robot)
-        self._meant = Meant(config, config.gripper, robot)
+        self._shown = ArenaRequest(config, robot)
+        self._meant = ArenaActions(config, config.gripper, robot)
         self.observation_eef = config.observation_eef
-        self.sees_poses = self._shown.sees_poses or (self._meant.cartesian and self._meant.velocity)
-        self._wants: Wants | None = None
-        self.glances_s = self._shown.glances_s
+        self.uses_poses = self._shown.sees_poses or (self._meant.cartesian and self._meant.velocity)
+        self._wants: ServerRequirements | None = None
+        self.observe_period_s = self._shown.glances_s
         self._session = _new_session()
         self._asked = False  # in this session
         self._ending: dict[str, str] | None = (
@@ -78,7 +78,7 @@ class RoboarenaPolicy(WebsocketPolicy):
             self._reopen()
             self._end_session()
             request = msgpack_arrays.pack(
-                self._shown.of(observation) | self._session_field() | {"endpoint": "infer"}
+                self._shown.build(observation) | self._session_field() | {"endpoint": "infer"}
             )
             self._asked = True
             answer, round_trip = self._exchange(request)
@@ -86,9 +86,9 @@ class RoboarenaPolicy(WebsocketPolicy):
         _require_no_error(reply)
         return self._meant.chunk(reply, {"round_trip_ms": round_trip})
 
-    def glance(self, observation: Observation) -> None:
+    def observe(self, observation: Observation) -> None:
         """Keep its pictures for the requests to come."""
-        self._shown.glance(observation)
+        self._shown.observe(observation)
 
     def reset(self) -> None:
         """End the session on the server and wait for its acknowledgement; nothing is sent where it never began.
@@ -96,19 +96,19 @@ class RoboarenaPolicy(WebsocketPolicy):
         Where that fails, the next `infer` tries it again before it asks: the server may keep a history.
         """
         with self._lock:
-            self._leave_session()
+            self._forget_session()
             if self._ending is not None:
                 self._reopen()
                 self._end_session()
 
-    def rest(self) -> None:
+    def end_episode(self) -> None:
         """As `reset`, on a connection that stands: none is opened to end a session, the next `infer` does that."""
         with self._lock:
-            self._leave_session()
-            if self._link.is_open and not self._link.was_left and not self._closed:
+            self._forget_session()
+            if self._link.is_open and not self._link.closed_by_peer and not self._closed:
                 self._end_session()
 
-    def _leave_session(self) -> None:
+    def _forget_session(self) -> None:
         if self._asked:
             self._ending = self._session_field()
             self._session, self._asked = _new_session(), False
@@ -118,30 +118,30 @@ class RoboarenaPolicy(WebsocketPolicy):
         if self._ending is None:
             return
         request = msgpack_arrays.pack(self._ending | {"endpoint": "reset"})
-        answer = self._link.acknowledged(request, self._config.reset_deadline, ACKNOWLEDGED)
+        answer = self._link.exchange_ack(request, self._config.reset_deadline, ACKNOWLEDGED)
         self._last = None  # no answer of before can follow
         if answer is not None:
             self._require_acknowledged(self._value(answer, "an acknowledgement"))
         self._ending = None
 
     def _reopen(self) -> None:
-        if self._link.was_left:
-            self._link.leave()
+        if self._link.closed_by_peer:
+            self._link.close_gracefully()
         self._require_open()
 
     def _session_field(self) -> dict[str, str]:
         return {"session_id": self._session} if self._wants is not None and self._wants.session else {}
 
-    def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
-        wants = wanted(metadata)
+    def _check_metadata(self, metadata: dict[str, Any]) -> PolicyInfo:
+        wants = parse_requirements(metadata)
         own = self._config.image_size
         if own is not None and wants.resolution is not None and own != list(wants.resolution):
             raise ContradictionError(
                 f"the server's metadata has image_resolution = {list(wants.resolution)}, policy.image_size = {own}; "
                 "correct the one that is wrong"
             )
-        self._shown.agree(wants)
-        self._meant.agree(wants)
+        self._shown.configure(wants)
+        self._meant.configure(wants)
         self._wants = wants
         return PolicyInfo(
             name=str(metadata.get("name", "roboarena")),
@@ -154,7 +154,7 @@ class RoboarenaPolicy(WebsocketPolicy):
     def _require_acknowledged(self, reply: Any) -> None:
         _require_no_error(reply)
         if not isinstance(reply, Mapping) or reply.get("status") != ACKNOWLEDGED:
-            self._link.leave()  # whatever this answers, it is no reset
+            self._link.close_gracefully()  # whatever this answers, it is no reset
             raise WrongProtocolError(
                 f"{self._config.url} answered a reset with {_short(reply)}; expected the text or the status "
                 f"{ACKNOWLEDGED!r}"
@@ -165,7 +165,7 @@ def _require_no_error(reply: Any) -> None:
     """vLLM-Omni tells errors as a map and stays connected."""
     if isinstance(reply, Mapping) and reply.get("type") == "error":
         said = reply.get("message") or reply.get("error") or "nothing more"
-        raise ServerSaysError(f"the policy server reports an error: {said}")
+        raise ServerReportedError(f"the policy server reports an error: {said}")
 
 
 def _short(value: Any) -> str:

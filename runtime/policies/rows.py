@@ -11,7 +11,7 @@ from runtime.core.errors import NotFiniteError, ShapeError
 from runtime.core.types import Float32
 
 
-def action_rows(name: str, given: object, width: int | None = None) -> Float32:
+def parse_action_rows(name: str, given: object, width: int | None = None) -> Float32:
     """float32 [T, W] of [W], [T, W] or [1, T, W]; raises ShapeError or NotFiniteError, which say where.
 
     `width` is the only W allowed, None allows any.
@@ -25,7 +25,7 @@ def action_rows(name: str, given: object, width: int | None = None) -> Float32:
         raise ShapeError(f"{name} is empty, shape {list(given.shape)}; expected at least one row")
     if width is not None and rows.shape[1] != width:
         raise ShapeError(f"{name} has rows of {rows.shape[1]} numbers; this robot needs {width}")
-    numbers = rows.astype(np.float32) if rows.dtype == np.float32 else _narrowed(rows)
+    numbers = rows.astype(np.float32) if rows.dtype == np.float32 else _to_float32(rows)
     finite = np.isfinite(numbers)
     if not finite.all():  # where it fails is looked for only then: every answer passes here
         wrong = np.argwhere(~finite)
@@ -37,7 +37,7 @@ def action_rows(name: str, given: object, width: int | None = None) -> Float32:
     return numbers
 
 
-def _narrowed(rows: NDArray[Any]) -> Float32:
+def _to_float32(rows: NDArray[Any]) -> Float32:
     """As float32; what overflows becomes infinite, and is refused as such."""
     with np.errstate(over="ignore"):
         return rows.astype(np.float32)

@@ -22,15 +22,15 @@ from runtime.core.errors import (
     ConfigurationError,
     ContradictionError,
     PolicyError,
-    ServerSaysError,
+    ServerReportedError,
     WrongProtocolError,
 )
 from runtime.core.types import ActionChunk, Conditioning, Observation
-from runtime.policies.action_layout import MeaningSettings
+from runtime.policies.action_layout import ActionLayoutSettings
 from runtime.policies.base import PolicyInfo
-from runtime.policies.link import headline
+from runtime.policies.link import error_headline
 from runtime.policies.request import PIXELS, RequestLayout, Size
-from runtime.policies.rows import action_rows
+from runtime.policies.rows import parse_action_rows
 from runtime.policies.statistics import Statistics
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
 
@@ -44,7 +44,7 @@ _ENVIRONMENTS = (
 )  # the second until May 2026, with nothing else beside it
 
 
-class Config(ServerSettings, MeaningSettings):
+class Config(ServerSettings, ActionLayoutSettings):
     """A policy server of StarVLA."""
 
     kind: Literal["starvla"] = "starvla"
@@ -88,7 +88,7 @@ class StarvlaPolicy(WebsocketPolicy):
             config.statistics.require_width(self._width)
         self._layout = self._layout_for(config.image_size)
         self.observation_eef = config.observation_eef
-        self.sees_poses = config.sees_poses
+        self.uses_poses = config.sees_poses
         self._unnorm_key = config.unnorm_key
         self._number = 0
         self._spoken = time.monotonic()
@@ -116,14 +116,14 @@ class StarvlaPolicy(WebsocketPolicy):
         if conditioning is not None:
             raise PolicyError("the StarVLA protocol has no real-time chunking; choose another strategy")
         with self._lock:
-            if self._link.was_left:
-                self._link.leave()
+            if self._link.closed_by_peer:
+                self._link.close_gracefully()
             self._require_open()
             envelope = self._envelope("infer") | {"payload": self.payload(observation)}
             answer, round_trip = self._exchange(msgpack_arrays.pack(envelope))
             self._spoken = time.monotonic()
-            reply = self._unpacked(answer, "an answer")
-            self._require_answered(reply, envelope)
+            reply = self._decode(answer, "an answer")
+            self._check_reply(reply, envelope)
         return self._chunk(reply.get("data"), round_trip)
 
     def reset(self) -> None:
@@ -136,7 +136,7 @@ class StarvlaPolicy(WebsocketPolicy):
 
     def payload(self, observation: Observation) -> dict[str, Any]:
         """One example, and whose statistics are meant."""
-        shown = self._layout.of(observation)
+        shown = self._layout.build(observation)
         example: dict[str, Any] = {"image": list(shown["images"].values()), "lang": observation.prompt}
         if self._config.state:
             example["state"] = shown["state"][None]
@@ -146,7 +146,7 @@ class StarvlaPolicy(WebsocketPolicy):
         sized = self._config.model_copy(update={"image_size": size})
         return sized.layout(self._robot, {key: key for key in self._config.cameras})
 
-    def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
+    def _check_metadata(self, metadata: dict[str, Any]) -> PolicyInfo:
         said = metadata.get("env")
         if said not in _ENVIRONMENTS and not {"available_unnorm_keys", "ckpt_path"} & set(metadata):
             found = ", ".join(map(str, metadata)) or "nothing"
@@ -182,10 +182,10 @@ class StarvlaPolicy(WebsocketPolicy):
 
     def _ping(self, seconds: float) -> None:
         envelope = self._envelope("ping")
-        reply = self._unpacked(
+        reply = self._decode(
             self._link.exchange(msgpack_arrays.pack(envelope), seconds), "an answer to a ping"
         )
-        self._require_answered(reply, envelope)
+        self._check_reply(reply, envelope)
         self._spoken = time.monotonic()
 
     def _keep_awake(self, silent: threading.Event, every: float) -> None:
@@ -198,15 +198,15 @@ class StarvlaPolicy(WebsocketPolicy):
                     self._ping(self._config.inference_deadline)
             except PolicyError as error:
                 log.warning("the policy server did not answer a ping, the connection is dropped: %s", error)
-                self._link.leave()
+                self._link.close_gracefully()
             finally:
                 self._lock.release()
 
-    def _require_answered(self, reply: Mapping[str, Any], envelope: Mapping[str, Any]) -> None:
+    def _check_reply(self, reply: Mapping[str, Any], envelope: Mapping[str, Any]) -> None:
         """An answer to this very request that is no error; any other is followed by another connection."""
         asked, found = envelope["request_id"], reply.get("request_id")
         if found != asked:
-            self._link.leave()
+            self._link.close_gracefully()
             raise WrongProtocolError(
                 f"the answer has request_id {found!r}, asked was {asked!r}: it is another request's, or no StarVLA "
                 "server answers here"
@@ -214,7 +214,7 @@ class StarvlaPolicy(WebsocketPolicy):
         if reply.get("ok") is not True or reply.get("status") != "ok":
             error = reply.get("error")
             said = error.get("message") if isinstance(error, Mapping) else error
-            raise ServerSaysError(f"the policy server reports an error: {headline(str(said))}")
+            raise ServerReportedError(f"the policy server reports an error: {error_headline(str(said))}")
 
     def _chunk(self, data: Any, round_trip: float) -> ActionChunk:
         if not isinstance(data, Mapping):
@@ -223,19 +223,19 @@ class StarvlaPolicy(WebsocketPolicy):
 
     def _rows(self, data: Mapping[str, Any]) -> np.ndarray[Any, np.dtype[np.float32]]:
         if "actions" in data:
-            return action_rows("actions", data["actions"], self._width)
+            return parse_action_rows("actions", data["actions"], self._width)
         if "normalized_actions" not in data:
             raise WrongProtocolError(
                 "the answer has neither 'actions' nor 'normalized_actions'; it has "
                 f"{', '.join(map(str, data)) or 'nothing'}"
             )
-        rows = action_rows("normalized_actions", data["normalized_actions"], self._width)
+        rows = parse_action_rows("normalized_actions", data["normalized_actions"], self._width)
         if self._config.statistics is None:
             raise ActionSpaceError(
                 "the server answers with normalized_actions, which are no robot's numbers; allowed: a server that "
                 "un-normalises them, or its statistics in policy.statistics (low, high, mask)"
             )
-        return self._config.statistics.undone(rows)
+        return self._config.statistics.denormalize(rows)
 
 
 def _unnorm_key(metadata: Mapping[str, Any], own: str | None) -> str | None:

@@ -45,7 +45,7 @@ class Statistics(Settings):
                 f"policy.statistics has {len(self.low)} numbers; the rows of this robot have {width}"
             )
 
-    def undone(self, rows: Float32) -> Float32:
+    def denormalize(self, rows: Float32) -> Float32:
         """The robot's numbers of normalised rows [T, W]; what is beyond -1 and 1 is at them."""
         low, high = np.asarray(self.low), np.asarray(self.high)
         made = low + (np.clip(rows, -1.0, 1.0) + 1.0) / 2.0 * (high - low)

@@ -26,7 +26,7 @@ class Watchdog:
         self._fired = False
 
     @contextlib.contextmanager
-    def watching(self, seconds: float) -> Iterator[Callable[[], bool]]:
+    def deadline(self, seconds: float) -> Iterator[Callable[[], bool]]:
         """Cut the work of this context after `seconds`; the function given returns True if that was so."""
         self._begin(time.monotonic() + seconds)
         try:
@@ -35,7 +35,7 @@ class Watchdog:
             with self._changed:
                 self._deadline = math.inf
 
-    def end(self) -> None:
+    def stop(self) -> None:
         """Nothing is cut any more."""
         with self._changed:
             self._thread, self._deadline = None, math.inf

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from runtime.core import msgpack_arrays
-from runtime.core.environment import secret
+from runtime.core.environment import read_secret
 from runtime.core.errors import CodecError, PolicyError, WrongProtocolError
 from runtime.core.machine_names import Variable
 from runtime.core.sentences import Pattern, fixed
@@ -76,7 +76,7 @@ class WebsocketPolicy(Policy):
         self._excused: set[str] = set()  # doubts that another connection has not confirmed
 
     @abstractmethod
-    def _greeted(self, metadata: dict[str, Any]) -> PolicyInfo:
+    def _check_metadata(self, metadata: dict[str, Any]) -> PolicyInfo:
         """The server's statement of itself; PolicyError and a dropped connection if it is the wrong one."""
 
     def connect(self) -> PolicyInfo:
@@ -84,7 +84,7 @@ class WebsocketPolicy(Policy):
         with self._lock:
             self._warm, self._last = False, None
             self._excused.clear()
-            self._link.leave()
+            self._link.close_gracefully()
             with self._turning:
                 self._closed = False
                 self._link = self._new_link()
@@ -99,13 +99,15 @@ class WebsocketPolicy(Policy):
             self._closed = True
             if self._lock.acquire(blocking=False):
                 try:
-                    self._link.leave()
+                    self._link.close_gracefully()
                 finally:
                     self._lock.release()
             self._link.abort()
 
     def _new_link(self) -> WebsocketLink:
-        return WebsocketLink(self._server.url, self._headers, self._server.connect_deadline, self.dial)
+        return WebsocketLink(
+            self._server.url, self._headers, self._server.connect_deadline, self.address_override
+        )
 
     def _require_open(self) -> None:
         """A connection, another one where there is none any more; PolicyError after `close`."""
@@ -117,13 +119,15 @@ class WebsocketPolicy(Policy):
     def _open(self) -> PolicyInfo:
         if self._server.health_path is not None:
             deadline = self._server.connect_deadline
-            require_healthy(self._server.url, self._server.health_path, self._headers, deadline, self.dial)
-        metadata = self._unpacked(self._link.open(), "metadata")
+            require_healthy(
+                self._server.url, self._server.health_path, self._headers, deadline, self.address_override
+            )
+        metadata = self._decode(self._link.open(), "metadata")
         self._last = None  # the first answer of a connection is to its first question
         try:
-            return self._greeted(metadata)
+            return self._check_metadata(metadata)
         except PolicyError:
-            self._link.leave()
+            self._link.close_gracefully()
             raise
 
     def _exchange(self, request: bytes) -> tuple[bytes, float]:
@@ -135,35 +139,35 @@ class WebsocketPolicy(Policy):
         seconds = self._server.inference_deadline if self._warm else self._server.first_inference_deadline
         self._warm = True
         started = time.monotonic()
-        answer, took = self._asked_once(request, seconds)
-        doubted, doubt = answer, self._doubt(request, answer, took)
+        answer, took = self._exchange_once(request, seconds)
+        doubted, doubt = answer, self._mismatch_reason(request, answer, took)
         if doubt and doubt not in self._excused:
             log.warning("%s: %s: it is asked again over another connection", self._server.url, doubt)
-            self._link.leave()
+            self._link.close_gracefully()
             self._require_open()
-            answer, took = self._asked_once(request, max(1e-3, seconds - (time.monotonic() - started)))
-            if answer == doubted or self._doubt(request, answer, took) == doubt:
+            answer, took = self._exchange_once(request, max(1e-3, seconds - (time.monotonic() - started)))
+            if answer == doubted or self._mismatch_reason(request, answer, took) == doubt:
                 self._excused.add(doubt)
         elif not doubt:
             self._excused.discard(_REPEATED)  # it does answer otherwise
         self._last = request, answer
         return answer, took
 
-    def _asked_once(self, request: bytes, seconds: float) -> tuple[bytes, float]:
+    def _exchange_once(self, request: bytes, seconds: float) -> tuple[bytes, float]:
         started = time.monotonic()
         answer = self._link.exchange(request, seconds)
         return answer, 1e3 * (time.monotonic() - started)
 
-    def _doubt(self, request: bytes, answer: bytes, took: float) -> str:
+    def _mismatch_reason(self, request: bytes, answer: bytes, took: float) -> str:
         """Why an answer that took so long [ms] may be another question's; "" where nothing says so."""
         if self._last is not None and self._last[0] != request and self._last[1] == answer:
             return _REPEATED
         return ""
 
-    def _unpacked(self, payload: bytes, what: str) -> dict[str, Any]:
+    def _decode(self, payload: bytes, what: str) -> dict[str, Any]:
         message = self._value(payload, what)
         if not isinstance(message, dict):
-            self._link.leave()
+            self._link.close_gracefully()
             raise WrongProtocolError(_NO_MAP(url=self._server.url, what=what, kind=type(message).__name__))
         return message
 
@@ -171,7 +175,7 @@ class WebsocketPolicy(Policy):
         try:
             return msgpack_arrays.unpack(payload, ANSWER_LIMIT)
         except CodecError as error:
-            self._link.leave()
+            self._link.close_gracefully()
             raise WrongProtocolError(
                 _OTHER_PROTOCOL(url=self._server.url, what=what, protocol=self.PROTOCOL, error=error)
             ) from error
@@ -181,4 +185,4 @@ def headers(server: ServerSettings) -> dict[str, str]:
     """The request headers; ConfigurationError where the key that is named is not in the environment."""
     if server.api_key_env is None:
         return {}
-    return {"Authorization": f"Api-Key {secret('policy.api_key_env', server.api_key_env)}"}
+    return {"Authorization": f"Api-Key {read_secret('policy.api_key_env', server.api_key_env)}"}

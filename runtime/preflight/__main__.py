@@ -15,20 +15,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.config import loader
 from runtime.config.loader import Resolved
 from runtime.core import environment
 from runtime.core import logs as log
 from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.ipc.lifeline import Lifeline
-from runtime.policies.link import await_left
-from runtime.preflight.course import Course
+from runtime.policies.link import wait_closed
+from runtime.preflight.course import PreflightRunner
 from runtime.preflight.report import Report
-from runtime.preflight.verdict import Stage, Verdict
-from runtime.station.checks import checked_spec
-from runtime.station.permissions import require_named
-from runtime.station.preflight_child import patience
+from runtime.preflight.verdict import PreflightStage, PreflightVerdict
+from runtime.station.checks import check_deployment
+from runtime.station.permissions import require_allowed_references
+from runtime.station.preflight_child import default_deadline
 
 _LOOK_S = 0.2
 _LONGEST_S = 3600.0
@@ -36,7 +36,7 @@ _GOODBYE_S = 1.0
 _BACKGROUND_NICE = 5  # stations of the same machine come first
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fly once and print what was found."""
     parser = _parser()
@@ -46,22 +46,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.given:
         return _for_a_parent()
     report = preflight(lambda: loader.load(given.deployment, given.assignments), given.deadline)
-    print(json.dumps(report.plain(), indent=1) if given.json else "\n".join(report.lines()))
+    print(json.dumps(report.to_dict(), indent=1) if given.json else "\n".join(report.lines()))
     return exit_code(report)
 
 
 def preflight(resolved: Any, deadline: float | None = None) -> Report:
     """The report about what `resolved()` returns, within `deadline` seconds, None: the policy's own deadlines."""
     try:
-        made = checked_spec(resolved())
+        made = check_deployment(resolved())
     except RuntimeFault as fault:
-        return Report(Verdict.MISCONFIGURED, Stage.RESOLVE, str(fault), Verdict.MISCONFIGURED.advice)
-    return Course(made).run(patience(made.deployment) if deadline is None else deadline)
+        return Report(
+            PreflightVerdict.MISCONFIGURED,
+            PreflightStage.RESOLVE,
+            str(fault),
+            PreflightVerdict.MISCONFIGURED.advice,
+        )
+    return PreflightRunner(made).run(default_deadline(made.deployment) if deadline is None else deadline)
 
 
 def exit_code(report: Report) -> int:
     """For a shell."""
-    return 2 if report.verdict is Verdict.MISCONFIGURED else 0 if report.ok else 1
+    return 2 if report.verdict is PreflightVerdict.MISCONFIGURED else 0 if report.ok else 1
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -95,27 +100,27 @@ def _for_a_parent() -> int:
     set-up; "deadline_s" or null.
     """
     os.nice(_BACKGROUND_NICE)
-    log.start("preflight")
+    log.configure_logging("preflight")
     asked = json.loads(_line())
     threading.Thread(target=_end_with_parent, name="lifeline", daemon=True).start()
     report = preflight(lambda: _asked_for(asked), asked.get("deadline_s"))
-    print(json.dumps(report.plain()), flush=True)
-    await_left(_GOODBYE_S)
+    print(json.dumps(report.to_dict()), flush=True)
+    wait_closed(_GOODBYE_S)
     os._exit(exit_code(report))  # a policy's own threads are not waited for
 
 
 def _asked_for(asked: Mapping[str, Any]) -> Resolved:
     changes = asked.get("changes", {})
     if "tree" in asked:  # the station has seen to who may ask for what
-        base = loader.resolve(asked["tree"], {}, "the station's deployment")
-        return loader.changed(base, changes, "the checkpoint")
+        base = loader.resolve_deployment(asked["tree"], {}, "the station's deployment")
+        return loader.apply_changes(base, changes, "the checkpoint")
     if "deployment" not in asked:
         raise ConfigurationError(
             f"preflight: given {', '.join(asked) or 'nothing'}; needed: tree or deployment"
         )
     base = loader.load(Path(asked["deployment"]))
-    resolved = loader.changed(base, changes, "the checkpoint")
-    require_named(base.deployment, resolved.deployment)
+    resolved = loader.apply_changes(base, changes, "the checkpoint")
+    require_allowed_references(base.deployment, resolved.deployment)
     return resolved
 
 
@@ -132,11 +137,11 @@ def _line() -> bytes:
 
 def _end_with_parent() -> None:
     lifeline = Lifeline()
-    while not lifeline.cut:
+    while not lifeline.is_cut:
         time.sleep(_LOOK_S)
     os._exit(3)
 
 
 if __name__ == "__main__":
-    environment.shed()
+    environment.restart_without_web_secrets()
     sys.exit(main())

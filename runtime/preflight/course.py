@@ -13,11 +13,11 @@ from runtime.core.errors import RuntimeFault
 from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
-from runtime.kinematics.loading import Loading
+from runtime.kinematics.loading import LazyKinematics
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.preflight.report import Call, Chunk, Report
-from runtime.preflight.subject import Subject
-from runtime.preflight.verdict import Stage, Verdict, stage_of, verdict_of
+from runtime.preflight.subject import VirtualRobot
+from runtime.preflight.verdict import PreflightStage, PreflightVerdict, stage_of, verdict_of
 from runtime.processes.coordinator.builders import make_kinematics, make_policy
 from runtime.processes.coordinator.inference.requests import PolicyRequests, PolicyResponse
 from runtime.processes.coordinator.inference.worker import LockstepRunner
@@ -32,16 +32,16 @@ _LOOK_S = 0.2
 Result = TypeVar("Result")
 
 
-class Timed(Policy):
+class TimedPolicy(Policy):
     """A policy whose calls are counted and timed; `under_way` names the one that has not come back."""
 
     def __init__(self, policy: Policy, clock: Clock) -> None:
         self._policy = policy
         self._clock = clock
         self.observation_eef = policy.observation_eef
-        self.sees_poses = policy.sees_poses
+        self.uses_poses = policy.uses_poses
         self.calls: list[Call] = []
-        self.under_way = ""
+        self.current_call = ""
         self.since = clock.now()
         self.info: PolicyInfo | None = None
 
@@ -66,25 +66,25 @@ class Timed(Policy):
         self._policy.close()
 
     def _call(self, name: str, call: Callable[[], Result], note: str = "") -> Result:
-        self.under_way, self.since = name, self._clock.now()
+        self.current_call, self.since = name, self._clock.now()
         ok = False
         try:
             result = call()
             ok = True
         finally:
             self.calls.append(Call(name, 1000.0 * (self._clock.now() - self.since), ok, note))
-        self.under_way = ""
+        self.current_call = ""
         return result
 
 
-class Course:
+class PreflightRunner:
     """One preflight of one plan; `run` once. It has no transport: no action can go anywhere."""
 
     def __init__(self, spec: StationSpec, clock: Clock | None = None) -> None:
         self._plan = spec
         self._clock = clock or MonotonicClock()
         self._begun = self._clock.now()
-        self._policy: Timed | None = None
+        self._policy: TimedPolicy | None = None
         self._answered: PolicyResponse | None = None
         self._notes: list[str] = []
         self._loading: float | None = None  # since when the compiler of kinematics has been at work
@@ -104,7 +104,7 @@ class Course:
             return self._overdue(deadline)
         error = ended[0]
         if error is None:
-            return self._report(Verdict.OK, Stage.SPACE, self._sentence())
+            return self._report(PreflightVerdict.OK, PreflightStage.SPACE, self._sentence())
         if not isinstance(error, RuntimeFault):
             raise error
         verdict = verdict_of(error)
@@ -116,18 +116,18 @@ class Course:
         policy = self._policy
         if policy is None:
             return ""
-        return policy.under_way or ("" if self._asked else "connect")
+        return policy.current_call or ("" if self._asked else "connect")
 
     @property
     def _asked(self) -> bool:
         return self._policy is not None and any(call.name == "infer" for call in self._policy.calls)
 
-    def _stage(self, verdict: Verdict) -> Stage:
-        return Stage.RESOLVE if self._policy is None else stage_of(verdict, self._call)
+    def _stage(self, verdict: PreflightVerdict) -> PreflightStage:
+        return PreflightStage.RESOLVE if self._policy is None else stage_of(verdict, self._call)
 
     def _outcome(self) -> BaseException | None:
         try:
-            self._go()
+            self._run_steps()
         except BaseException as error:  # for the thread that waits for us, whatever it is
             return error
         finally:
@@ -135,20 +135,20 @@ class Course:
                 self._policy.close()
         return None
 
-    def _go(self) -> None:
+    def _run_steps(self) -> None:
         spec, runner = self._plan, LockstepRunner(0)
         if spec.deployment.recording.enabled:
-            trial.require(spec.deployment.recording)
+            trial.require_encoder(spec.deployment.recording)
         strategy = strategy_of(spec)
-        policy = self._policy = Timed(make_policy(spec, self._clock), self._clock)
+        policy = self._policy = TimedPolicy(make_policy(spec, self._clock), self._clock)
         info = runner.submit(policy.connect).result()
-        check_info(info, spec, strategy.query.continues)
-        kinematics = Loading(ChainForward(spec.robot), self._kinematics, runner.aside)
-        spaces, subject = ActionSpaces(spec.robot, kinematics, spec.rate), Subject(spec, self._clock)
+        check_info(info, spec, strategy.query.uses_rtc)
+        kinematics = LazyKinematics(ChainForward(spec.robot), self._kinematics, runner.run_in_background)
+        spaces, subject = ActionSpaces(spec.robot, kinematics, spec.rate), VirtualRobot(spec, self._clock)
         asking = PolicyRequests(policy, spec.deployment.task, spaces, subject, runner, self._clock)
         for _ in range(2):  # the first resets before it asks
-            answered = self._answered = asking.ask(k_max=strategy.parameters.k_max).result()
-        asking.note(answered)
+            answered = self._answered = asking.send(k_max=strategy.parameters.k_max).result()
+        asking.log_ik_problems(answered)
         self._notes += [note.text for note in asking.notes]
         runner.submit(policy.reset).result()  # what it was shown was no robot: nobody shall go on from it
 
@@ -168,16 +168,18 @@ class Course:
         what = "before the policy was there"
         if policy is not None:
             waited = self._clock.now() - policy.since
-            what = f"while the policy's {policy.under_way} was under way for {waited:.1f} s"
-            what = what if policy.under_way else "between two calls of the policy"
+            what = f"while the policy's {policy.current_call} was under way for {waited:.1f} s"
+            what = what if policy.current_call else "between two calls of the policy"
         report = self._report(
-            Verdict.TIMEOUT, self._stage(Verdict.TIMEOUT), f"no end within {deadline:g} s, {what}"
+            PreflightVerdict.TIMEOUT,
+            self._stage(PreflightVerdict.TIMEOUT),
+            f"no end within {deadline:g} s, {what}",
         )
         if policy is not None:
             policy.close()
         return report
 
-    def _report(self, verdict: Verdict, stage: Stage, sentence: str) -> Report:
+    def _report(self, verdict: PreflightVerdict, stage: PreflightStage, sentence: str) -> Report:
         spec, policy = self._plan, self._policy
         settings = spec.deployment
         info = policy.info if policy else None
@@ -215,9 +217,9 @@ class Course:
         return [call.ms for call in self._policy.calls if call.name == "infer"][-1] if self._policy else 0.0
 
     def _chunk(self, answered: PolicyResponse) -> Chunk:
-        spec, chunk, made = self._plan, answered.chunk, answered.made
-        first = first_action(made.meant, np.asarray(answered.observation.qpos, np.float64), spec)
-        beyond = (spec.limits.outside(made.rows) > _TOLERANCE).any(axis=1)
+        spec, chunk, made = self._plan, answered.chunk, answered.commands
+        first = first_action(made.intended_start, np.asarray(answered.observation.qpos, np.float64), spec)
+        beyond = (spec.limits.excess(made.rows) > _TOLERANCE).any(axis=1)
         rate = chunk.rate or spec.rate
         return Chunk(
             rows=len(chunk.actions),
@@ -259,7 +261,7 @@ class Course:
     def _rtc_remarks(self) -> list[str]:
         """Where a strategy continues the model's own rows: what they are relative to decides whether it can."""
         chunk = self._answered.chunk if self._answered else None
-        if chunk is None or chunk.model_actions is None or not strategy_of(self._plan).query.continues:
+        if chunk is None or chunk.model_actions is None or not strategy_of(self._plan).query.uses_rtc:
             return []
         if chunk.mode != "absolute" or chunk.model_relative:
             return [

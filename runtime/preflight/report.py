@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.preflight.verdict import Stage, Verdict
+from runtime.preflight.verdict import PreflightStage, PreflightVerdict
 
 _LONGEST_TEXT, _LONGEST_LIST, _DEEPEST = 300, 40, 6  # of what a server says of itself
 
@@ -53,8 +53,8 @@ class Report:
     a page can show them: long values are cut. `notes` are sentences about what works and is worth knowing.
     """
 
-    verdict: Verdict
-    stage: Stage
+    verdict: PreflightVerdict
+    stage: PreflightStage
     sentence: str
     advice: str = ""
     kind: str = ""
@@ -72,7 +72,7 @@ class Report:
     @property
     def ok(self) -> bool:
         """True if a set-up could go on from here."""
-        return self.verdict is Verdict.OK
+        return self.verdict is PreflightVerdict.OK
 
     @property
     def warm_up_ms(self) -> float | None:
@@ -88,7 +88,7 @@ class Report:
         answers = [call.ms for call in self.calls if call.name == "infer" and call.ok]
         return answers[number] if number < len(answers) else None
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """As JSON may carry it."""
         told = asdict(self)
         return {
@@ -97,7 +97,7 @@ class Report:
             "stage": str(self.stage),
             "calls": list(told["calls"]),
             "notes": list(self.notes),
-            "metadata": shown(self.metadata),
+            "metadata": truncate_value(self.metadata),
             "ok": self.ok,
             "warm_up_ms": self.warm_up_ms,
             "latency_ms": self.latency_ms,
@@ -108,16 +108,16 @@ class Report:
         made = [f"{self.verdict}  at {self.stage}", self.sentence]
         made += [self.advice] if self.advice else []
         made += [f"policy    {self._policy()}"] if self.kind else []
-        made += [f"{call.name:<9} {call.ms:.0f} ms{_how(call)}" for call in self.calls]
-        made += [f"chunk     {words(self.chunk)}"] if self.chunk else []
-        made += [f"metadata  {key} = {value}" for key, value in shown(self.metadata).items()]
+        made += [f"{call.name:<9} {call.ms:.0f} ms{_call_summary(call)}" for call in self.calls]
+        made += [f"chunk     {chunk_summary(self.chunk)}"] if self.chunk else []
+        made += [f"metadata  {key} = {value}" for key, value in truncate_value(self.metadata).items()]
         return made + [f"note      {note}" for note in self.notes]
 
     def _policy(self) -> str:
         return ", ".join(filter(None, [self.kind, self.name, self.endpoint, f"for {self.robot}"]))
 
 
-def words(chunk: Chunk) -> str:
+def chunk_summary(chunk: Chunk) -> str:
     """The chunk in a line."""
     return (
         f"[{chunk.rows}, {chunk.width}] {chunk.mode} {chunk.space} at {chunk.rate:g} Hz, {chunk.seconds:.2f} s; "
@@ -125,7 +125,7 @@ def words(chunk: Chunk) -> str:
     )
 
 
-def shown(value: Any, depth: int = 0) -> Any:
+def truncate_value(value: Any, depth: int = 0) -> Any:
     """Value from a server as JSON may carry it and a person may read it: cut where it is long or deep."""
     if isinstance(value, np.generic):
         value = value.item()
@@ -141,16 +141,16 @@ def shown(value: Any, depth: int = 0) -> Any:
         return "..."
     if isinstance(value, Mapping):
         kept = {
-            str(key)[:_LONGEST_TEXT]: shown(one, depth + 1)
+            str(key)[:_LONGEST_TEXT]: truncate_value(one, depth + 1)
             for key, one in list(value.items())[:_LONGEST_LIST]
         }
         return kept | ({"...": f"{len(value) - _LONGEST_LIST} more"} if len(value) > _LONGEST_LIST else {})
     if isinstance(value, list | tuple):
         more = [f"... {len(value) - _LONGEST_LIST} more"] if len(value) > _LONGEST_LIST else []
-        return [shown(one, depth + 1) for one in value[:_LONGEST_LIST]] + more
+        return [truncate_value(one, depth + 1) for one in value[:_LONGEST_LIST]] + more
     text = str(value)
     return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
 
 
-def _how(call: Call) -> str:
+def _call_summary(call: Call) -> str:
     return f"  ({call.note})" if call.note else "" if call.ok else "  (failed)"

@@ -12,7 +12,7 @@ _HEIGHT, _WIDTH = 480, 640  # of cameras for which the deployment says no size
 _GREY, _GRAIN = 128, 12  # noise: what a camera sees in the dark is never all the same
 
 
-class Subject:
+class VirtualRobot:
     """Shows a policy the robot of a plan at rest in the pose of its set-up, with pictures of grey noise.
 
     Every observation is new, of this moment. It measures no poses: those of its joints are taken.
@@ -25,9 +25,9 @@ class Subject:
         self._clock = clock
         self._begun = clock.now()
         self._number = 0
-        self._pictures = pictures(spec)
+        self._pictures = noise_images(spec)
 
-    def now(self, prompt: str, pictures: bool = True) -> Observation:
+    def latest(self, prompt: str, pictures: bool = True) -> Observation:
         """The robot now."""
         self._number += 1
         robot, now = self._plan.robot, self._clock.now()
@@ -44,7 +44,7 @@ class Subject:
             prompt=prompt,
         )
 
-    def show_simulated(self, simulated: bool) -> None:
+    def use_simulated(self, simulated: bool) -> None:
         """The same robot: it stands for either."""
 
     def commanded(self) -> tuple[int, Float64] | None:
@@ -52,7 +52,7 @@ class Subject:
         return None
 
 
-def pictures(spec: StationSpec) -> dict[str, UInt8]:
+def noise_images(spec: StationSpec) -> dict[str, UInt8]:
     """Grey noise [H, W, 3] for each camera of the deployment, in the size that it says, the same on every call."""
     noise = np.random.default_rng(0)
     made: dict[str, UInt8] = {}

@@ -14,7 +14,7 @@ from runtime.core.errors import (
     PortClosedError,
     RefusedError,
     RuntimeFault,
-    ServerSaysError,
+    ServerReportedError,
     SetupError,
     ShapeError,
     TlsError,
@@ -24,7 +24,7 @@ from runtime.core.errors import (
 )
 
 
-class Stage(StrEnum):
+class PreflightStage(StrEnum):
     """Stages of a preflight, in this order."""
 
     RESOLVE = "resolve"  # the deployment, and that its policy fits its robot
@@ -36,7 +36,7 @@ class Stage(StrEnum):
     SPACE = "space"  # that become commands for this robot
 
 
-class Verdict(StrEnum):
+class PreflightVerdict(StrEnum):
     """Finding of a preflight."""
 
     OK = "ok"
@@ -62,65 +62,82 @@ class Verdict(StrEnum):
 
 
 _ADVICE = {
-    Verdict.OK: "",
-    Verdict.MISCONFIGURED: "Correct the deployment, or the checkpoint's policy table; no server was asked.",
-    Verdict.PORT_CLOSED: "The machine is there and nothing listens: start the policy server, or correct the port.",
-    Verdict.UNREACHABLE: "Correct the host's name, switch the machine on, or open the network on the way to it.",
-    Verdict.TUNNEL: "The SSH tunnel does not stand: try the same host with ssh in a terminal, without a password.",
-    Verdict.TLS: "Use ws:// for a server without TLS, else correct its certificate.",
-    Verdict.WRONG_PROTOCOL: "Another server listens there, or policy.kind is wrong: compare both.",
-    Verdict.TIMEOUT: "See whether the server is busy, still loading or stuck; a slow model needs longer deadlines.",
-    Verdict.REFUSED: "Give the key or token that the server wants to this machine's environment, by the name in the "
+    PreflightVerdict.OK: "",
+    PreflightVerdict.MISCONFIGURED: "Correct the deployment, or the checkpoint's policy table; no server was asked.",
+    PreflightVerdict.PORT_CLOSED: "The machine is there and nothing listens: start the policy server, or correct the "
+    "port.",
+    PreflightVerdict.UNREACHABLE: "Correct the host's name, switch the machine on, or open the network on the way to "
+    "it.",
+    PreflightVerdict.TUNNEL: "The SSH tunnel does not stand: try the same host with ssh in a terminal, without a "
+    "password.",
+    PreflightVerdict.TLS: "Use ws:// for a server without TLS, else correct its certificate.",
+    PreflightVerdict.WRONG_PROTOCOL: "Another server listens there, or policy.kind is wrong: compare both.",
+    PreflightVerdict.TIMEOUT: "See whether the server is busy, still loading or stuck; a slow model needs longer "
+    "deadlines.",
+    PreflightVerdict.REFUSED: "Give the key or token that the server wants to this machine's environment, by the "
+    "name in the "
+    ""
     "policy table.",
-    Verdict.SERVER_ERROR: "The server is there and fails: its own log says why; if it has no word of us, it is "
-    "a server of another kind.",
-    Verdict.BAD_SHAPE: "The checkpoint behind the server is for another robot, or the policy table lays its rows out "
+    PreflightVerdict.SERVER_ERROR: "The server is there and fails: its own log says why; if it has no word of us, "
+    ""
+    ""
+    "it is a server of another kind.",
+    PreflightVerdict.BAD_SHAPE: "The checkpoint behind the server is for another robot, or the policy table lays its "
+    "rows out "
+    ""
     "wrongly.",
-    Verdict.WRONG_ACTION_SPACE: "The checkpoint's actions are of another space than the policy table says: correct "
-    "the table, never guess.",
-    Verdict.NOT_FINITE: "The model computes what is no number: look at its checkpoint and its normalisation.",
-    Verdict.CONTRADICTION: "Server and deployment say different things: correct the one that is wrong.",
-    Verdict.FAILED: "Read the sentence; it is none of the usual cases.",
+    PreflightVerdict.WRONG_ACTION_SPACE: "The checkpoint's actions are of another space than the policy table says: "
+    ""
+    ""
+    "correct the table, never guess.",
+    PreflightVerdict.NOT_FINITE: "The model computes what is no number: look at its checkpoint and its normalisation.",
+    PreflightVerdict.CONTRADICTION: "Server and deployment say different things: correct the one that is wrong.",
+    PreflightVerdict.FAILED: "Read the sentence; it is none of the usual cases.",
 }
 
 # The first that fits; a subclass stands before its base.
-_FOUND: tuple[tuple[type[RuntimeFault], Verdict], ...] = (
-    (PortClosedError, Verdict.PORT_CLOSED),
-    (UnreachableError, Verdict.UNREACHABLE),
-    (TunnelError, Verdict.TUNNEL),
-    (TlsError, Verdict.TLS),
-    (WrongProtocolError, Verdict.WRONG_PROTOCOL),
-    (RefusedError, Verdict.REFUSED),
-    (PolicyTimeout, Verdict.TIMEOUT),
-    (ServerSaysError, Verdict.SERVER_ERROR),
-    (PolicyLostError, Verdict.SERVER_ERROR),
-    (ShapeError, Verdict.BAD_SHAPE),
-    (NotFiniteError, Verdict.NOT_FINITE),
-    (ActionSpaceError, Verdict.WRONG_ACTION_SPACE),
-    (ContradictionError, Verdict.CONTRADICTION),
-    (ConfigurationError, Verdict.MISCONFIGURED),
-    (SetupError, Verdict.CONTRADICTION),
+_FOUND: tuple[tuple[type[RuntimeFault], PreflightVerdict], ...] = (
+    (PortClosedError, PreflightVerdict.PORT_CLOSED),
+    (UnreachableError, PreflightVerdict.UNREACHABLE),
+    (TunnelError, PreflightVerdict.TUNNEL),
+    (TlsError, PreflightVerdict.TLS),
+    (WrongProtocolError, PreflightVerdict.WRONG_PROTOCOL),
+    (RefusedError, PreflightVerdict.REFUSED),
+    (PolicyTimeout, PreflightVerdict.TIMEOUT),
+    (ServerReportedError, PreflightVerdict.SERVER_ERROR),
+    (PolicyLostError, PreflightVerdict.SERVER_ERROR),
+    (ShapeError, PreflightVerdict.BAD_SHAPE),
+    (NotFiniteError, PreflightVerdict.NOT_FINITE),
+    (ActionSpaceError, PreflightVerdict.WRONG_ACTION_SPACE),
+    (ContradictionError, PreflightVerdict.CONTRADICTION),
+    (ConfigurationError, PreflightVerdict.MISCONFIGURED),
+    (SetupError, PreflightVerdict.CONTRADICTION),
 )
-_ON_THE_WAY = (Verdict.PORT_CLOSED, Verdict.UNREACHABLE, Verdict.TUNNEL, Verdict.TLS)
-_OF_THE_ROWS = (Verdict.BAD_SHAPE, Verdict.NOT_FINITE)
-_OF_WORDS = (Verdict.WRONG_ACTION_SPACE, Verdict.CONTRADICTION)
+_ON_THE_WAY = (
+    PreflightVerdict.PORT_CLOSED,
+    PreflightVerdict.UNREACHABLE,
+    PreflightVerdict.TUNNEL,
+    PreflightVerdict.TLS,
+)
+_OF_THE_ROWS = (PreflightVerdict.BAD_SHAPE, PreflightVerdict.NOT_FINITE)
+_OF_WORDS = (PreflightVerdict.WRONG_ACTION_SPACE, PreflightVerdict.CONTRADICTION)
 
 
-def verdict_of(error: RuntimeFault) -> Verdict:
+def verdict_of(error: RuntimeFault) -> PreflightVerdict:
     """Verdict on an error of a policy, of its set-up or of its configuration."""
-    return next((verdict for kind, verdict in _FOUND if isinstance(error, kind)), Verdict.FAILED)
+    return next((verdict for kind, verdict in _FOUND if isinstance(error, kind)), PreflightVerdict.FAILED)
 
 
-def stage_of(verdict: Verdict, call: str) -> Stage:
+def stage_of(verdict: PreflightVerdict, call: str) -> PreflightStage:
     """Stage of that verdict; `call` is the policy's call that was under way, "" after the last of them."""
-    if verdict is Verdict.MISCONFIGURED:
-        return Stage.RESOLVE
+    if verdict is PreflightVerdict.MISCONFIGURED:
+        return PreflightStage.RESOLVE
     if call == "connect":
         if verdict in _ON_THE_WAY:
-            return Stage.CONNECT
-        return Stage.METADATA if verdict in _OF_WORDS else Stage.PROTOCOL
+            return PreflightStage.CONNECT
+        return PreflightStage.METADATA if verdict in _OF_WORDS else PreflightStage.PROTOCOL
     if verdict in _OF_THE_ROWS:
-        return Stage.SHAPE
+        return PreflightStage.SHAPE
     if verdict in _OF_WORDS or not call:
-        return Stage.SPACE
-    return Stage.INFER
+        return PreflightStage.SPACE
+    return PreflightStage.INFER

@@ -11,17 +11,17 @@ from runtime.ipc.bells import bells
 from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.membership import Membership
 from runtime.ipc.shared_state import SharedState
-from runtime.station.spec import StationSpec, planned
+from runtime.station.spec import StationSpec, load_checked_spec
 
 
 @dataclass(frozen=True, slots=True)
-class Member(Membership):
+class ProcessContext(Membership):
     """One process of a station: what it works with."""
 
     spec: StationSpec
 
 
-def join(process: str, pictures: bool = True, unread: Collection[str] = ()) -> Member:
+def join_station(process: str, pictures: bool = True, unread: Collection[str] = ()) -> ProcessContext:
     """Read what the supervisor handed over on the command line; `unread` as by `planned`."""
     parser = argparse.ArgumentParser(prog=f"runtime.{process}", description="started by the supervisor")
     parser.add_argument("--resolved", required=True)
@@ -30,8 +30,8 @@ def join(process: str, pictures: bool = True, unread: Collection[str] = ()) -> M
     parser.add_argument("--bells", required=True, type=bells)
     parser.add_argument("--boot", required=True)
     given = parser.parse_args()
-    log.start(process)
-    made = planned(given.resolved, given.capabilities, unread)
+    log.configure_logging(process)
+    made = load_checked_spec(given.resolved, given.capabilities, unread)
     shared = SharedState.attach(made.layout, given.shared, pictures)
     shared.hang(given.bells)
-    return Member(shared, given.boot, Lifeline(), made)
+    return ProcessContext(shared, given.boot, Lifeline(), made)

@@ -8,18 +8,18 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.reader import open_dataset
-from runtime.quality.inspection import inspect, inspect_dataset
+from runtime.quality.inspection import check_dataset_episode, check_episode
 from runtime.quality.report import Report
 from runtime.quality.settings import QualitySettings, read_settings
 
 SHOWN = 20  # flags of an episode that are printed
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where every episode is clean, 1 where one is flagged, 2 where something cannot be judged."""
     options = _parser().parse_args(arguments)
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for report in _reports(options, settings):
             clean = clean and report.clean
             if options.json:
-                print(json.dumps(report.document(), ensure_ascii=False, allow_nan=False), flush=True)
+                print(json.dumps(report.to_dict(), ensure_ascii=False, allow_nan=False), flush=True)
             else:
                 print(*([] if first else [""]), *_lines(report), sep="\n", flush=True)
             first = False
@@ -58,10 +58,10 @@ def _reports(options: argparse.Namespace, settings: QualitySettings) -> Iterator
         if (path / layout.INFO).exists():
             dataset = open_dataset(path)
             for index in options.episodes or [entry.index for entry in dataset.episodes]:
-                yield inspect_dataset(dataset, index, settings, state=options.state)
+                yield check_dataset_episode(dataset, index, settings, state=options.state)
         else:
             for folder in _episodes(path):
-                yield inspect(folder, settings)
+                yield check_episode(folder, settings)
 
 
 def _episodes(path: Path) -> list[Path]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.core.types import Float32, Float64
-from runtime.quality.luma import Film
+from runtime.quality.luma import FrameStream
 from runtime.quality.report import Severity
 
 Bools = NDArray[np.bool_]
@@ -34,7 +34,7 @@ class Vector:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Numbers:
+class VectorColumn:
     """A column of vectors in a block: `values` float32 [N, W], zeros where a row is `missing` or `malformed`."""
 
     values: Float32
@@ -50,7 +50,7 @@ class Block:
     rows: int
     index: NDArray[np.int64] | None  # as numbered in the file
     clocks: Mapping[str, Float64]  # [N] s: each has to increase
-    vectors: Mapping[str, Numbers]
+    vectors: Mapping[str, VectorColumn]
     captured: Mapping[str, Float64] = field(default_factory=dict)  # by stream [N] s, NaN unknown
     repeated: Mapping[str, Bools] = field(default_factory=dict)  # by camera
     lost: Mapping[str, Bools] = field(
@@ -67,7 +67,7 @@ class VideoEnd(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joints:
+class JointSpecs:
     """Facts about the robot's numbers [D]; limits and velocities are NaN where they are not known."""
 
     names: tuple[str, ...]
@@ -79,12 +79,12 @@ class Joints:
     velocity: Float64
 
     @property
-    def ordinary(self) -> Bools:
+    def position_mask(self) -> Bools:
         """Those that are places of joints: neither grippers nor speeds."""
         return ~(self.grippers | self.bases)
 
 
-class Source(ABC):
+class EpisodeSource(ABC):
     """One episode as it lies on disk. What is damaged beyond its rows is a RecordingError of `blocks`."""
 
     name: str
@@ -103,9 +103,9 @@ class Source(ABC):
         """The rows, in order; raises RecordingError where they cannot be read on."""
 
     @abstractmethod
-    def film(self, camera: str, sampling: int) -> Film:
+    def open_frames(self, camera: str, sampling: int) -> FrameStream:
         """The pictures of one camera; raises RecordingError where they cannot be opened."""
 
     @abstractmethod
-    def joints(self) -> tuple[Joints | None, str]:
+    def joints(self) -> tuple[JointSpecs | None, str]:
         """The robot's numbers, and why their limits are not known, "" where they are; None: no state or action."""

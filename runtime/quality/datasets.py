@@ -16,11 +16,11 @@ from runtime.core.types import EEF_WIDTH, Float64
 from runtime.datasets import layout
 from runtime.datasets.features import picture_size
 from runtime.datasets.mapping import ColumnMapping, video_key
-from runtime.datasets.pictures import Stretch
+from runtime.datasets.pictures import VideoSegment
 from runtime.datasets.reader import Dataset
-from runtime.quality.block import BLOCK_ROWS, Block, Bools, Joints, Numbers, Source, Vector
+from runtime.quality.block import BLOCK_ROWS, Block, Bools, EpisodeSource, JointSpecs, Vector, VectorColumn
 from runtime.quality.joints import known_joints, unknown_joints
-from runtime.quality.luma import Film, StoredFilm, VideoFilm
+from runtime.quality.luma import FrameStream, StoredFrameStream, VideoFrameStream
 
 STATES = ("observation.state", "observation.qpos")  # the first that there is
 ACTION = "action"
@@ -30,7 +30,7 @@ _SPARSE = ("joint_velocity", "joint_effort")  # NaN in a row where the robot gav
 _INDEX = "frame_index"
 
 
-class DatasetSource(Source):
+class DatasetSource(EpisodeSource):
     """Episode `index` of a dataset; `state` names the column of measured joints, the usual ones where it is "".
 
     `robot` is whose joints these are, in its order; "" where only the dataset knows.
@@ -147,17 +147,19 @@ class DatasetSource(Source):
             else np.array([one == "sim" for one in sources.to_pylist()], np.bool_),
         )
 
-    def film(self, camera: str, sampling: int) -> Film:
+    def open_frames(self, camera: str, sampling: int) -> FrameStream:
         key = self._keys[camera]
         if key not in self._entry.videos:
             any_vector = self._state or next(iter(self.vectors), STATES[0])
             mapping = ColumnMapping(state=any_vector, action=None, videos={camera: key})
-            return StoredFilm(self._dataset.episode(self._entry.index, mapping).pictures(camera), sampling)
+            return StoredFrameStream(
+                self._dataset.episode(self._entry.index, mapping).pictures(camera), sampling
+            )
         span = self._entry.videos[key]
-        stretch = None if span.start is None else Stretch(span.start, self._entry.length, self.fps)
-        return VideoFilm(span.path, sampling, stretch)
+        stretch = None if span.start is None else VideoSegment(span.start, self._entry.length, self.fps)
+        return VideoFrameStream(span.path, sampling, stretch)
 
-    def joints(self) -> tuple[Joints | None, str]:
+    def joints(self) -> tuple[JointSpecs | None, str]:
         if not self._state:
             there = ", ".join(self.vectors) or "none"
             return (
@@ -167,7 +169,7 @@ class DatasetSource(Source):
         names = self.vectors[self._state].names
         robot = self._robot or str(self._dataset.info.get("robot_type") or "")
         if self._robot:
-            names = tuple(robots.load(self._robot).joint_names)
+            names = tuple(robots.load_robot(self._robot).joint_names)
         try:
             return known_joints(robot, names), ""
         except RobotError as error:
@@ -197,7 +199,7 @@ def _scalars(column: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), np.float64)
 
 
-def _lists(column: Any, vector: Vector) -> Numbers:
+def _lists(column: Any, vector: Vector) -> VectorColumn:
     """Lists as float32 [N, W]; rows of another width are malformed and 0."""
     rows = len(column)
     missing = ~np.asarray(column.is_valid().to_numpy(zero_copy_only=False), np.bool_)
@@ -207,7 +209,7 @@ def _lists(column: Any, vector: Vector) -> Numbers:
     elif pa.types.is_list(column.type) or pa.types.is_large_list(column.type):
         lengths = np.asarray(column.value_lengths().fill_null(0).to_numpy(zero_copy_only=False), np.int64)
     else:
-        return Numbers(values, missing, ~missing)
+        return VectorColumn(values, missing, ~missing)
     malformed = ~missing & (lengths != vector.width)
     good = ~missing & ~malformed
     flat = column.filter(pa.array(good)).flatten()
@@ -216,4 +218,4 @@ def _lists(column: Any, vector: Vector) -> Numbers:
     values[good] = flat.to_numpy(zero_copy_only=False).astype(np.float32).reshape(-1, vector.width)
     if vector.sparse:
         missing = missing | (good & np.isnan(values).all(axis=1))
-    return Numbers(values, missing, malformed)
+    return VectorColumn(values, missing, malformed)

@@ -9,23 +9,23 @@ import numpy as np
 
 from runtime.core.errors import RecordingError
 from runtime.datasets.reader import Dataset, open_dataset
-from runtime.quality.block import Source
+from runtime.quality.block import EpisodeSource
 from runtime.quality.datasets import DatasetSource
 from runtime.quality.journals import JournalSource
-from runtime.quality.motion import Motion
-from runtime.quality.pictures import Pictures
-from runtime.quality.report import Flag, Flags, Report
+from runtime.quality.motion import MotionCheck
+from runtime.quality.pictures import ImageCheck
+from runtime.quality.report import Flag, FlagCollector, Report
 from runtime.quality.settings import QualitySettings
-from runtime.quality.times import Times
-from runtime.quality.values import Values
+from runtime.quality.times import TimingCheck
+from runtime.quality.values import ValueCheck
 
 
-def inspect(folder: Path, settings: QualitySettings | None = None) -> Report:
+def check_episode(folder: Path, settings: QualitySettings | None = None) -> Report:
     """The report on the episode in a folder of ours; damage is a flag, RecordingError where there is no manifest."""
-    return examine(JournalSource(folder), settings or QualitySettings())
+    return run_checks(JournalSource(folder), settings or QualitySettings())
 
 
-def inspect_dataset(
+def check_dataset_episode(
     dataset: Dataset | Path,
     index: int,
     settings: QualitySettings | None = None,
@@ -35,21 +35,21 @@ def inspect_dataset(
 ) -> Report:
     """The report on episode `index` of a LeRobot dataset; RecordingError where the dataset has no such episode."""
     opened = open_dataset(dataset) if isinstance(dataset, Path) else dataset
-    return examine(DatasetSource(opened, index, state, robot), settings or QualitySettings())
+    return run_checks(DatasetSource(opened, index, state, robot), settings or QualitySettings())
 
 
-def examine(source: Source, settings: QualitySettings) -> Report:
+def run_checks(source: EpisodeSource, settings: QualitySettings) -> Report:
     """All checks of one episode, wherever it comes from."""
-    flags = Flags(settings.most_flags)
+    flags = FlagCollector(settings.most_flags)
     for kind, severity, sentence in source.remarks:
         flags.add(Flag(kind, severity, -1, -1, "", sentence))
     joints, unknown = source.joints()
     if unknown:
         flags.unchecked.append(unknown)
-    times = Times(source, settings, flags)
-    values = Values(source, joints, settings, flags)
-    motion = Motion(source, joints, settings, flags) if joints is not None else None
-    cameras = {camera: Pictures(source, camera, settings, flags) for camera in source.cameras}
+    times = TimingCheck(source, settings, flags)
+    values = ValueCheck(source, joints, settings, flags)
+    motion = MotionCheck(source, joints, settings, flags) if joints is not None else None
+    cameras = {camera: ImageCheck(source, camera, settings, flags) for camera in source.cameras}
     rows, whole = 0, True
     with ExitStack() as stack:
         for camera in cameras.values():
@@ -75,7 +75,7 @@ def examine(source: Source, settings: QualitySettings) -> Report:
     return flags.report(source.name, rows, source.fps, figures)
 
 
-def _length(source: Source, rows: int, settings: QualitySettings, flags: Flags) -> None:
+def _length(source: EpisodeSource, rows: int, settings: QualitySettings, flags: FlagCollector) -> None:
     given = source.schema.get("min_length_s")
     bound = float(given) if isinstance(given, int | float) and given >= 0 else settings.min_length_s
     seconds = rows / source.fps

@@ -8,15 +8,15 @@ import numpy as np
 
 import robots
 from robots import RobotError
-from runtime.quality.block import Joints
+from runtime.quality.block import JointSpecs
 
 GRIPPER = "gripper"  # what such a number is called where no description says so
 _UNKNOWN = np.nan
 
 
-def known_joints(robot: str, names: Sequence[str]) -> Joints:
+def known_joints(robot: str, names: Sequence[str]) -> JointSpecs:
     """The numbers of a robot that is described here; RobotError where it is not, or its numbers have other names."""
-    described = robots.load(robot, groups_of(names))
+    described = robots.load_robot(robot, groups_of(names))
     if list(described.joint_names) != list(names):
         raise RobotError(f"{robot} has other numbers today: {', '.join(described.joint_names)}")
     groups = [group.name for group in described.groups for _ in range(group.dof)]
@@ -24,17 +24,19 @@ def known_joints(robot: str, names: Sequence[str]) -> Joints:
     bases[list(described.speed_dims)] = True
     gripping = np.zeros(described.dim, np.bool_)
     gripping[list(described.gripper_dims)] = True
-    return Joints(
+    return JointSpecs(
         tuple(names), tuple(groups), gripping, bases, described.lower, described.upper, described.velocity
     )
 
 
-def unknown_joints(names: Sequence[str]) -> Joints:
+def unknown_joints(names: Sequence[str]) -> JointSpecs:
     """Numbers of which only the names are known."""
     unknown = np.full(len(names), _UNKNOWN)
     gripping = np.array([GRIPPER in name.lower() for name in names], np.bool_)
     groups = tuple(name.partition(".")[0] for name in names)
-    return Joints(tuple(names), groups, gripping, np.zeros(len(names), np.bool_), unknown, unknown, unknown)
+    return JointSpecs(
+        tuple(names), groups, gripping, np.zeros(len(names), np.bool_), unknown, unknown, unknown
+    )
 
 
 def groups_of(names: Sequence[str]) -> list[str]:

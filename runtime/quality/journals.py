@@ -11,13 +11,22 @@ import pyarrow as pa
 
 from robots import RobotError
 from runtime.core.errors import RecordingError
-from runtime.quality.block import BLOCK_ROWS, Block, Bools, Joints, Numbers, Source, Vector, VideoEnd
+from runtime.quality.block import (
+    BLOCK_ROWS,
+    Block,
+    Bools,
+    EpisodeSource,
+    JointSpecs,
+    Vector,
+    VectorColumn,
+    VideoEnd,
+)
 from runtime.quality.joints import known_joints, unknown_joints
-from runtime.quality.luma import Film, VideoFilm
+from runtime.quality.luma import FrameStream, VideoFrameStream
 from runtime.quality.report import Severity
-from runtime.recording.files import read_document
+from runtime.recording.files import read_json
 from runtime.recording.layout import Layout, simulated
-from runtime.recording.scrub import verify
+from runtime.recording.scrub import verify_episode
 from runtime.recording.sealing import DIGESTS, OUTCOME, read_outcome
 from runtime.recording.tables import added, rows_schema
 
@@ -25,15 +34,15 @@ _ROLES = {"qpos": "state", "action": "action", "eef": "poses", "eef_action": "po
 _SPARSE = ("qvel", "effort")  # of robots that give them now and then
 
 
-class JournalSource(Source):
+class JournalSource(EpisodeSource):
     """The episode in a folder DATA/episodes/UUID; raises RecordingError where its manifest cannot be read."""
 
     started = "tick_time"
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._manifest = read_document(folder / "manifest.json")
-        self._layout = Layout.of(self._manifest)
+        self._manifest = read_json(folder / "manifest.json")
+        self._layout = Layout.from_manifest(self._manifest)
         self._robot = _table(self._manifest, "robot")
         self.name = self._layout.uuid
         self.fps = self._layout.fps
@@ -55,7 +64,7 @@ class JournalSource(Source):
             return None, [("unfinished", "error", str(error))]
         remarks: list[tuple[str, Severity, str]] = []
         if DIGESTS in outcome:  # else what cannot be read is found below
-            remarks += [("damaged", "error", damage.text) for damage in verify(self._folder).damage]
+            remarks += [("damaged", "error", damage.text) for damage in verify_episode(self._folder).damage]
         status, reason = outcome.get("status"), outcome.get("reason", "")
         if status == "failed":
             remarks.append(("recording_failed", "error", f"the recording failed: {reason}"))
@@ -134,10 +143,10 @@ class JournalSource(Source):
             else None,
         )
 
-    def film(self, camera: str, sampling: int) -> Film:
-        return VideoFilm(self._folder / f"{camera}.mp4", sampling)
+    def open_frames(self, camera: str, sampling: int) -> FrameStream:
+        return VideoFrameStream(self._folder / f"{camera}.mp4", sampling)
 
-    def joints(self) -> tuple[Joints | None, str]:
+    def joints(self) -> tuple[JointSpecs | None, str]:
         names = self.vectors["qpos"].names
         settings = _table(self._manifest, "configuration")
         try:
@@ -146,12 +155,12 @@ class JournalSource(Source):
             return unknown_joints(names), f"limits are not checked: {error}"
 
 
-def fixed(column: Any, width: int) -> Numbers:
+def fixed(column: Any, width: int) -> VectorColumn:
     """A column of lists of one width as arrays; null rows are missing."""
     missing = ~np.asarray(column.is_valid().to_numpy(zero_copy_only=False), np.bool_)
     values = np.zeros((len(column), width), np.float32)
     values[~missing] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
-    return Numbers(values, missing, np.zeros(len(column), np.bool_))
+    return VectorColumn(values, missing, np.zeros(len(column), np.bool_))
 
 
 def numbers(column: Any) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -5,28 +5,28 @@ from __future__ import annotations
 import numpy as np
 
 from runtime.quality.block import Bools, VideoEnd
-from runtime.quality.report import Flag, Flags, Run, Runs, Severity, span
+from runtime.quality.report import Flag, FlagCollector, FrameRun, RunCollector, Severity, frame_range
 from runtime.quality.settings import QualitySettings
 
 
-class Losses:
+class LostFrames:
     """Losses of one camera; rows beyond the end of its video are one flag."""
 
     def __init__(
-        self, camera: str, fps: float, settings: QualitySettings, flags: Flags, end: VideoEnd | None
+        self, camera: str, fps: float, settings: QualitySettings, flags: FlagCollector, end: VideoEnd | None
     ) -> None:
         self._camera = camera
         self._fps = fps
         self._settings = settings
         self._flags = flags
         self._end = end
-        self._runs = Runs(self._lost)
+        self._runs = RunCollector(self._lost)
 
     def add(self, first: int, lost: Bools) -> None:
         """The rows from `first` on whose picture is not in the video."""
-        self._runs.add(first, lost & ~self.beyond(first, len(lost)))
+        self._runs.add(first, lost & ~self.past_end(first, len(lost)))
 
-    def beyond(self, first: int, rows: int) -> Bools:
+    def past_end(self, first: int, rows: int) -> Bools:
         """Which of these rows [N] are past the end of the video."""
         return np.arange(first, first + rows) >= (np.inf if self._end is None else self._end.row)
 
@@ -43,10 +43,10 @@ class Losses:
             text = f"after the last frame {told}"
             self._flags.add(Flag("video_lost", "warning", -1, -1, self._camera, text))
 
-    def _lost(self, run: Run) -> None:
+    def _lost(self, run: FrameRun) -> None:
         seconds, bound = run.frames / self._fps, self._settings.picture_age_s
         severity: Severity = "error" if seconds > bound else "warning"
-        where = span(run.first, run.last)
+        where = frame_range(run.first, run.last)
         long = f"{seconds:.1f}" if seconds >= 0.1 else f"{seconds:.2f}"
         text = f"{where}: what {self._camera} gave for {long} s is not in its video, the picture before is"
         self._flags.add(Flag("lost", severity, run.first, run.last, self._camera, text, seconds, bound))

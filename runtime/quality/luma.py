@@ -13,7 +13,7 @@ import numpy as np
 from runtime.core.errors import RecordingError
 from runtime.core.picture_bounds import open_video
 from runtime.core.types import Float32
-from runtime.datasets.pictures import PictureSequence, Stretch
+from runtime.datasets.pictures import ImageSequence, VideoSegment
 
 # Where the first plane is brightness, 8 bits a pixel; others are converted, which costs twice the time.
 _PLANAR = frozenset({"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray"})
@@ -22,7 +22,7 @@ _JPEG = 2  # AVCOL_RANGE_JPEG
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shot:
+class LumaFrame:
     """One picture: brightness float32 [h, w], 0 to 255; its full size; whether it is coded by itself; its time [s]."""
 
     luma: Float32
@@ -32,10 +32,10 @@ class Shot:
     time: float | None  # since the episode's first picture should be shown; None where pictures have no times
 
 
-class Film(Protocol):
+class FrameStream(Protocol):
     """The pictures of an episode by one camera, each once and in order."""
 
-    def __iter__(self) -> Iterator[Shot]:
+    def __iter__(self) -> Iterator[LumaFrame]:
         """Raises RecordingError at the picture that cannot be decoded."""
         ...
 
@@ -44,10 +44,10 @@ class Film(Protocol):
         ...
 
 
-class VideoFilm:
+class VideoFrameStream:
     """The pictures of a video, or of a stretch of one."""
 
-    def __init__(self, path: Path, sampling: int, stretch: Stretch | None = None) -> None:
+    def __init__(self, path: Path, sampling: int, stretch: VideoSegment | None = None) -> None:
         if not path.is_file():
             raise RecordingError(f"there is no video {path}")
         self._path = path
@@ -61,7 +61,7 @@ class VideoFilm:
             self.close()
             raise RecordingError(f"{path} has no video stream")
 
-    def __iter__(self) -> Iterator[Shot]:
+    def __iter__(self) -> Iterator[LumaFrame]:
         stream = self._container.streams.video[0]
         stream.thread_type = "NONE"  # whoever checks does so beside a robot
         start, end = 0.0, float("inf")
@@ -84,7 +84,7 @@ class VideoFilm:
         except (av.FFmpegError, ValueError) as error:
             raise RecordingError(f"{self._path}, frame {number} cannot be decoded: {error}") from error
 
-    def _shot(self, frame: Any, time: float | None) -> Shot:
+    def _shot(self, frame: Any, time: float | None) -> LumaFrame:
         kind = frame.format.name
         full = kind in _FULL or frame.color_range == _JPEG
         if kind not in _PLANAR:
@@ -93,26 +93,26 @@ class VideoFilm:
         rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
         taken = rows[: frame.height : self._sampling, : frame.width : self._sampling].astype(np.float32)
         luma = taken if full else np.clip((taken - 16.0) * (255.0 / 219.0), 0.0, 255.0)
-        return Shot(luma, frame.height, frame.width, bool(frame.key_frame), time)
+        return LumaFrame(luma, frame.height, frame.width, bool(frame.key_frame), time)
 
     def close(self) -> None:
         self._container.close()
 
 
-class StoredFilm:
+class StoredFrameStream:
     """Pictures that are stored one by one; each is coded by itself."""
 
-    def __init__(self, pictures: PictureSequence, sampling: int) -> None:
+    def __init__(self, pictures: ImageSequence, sampling: int) -> None:
         self._pictures = pictures
         self._sampling = sampling
 
-    def __iter__(self) -> Iterator[Shot]:
+    def __iter__(self) -> Iterator[LumaFrame]:
         for number in range(len(self._pictures)):
             picture = self._pictures[number]
             height, width = picture.shape[:2]
             taken = picture[:: self._sampling, :: self._sampling].astype(np.float32)
             luma = (taken @ np.array([0.299, 0.587, 0.114], np.float32)).astype(np.float32)
-            yield Shot(luma, height, width, True, None)
+            yield LumaFrame(luma, height, width, True, None)
 
     def close(self) -> None:
         self._pictures.close()

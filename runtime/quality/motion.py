@@ -7,15 +7,17 @@ from collections.abc import Callable
 import numpy as np
 
 from runtime.core.types import Float32, Float64
-from runtime.quality.block import Block, Bools, Joints, Source
-from runtime.quality.report import Flag, Flags, Run, Runs, span
+from runtime.quality.block import Block, Bools, EpisodeSource, JointSpecs
+from runtime.quality.report import Flag, FlagCollector, FrameRun, RunCollector, frame_range
 from runtime.quality.settings import QualitySettings
 
 
-class Motion:
+class MotionCheck:
     """Judges what the state and the action say of the robot, block by block; `add` says in which rows it moves."""
 
-    def __init__(self, source: Source, joints: Joints, settings: QualitySettings, flags: Flags) -> None:
+    def __init__(
+        self, source: EpisodeSource, joints: JointSpecs, settings: QualitySettings, flags: FlagCollector
+    ) -> None:
         self._fps = source.fps
         self._joints = joints
         self._settings = settings
@@ -27,7 +29,7 @@ class Motion:
                 f"limits and following are not checked: {self._action} has another width than {self._state}"
             )
             self._action = ""
-        self._still = _still(joints, settings)
+        self._still = _idle_speeds(joints, settings)
         lag = max(1, round(settings.motion_lag_s * self._fps))
         self._lag = lag
         self._past = np.empty((0, len(joints.names)), np.float32)  # the last `lag` rows
@@ -40,9 +42,9 @@ class Motion:
         ranges = joints.upper - joints.lower
         self._away = np.zeros(len(joints.names), np.bool_)  # whether it was commanded off its limits yet
         self._margin = np.where(np.isfinite(ranges), ranges, np.nan) * settings.limit_margin
-        self._at_limit = [Runs(self._saturated(dim)) for dim in range(len(joints.names))]
-        self._outside = [Runs(self._beyond(dim)) for dim in range(len(joints.names))]
-        self._following = _Following(
+        self._at_limit = [RunCollector(self._saturated(dim)) for dim in range(len(joints.names))]
+        self._outside = [RunCollector(self._beyond(dim)) for dim in range(len(joints.names))]
+        self._following = _TrackingDelay(
             round(settings.tracking_s * self._fps), joints, settings, flags, self._action
         )
 
@@ -95,13 +97,13 @@ class Motion:
         near &= came[1:]
         for members in self._members.values():
             stirring = moving[:, members].any(axis=1)
-            for dim in np.flatnonzero(members & joints.ordinary):
+            for dim in np.flatnonzero(members & joints.position_mask):
                 self._at_limit[dim].add(first, near[:, dim] & stirring)
 
     def _beyond_limits(self, first: int, state: Float32) -> None:
         joints = self._joints
         excess = np.maximum(joints.lower - state, state - joints.upper)
-        for dim in np.flatnonzero(joints.ordinary):
+        for dim in np.flatnonzero(joints.position_mask):
             marked = excess[:, dim] > self._settings.limit_excess
             self._outside[dim].add(first, marked, np.nan_to_num(excess[:, dim]))
 
@@ -116,7 +118,7 @@ class Motion:
     def _idle(self) -> None:
         last = self._rows - 1
         if self._first_motion < 0:
-            text = f"{span(0, last)}: the robot never moves"
+            text = f"{frame_range(0, last)}: the robot never moves"
             self._flags.add(Flag("idle", "error", 0, last, self._state, text, self._rows / self._fps, None))
             return
         # Motion is seen as soon as the robot is elsewhere, at most the lag after it began.
@@ -128,15 +130,15 @@ class Motion:
             seconds = frames / self._fps
             if seconds > bound:
                 end = first + frames - 1
-                text = f"{span(first, end)}: the robot stands for {seconds:.1f} s {what}"
+                text = f"{frame_range(first, end)}: the robot stands for {seconds:.1f} s {what}"
                 self._flags.add(Flag(kind, "warning", first, end, self._state, text, seconds, bound))
 
-    def _saturated(self, dim: int) -> Callable[[Run], None]:
-        def ended(run: Run) -> None:
+    def _saturated(self, dim: int) -> Callable[[FrameRun], None]:
+        def ended(run: FrameRun) -> None:
             seconds = run.frames / self._fps
             if seconds > self._settings.saturation_s:
                 name = self._joints.names[dim]
-                where = span(run.first, run.last)
+                where = frame_range(run.first, run.last)
                 text = f"{where}: {name} is commanded to its limit for {seconds:.1f} s with its group moving"
                 bound = self._settings.saturation_s
                 self._flags.add(
@@ -145,10 +147,10 @@ class Motion:
 
         return ended
 
-    def _beyond(self, dim: int) -> Callable[[Run], None]:
-        def ended(run: Run) -> None:
+    def _beyond(self, dim: int) -> Callable[[FrameRun], None]:
+        def ended(run: FrameRun) -> None:
             name = self._joints.names[dim]
-            text = f"{span(run.first, run.last)}: {name} is measured {run.value:.3f} beyond its limit"
+            text = f"{frame_range(run.first, run.last)}: {name} is measured {run.value:.3f} beyond its limit"
             bound = self._settings.limit_excess
             self._flags.add(
                 Flag("outside_limits", "warning", run.first, run.last, self._state, text, run.value, bound)
@@ -157,21 +159,21 @@ class Motion:
         return ended
 
 
-class _Following:
+class _TrackingDelay:
     """Nearness of each joint to its command within `wait` rows, and the delay in rows where it is nearest."""
 
     def __init__(
-        self, wait: int, joints: Joints, settings: QualitySettings, flags: Flags, stream: str
+        self, wait: int, joints: JointSpecs, settings: QualitySettings, flags: FlagCollector, stream: str
     ) -> None:
         self._wait = max(0, wait)
         self._joints = joints
         self._settings = settings
         self._flags = flags
         self._stream = stream
-        self._judged = joints.ordinary
+        self._judged = joints.position_mask
         self._actions = np.empty((0, len(joints.names)), np.float32)  # rows whose time is not over
         self._states = np.empty((0, len(joints.names)), np.float32)
-        self._runs = Runs(self._ended, apart=self._wait)
+        self._runs = RunCollector(self._ended, apart=self._wait)
         self._worst: dict[int, int] = {}
         self._sums: Float64 = np.zeros(self._wait + 1)
         self._counted = 0
@@ -212,11 +214,11 @@ class _Following:
             travelled = np.ptp(actions[rows][:, self._judged], axis=0)
             self._moved = self._moved or bool((travelled > self._settings.tracking_error).any())
 
-    def _ended(self, run: Run) -> None:
+    def _ended(self, run: FrameRun) -> None:
         dim = self._worst[run.at]
         self._worst = {frame: other for frame, other in self._worst.items() if frame > run.last}
         text = (
-            f"{span(run.first, run.last)}: {self._joints.names[dim]} stays {run.value:.3f} away from what was "
+            f"{frame_range(run.first, run.last)}: {self._joints.names[dim]} stays {run.value:.3f} away from what was "
             f"commanded, {self._settings.tracking_s:g} s long"
         )
         bound = self._settings.tracking_error
@@ -235,7 +237,7 @@ def _usable(block: Block, name: str) -> Float32:
     return np.where(known[:, None] & np.isfinite(numbers.values), numbers.values, np.nan).astype(np.float32)
 
 
-def _still(joints: Joints, settings: QualitySettings) -> Float64:
+def _idle_speeds(joints: JointSpecs, settings: QualitySettings) -> Float64:
     """Changes per second [D] up to which a number stands."""
     travel = joints.upper - joints.lower
     travel = np.where(np.isfinite(travel) & (travel > 0), travel, 1.0)

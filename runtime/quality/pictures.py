@@ -8,45 +8,47 @@ import numpy as np
 
 from runtime.core.errors import RecordingError
 from runtime.core.types import Float32, Float64
-from runtime.quality.block import Bools, Source
-from runtime.quality.losses import Losses
-from runtime.quality.luma import Film, Shot
-from runtime.quality.report import Flag, Flags, Run, Runs, Severity, span
+from runtime.quality.block import Bools, EpisodeSource
+from runtime.quality.losses import LostFrames
+from runtime.quality.luma import FrameStream, LumaFrame
+from runtime.quality.report import Flag, FlagCollector, FrameRun, RunCollector, Severity, frame_range
 from runtime.quality.settings import QualitySettings
 
 CHANGED = 10.0  # times `same`: a difference that only motion makes
 
 
-class Pictures:
+class ImageCheck:
     """Decodes the pictures of one camera alongside its rows and judges them."""
 
-    def __init__(self, source: Source, camera: str, settings: QualitySettings, flags: Flags) -> None:
+    def __init__(
+        self, source: EpisodeSource, camera: str, settings: QualitySettings, flags: FlagCollector
+    ) -> None:
         end = source.ends.get(camera)
         self._camera = camera
         self._fps = source.fps
         self._size = source.cameras[camera]
         self._settings = settings
         self._flags = flags
-        self._film: Film | None = None
-        self._shots: Iterator[Shot] = iter(())
+        self._film: FrameStream | None = None
+        self._shots: Iterator[LumaFrame] = iter(())
         self._shown = 0  # pictures that were taken
         self._before: Float32 | None = None
-        self._repeats = _Repeats(camera, self._fps, settings, flags, drawn=source.drawn)
-        self._losses = Losses(camera, self._fps, settings, flags, end)
+        self._repeats = _RepeatCheck(camera, self._fps, settings, flags, drawn=source.drawn)
+        self._losses = LostFrames(camera, self._fps, settings, flags, end)
         self._runs = {
-            "black": Runs(self._black),
-            "uniform": Runs(self._uniform),
-            "video_time": Runs(self._off_time),
-            "no_picture": Runs(self._absent),
+            "black": RunCollector(self._black),
+            "uniform": RunCollector(self._uniform),
+            "video_time": RunCollector(self._off_time),
+            "no_picture": RunCollector(self._absent),
         }
         self._strange: tuple[int, int] | None = None
         if end is not None and end.row == 0:
             return  # there need not be a file
         try:
-            self._film = source.film(camera, settings.sampling)
+            self._film = source.open_frames(camera, settings.sampling)
             self._shots = iter(self._film)
         except RecordingError as error:
-            self._say("video", "error", -1, -1, str(error))
+            self._flag("video", "error", -1, -1, str(error))
 
     def add(
         self, first: int, moving: Bools, repeated: Bools | None = None, lost: Bools | None = None
@@ -55,7 +57,7 @@ class Pictures:
         rows = len(moving)
         nobody = np.zeros(rows, np.bool_)
         repeated, lost = nobody if repeated is None else repeated, nobody if lost is None else lost
-        beyond = self._losses.beyond(first, rows)
+        beyond = self._losses.past_end(first, rows)
         self._losses.add(first, lost)
         figures = np.full((rows, 4), np.nan)  # mean, standard deviation, change, time off the grid
         keys = np.zeros(rows, np.bool_)
@@ -76,22 +78,22 @@ class Pictures:
         self._runs["video_time"].add(first, np.nan_to_num(off) > 0.5 / self._fps, np.nan_to_num(off))
         self._repeats.add(first, change, keys, black | uniform, moving, repeated & ~beyond, lost)
 
-    def _next(self, frame: int) -> Shot | None:
+    def _next(self, frame: int) -> LumaFrame | None:
         try:
             shot = next(self._shots, None)
         except RecordingError as error:
-            self._say("undecodable", "error", frame, frame, str(error))
+            self._flag("undecodable", "error", frame, frame, str(error))
             self._shots = iter(())
             return None
         self._shown += shot is not None
         return shot
 
-    def _figures(self, shot: Shot, frame: int) -> tuple[float, float, float, float]:
+    def _figures(self, shot: LumaFrame, frame: int) -> tuple[float, float, float, float]:
         size = (shot.height, shot.width)
         if self._size is not None and size != self._size and size != self._strange:
             self._strange = size
             told = f"{self._camera} is {size[1]}x{size[0]}, declared is {self._size[1]}x{self._size[0]}"
-            self._say("dimensions", "error", frame, frame, f"from frame {frame} on {told}")
+            self._flag("dimensions", "error", frame, frame, f"from frame {frame} on {told}")
         before, self._before = self._before, shot.luma
         change = np.nan
         if before is not None:
@@ -108,40 +110,41 @@ class Pictures:
         self._repeats.close(self._shown)
         if self._film is None:
             return
-        ended = self._losses.beyond(rows, 1).all()
+        ended = self._losses.past_end(rows, 1).all()
         if whole and not ended and self._next(self._shown) is not None:
             text = f"{self._camera} has more pictures than there are rows, {self._shown - 1}"
-            self._say("video_length", "info", -1, -1, text)
+            self._flag("video_length", "info", -1, -1, text)
 
     def release(self) -> None:
         """Close the video, however the check ended."""
         if self._film is not None:
             self._film.close()
 
-    def _black(self, run: Run) -> None:
-        text = (
-            f"{span(run.first, run.last)}: {self._camera} is black, mean brightness {-run.value:.1f} of 255"
-        )
-        self._say("black", self._lasting(run), run.first, run.last, text, -run.value, self._settings.black)
+    def _black(self, run: FrameRun) -> None:
+        text = f"{frame_range(run.first, run.last)}: {self._camera} is black, mean brightness {-run.value:.1f} of 255"
+        self._flag("black", self._lasting(run), run.first, run.last, text, -run.value, self._settings.black)
 
-    def _uniform(self, run: Run) -> None:
-        text = f"{span(run.first, run.last)}: {self._camera} shows nothing, brightness varies by {-run.value:.2f}"
-        self._say(
+    def _uniform(self, run: FrameRun) -> None:
+        where = frame_range(run.first, run.last)
+        text = f"{where}: {self._camera} shows nothing, brightness varies by {-run.value:.2f}"
+        self._flag(
             "uniform", self._lasting(run), run.first, run.last, text, -run.value, self._settings.uniform
         )
 
-    def _lasting(self, run: Run) -> Severity:
+    def _lasting(self, run: FrameRun) -> Severity:
         return "error" if run.frames / self._fps > self._settings.picture_age_s else "warning"
 
-    def _off_time(self, run: Run) -> None:
-        text = f"{span(run.first, run.last)}: {self._camera} is shown {run.value:.3f} s off its row"
-        self._say("video_time", "error", run.first, run.last, text, run.value, 0.5 / self._fps)
+    def _off_time(self, run: FrameRun) -> None:
+        text = f"{frame_range(run.first, run.last)}: {self._camera} is shown {run.value:.3f} s off its row"
+        self._flag("video_time", "error", run.first, run.last, text, run.value, 0.5 / self._fps)
 
-    def _absent(self, run: Run) -> None:
-        text = f"{span(run.first, run.last)}: {self._camera} has no picture, only {self._shown}"
-        self._say("video_length", "error", run.first, run.last, text, float(self._shown), float(run.last + 1))
+    def _absent(self, run: FrameRun) -> None:
+        text = f"{frame_range(run.first, run.last)}: {self._camera} has no picture, only {self._shown}"
+        self._flag(
+            "video_length", "error", run.first, run.last, text, float(self._shown), float(run.last + 1)
+        )
 
-    def _say(
+    def _flag(
         self,
         kind: str,
         severity: Severity,
@@ -154,7 +157,7 @@ class Pictures:
         self._flags.add(Flag(kind, severity, first, last, self._camera, text, value, bound))
 
 
-class _Repeats:
+class _RepeatCheck:
     """Pictures that are the one before again: said so by the recorder, or seen so while the robot moved.
 
     A picture that stays the same is no proof where the robot stands. One that is coded by itself after such as are
@@ -163,7 +166,7 @@ class _Repeats:
     """
 
     def __init__(
-        self, camera: str, fps: float, settings: QualitySettings, flags: Flags, *, drawn: bool
+        self, camera: str, fps: float, settings: QualitySettings, flags: FlagCollector, *, drawn: bool
     ) -> None:
         self._camera = camera
         self._fps = fps
@@ -172,8 +175,8 @@ class _Repeats:
         self._drawn = drawn
         self._repeated = self._skipped = 0
         self._spans = {"repeated": [-1, -1], "skipped": [-1, -1]}
-        self._said = Runs(self._no_new)
-        self._seen = Runs(self._stands)
+        self._said = RunCollector(self._no_new)
+        self._seen = RunCollector(self._stands)
         self._last: Float64 = np.full(2, np.nan)  # changes of the two pictures before
         self._key = False  # whether the picture before was coded by itself
 
@@ -240,18 +243,20 @@ class _Repeats:
                     Flag("duplicate", severity, first, last, self._camera, sentence, share, bound)
                 )
 
-    def _no_new(self, run: Run) -> None:
+    def _no_new(self, run: FrameRun) -> None:
         seconds, bound = run.frames / self._fps, self._settings.picture_age_s
         if seconds > bound:
-            text = f"{span(run.first, run.last)}: {self._camera} gave no new picture for {seconds:.1f} s"
+            text = (
+                f"{frame_range(run.first, run.last)}: {self._camera} gave no new picture for {seconds:.1f} s"
+            )
             self._frozen("error", run, text, seconds, bound)
 
-    def _stands(self, run: Run) -> None:
+    def _stands(self, run: FrameRun) -> None:
         seconds, bound = run.frames / self._fps, self._settings.frozen_s
         if seconds > bound:
-            where = span(run.first, run.last)
+            where = frame_range(run.first, run.last)
             text = f"{where}: {self._camera} shows one picture for {seconds:.1f} s while the robot moves"
             self._frozen("warning", run, text, seconds, bound)
 
-    def _frozen(self, severity: Severity, run: Run, text: str, seconds: float, bound: float) -> None:
+    def _frozen(self, severity: Severity, run: FrameRun, text: str, seconds: float, bound: float) -> None:
         self._flags.add(Flag("frozen", severity, run.first, run.last, self._camera, text, seconds, bound))

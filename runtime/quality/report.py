@@ -65,7 +65,7 @@ class Report:
         found = {flag.severity for flag in self.flags}
         return next((severity for severity in reversed(SEVERITIES) if severity in found), "")
 
-    def document(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """As JSON; numbers that are not finite become null."""
         return {
             "format": FORMAT,
@@ -85,7 +85,7 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-class Flags:
+class FlagCollector:
     """Collects flags in constant memory: of each kind and stream at most `most` are kept, all are counted."""
 
     def __init__(self, most: int) -> None:
@@ -122,7 +122,7 @@ class Flags:
         )
 
 
-class Run(NamedTuple):
+class FrameRun(NamedTuple):
     """Consecutive frames that have something in common; `value` is the worst of them, at frame `at`."""
 
     first: int
@@ -135,16 +135,16 @@ class Run(NamedTuple):
         return self.last - self.first + 1
 
 
-class Runs:
+class RunCollector:
     """Joins marked frames of consecutive blocks into runs and gives each, once it has ended, to `ended`.
 
     Runs that are at most `apart` unmarked frames apart are one.
     """
 
-    def __init__(self, ended: Callable[[Run], None], apart: int = 0) -> None:
+    def __init__(self, ended: Callable[[FrameRun], None], apart: int = 0) -> None:
         self._ended = ended
         self._apart = apart
-        self._open: Run | None = None
+        self._open: FrameRun | None = None
 
     def add(self, first: int, marked: NDArray[np.bool_], values: ArrayLike | None = None) -> None:
         """The frames from `first` on; `values` says how bad each is, larger is worse."""
@@ -157,16 +157,16 @@ class Runs:
         breaks = np.flatnonzero(np.diff(frames) > self._apart + 1)
         for part in np.split(frames, breaks + 1):
             at = int(part[np.argmax(worst[part])])
-            self._take(Run(first + int(part[0]), first + int(part[-1]), float(worst[at]), first + at))
+            self._take(FrameRun(first + int(part[0]), first + int(part[-1]), float(worst[at]), first + at))
 
-    def _take(self, new: Run) -> None:
+    def _take(self, new: FrameRun) -> None:
         known = self._open
         if known is None or new.first - known.last > self._apart + 1:
             self.close()
             self._open = new
             return
         worse = new if new.value > known.value else known
-        self._open = Run(known.first, new.last, worse.value, worse.at)
+        self._open = FrameRun(known.first, new.last, worse.value, worse.at)
 
     def close(self) -> None:
         """The episode has ended."""
@@ -175,7 +175,7 @@ class Runs:
             self._ended(known)
 
 
-def span(first: int, last: int) -> str:
+def frame_range(first: int, last: int) -> str:
     """Frames as a person names them."""
     return f"frame {first}" if first == last else f"frames {first} to {last}"
 

@@ -85,10 +85,10 @@ class QualitySettings(Settings):
 def read_settings(path: Path) -> QualitySettings:
     """The bounds in a TOML file with keys of QualitySettings; RecordingError names file, key, given and allowed."""
     try:
-        content = bounded.toml_file(path, str(path))
+        content = bounded.load_toml(path, str(path))
     except FileNotFoundError:
         raise RecordingError(f"there is no file {path} with settings") from None
-    except bounded.Unreadable as error:
+    except bounded.UnreadableDocument as error:
         raise RecordingError(str(error)) from error
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error}") from error

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from runtime.core.types import Float64
-from runtime.quality.block import Block, Source
-from runtime.quality.report import Flag, Flags, Run, Runs, Severity, span
+from runtime.quality.block import Block, EpisodeSource
+from runtime.quality.report import Flag, FlagCollector, FrameRun, RunCollector, Severity, frame_range
 from runtime.quality.settings import QualitySettings
 
 JOINTS = ("joints", "eef")  # streams that are no cameras
 
 
-class Times:
+class TimingCheck:
     """Judges order, gaps, skew and ages, block by block."""
 
-    def __init__(self, source: Source, settings: QualitySettings, flags: Flags) -> None:
+    def __init__(self, source: EpisodeSource, settings: QualitySettings, flags: FlagCollector) -> None:
         self._source = source
         self._settings = settings
         self._flags = flags
@@ -23,7 +23,7 @@ class Times:
         self._skew = float(given) if isinstance(given, int | float) and given > 0 else settings.max_skew_s
         self._before: dict[str, float] = {}  # the newest value of each clock and stream
         self._index: int | None = None
-        self._runs: dict[tuple[str, str], Runs] = {}
+        self._runs: dict[tuple[str, str], RunCollector] = {}
         self.largest_skew: float | None = None
 
     def add(self, block: Block) -> None:
@@ -120,12 +120,12 @@ class Times:
     ) -> None:
         place = (kind, stream)
         if place not in self._runs:
-            self._runs[place] = Runs(lambda run: self._say(kind, stream, run))
+            self._runs[place] = RunCollector(lambda run: self._flag_run(kind, stream, run))
         values = None if values is None else np.nan_to_num(values, nan=0.0)
         self._runs[place].add(block.first, wrong, values)
 
-    def _say(self, kind: str, stream: str, run: Run) -> None:
-        where, value = span(run.first, run.last), run.value
+    def _flag_run(self, kind: str, stream: str, run: FrameRun) -> None:
+        where, value = frame_range(run.first, run.last), run.value
         settings = self._settings
         age = settings.joint_age_s if stream in JOINTS else settings.picture_age_s
         said: dict[str, tuple[Severity, str, float | None, float | None]] = {

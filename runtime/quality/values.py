@@ -5,21 +5,25 @@ from __future__ import annotations
 import numpy as np
 
 from runtime.core.types import EEF_WIDTH, Float32
-from runtime.quality.block import Block, Joints, Numbers, Source, Vector
-from runtime.quality.report import Flag, Flags, Run, Runs, Severity, listed, span
+from runtime.quality.block import Block, EpisodeSource, JointSpecs, Vector, VectorColumn
+from runtime.quality.report import Flag, FlagCollector, FrameRun, RunCollector, Severity, frame_range, listed
 from runtime.quality.settings import QualitySettings
 
 MOVING = ("state", "action")
 
 
-class Values:
+class ValueCheck:
     """Judges every column of vectors, block by block.
 
     Numbers that are not finite count as 0 and are unknown to all other checks; their rows are flagged and stay.
     """
 
     def __init__(
-        self, source: Source, joints: Joints | None, settings: QualitySettings, flags: Flags
+        self,
+        source: EpisodeSource,
+        joints: JointSpecs | None,
+        settings: QualitySettings,
+        flags: FlagCollector,
     ) -> None:
         self._columns = [
             _Column(name, vector, source.fps, joints, settings, flags)
@@ -43,9 +47,9 @@ class _Column:
         name: str,
         vector: Vector,
         fps: float,
-        joints: Joints | None,
+        joints: JointSpecs | None,
         settings: QualitySettings,
-        flags: Flags,
+        flags: FlagCollector,
     ) -> None:
         self.name = name
         self._vector = vector
@@ -57,15 +61,15 @@ class _Column:
         self._before = np.full(vector.width, np.nan, np.float32)
         self._fastest = 0  # the dimension of the worst jump
         self._runs = {
-            "missing": Runs(self._missing),
-            "dimensions": Runs(self._malformed),
-            "not_finite": Runs(self._not_finite),
-            "quaternion": Runs(self._no_rotation),
-            "jump": Runs(self._jump),
+            "missing": RunCollector(self._missing),
+            "dimensions": RunCollector(self._malformed),
+            "not_finite": RunCollector(self._not_finite),
+            "quaternion": RunCollector(self._no_rotation),
+            "jump": RunCollector(self._jump),
         }
         self._worst: dict[int, int] = {}
 
-    def _allowed(self, joints: Joints | None) -> np.ndarray[tuple[int], np.dtype[np.float64]] | None:
+    def _allowed(self, joints: JointSpecs | None) -> np.ndarray[tuple[int], np.dtype[np.float64]] | None:
         """Allowed change of each number [1/s]; infinite where any change is right. None: it is not judged."""
         width, settings = self._vector.width, self._settings
         if self._vector.role == "poses":
@@ -78,9 +82,9 @@ class _Column:
             return np.full(width, settings.joint_speed)
         known = np.isfinite(joints.velocity)
         bound = np.where(known, joints.velocity * settings.speed_factor, settings.joint_speed)
-        return np.where(joints.ordinary, bound, np.inf)
+        return np.where(joints.position_mask, bound, np.inf)
 
-    def add(self, first: int, numbers: Numbers) -> None:
+    def add(self, first: int, numbers: VectorColumn) -> None:
         finite = np.isfinite(numbers.values)
         there = ~(numbers.missing | numbers.malformed)
         broken = there & ~finite.all(axis=1)
@@ -118,27 +122,27 @@ class _Column:
         for runs in self._runs.values():
             runs.close()
 
-    def _missing(self, run: Run) -> None:
+    def _missing(self, run: FrameRun) -> None:
         severity: Severity = "info" if self._vector.sparse else "error" if self._moves else "warning"
         self._say("missing_values", severity, run, f"{self.name} was not recorded", None, None)
 
-    def _malformed(self, run: Run) -> None:
+    def _malformed(self, run: FrameRun) -> None:
         self._say(
             "dimensions", "error", run, f"{self.name} has another width than {self._vector.width}", None, None
         )
 
-    def _not_finite(self, run: Run) -> None:
+    def _not_finite(self, run: FrameRun) -> None:
         names = listed([self._vector.names[dim] for dim in sorted(self._broken)])
         self._broken = set()
         severity: Severity = "error" if self._moves else "warning"
         text = f"{self.name} is not finite in {names}: it counts as 0"
         self._say("not_finite", severity, run, text, float(run.frames), 0.0)
 
-    def _no_rotation(self, run: Run) -> None:
+    def _no_rotation(self, run: FrameRun) -> None:
         text = f"{self.name}: the length of a quaternion is {run.value:.3f} off 1"
         self._say("quaternion", "error", run, text, run.value, self._settings.quaternion_error)
 
-    def _jump(self, run: Run) -> None:
+    def _jump(self, run: FrameRun) -> None:
         assert self._speeds is not None
         dim = self._worst[run.at]
         self._worst = {frame: other for frame, other in self._worst.items() if frame > run.last}
@@ -152,7 +156,13 @@ class _Column:
         return self._vector.role in MOVING
 
     def _say(
-        self, kind: str, severity: Severity, run: Run, text: str, value: float | None, bound: float | None
+        self,
+        kind: str,
+        severity: Severity,
+        run: FrameRun,
+        text: str,
+        value: float | None,
+        bound: float | None,
     ) -> None:
-        sentence = f"{span(run.first, run.last)}: {text}"
+        sentence = f"{frame_range(run.first, run.last)}: {text}"
         self._flags.add(Flag(kind, severity, run.first, run.last, self.name, sentence, value, bound))

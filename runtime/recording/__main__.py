@@ -10,16 +10,16 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.errors import RecordingError
-from runtime.recording.export import export
-from runtime.recording.quarantine import keep
+from runtime.recording.export import write_export
+from runtime.recording.quarantine import update_mark
 from runtime.recording.reader import Episode, open_episode
-from runtime.recording.repair import Report, repair, repair_all
-from runtime.recording.scrub import episodes_in, verify
+from runtime.recording.repair import RepairReport, repair, repair_all
+from runtime.recording.scrub import episodes_in, verify_episode
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where all is well, 1 where an episode is unreadable, damaged, or the disk fails.
 
@@ -78,13 +78,13 @@ def _scrubbed(folder: Path, as_json: bool) -> int:
     """Tell and mark; the exit code that it comes to."""
     damaged = False
     try:
-        verdict = verify(folder)
+        verdict = verify_episode(folder)
         damaged = verdict.state == "damaged"
         print(
-            json.dumps(verdict.document()) if as_json else f"{folder}: {verdict.state}: {verdict.text}",
+            json.dumps(verdict.to_dict()) if as_json else f"{folder}: {verdict.state}: {verdict.text}",
             flush=True,
         )
-        keep(verdict)
+        update_mark(verdict)
     except RecordingError as error:
         print(error, file=sys.stderr)
         return 1 if damaged else 2
@@ -99,7 +99,7 @@ def _repair(path: Path) -> int:
     return int(any(report.verdict in ("unreadable", "damaged", "failed") for report in reports))
 
 
-def _line(report: Report) -> str:
+def _line(report: RepairReport) -> str:
     figures = f"{report.frames} rows, {report.rows_cut} cut, {report.torn_bytes} torn bytes"
     said = "; ".join(filter(None, (figures if report.verdict == "repaired" else "", report.problem)))
     return f"{report.path}: {report.verdict}: {said or figures}"
@@ -132,7 +132,7 @@ def _export(paths: Sequence[Path], to: Path | None) -> int:
     failed = 0
     for folder in (episode for path in paths for episode in episodes_in(path)):
         try:
-            print(export(folder, to or _data_of(folder)), flush=True)
+            print(write_export(folder, to or _data_of(folder)), flush=True)
         except RecordingError as error:
             failed += 1
             print(error, file=sys.stderr)

@@ -20,7 +20,7 @@ class Picture(NamedTuple):
     captured: float
 
 
-def codings(repeats: int) -> int:
+def encode_count(repeats: int) -> int:
     """Count of frames to be coded for so many repeats in a row; the rest are copies.
 
     A run of copies alternates between two key frames and ends with the second, so that an odd one has a
@@ -35,7 +35,7 @@ class Pace:
     def __init__(self) -> None:
         self.coding_s = _GUESS_S
 
-    def see(self, codings: int, seconds: float) -> None:
+    def update(self, codings: int, seconds: float) -> None:
         """So many frames were coded in that time, waiting for a processor included."""
         each = seconds / codings
         self.coding_s = max(each, self.coding_s + 0.2 * (each - self.coding_s))
@@ -62,7 +62,7 @@ class PictureQueue:
         with self._changed:
             if picture is not None and patience:
                 self._changed.wait_for(lambda: self._held < self._places or self._closed, patience)
-            if picture is not None and self._takes(patient=patience > 0.0):
+            if picture is not None and self._has_room(patient=patience > 0.0):
                 self._entries.append(Picture(picture, captured))
                 self._held += 1
                 taken = True
@@ -84,10 +84,10 @@ class PictureQueue:
                 self._changed.notify_all()
             return entry
 
-    def coded(self, codings: int, seconds: float) -> None:
+    def report_encoded(self, codings: int, seconds: float) -> None:
         """Report the coding time of an entry, for the pace."""
         with self._changed:
-            self._pace.see(codings, seconds)
+            self._pace.update(codings, seconds)
 
     def close(self, *, discard: bool = False) -> None:
         """No more entries come; with `discard` those that wait are dropped."""
@@ -103,12 +103,12 @@ class PictureQueue:
         with self._changed:
             return sum(entry if isinstance(entry, int) else 1 for entry in self._entries)
 
-    def _takes(self, *, patient: bool) -> bool:
+    def _has_room(self, *, patient: bool) -> bool:
         if self._held >= self._places:
             return False
         if patient or not self._entries:
             return True
-        ahead = sum(codings(entry) if isinstance(entry, int) else 1 for entry in self._entries)
+        ahead = sum(encode_count(entry) if isinstance(entry, int) else 1 for entry in self._entries)
         return (ahead + 1) * self._pace.coding_s <= self._max_lag_s
 
     def _repeat(self) -> None:

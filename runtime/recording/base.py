@@ -102,7 +102,7 @@ VIDEO_LOST = "video_lost"  # the event of a camera whose video has ended; repair
 
 
 @dataclass(frozen=True, slots=True)
-class Loss:
+class LostCamera:
     """A camera whose video ends at row `row`, while all else is recorded on."""
 
     camera: str
@@ -137,11 +137,11 @@ class Journal(ABC):
         """Take one record; waits for no encoder and no longer than a write; raises RecordingError."""
 
     @abstractmethod
-    def mark(self, event: Mapping[str, object]) -> None:
+    def append_event(self, event: Mapping[str, object]) -> None:
         """Append one event to the episode's log."""
 
     @abstractmethod
-    def losses(self) -> Sequence[Loss]:
+    def pop_lost_cameras(self) -> Sequence[LostCamera]:
         """Cameras that this episode, or the one that ended last, has lost since the last call."""
 
     @abstractmethod

@@ -59,7 +59,7 @@ def options(name: str, preset: str, crf: int, gop: int) -> dict[str, str]:
     }
 
 
-def set_up(
+def configure_context(
     context: Any, name: str, size: tuple[int, int], rate: Fraction, told: Mapping[str, str], gop: int
 ) -> None:
     """Make an encoder's context ready for pictures of (height, width) at `rate`."""

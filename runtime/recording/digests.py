@@ -10,7 +10,7 @@ FileDigest = dict[
 ]  # "bytes", "sha256", "pieces": "END ROWS SHA256" each, up to that byte and that row
 
 
-def rows_of_piece(fps: float) -> int:
+def rows_per_piece(fps: float) -> int:
     """Of a video: a second of it, so that the list of a long one stays short."""
     return max(1, round(fps))
 
@@ -35,7 +35,7 @@ class Digest:
         if self._rows == self._ended_rows or self._rows - self._ended_rows >= self._least:
             self._end_piece()
 
-    def told(self) -> FileDigest:
+    def to_dict(self) -> FileDigest:
         """As it stands in the outcome."""
         if self._bytes > self._ended_bytes:
             self._end_piece()

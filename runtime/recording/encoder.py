@@ -12,10 +12,10 @@ import av
 
 from runtime.core.errors import RecordingError
 from runtime.core.types import UInt8
-from runtime.recording.backlog import Picture, PictureQueue, codings
-from runtime.recording.digests import rows_of_piece
+from runtime.recording.backlog import Picture, PictureQueue, encode_count
+from runtime.recording.digests import rows_per_piece
 from runtime.recording.files import AppendFile, DiskFullError
-from runtime.recording.histogram import Histogram
+from runtime.recording.histogram import DurationHistogram
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.video import FragmentedVideo
 
@@ -29,14 +29,14 @@ class CameraEncoder:
         self.camera = camera
         self.path = path
         self.failure: RecordingError | None = None
-        self.file = AppendFile(path, rows_of_piece(fps))
+        self.file = AppendFile(path, rows_per_piece(fps))
         self._fps = fps
         self._most_behind = max(2, round(settings.give_up_s * fps))  # frames
         self._abandoned = self._refused = self._all_coded = False
         self._captured: deque[float] = (
             deque()
         )  # of the frames in the encoder [s, monotonic]; NaN for a repeat
-        self._muxed = Histogram()
+        self._muxed = DurationHistogram()
         self._queue = PictureQueue(settings.queue_frames, settings.max_lag_s)
         try:
             self._video = FragmentedVideo(self.file, size, fps, settings)
@@ -141,11 +141,11 @@ class CameraEncoder:
         if isinstance(entry, int):
             self._captured.extend([math.nan] * entry)
             self._video.repeat(entry)
-            self._queue.coded(codings(entry), time.monotonic() - begun)
+            self._queue.report_encoded(encode_count(entry), time.monotonic() - begun)
         else:
             self._captured.append(entry.captured)
             self._video.encode(entry.pixels)
-            self._queue.coded(1, time.monotonic() - begun)
+            self._queue.report_encoded(1, time.monotonic() - begun)
         while self._captured and len(self._captured) > self._video.frames - self._video.muxed:
             self._muxed.add(self._video.muxed_at - self._captured.popleft())
 

@@ -14,26 +14,35 @@ from pathlib import Path
 
 from runtime.core.errors import RecordingError
 from runtime.recording.admission import admit_chunk, admit_row, admit_tick
-from runtime.recording.base import VIDEO_LOST, ExecutedTick, Journal, Loss, Outcome, RawChunk, Record, Row
+from runtime.recording.base import (
+    VIDEO_LOST,
+    ExecutedTick,
+    Journal,
+    LostCamera,
+    Outcome,
+    RawChunk,
+    Record,
+    Row,
+)
 from runtime.recording.columns import RecordedRow
 from runtime.recording.digests import FileDigest
 from runtime.recording.encoder import CameraEncoder
 from runtime.recording.files import (
     DiskFullError,
     UnclosedError,
-    disk_fault,
-    document,
+    disk_error,
     require_room,
     sync_folder,
-    write_whole,
+    to_json,
+    write_atomic,
 )
 from runtime.recording.fragments import count_frames
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import MANIFEST, digest_of, digests_of, sealed, write_outcome
+from runtime.recording.sealing import MANIFEST, digest_of, digests_of, seal_outcome, write_outcome
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.summary import summarise
 from runtime.recording.tables import read_table, rows_schema
-from runtime.recording.writer import DiskWriter, Faults
+from runtime.recording.writer import DiskWriter, ErrorLatch
 
 _LEAST_DISK_SECONDS = 1.0  # for the last writes
 _PATIENCE = 6.0  # times as long as a robot would wait: lockstep loses nothing to a busy machine
@@ -56,7 +65,7 @@ class EpisodeJournal(Journal):
         self._settings = settings or RecordingSettings()
         self._patience = _PATIENCE * self._settings.drain_timeout_s if patient else 0.0
         self._recording: _Recording | None = None
-        self._losses: list[Loss] = []
+        self._losses: list[LostCamera] = []
 
     @property
     def folder(self) -> Path | None:
@@ -66,12 +75,12 @@ class EpisodeJournal(Journal):
     def begin(self, manifest: Mapping[str, object]) -> None:
         if self._recording is not None:
             raise RecordingError(f"episode {self._recording.folder} has not ended, a second one cannot begin")
-        layout = Layout.of(manifest)
-        text = document(manifest, "the manifest", indent=1)
+        layout = Layout.from_manifest(manifest)
+        text = to_json(manifest, "the manifest", indent=1)
         require_room(self._root, self._settings.min_free_bytes)
         folder = _create(self._root, layout.uuid)
         try:
-            write_whole(folder / MANIFEST, text)
+            write_atomic(folder / MANIFEST, text)
             recording = _Recording(folder, layout, self._settings, self._patience)
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)  # it is ours and empty: no row was ever taken
@@ -82,12 +91,12 @@ class EpisodeJournal(Journal):
     def append(self, record: Record) -> None:
         self._begun().append(record)
 
-    def mark(self, event: Mapping[str, object]) -> None:
+    def append_event(self, event: Mapping[str, object]) -> None:
         self._begun().mark(event)
 
-    def losses(self) -> Sequence[Loss]:
+    def pop_lost_cameras(self) -> Sequence[LostCamera]:
         if self._recording is not None:
-            self._losses += self._recording.look()
+            self._losses += self._recording.pop_lost_cameras()
         told, self._losses = self._losses, []
         return told
 
@@ -102,7 +111,7 @@ class EpisodeJournal(Journal):
         try:
             recording.end(outcome)
         finally:
-            self._losses += recording.look()
+            self._losses += recording.pop_lost_cameras()
 
     def _begun(self) -> _Recording:
         if self._recording is None:
@@ -119,11 +128,11 @@ def _create(root: Path, name: str) -> Path:
         folder.mkdir()
         sync_folder(root)
     except OSError as error:
-        raise disk_fault("creating", folder, error) from error
+        raise disk_error("creating", folder, error) from error
     return folder
 
 
-def lock(folder: Path) -> int | None:
+def lock_folder(folder: Path) -> int | None:
     """A descriptor that marks `folder` as being written until it is closed; None where another one does so.
 
     The kernel lets go of it however its process ends.
@@ -131,7 +140,7 @@ def lock(folder: Path) -> int | None:
     try:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:
-        raise disk_fault("opening", folder, error) from error
+        raise disk_error("opening", folder, error) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -139,12 +148,12 @@ def lock(folder: Path) -> int | None:
         return None
     except OSError as error:
         os.close(descriptor)
-        raise disk_fault("locking", folder, error) from error
+        raise disk_error("locking", folder, error) from error
     return descriptor
 
 
 def _locked(folder: Path) -> int:
-    descriptor = lock(folder)
+    descriptor = lock_folder(folder)
     if descriptor is None:
         raise RecordingError(f"episode {folder} is being written by another process")
     return descriptor
@@ -160,8 +169,8 @@ class _Recording:
         self._patience = patience
         self._rows = 0
         self._newest = layout.started  # time of the newest row [s], on the clock that rows are on
-        self._faults = Faults()
-        self._lost: dict[str, Loss] = {}
+        self._faults = ErrorLatch()
+        self._lost: dict[str, LostCamera] = {}
         self._told = 0
         self._ending = False
         self._encoders: dict[str, CameraEncoder] = {}
@@ -178,7 +187,7 @@ class _Recording:
             undo.pop_all()
 
     def append(self, record: Record) -> None:
-        self._tell()
+        self._raise_pending()
         if isinstance(record, Row):
             self._append_row(record)
         elif isinstance(record, ExecutedTick):
@@ -200,7 +209,7 @@ class _Recording:
         repeated = {
             camera
             for camera, encoder in self._encoders.items()
-            if not encoder.put(row.pictures[camera], self._patience, self._taken(row, camera))
+            if not encoder.put(row.pictures[camera], self._patience, self._capture_time(row, camera))
         }
         self._rows += 1
         self._newest = row.tick_time
@@ -208,15 +217,15 @@ class _Recording:
         lost = row.lost | unseen | self._lost.keys()
         self._writer.add("rows", RecordedRow(kept, frozenset(repeated), frozenset(lost)), self._patience)
 
-    def _taken(self, row: Row, camera: str) -> float:
+    def _capture_time(self, row: Row, camera: str) -> float:
         """When the picture was captured; NaN in lockstep, whose clock is not that of the encoders."""
         return math.nan if self._patience else row.captured.get(camera, math.nan)
 
     def mark(self, event: Mapping[str, object]) -> None:
-        self._tell()
-        self._writer.add_line(document(event, "an event"))
+        self._raise_pending()
+        self._writer.add_line(to_json(event, "an event"))
 
-    def look(self) -> list[Loss]:
+    def pop_lost_cameras(self) -> list[LostCamera]:
         """Cameras that have been lost since the last call."""
         new = list(self._lost.values())[self._told :]
         self._told += len(new)
@@ -236,8 +245,8 @@ class _Recording:
             self._faults.report(
                 RecordingError(f"the disk did not take the end of episode {self.folder} in time")
             )
-            self._faults.tell()
-        self._faults.forget_full()
+            self._faults.raise_pending()
+        self._faults.clear_disk_full()
         self._conclude(outcome, stuck)
 
     def _conclude(self, outcome: Outcome, stuck: Sequence[CameraEncoder]) -> None:
@@ -246,7 +255,7 @@ class _Recording:
         try:
             if full is None:
                 self._look_at_losses()
-                write_outcome(self.folder, sealed(self._conclusion(outcome), self._digests(stuck)))
+                write_outcome(self.folder, seal_outcome(self._conclusion(outcome), self._digests(stuck)))
         except DiskFullError as error:
             full = error
         finally:
@@ -255,7 +264,7 @@ class _Recording:
         if full is not None:
             raise UnclosedError(str(full), lambda: self._conclude_again(outcome, stuck)) from full
         if not self._faults.told:
-            self._faults.tell()
+            self._faults.raise_pending()
 
     def _conclude_again(self, outcome: Outcome, stuck: Sequence[CameraEncoder]) -> None:
         self._writer.save()
@@ -296,7 +305,7 @@ class _Recording:
             "status": status,
             "reason": "; ".join(filter(None, (reason, *(loss.text for loss in lost)))),
             "ended_wall": outcome.ended_wall,
-            **summary.fields(),
+            **summary.to_dict(),
             "rows": rows,
             "video_frames": videos,
             "lost_cameras": {loss.camera: {"row": loss.row, "reason": loss.reason} for loss in lost},
@@ -316,9 +325,9 @@ class _Recording:
             digests.pop(encoder.path.name, None)
         return digests
 
-    def _tell(self) -> None:
+    def _raise_pending(self) -> None:
         self._look_at_encoders()
-        self._faults.tell()
+        self._faults.raise_pending()
 
     def _look_at_encoders(self) -> None:
         """A disk that is full ends the recording, any other failure the video of its camera."""
@@ -328,7 +337,7 @@ class _Recording:
                 if not self._ending:  # else what it holds is written with the rest
                     self._faults.report(failure)
             elif failure is not None and camera not in self._lost:
-                loss = self._lost[camera] = Loss(camera, encoder.frames, str(failure))
+                loss = self._lost[camera] = LostCamera(camera, encoder.frames, str(failure))
                 event = {"camera": camera, "row": loss.row}
                 told = {
                     "kind": VIDEO_LOST,
@@ -337,4 +346,4 @@ class _Recording:
                     "step": -1,
                     "data": event,
                 }
-                self._writer.add_line(document(told, "an event"))
+                self._writer.add_line(to_json(told, "an event"))

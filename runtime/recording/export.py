@@ -15,10 +15,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from runtime.core.errors import RecordingError
-from runtime.recording.files import alone_in, disk_fault, document, read_document, write_whole
+from runtime.recording.files import disk_error, exclusive, read_json, to_json, write_atomic
 from runtime.recording.layout import Layout
-from runtime.recording.scrub import require_sound
-from runtime.recording.sealing import read_outcome, told
+from runtime.recording.scrub import require_intact
+from runtime.recording.sealing import read_outcome, without_digests
 from runtime.recording.tables import SCHEMAS, read_table
 
 FOLDER = "exports"
@@ -78,32 +78,32 @@ class _Run:
     raw: Any
 
 
-def export(folder: Path, root: Path) -> Path:
+def write_export(folder: Path, root: Path) -> Path:
     """Write the episode in `folder` to its place below `root`; what is there already and whole stays.
 
     Any number of processes may do so at once. Raises RecordingError where the episode has no outcome yet, is
     damaged, or the disk does not take it.
     """
-    manifest = read_document(folder / "manifest.json")
+    manifest = read_json(folder / "manifest.json")
     if not (folder / "outcome.json").exists():
         raise RecordingError(f"{folder} has no outcome.json: it is being recorded, or wants repair")
-    path = place(manifest, root)
-    with alone_in(path.parent):
+    path = export_path(manifest, root)
+    with exclusive(path.parent):
         if not is_exported(folder, path):
-            require_sound(folder, _FILES)
-            write_whole(path, _content(_read(folder, manifest)))
+            require_intact(folder, _FILES)
+            write_atomic(path, _content(_read(folder, manifest)))
     return path
 
 
-def exported(folder: Path) -> bytes:
+def export_table(folder: Path) -> bytes:
     """The table of the episode in `folder` as a parquet file; raises RecordingError where it is damaged."""
-    return _content(_read(folder, read_document(folder / "manifest.json")))
+    return _content(_read(folder, read_json(folder / "manifest.json")))
 
 
-def place(manifest: Mapping[str, object], root: Path) -> Path:
+def export_path(manifest: Mapping[str, object], root: Path) -> Path:
     """Path of the export of that manifest's run; RecordingError where it has no uuid of its own."""
     prompt, mode, strategy = (manifest.get(key) for key in ("task", "mode", "strategy"))
-    run = Layout.of(manifest).uuid
+    run = Layout.from_manifest(manifest).uuid
     return root / FOLDER / slug(prompt, NO_PROMPT) / slug(mode) / slug(strategy) / f"{run}.parquet"
 
 
@@ -114,7 +114,7 @@ def is_exported(folder: Path, path: Path) -> bool:
     except FileNotFoundError:
         return False
     except OSError as error:
-        raise disk_fault("looking at", path, error) from error
+        raise disk_error("looking at", path, error) from error
 
 
 def slug(text: object, empty: str = "unknown") -> str:
@@ -134,9 +134,9 @@ def slug(text: object, empty: str = "unknown") -> str:
 
 
 def _read(folder: Path, manifest: Mapping[str, object]) -> _Run:
-    layout = Layout.of(manifest)
+    layout = Layout.from_manifest(manifest)
     tables = {name: read_table(folder / f"{name}.arrow", SCHEMAS[name](layout)).table for name in _STREAMS}
-    return _Run(manifest, told(read_outcome(folder)), **tables)
+    return _Run(manifest, without_digests(read_outcome(folder)), **tables)
 
 
 def _content(run: _Run) -> bytes:
@@ -162,8 +162,8 @@ def _metadata(run: _Run) -> dict[str, bytes]:
     return {
         "eva.format": str(FORMAT).encode(),
         "eva.prompt": (prompt if isinstance(prompt, str) else "").encode(errors="replace"),
-        "eva.manifest": document(run.manifest, "the manifest"),
-        "eva.outcome": document(run.outcome, "the outcome"),
+        "eva.manifest": to_json(run.manifest, "the manifest"),
+        "eva.outcome": to_json(run.outcome, "the outcome"),
     }
 
 
@@ -185,14 +185,14 @@ def _raw(run: _Run) -> dict[str, Any]:
         *("chunk_id", "observation_step", "index", "mistimed", "overlap", "inference_ms", "space", "action"),
         *("ik_position_error", "ik_rotation_error", "ik_flags", "eef_source"),
     )
-    target = _known(raw["target_step"])
+    target = _null_if_negative(raw["target_step"])
     strategy = raw["strategy"]
     return {name: raw[name] for name in same} | {
         "stream": ["raw"] * raw.num_rows,
         "step": target,
         "target_step": target,
         "time": _planned(run, raw["target_step"]),
-        "arrival_step": _known(raw["arrival_step"]),
+        "arrival_step": _null_if_negative(raw["arrival_step"]),
         "delay": pc.if_else(pc.less(raw["arrival_step"], 0), None, raw["delay"]),
         "strategy": pc.if_else(pc.equal(strategy, ""), None, strategy),
     }
@@ -217,26 +217,26 @@ def _executed(run: _Run) -> dict[str, Any]:
     return {name: ticks[name] for name in same} | {
         "stream": ["executed"] * ticks.num_rows,
         "time": ticks["planned"],
-        "chunk_id": _known(ticks["chunk_id"]),
+        "chunk_id": _null_if_negative(ticks["chunk_id"]),
         "action": ticks["executed"],
         "measured": ticks["qpos"],
     }
 
 
-def _known(numbers: Any) -> Any:
+def _null_if_negative(numbers: Any) -> Any:
     """Null in place of -1, which stands for none."""
     return pc.if_else(pc.less(numbers, 0), None, numbers)
 
 
 def _planned(run: _Run, steps: Any) -> Any:
-    return _at(run.ticks, "planned", steps)
+    return _at_steps(run.ticks, "planned", steps)
 
 
 def _owners(run: _Run, steps: Any) -> Any:
-    return _known(_at(run.ticks, "chunk_id", steps))
+    return _null_if_negative(_at_steps(run.ticks, "chunk_id", steps))
 
 
-def _at(ticks: Any, column: str, steps: Any) -> Any:
+def _at_steps(ticks: Any, column: str, steps: Any) -> Any:
     """That column of the ticks of these steps; null for a step that never was."""
     known, wanted = ticks["step"].to_numpy(), steps.to_numpy()
     places = np.searchsorted(known, wanted)

@@ -49,12 +49,12 @@ class AppendFile:
         try:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         except OSError as error:
-            raise disk_fault("creating", path, error) from error
+            raise disk_error("creating", path, error) from error
 
     @property
     def digest(self) -> FileDigest:
         """Of what was written; to be asked for once nothing more is."""
-        return self._digest.told()
+        return self._digest.to_dict()
 
     def write(self, data: bytes | bytearray | memoryview, rows: int = 0) -> None:
         """Append all of `data`, which has so many rows or lines, or nothing."""
@@ -66,7 +66,7 @@ class AppendFile:
         except OSError as error:
             if written:
                 self._cut()
-            raise disk_fault("writing", self.path, error) from error
+            raise disk_error("writing", self.path, error) from error
         self.size += written
         self._digest.add(data, rows)
 
@@ -78,7 +78,7 @@ class AppendFile:
         try:
             os.fdatasync(self._descriptor)
         except OSError as error:
-            raise disk_fault("syncing", self.path, error) from error
+            raise disk_error("syncing", self.path, error) from error
         self._synced = size
 
     def _cut(self) -> None:
@@ -86,14 +86,14 @@ class AppendFile:
             os.ftruncate(self._descriptor, self.size)
             os.lseek(self._descriptor, self.size, os.SEEK_SET)
         except OSError as error:
-            raise disk_fault("cutting half a write from", self.path, error) from error
+            raise disk_error("cutting half a write from", self.path, error) from error
 
     def close(self) -> None:
         """Close without syncing."""
         os.close(self._descriptor)
 
 
-def disk_fault(doing: str, path: Path, error: OSError) -> RecordingError:
+def disk_error(doing: str, path: Path, error: OSError) -> RecordingError:
     """The error for a person: what failed, on which file, why, and how much room there is."""
     full = _FULL.get(error.errno or 0)
     what = full or _OTHERS.get(error.errno or 0, "disk error")
@@ -111,7 +111,7 @@ def require_room(folder: Path, wanted: int) -> None:
     try:
         free = shutil.disk_usage(_existing(folder)).free
     except OSError as error:
-        raise disk_fault("measuring", folder, error) from error
+        raise disk_error("measuring", folder, error) from error
     if free < wanted:
         raise RecordingError(
             f"too little room to record in {folder}: {free} bytes free, at least {wanted} wanted "
@@ -119,7 +119,7 @@ def require_room(folder: Path, wanted: int) -> None:
         )
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes) -> None:
     """Put `data` at `path` so that there is the old file or all of the new one, also after a power cut.
 
     Any number of processes may do so at once: the last one's stays.
@@ -137,7 +137,7 @@ def write_whole(path: Path, data: bytes) -> None:
                 raise
         sync_folder(path.parent)
     except OSError as error:
-        raise disk_fault("writing", path, error) from error
+        raise disk_error("writing", path, error) from error
 
 
 @contextmanager
@@ -146,13 +146,13 @@ def _drafted(draft: Path) -> Iterator[BinaryIO]:
     while True:
         with open(draft, "ab") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            if _lies_at(file, draft):
+            if _is_at(file, draft):
                 file.truncate(0)
                 yield file
                 return
 
 
-def _lies_at(file: BinaryIO, path: Path) -> bool:
+def _is_at(file: BinaryIO, path: Path) -> bool:
     """True if `path` is still its name: another writer may have put its own file in place."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
@@ -161,7 +161,7 @@ def _lies_at(file: BinaryIO, path: Path) -> bool:
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
+def exclusive(folder: Path) -> Iterator[None]:
     """Nobody else who asks for it works in `folder` meanwhile; it is made where it is not there.
 
     The kernel lets go however we end. Raises RecordingError.
@@ -170,7 +170,7 @@ def alone_in(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:
-        raise disk_fault("creating", folder, error) from error
+        raise disk_error("creating", folder, error) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
@@ -187,15 +187,15 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def document(value: Mapping[str, object], name: str, *, indent: int | None = None) -> bytes:
+def to_json(value: Mapping[str, object], name: str, *, indent: int | None = None) -> bytes:
     """`value` as JSON; numpy values become plain ones, numbers that are not finite become null."""
     try:
-        return json.dumps(_plain(value), indent=indent, ensure_ascii=False, allow_nan=False).encode()
+        return json.dumps(_to_builtin(value), indent=indent, ensure_ascii=False, allow_nan=False).encode()
     except (TypeError, ValueError, UnicodeEncodeError) as error:
         raise RecordingError(f"{name} cannot be written as JSON: {error}") from error
 
 
-def read_document(path: Path) -> dict[str, object]:
+def read_json(path: Path) -> dict[str, object]:
     """The JSON object in `path`; RecordingError where it is absent, torn or something else."""
     try:
         value = json.loads(path.read_bytes())
@@ -208,13 +208,13 @@ def read_document(path: Path) -> dict[str, object]:
     return value
 
 
-def _plain(value: object) -> object:
+def _to_builtin(value: object) -> object:
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _to_builtin(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [_plain(item) for item in value]
+        return [_to_builtin(item) for item in value]
     if isinstance(value, (np.ndarray, np.generic)):
-        return _plain(value.tolist())
+        return _to_builtin(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Path):

@@ -11,7 +11,7 @@ _STEP = math.log(1.01)
 _BUCKETS = math.ceil(math.log(_MOST / _LEAST) / _STEP) + 1
 
 
-class Histogram:
+class DurationHistogram:
     """Counts durations [s]; numbers that are not finite do not count."""
 
     def __init__(self) -> None:

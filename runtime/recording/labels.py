@@ -26,7 +26,7 @@ class Label:
     discarded: bool = False
 
 
-def labels(data: Path, episode: str) -> list[Label]:
+def read_labels(data: Path, episode: str) -> list[Label]:
     """All of an episode, the oldest first; a line that was torn by a kill, or is none, is left out."""
     try:
         content = _file(data, episode).read_text("utf-8", "replace")
@@ -37,13 +37,13 @@ def labels(data: Path, episode: str) -> list[Label]:
     return [label for line in content.split("\n") if (label := _read(line)) is not None]
 
 
-def newest(data: Path, episode: str) -> Label | None:
+def latest_label(data: Path, episode: str) -> Label | None:
     """The one that counts."""
-    said = labels(data, episode)
+    said = read_labels(data, episode)
     return said[-1] if said else None
 
 
-def append(data: Path, episode: str, label: Label) -> None:
+def append_label(data: Path, episode: str, label: Label) -> None:
     """Write one line, which is on the disk when this returns; RecordingError where it cannot be."""
     path = _file(data, episode)
     line = json.dumps(asdict(label), ensure_ascii=False).encode() + b"\n"

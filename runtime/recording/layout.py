@@ -36,15 +36,15 @@ class Layout:
         return self.eef_dim if vector in ("eef", "eef_action") else self.dim
 
     @classmethod
-    def of(cls, manifest: Mapping[str, object]) -> Layout:
+    def from_manifest(cls, manifest: Mapping[str, object]) -> Layout:
         """Read it from a manifest; RecordingError names the key that is missing or wrong."""
         if manifest.get("format", FORMAT) != FORMAT:
             raise _wrong("format", manifest["format"], str(FORMAT))
-        robot = _get(manifest, "robot", dict)
-        streams = _get(manifest, "streams", dict)
+        robot = _require_key(manifest, "robot", dict)
+        streams = _require_key(manifest, "streams", dict)
         chosen = tuple(name for name in VECTOR_STREAMS if streams.get(name) is True)
         poses = any(name.startswith("eef") for name in chosen)
-        cameras = _get(manifest, "cameras", dict)
+        cameras = _require_key(manifest, "cameras", dict)
         return cls(
             uuid=_uuid(manifest),
             fps=_rate(manifest, "fps"),
@@ -53,7 +53,7 @@ class Layout:
             started=_number(manifest, "started_monotonic"),
             cameras={key: _camera(key, value) for key, value in cameras.items()},
             streams=chosen,
-            capture_streams=tuple(str(name) for name in _get(manifest, "capture_streams", list)),
+            capture_streams=tuple(str(name) for name in _require_key(manifest, "capture_streams", list)),
             pictures={key: _captured(value) for key, value in cameras.items()},
             max_skew_s=_number(manifest, "max_skew_s") if "max_skew_s" in manifest else math.inf,
         )
@@ -63,7 +63,7 @@ def _wrong(key: str, given: object, allowed: str) -> RecordingError:
     return RecordingError(f"manifest: {key} is {given!r}, must be {allowed}")
 
 
-def _get(table: Mapping[str, object], key: str, kind: type[_Kind]) -> _Kind:
+def _require_key(table: Mapping[str, object], key: str, kind: type[_Kind]) -> _Kind:
     value = table.get(key)
     if isinstance(value, tuple) and kind is list:
         value = list(value)
@@ -96,7 +96,7 @@ def _count(table: Mapping[str, object], key: str) -> int:
 
 
 def _uuid(manifest: Mapping[str, object]) -> str:
-    value = _get(manifest, "uuid", str)
+    value = _require_key(manifest, "uuid", str)
     try:
         parsed = uuid.UUID(value)
     except ValueError:

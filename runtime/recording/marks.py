@@ -8,21 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from runtime.core.errors import RecordingError
-from runtime.recording.files import read_document
+from runtime.recording.files import read_json
 from runtime.recording.sealing import OUTCOME
-from runtime.recording.verdict import Damage, Verdict
+from runtime.recording.verdict import Damage, IntegrityCheck
 
 FOLDER = "quarantine"
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class DamageMark:
     """Finding: `damage` as in Verdict.document; `seal` of the outcome then, "" for none, None: not known."""
 
     damage: list[dict[str, Any]]
     seal: str | None
 
-    def resolved(self, verdict: Verdict) -> bool:
+    def is_resolved_by(self, verdict: IntegrityCheck) -> bool:
         """True if the same recording is whole again: not another one that was sealed since."""
         if verdict.state == "sound":
             return verdict.seal == self.seal if self.seal else self.seal is None or not verdict.repaired
@@ -42,26 +42,26 @@ def data_of(folder: Path) -> Path | None:
     return episodes.parent if episodes.name == "episodes" else None
 
 
-def mark_of(data: Path, uuid: str) -> Mark | None:
+def read_mark(data: Path, uuid: str) -> DamageMark | None:
     """That of a recording; None where there is none. One that is damaged itself says nothing: without damage."""
     path = mark_file(data, uuid)
     if not path.exists():
         return None
     try:
-        told = read_document(path)
+        told = read_json(path)
     except RecordingError:
         told = {}
     damage, seal = told.get("damage"), told.get("seal")
-    if not (isinstance(damage, list) and all(map(_is_told, damage))):
-        return Mark([], "")
-    return Mark(damage, seal if isinstance(seal, str) else None)
+    if not (isinstance(damage, list) and all(map(_is_damage_table, damage))):
+        return DamageMark([], "")
+    return DamageMark(damage, seal if isinstance(seal, str) else None)
 
 
-def standing(verdict: Verdict) -> tuple[Damage, ...]:
+def known_damage(verdict: IntegrityCheck) -> tuple[Damage, ...]:
     """The damage that an earlier look found, and that what was found now does not resolve."""
     data = data_of(verdict.path)
-    mark = mark_of(data, verdict.path.name) if data else None
-    if mark is None or mark.resolved(verdict):
+    mark = read_mark(data, verdict.path.name) if data else None
+    if mark is None or mark.is_resolved_by(verdict):
         return ()
     spoiled = Damage(f"{FOLDER}/{verdict.path.name}.json", "is no mark any more, and was one")
     return tuple(_damage(one) for one in mark.damage) or (spoiled,)
@@ -72,7 +72,7 @@ def _damage(told: Mapping[str, Any]) -> Damage:
     return Damage(told["file"], told["what"], **spans)
 
 
-def _is_told(one: object) -> bool:
+def _is_damage_table(one: object) -> bool:
     """True if it is a table of Verdict.document."""
     if not isinstance(one, dict) or one.keys() != {"file", "what", "rows", "times", "text"}:
         return False

@@ -25,7 +25,7 @@ _COLOURS = np.array(
 )
 
 
-def planes(picture: UInt8, size: tuple[int, int]) -> av.VideoFrame:
+def to_yuv_planes(picture: UInt8, size: tuple[int, int]) -> av.VideoFrame:
     """The picture, RGB uint8 [H, W, 3], scaled to `size` (height and width, both even) where it is of another one."""
     height, width = size
     rgb = np.ascontiguousarray(picture)

@@ -7,13 +7,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from runtime.recording.files import alone_in, disk_fault, document, sync_folder, write_whole
-from runtime.recording.marks import data_of, mark_file, mark_of
-from runtime.recording.scrub import verify
-from runtime.recording.verdict import Verdict
+from runtime.recording.files import disk_error, exclusive, sync_folder, to_json, write_atomic
+from runtime.recording.marks import data_of, mark_file, read_mark
+from runtime.recording.scrub import verify_episode
+from runtime.recording.verdict import IntegrityCheck
 
 
-def keep(verdict: Verdict) -> None:
+def update_mark(verdict: IntegrityCheck) -> None:
     """Make the mark of an episode in DATA/episodes say what was found; one that is whole again loses it.
 
     It stays where the recording is whole by another seal than when it was marked, or has none any more: then nobody can
@@ -29,31 +29,31 @@ def keep(verdict: Verdict) -> None:
         _take_back(data, verdict)
 
 
-def marked(data: Path, uuid: str) -> list[dict[str, Any]]:
+def marked_damage(data: Path, uuid: str) -> list[dict[str, Any]]:
     """Damage of an episode, a table per file as in Verdict.document; [] where nothing was found.
 
     An invalid mark counts as nothing found: the next scrub makes it anew.
     """
-    mark = mark_of(data, uuid)
+    mark = read_mark(data, uuid)
     return mark.damage if mark else []
 
 
-def _mark(data: Path, verdict: Verdict) -> None:
-    path, damage = mark_file(data, verdict.path.name), verdict.document()["damage"]
-    with alone_in(path.parent):
-        known = mark_of(data, verdict.path.name)
+def _mark(data: Path, verdict: IntegrityCheck) -> None:
+    path, damage = mark_file(data, verdict.path.name), verdict.to_dict()["damage"]
+    with exclusive(path.parent):
+        known = read_mark(data, verdict.path.name)
         seal = (known.seal if known else None) or verdict.seal  # the first one: that of what was recorded
         if known is None or (known.damage, known.seal) != (damage, seal):
             told = {"uuid": verdict.path.name, "found": time.time(), "seal": seal, "damage": damage}
-            write_whole(path, document(told, "the mark", indent=1))
+            write_atomic(path, to_json(told, "the mark", indent=1))
 
 
-def _take_back(data: Path, verdict: Verdict) -> None:
+def _take_back(data: Path, verdict: IntegrityCheck) -> None:
     """Only after another look: somebody else may have found damage since the one that `verdict` is of."""
     path = mark_file(data, verdict.path.name)
-    with alone_in(path.parent):
-        mark = mark_of(data, verdict.path.name)
-        if mark and mark.resolved(verify(verdict.path)):
+    with exclusive(path.parent):
+        mark = read_mark(data, verdict.path.name)
+        if mark and mark.is_resolved_by(verify_episode(verdict.path)):
             _remove(path)
 
 
@@ -64,4 +64,4 @@ def _remove(path: Path) -> None:
     except FileNotFoundError:
         return
     except OSError as error:
-        raise disk_fault("removing", path, error) from error
+        raise disk_error("removing", path, error) from error

@@ -15,7 +15,7 @@ from runtime.recording.verdict import Damage
 EVENTS = "events.jsonl"
 
 
-def unreadable(folder: Path) -> tuple[Damage, ...]:
+def find_unreadable(folder: Path) -> tuple[Damage, ...]:
     """The files of the closed episode in `folder` that are torn, empty or absent.
 
     Tables and events of one that failed may end anywhere: that is how it was recorded.

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from runtime.core.errors import RecordingError
-from runtime.recording.files import read_document
+from runtime.recording.files import read_json
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import OUTCOME, read_outcome, told
+from runtime.recording.sealing import OUTCOME, read_outcome, without_digests
 from runtime.recording.tables import SCHEMAS, read_table
 
 
@@ -51,9 +51,9 @@ class Episode:
 
 def open_episode(path: Path) -> Episode:
     """Read the episode in folder `path`; RecordingError names the file that is absent or damaged."""
-    manifest = read_document(path / "manifest.json")
-    layout = Layout.of(manifest)
-    outcome = told(read_outcome(path)) if (path / OUTCOME).exists() else None
+    manifest = read_json(path / "manifest.json")
+    layout = Layout.from_manifest(manifest)
+    outcome = without_digests(read_outcome(path)) if (path / OUTCOME).exists() else None
     tables = {
         name: read_table(path / f"{name}.arrow", schema(layout)).table for name, schema in SCHEMAS.items()
     }

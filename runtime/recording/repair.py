@@ -11,27 +11,27 @@ from typing import Literal
 
 from runtime.core.errors import RecordingError
 from runtime.recording.base import VIDEO_LOST
-from runtime.recording.episode import lock
-from runtime.recording.export import place
-from runtime.recording.files import disk_fault, document, read_document, sync_folder, write_whole
+from runtime.recording.episode import lock_folder
+from runtime.recording.export import export_path
+from runtime.recording.files import disk_error, read_json, sync_folder, to_json, write_atomic
 from runtime.recording.fragments import count_frames, whole_bytes
 from runtime.recording.layout import Layout
 from runtime.recording.marks import data_of
 from runtime.recording.reader import read_events
-from runtime.recording.scrub import verify
+from runtime.recording.scrub import verify_episode
 from runtime.recording.sealing import (
     MANIFEST,
     OUTCOME,
+    OUTCOME_COPY,
     SEAL,
-    SECOND,
     digests_of,
     read_outcome,
-    sealed,
+    seal_outcome,
     write_outcome,
 )
 from runtime.recording.summary import summarise
 from runtime.recording.tables import SCHEMAS, read_table, write_table
-from runtime.recording.verdict import Verdict
+from runtime.recording.verdict import IntegrityCheck
 
 REASON = "the recorder ended without closing the episode"
 UNCUT = "rows.uncut.arrow"  # the rows as they were found, where any had to go
@@ -40,7 +40,7 @@ UNPROVABLE = "its outcome is lost, and with it whether its files are as they wer
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class RepairReport:
     """Findings and actions of a repair.
 
     "complete": had an outcome, nothing done. "restored": has its outcome back from its copy; `problem` is
@@ -61,7 +61,7 @@ class Report:
     lost: Mapping[str, str] = field(default_factory=dict)  # cameras whose video had ended before, and why
 
 
-def repair(path: Path) -> Report:
+def repair(path: Path) -> RepairReport:
     """Complete the episode in folder `path` where it has no outcome; running it again changes nothing.
 
     One that had an outcome gets that back from its copy, where its files are as that says, and is left alone where they
@@ -73,61 +73,61 @@ def repair(path: Path) -> Report:
     """
     if not path.is_dir():
         raise RecordingError(f"{path} is no folder of an episode")
-    descriptor = lock(path)
+    descriptor = lock_folder(path)
     if descriptor is None:
-        return Report(path, "recording", "it is being written right now")
+        return RepairReport(path, "recording", "it is being written right now")
     try:
         return _judge(path)
     except OSError as error:
-        raise disk_fault("repairing", path, error) from error
+        raise disk_error("repairing", path, error) from error
     finally:
         os.close(descriptor)
 
 
-def repair_all(root: Path) -> list[Report]:
+def repair_all(root: Path) -> list[RepairReport]:
     """Repair every episode in `root` that has no outcome; one that fails does not keep the others."""
     folders = [folder for folder in sorted(root.iterdir()) if folder.is_dir()] if root.is_dir() else []
     return [_attempt(folder) for folder in folders if not (folder / OUTCOME).exists()]
 
 
-def _attempt(folder: Path) -> Report:
+def _attempt(folder: Path) -> RepairReport:
     try:
         return repair(folder)
     except RecordingError as error:
-        return Report(folder, "failed", str(error))
+        return RepairReport(folder, "failed", str(error))
 
 
-def _judge(path: Path) -> Report:
+def _judge(path: Path) -> RepairReport:
     try:
-        layout = Layout.of(read_document(path / MANIFEST))
-        found = verify(path)
-        if found.state != "open" or (path / SECOND).exists():
+        layout = Layout.from_manifest(read_json(path / MANIFEST))
+        found = verify_episode(path)
+        if found.state != "open" or (path / OUTCOME_COPY).exists():
             return _closed(path, found)
     except RecordingError as error:
-        return Report(path, "unreadable", str(error))
+        return RepairReport(path, "unreadable", str(error))
     return _complete(path, layout)
 
 
-def _closed(path: Path, found: Verdict) -> Report:
+def _closed(path: Path, found: IntegrityCheck) -> RepairReport:
     """Nothing is mended but the outcome, from its copy, or that copy, where all other files are as they say."""
     restored = ""
     if found.state in ("open", "damaged") and (whole := _whole_outcome(path, found)):
         write_outcome(path, whole)
-        restored, found = found.text, verify(path)
+        restored, found = found.text, verify_episode(path)
     if found.state == "damaged":
-        return Report(path, "damaged", found.text)
+        return RepairReport(path, "damaged", found.text)
     (path / PLAN).unlink(missing_ok=True)
     frames = read_outcome(path).get("frames")
     verdict: Literal["restored", "complete"] = "restored" if restored else "complete"
-    return Report(path, verdict, restored, frames=frames if isinstance(frames, int) else 0)
+    return RepairReport(path, verdict, restored, frames=frames if isinstance(frames, int) else 0)
 
 
-def _whole_outcome(path: Path, found: Verdict) -> bytes | None:
+def _whole_outcome(path: Path, found: IntegrityCheck) -> bytes | None:
     """The one of its two files that is as it was sealed, where nothing but the other one is damaged; None else."""
-    if {one.file for one in found.damage} - {OUTCOME, SECOND}:
+    if {one.file for one in found.damage} - {OUTCOME, OUTCOME_COPY}:
         return None
     whole = {}
-    for name in (OUTCOME, SECOND):
+    for name in (OUTCOME, OUTCOME_COPY):
         try:
             if SEAL in read_outcome(path, name):
                 whole[name] = (path / name).read_bytes()
@@ -136,23 +136,23 @@ def _whole_outcome(path: Path, found: Verdict) -> bytes | None:
     return next(iter(whole.values())) if len(whole) == 1 else None
 
 
-def _complete(path: Path, layout: Layout) -> Report:
-    found = _found(path, layout)
-    videos = _mend_videos(path, layout)
-    lost = _mend_events(path)
+def _complete(path: Path, layout: Layout) -> RepairReport:
+    found = _load_or_measure(path, layout)
+    videos = _repair_videos(path, layout)
+    lost = _repair_events(path)
     going = [frames for camera, frames in videos.items() if camera not in lost]
-    frames = _mend_tables(path, layout, going)
+    frames = _repair_tables(path, layout, going)
     cut = found.rows - frames
-    report = Report(
+    report = RepairReport(
         path, "repaired", found.unproven, frames, cut, videos, found.torn_bytes, found.torn_lines, lost
     )
-    write_outcome(path, sealed(_outcome(report, layout, found.ended), digests_of(path, layout)))
+    write_outcome(path, seal_outcome(_outcome(report, layout, found.ended), digests_of(path, layout)))
     (path / PLAN).unlink()
     return report
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
+class _FolderState:
     """The episode as it lay there before anything was mended, for who goes on where a repair was killed."""
 
     ended: float  # when it was last written [Unix s]
@@ -162,33 +162,33 @@ class _Found:
     unproven: str  # what nobody can say of it any more
 
 
-def _found(path: Path, layout: Layout) -> _Found:
+def _load_or_measure(path: Path, layout: Layout) -> _FolderState:
     """As an earlier attempt wrote it down, else measured and written down now."""
     plan = path / PLAN
     if plan.exists():
         try:
-            return _Found(**read_document(plan))  # type: ignore[arg-type]
+            return _FolderState(**read_json(plan))  # type: ignore[arg-type]
         except TypeError as error:
             raise RecordingError(f"{plan} is none of repair's: {error}. Remove it") from error
     found = _measured(path, layout)
-    write_whole(plan, document(asdict(found), "the plan of a repair"))
+    write_atomic(plan, to_json(asdict(found), "the plan of a repair"))
     return found
 
 
-def _measured(path: Path, layout: Layout) -> _Found:
+def _measured(path: Path, layout: Layout) -> _FolderState:
     ended = max(file.stat().st_mtime for file in path.iterdir() if not file.name.startswith("."))  # no drafts
     tables = [read_table(path / f"{name}.arrow", schema(layout)) for name, schema in SCHEMAS.items()]
     torn = sum(_torn(path / f"{camera}.mp4") for camera in layout.cameras)
     torn += sum(table.torn_bytes for table in tables)
     rows = tables[list(SCHEMAS).index("rows")].table.num_rows
     closed = all(table.closed for table in tables)
-    return _Found(ended, rows, torn, read_events(path / "events.jsonl").torn, _unproven(path, closed))
+    return _FolderState(ended, rows, torn, read_events(path / "events.jsonl").torn, _unproven(path, closed))
 
 
 def _unproven(path: Path, closed: bool) -> str:
     """Facts that cannot be known any more of an episode once closed, "" where nothing tells that it was."""
     data = data_of(path)
-    table = place(read_document(path / MANIFEST), data) if data else None
+    table = export_path(read_json(path / MANIFEST), data) if data else None
     if table is not None and table.exists():
         return f"{UNPROVABLE}: it was closed, for {table} was made of it"
     return f"{UNPROVABLE}: all its tables were ended, which is done when it is closed" if closed else ""
@@ -200,7 +200,7 @@ def _torn(video: Path) -> int:
     return video.stat().st_size - end if end else 0
 
 
-def _mend_videos(path: Path, layout: Layout) -> dict[str, int]:
+def _repair_videos(path: Path, layout: Layout) -> dict[str, int]:
     """Frames per camera."""
     frames = {}
     for camera in layout.cameras:
@@ -213,7 +213,7 @@ def _mend_videos(path: Path, layout: Layout) -> dict[str, int]:
     return frames
 
 
-def _mend_tables(path: Path, layout: Layout, videos: Sequence[int]) -> int:
+def _repair_tables(path: Path, layout: Layout, videos: Sequence[int]) -> int:
     """Common number of rows and frames in videos of so many."""
     frames = 0
     for name, schema in SCHEMAS.items():
@@ -237,26 +237,26 @@ def _keep_uncut(path: Path) -> None:
         sync_folder(path)
 
 
-def _mend_events(path: Path) -> dict[str, str]:
+def _repair_events(path: Path) -> dict[str, str]:
     """The cameras whose video had ended, with what was said of it."""
     log = path / "events.jsonl"
     events = read_events(log)
     if events.torn or not log.exists():
-        write_whole(log, b"".join(line + b"\n" for line in events.lines))
+        write_atomic(log, b"".join(line + b"\n" for line in events.lines))
     said = [json.loads(line) for line in events.lines]
     return {
         str(event["data"]["camera"]): str(event["text"]) for event in said if event.get("kind") == VIDEO_LOST
     }
 
 
-def _outcome(report: Report, layout: Layout, ended: float) -> dict[str, object]:
+def _outcome(report: RepairReport, layout: Layout, ended: float) -> dict[str, object]:
     summary = summarise(report.path / "rows.arrow", layout, report.frames)
     return {
         "status": "interrupted",
         "reason": f"{REASON}; {report.frames} rows kept, {report.rows_cut} without a frame cut"
         + (f"; {report.problem}" if report.problem else ""),
         "ended_wall": ended,
-        **summary.fields(),
+        **summary.to_dict(),
         "rows": report.frames,
         "video_frames": dict(report.video_frames),
         "lost_cameras": {

@@ -21,7 +21,7 @@ class Schema:
     max_skew_s: float | None = None
 
     @classmethod
-    def of(cls, manifest: Mapping[str, Any]) -> Schema:
+    def from_manifest(cls, manifest: Mapping[str, Any]) -> Schema:
         """That of a manifest, before media has completed it."""
         said = manifest.get("collection")
         if not said:
@@ -35,18 +35,18 @@ class Schema:
             said.get("max_skew_s"),
         )
 
-    def kept(self, cameras: Sequence[str]) -> tuple[str, ...]:
+    def recorded_cameras(self, cameras: Sequence[str]) -> tuple[str, ...]:
         """Those of `cameras` that are recorded."""
         return tuple(key for key in cameras if self.cameras is None or key in self.cameras)
 
-    def records(self, column: str) -> bool:
+    def records_column(self, column: str) -> bool:
         """True if that vector is recorded, where it is there."""
         return self.columns is None or column in self.columns
 
     def streams(self, *, qvel: bool, effort: bool, posed: bool) -> dict[str, bool]:
         """Which vectors beside joints and actions are recorded of a robot that has these; `posed`: it has arms."""
         there = {"qvel": qvel, "effort": effort, "eef": posed, "eef_action": posed}
-        return {name: has and self.records(name) for name, has in there.items()}
+        return {name: has and self.records_column(name) for name, has in there.items()}
 
     def check(self, newest: Observation) -> None:
         """RecordingError where the robot does not measure what every row must have."""

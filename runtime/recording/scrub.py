@@ -11,88 +11,88 @@ from typing import Any, BinaryIO
 
 from runtime.core.errors import RecordingError
 from runtime.recording.digests import FileDigest
-from runtime.recording.files import disk_fault, read_document
-from runtime.recording.marks import standing
-from runtime.recording.readable import unreadable
-from runtime.recording.sealing import COPY, DIGESTS, MANIFEST, OUTCOME, SEAL, SECOND, read_outcome
-from runtime.recording.verdict import Damage, DamagedError, State, Verdict
+from runtime.recording.files import disk_error, read_json
+from runtime.recording.marks import known_damage
+from runtime.recording.readable import find_unreadable
+from runtime.recording.sealing import COPY, DIGESTS, MANIFEST, OUTCOME, OUTCOME_COPY, SEAL, read_outcome
+from runtime.recording.verdict import Damage, DamagedError, IntegrityCheck, State
 
 
-def verify(folder: Path, files: Collection[str] = ()) -> Verdict:
+def verify_episode(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
     """Read the files of the episode in `folder`, all or `files`; RecordingError where it is none, or closed to us."""
     if not (folder / OUTCOME).exists():
         return _without_outcome(folder)
     try:
         outcome = read_outcome(folder)
     except RecordingError as error:
-        return _by_second(folder, Damage(OUTCOME, f"is damaged: {error}"))
+        return _verify_by_copy(folder, Damage(OUTCOME, f"is damaged: {error}"))
     if DIGESTS in outcome:
-        return _compared(folder, outcome, files)
-    if (folder / SECOND).exists():
-        return _by_second(folder, Damage(OUTCOME, f"has lost its digests: there is {SECOND}"))
-    damage = () if files else unreadable(folder)
-    return Verdict(folder, "damaged" if damage else "unsealed", damage)
+        return _compare_digests(folder, outcome, files)
+    if (folder / OUTCOME_COPY).exists():
+        return _verify_by_copy(folder, Damage(OUTCOME, f"has lost its digests: there is {OUTCOME_COPY}"))
+    damage = () if files else find_unreadable(folder)
+    return IntegrityCheck(folder, "damaged" if damage else "unsealed", damage)
 
 
-def _without_outcome(folder: Path) -> Verdict:
+def _without_outcome(folder: Path) -> IntegrityCheck:
     """Open, as far as anything here tells."""
-    if (folder / SECOND).exists():
-        found = _by_second(folder, Damage(OUTCOME, "is absent, and was there"))
+    if (folder / OUTCOME_COPY).exists():
+        found = _verify_by_copy(folder, Damage(OUTCOME, "is absent, and was there"))
         if found.seal and len(found.damage) == 1:
-            why = f"it has no outcome, and a whole copy of it, {SECOND}: repair brings it back"
-            return Verdict(folder, "open", bytes=found.bytes, seal=found.seal, why=why)
+            why = f"it has no outcome, and a whole copy of it, {OUTCOME_COPY}: repair brings it back"
+            return IntegrityCheck(folder, "open", bytes=found.bytes, seal=found.seal, why=why)
         return found
-    damage = standing(Verdict(folder, "open"))
+    damage = known_damage(IntegrityCheck(folder, "open"))
     if not damage and not (folder / MANIFEST).exists():
         raise RecordingError(f"{folder} is no episode: there is no {MANIFEST} in it")
-    return Verdict(folder, "damaged" if damage else "open", damage)
+    return IntegrityCheck(folder, "damaged" if damage else "open", damage)
 
 
-def _by_second(folder: Path, lost: Damage) -> Verdict:
+def _verify_by_copy(folder: Path, lost: Damage) -> IntegrityCheck:
     """That of an episode whose outcome is `lost`, and what the copy of that says of the other files."""
-    if not (folder / SECOND).exists():
-        return Verdict(folder, "damaged", (lost,))
+    if not (folder / OUTCOME_COPY).exists():
+        return IntegrityCheck(folder, "damaged", (lost,))
     try:
-        outcome = read_outcome(folder, SECOND)
+        outcome = read_outcome(folder, OUTCOME_COPY)
     except RecordingError as error:
-        return Verdict(folder, "damaged", (lost, Damage(SECOND, f"is damaged: {error}")))
+        return IntegrityCheck(folder, "damaged", (lost, Damage(OUTCOME_COPY, f"is damaged: {error}")))
     if DIGESTS not in outcome:
-        return Verdict(folder, "damaged", (lost, Damage(SECOND, "is no copy of an outcome")))
-    found = _compared(folder, outcome, (), second=False)
-    return Verdict(folder, "damaged", (lost, *found.damage), found.bytes, found.seal)
+        return IntegrityCheck(folder, "damaged", (lost, Damage(OUTCOME_COPY, "is no copy of an outcome")))
+    found = _compare_digests(folder, outcome, (), second=False)
+    return IntegrityCheck(folder, "damaged", (lost, *found.damage), found.bytes, found.seal)
 
 
-def _compared(
+def _compare_digests(
     folder: Path, outcome: Mapping[str, Any], files: Collection[str], second: bool = True
-) -> Verdict:
+) -> IntegrityCheck:
     """All files, or `files`, against their digests; all files include, if `second`, the copy of the outcome."""
     manifest = _manifest(folder)
     digests = {name: told for name, told in outcome[DIGESTS].items() if not files or name in files}
     found = [_damage(folder / name, digest, manifest) for name, digest in digests.items()]
-    found += [_second(folder)] if second and not files and COPY in outcome else []
+    found += [_verify_copy(folder)] if second and not files and COPY in outcome else []
     damage = tuple(one for one in found if one is not None)
     size = sum(digest["bytes"] for digest in digests.values())
     repair = outcome.get("repair")
     why = str(repair.get("unproven", "")) if isinstance(repair, Mapping) else ""
     state: State = "damaged" if damage else "unsealed" if why else "sound"
-    return Verdict(folder, state, damage, size, str(outcome[SEAL]), repair is not None, why)
+    return IntegrityCheck(folder, state, damage, size, str(outcome[SEAL]), repair is not None, why)
 
 
-def _second(folder: Path) -> Damage | None:
+def _verify_copy(folder: Path) -> Damage | None:
     try:
-        same = (folder / SECOND).read_bytes() == (folder / OUTCOME).read_bytes()
+        same = (folder / OUTCOME_COPY).read_bytes() == (folder / OUTCOME).read_bytes()
     except OSError as error:
-        return Damage(SECOND, f"cannot be read: {error.strerror}")
-    return None if same else Damage(SECOND, f"is not the copy of {OUTCOME} that it was")
+        return Damage(OUTCOME_COPY, f"cannot be read: {error.strerror}")
+    return None if same else Damage(OUTCOME_COPY, f"is not the copy of {OUTCOME} that it was")
 
 
-def require_sound(folder: Path, files: Collection[str] = ()) -> Verdict:
+def require_intact(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
     """As `verify`; DamagedError where a file is not what was recorded, or was found not to be and nothing says that
     this is mended.
     """
-    verdict = verify(folder, files)
-    if verdict.state in ("sound", "unsealed") and (damage := standing(verdict)):
-        verdict = Verdict(folder, "damaged", damage, verdict.bytes, verdict.seal)
+    verdict = verify_episode(folder, files)
+    if verdict.state in ("sound", "unsealed") and (damage := known_damage(verdict)):
+        verdict = IntegrityCheck(folder, "damaged", damage, verdict.bytes, verdict.seal)
     if verdict.state == "damaged":
         raise DamagedError(verdict)
     return verdict
@@ -112,7 +112,7 @@ def episodes_in(path: Path) -> list[Path]:
 
 
 def _is_episode(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in (MANIFEST, OUTCOME, SECOND))
+    return any((folder / name).is_file() for name in (MANIFEST, OUTCOME, OUTCOME_COPY))
 
 
 def _damage(path: Path, digest: FileDigest, manifest: Mapping[str, object]) -> Damage | None:
@@ -128,7 +128,7 @@ def _damage(path: Path, digest: FileDigest, manifest: Mapping[str, object]) -> D
     except OSError as error:
         if error.errno == errno.EIO:  # of the disk itself; any other is ours to mend
             return Damage(path.name, "cannot be read: the disk fails")
-        raise disk_fault("verifying", path, error) from error
+        raise disk_error("verifying", path, error) from error
 
 
 def _located(name: str, file: BinaryIO, digest: FileDigest, rate: float | None) -> Damage:
@@ -169,7 +169,7 @@ def _joined(spans: list[tuple[int, int]], first: int, last: int) -> list[tuple[i
 def _manifest(folder: Path) -> Mapping[str, object]:
     """For times alone: one that cannot be read is named by its digest."""
     try:
-        return read_document(folder / MANIFEST)
+        return read_json(folder / MANIFEST)
     except RecordingError:
         return {}
 

@@ -10,14 +10,14 @@ from typing import Any
 import pyarrow as pa
 
 from runtime.core.errors import RecordingError
-from runtime.recording.digests import Digest, FileDigest, rows_of_piece
-from runtime.recording.files import document, read_document, write_whole
+from runtime.recording.digests import Digest, FileDigest, rows_per_piece
+from runtime.recording.files import read_json, to_json, write_atomic
 from runtime.recording.fragments import fragments
 from runtime.recording.layout import Layout
 from runtime.recording.tables import SCHEMAS
 
 MANIFEST, OUTCOME = "manifest.json", "outcome.json"
-SECOND = (
+OUTCOME_COPY = (
     "sealed.json"  # the outcome once more, byte by byte: what tells a lost one from none, and brings it back
 )
 DIGESTS, SEAL, COPY = "digests", "seal", "copy"  # keys of the outcome
@@ -26,13 +26,13 @@ _UNSEALED = b"0" * hashlib.sha256().digest_size * 2
 
 def digest_of(path: Path, layout: Layout) -> FileDigest:
     """Of a file as it lies in the folder of an episode; RecordingError where it cannot be read."""
-    digest = Digest(rows_of_piece(layout.fps) if path.suffix == ".mp4" else 1)
+    digest = Digest(rows_per_piece(layout.fps) if path.suffix == ".mp4" else 1)
     try:
         for data, rows in _parts(path):
             digest.add(data, rows)
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-    return digest.told()
+    return digest.to_dict()
 
 
 def digests_of(folder: Path, layout: Layout) -> dict[str, FileDigest]:
@@ -45,18 +45,18 @@ def _counts(path: Path, layout: Layout) -> bool:
     return path.name in named or (path.suffix == ".arrow" and path.name.partition(".")[0] in SCHEMAS)
 
 
-def sealed(outcome: Mapping[str, object], digests: Mapping[str, FileDigest]) -> bytes:
+def seal_outcome(outcome: Mapping[str, object], digests: Mapping[str, FileDigest]) -> bytes:
     """outcome.json: with the digests of the files, and last that of itself, taken with zeros in its place."""
-    whole = {**outcome, COPY: SECOND, DIGESTS: digests, SEAL: _UNSEALED.decode()}
-    text = document(whole, "the outcome", indent=1)
+    whole = {**outcome, COPY: OUTCOME_COPY, DIGESTS: digests, SEAL: _UNSEALED.decode()}
+    text = to_json(whole, "the outcome", indent=1)
     before, _, after = text.rpartition(_UNSEALED)
     return before + hashlib.sha256(text).hexdigest().encode() + after
 
 
 def write_outcome(folder: Path, text: bytes) -> None:
     """Put the sealed outcome at its two places; with outcome.json, which comes last, the episode is closed."""
-    for name in (SECOND, OUTCOME):
-        write_whole(folder / name, text)
+    for name in (OUTCOME_COPY, OUTCOME):
+        write_atomic(folder / name, text)
 
 
 def read_outcome(folder: Path, name: str = OUTCOME) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def read_outcome(folder: Path, name: str = OUTCOME) -> dict[str, Any]:
     One from before there were digests has none, and no seal. `name` is that of either of its files.
     """
     path = folder / name
-    outcome = read_document(path)
+    outcome = read_json(path)
     if DIGESTS not in outcome and SEAL not in outcome:
         return outcome
     seal = str(outcome.get(SEAL)).encode()
@@ -76,7 +76,7 @@ def read_outcome(folder: Path, name: str = OUTCOME) -> dict[str, Any]:
     raise RecordingError(f"{path} is damaged: it is not as it was sealed")
 
 
-def told(outcome: Mapping[str, object]) -> dict[str, object]:
+def without_digests(outcome: Mapping[str, object]) -> dict[str, object]:
     """An outcome without its digests, for who copies it to where they mean nothing."""
     return {name: value for name, value in outcome.items() if name not in (COPY, DIGESTS, SEAL)}
 

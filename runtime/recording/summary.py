@@ -32,7 +32,7 @@ class Summary:
     skew_mean_s: float | None  # None where no row has two known capture times
     skew_max_s: float | None
 
-    def fields(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """As they stand in outcome.json."""
         return {
             "frames": self.frames,
@@ -76,8 +76,8 @@ class _Tally:
         self._held += sum(source in HELD for source in batch.column("control_source").to_pylist())
         for flag, counts in self._flags.items():
             for camera in counts:
-                counts[camera] += _true(batch, f"{flag}.{camera}")
-        self._skewed += _true(batch, "skewed")
+                counts[camera] += _count_true(batch, f"{flag}.{camera}")
+        self._skewed += _count_true(batch, "skewed")
         apart = self._spread(batch)
         if apart.size:
             self._spread_sum += float(apart.sum())
@@ -106,6 +106,6 @@ class _Tally:
         )
 
 
-def _true(batch: Any, column: str) -> int:
+def _count_true(batch: Any, column: str) -> int:
     """Rows that have the flag; 0 in a table from before there was one."""
     return int(batch.column(column).true_count) if column in batch.schema.names else 0

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from runtime.core.errors import RecordingError
 from runtime.recording.columns import COLUMNS
-from runtime.recording.files import AppendFile, write_whole
+from runtime.recording.files import AppendFile, write_atomic
 from runtime.recording.layout import Layout
 
 END_OF_STREAM = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # Arrow columnar format, "IPC streaming format"
@@ -270,4 +270,4 @@ def _difference(given: Any, expected: Any) -> str:
 def write_table(path: Path, table: Any) -> None:
     """Put a whole, closed Arrow stream at `path`, atomically."""
     batches = [batch.serialize().to_pybytes() for batch in table.to_batches()]
-    write_whole(path, b"".join([table.schema.serialize().to_pybytes(), *batches, END_OF_STREAM]))
+    write_atomic(path, b"".join([table.schema.serialize().to_pybytes(), *batches, END_OF_STREAM]))

@@ -10,27 +10,27 @@ import numpy as np
 from av.video.frame import PictureType
 
 from runtime.core.errors import ConfigurationError
-from runtime.recording.codecs import CODECS, PIXELS, options, set_up
+from runtime.recording.codecs import CODECS, PIXELS, configure_context, options
 from runtime.recording.settings import RecordingSettings
 
 _SIZE = (192, 256)  # height and width; hardware encoders refuse smaller ones
 _PICTURES = 4
 
 
-def require(settings: RecordingSettings) -> None:
+def require_encoder(settings: RecordingSettings) -> None:
     """ConfigurationError naming the encoder, and those that work, where this machine cannot code as it is asked to."""
     name = settings.codec
     try:
         _code(name, settings.chosen_preset, settings.chosen_crf, settings.gop or 1)
     except (av.FFmpegError, ValueError) as error:
-        others = ", ".join(other for other in CODECS if other != name and works(other))
+        others = ", ".join(other for other in CODECS if other != name and is_encoder_usable(other))
         why = getattr(error, "strerror", None) or str(error)
         raise ConfigurationError(
             f"recording.codec = {name!r} does not work on this machine: {why}; allowed here: {others or 'none'}"
         ) from error
 
 
-def works(name: str) -> bool:
+def is_encoder_usable(name: str) -> bool:
     """True if this machine can use that encoder as it is by default."""
     codec = CODECS[name]
     try:
@@ -44,7 +44,7 @@ def _code(name: str, preset: str, crf: int, gop: int) -> None:
     rate = Fraction(30)
     context: Any = av.CodecContext.create(name, "w")
     context.framerate = rate
-    set_up(context, name, _SIZE, rate, options(name, preset, crf, gop), gop)
+    configure_context(context, name, _SIZE, rate, options(name, preset, crf, gop), gop)
     coded = 0
     for number in range(_PICTURES):
         frame = av.VideoFrame.from_ndarray(np.full((*_SIZE, 3), 40 * number, np.uint8), format="rgb24")

@@ -20,7 +20,7 @@ class Damage:
     """Damage of one file of an episode, and its rows; of events.jsonl its lines."""
 
     file: str
-    what: str
+    description: str
     rows: tuple[tuple[int, int], ...] = ()  # first and last, both included
     times: tuple[
         tuple[float, float], ...
@@ -33,11 +33,11 @@ class Damage:
         spans = [f"{first} to {last}" for first, last in self.rows]
         times = [f"{first:.2f} to {last:.2f}" for first, last in self.times]
         where = f", {unit} {', '.join(spans)}" if spans else ""
-        return f"{self.file} {self.what}{where}" + (f" ({', '.join(times)} s)" if times else "")
+        return f"{self.file} {self.description}{where}" + (f" ({', '.join(times)} s)" if times else "")
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class IntegrityCheck:
     """Of one episode. "unsealed": nobody can say whether its files are as they were written. "open": it has no outcome.
 
     `seal` is that of its outcome, or of the copy of it where that is lost; "" where there is neither.
@@ -62,12 +62,12 @@ class Verdict:
         }
         return said[self.state]
 
-    def document(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """As JSON."""
         damage = [
             {
                 "file": one.file,
-                "what": one.what,
+                "what": one.description,
                 "rows": [list(span) for span in one.rows],
                 "times": [list(span) for span in one.times],
                 "text": one.text,
@@ -81,7 +81,7 @@ class Verdict:
 class DamagedError(RecordingError):
     """A recording is not what was recorded."""
 
-    def __init__(self, verdict: Verdict) -> None:
+    def __init__(self, verdict: IntegrityCheck) -> None:
         self.verdict = verdict
         super().__init__(
             f"{verdict.path} is damaged: {verdict.text}. It is left as it is and never published; bring its files "

@@ -17,7 +17,7 @@ from runtime.recording import codecs
 from runtime.recording.backlog import RUN
 from runtime.recording.files import AppendFile
 from runtime.recording.fragments import frames_in
-from runtime.recording.planes import planes
+from runtime.recording.planes import to_yuv_planes
 from runtime.recording.settings import RecordingSettings
 
 FRAGMENT_SECONDS = 0.2  # what a kill can take
@@ -42,7 +42,7 @@ class FragmentedVideo:
         self._rate = Fraction(fps).limit_denominator(1001)
         self._size = size
         self._key_next = self._ended = False
-        self._picture = planes(np.zeros((*size, 3), dtype=np.uint8), size)
+        self._picture = to_yuv_planes(np.zeros((*size, 3), dtype=np.uint8), size)
         options = {
             "movflags": _FRAGMENTS,
             "frag_duration": str(int(FRAGMENT_SECONDS * 1e6)),
@@ -56,7 +56,7 @@ class FragmentedVideo:
     def encode(self, picture: UInt8 | None) -> None:
         """Append one frame: `picture` [H, W, 3], or the previous one (black at first) for None."""
         if picture is not None:
-            self._picture = planes(picture, self._size)
+            self._picture = to_yuv_planes(picture, self._size)
         self._mux(self._code(key=self._key_next))
         self._key_next = False
         self._store()
@@ -122,7 +122,7 @@ class FragmentedVideo:
         told = codecs.options(settings.codec, settings.chosen_preset, settings.chosen_crf, gop)
         stream: Any = self._container.add_stream(settings.codec, rate=self._rate)
         context = stream.codec_context
-        codecs.set_up(context, settings.codec, self._size, self._rate, told, gop)
+        codecs.configure_context(context, settings.codec, self._size, self._rate, told, gop)
         context.colorspace, context.color_range = Colorspace.ITU601, ColorRange.MPEG
         return stream
 

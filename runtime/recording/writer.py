@@ -20,7 +20,7 @@ MOST_WAITING = 16384  # records of one table in memory: 80 s of ticks at 200 Hz
 _MANY = 1024  # from here on the thread does not wait for its period to end
 
 
-class Faults:
+class ErrorLatch:
     """The first error of any thread of a recording; kept until the caller has been told."""
 
     def __init__(self) -> None:
@@ -34,12 +34,12 @@ class Faults:
         elif error is not self.first:
             self.first.add_note(str(error))
 
-    def forget_full(self) -> None:
+    def clear_disk_full(self) -> None:
         """A full disk that nobody was told of has cost nothing yet: what it did not take is still held."""
         if isinstance(self.first, DiskFullError) and not self.told:
             self.first = None
 
-    def tell(self) -> None:
+    def raise_pending(self) -> None:
         """Raise what was reported, every time."""
         if self.first is not None:
             self.told = True
@@ -55,7 +55,7 @@ class DiskWriter:
         layout: Layout,
         settings: RecordingSettings,
         others: Sequence[AppendFile],
-        faults: Faults,
+        faults: ErrorLatch,
     ) -> None:
         self._folder = folder
         self._settings = settings
@@ -87,7 +87,7 @@ class DiskWriter:
         writer.add(record)
         if writer.waiting >= _MANY:
             self._wake.set()
-            self._hold_back(writer, patience)
+            self._wait_for_room(writer, patience)
 
     def add_line(self, line: bytes) -> None:
         """Queue one line of events.jsonl."""
@@ -114,7 +114,7 @@ class DiskWriter:
         """Of its own files, by name, once it has finished."""
         return {file.path.name: file.digest for file in self._own}
 
-    def _hold_back(self, writer: TableWriter, patience: float) -> None:
+    def _wait_for_room(self, writer: TableWriter, patience: float) -> None:
         deadline = time.monotonic() + patience
         while writer.waiting >= _MANY and time.monotonic() < deadline and self._faults.first is None:
             time.sleep(0.001)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robots import Robot
-from robots.clearance import clearance_of
+from robots.clearance import get_clearance
 from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 
@@ -26,14 +26,14 @@ class Collision:
     `distance` is that of the capsules that stand for them [m], below zero where they overlap.
     """
 
-    one: str
-    other: str
+    first: str
+    second: str
     distance: float
 
     def __str__(self) -> str:
         if self.distance < 0:
-            return _WOULD_COLLIDE(one=self.one, other=self.other, mm=-1000 * self.distance)
-        return _WOULD_BE_NEAR(one=self.one, other=self.other, mm=1000 * self.distance)
+            return _WOULD_COLLIDE(one=self.first, other=self.second, mm=-1000 * self.distance)
+        return _WOULD_BE_NEAR(one=self.first, other=self.second, mm=1000 * self.distance)
 
 
 class Collisions:
@@ -44,8 +44,8 @@ class Collisions:
     """
 
     def __init__(self, robot: Robot, margin: float) -> None:
-        self._clearance = clearance_of(robot)
-        self._least = self._clearance.least(margin)
+        self._clearance = get_clearance(robot)
+        self._least = self._clearance.touch_thresholds(margin)
         self._grippers = np.array(robot.gripper_dims, dtype=np.intp)
 
     def nearest(self, q: Float64) -> Collision | None:
@@ -53,7 +53,7 @@ class Collisions:
         apart = self._clearance.distances(q)
         return self._worst(apart, apart < self._least)
 
-    def approached(self, q: Float64, before: Float64) -> Collision | None:
+    def closer_pair(self, q: Float64, before: Float64) -> Collision | None:
         """The nearest pair that touches at `q` and came nearer since `before`; None where nothing does."""
         apart = self._clearance.distances(q)
         touching = apart < self._least
@@ -63,7 +63,7 @@ class Collisions:
             apart, touching & (apart < self._clearance.distances(self._gripping(before, q)) - _NEARER)
         )
 
-    def on_way(self, way: Float64) -> tuple[Collision, int] | None:
+    def first_on_path(self, way: Float64) -> tuple[Collision, int] | None:
         """The first pair that comes nearer while it touches, and at which posture of `way` [T, D]; None where none.
 
         Judged with the grippers of the beginning and with those of the end all along: they may move at any time.

@@ -33,7 +33,7 @@ __all__ = [
     "RobotState",
     "SafetyFilter",
     "SafetySettings",
-    "Verdict",
+    "SafetyVerdict",
     "WorkspaceBox",
 ]
 
@@ -52,15 +52,15 @@ class RobotState:
     measured: Float64
     elapsed: float  # since the last command, capped by the caller at 1.5 periods
     joint_age: float = 0.0
-    doubt: str = ""  # why `measured` cannot be true
+    implausible_reason: str = ""  # why `measured` cannot be true
     picture_ages: dict[str, float] = field(default_factory=dict)
-    aim: Float64 | None = (
+    previous_target: Float64 | None = (
         None  # the action that was wanted at the last tick; None: none was, `previous` counts
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class SafetyVerdict:
     """Verdict: `action` float64 [D] may be sent, None where refused; `notes` say what changed or why.
 
     `most` is the note on what was changed most, and `change` by how much [rad, or a gripper's worth of them]. `near`
@@ -69,9 +69,9 @@ class Verdict:
 
     action: Float64 | None
     notes: tuple[str, ...] = ()
-    most: str = ""
+    largest_change_note: str = ""
     change: float = 0.0
-    near: Collision | None = None
+    near_collision: Collision | None = None
 
     @property
     def refused(self) -> bool:
@@ -100,9 +100,9 @@ class SafetyFilter:
         self._limits = limits
         self._outside = outside  # names the arms whose end effector is outside its box anywhere in q [..., D]
         self._collisions = collisions
-        self._angles = limits.places
+        self._angles = limits.position_mask
         self._switching = bool(limits.binary.any())
-        self._reach = limits.reach
+        self._reach = limits.radian_scale
         self._room = np.zeros((2, len(limits.lower)))  # scratch: to the upper and from the lower limit
         self._stopping = settings.acceleration * self._reach
         self._top = {
@@ -115,44 +115,46 @@ class SafetyFilter:
             "motion": settings.motion_acceleration * self._reach * _MARGIN,
         }
 
-    def judge(self, action: Float64, state: RobotState, path: Path = "policy") -> Verdict:
+    def judge(self, action: Float64, state: RobotState, path: Path = "policy") -> SafetyVerdict:
         """The verdict on `action` [D]; with report-only the action comes back unchanged, with the notes."""
         if not _usable(action, state):
-            return Verdict(None, (_unusable(action, self._limits),))
+            return SafetyVerdict(None, (_unusable(action, self._limits),))
         refusal = self._refusal(action, state, path)
         if refusal and not self._settings.report_only:
-            return Verdict(None, (refusal,))
+            return SafetyVerdict(None, (refusal,))
         reachable = self.reachable(action, state, path)
         notes = self._changes(action, reachable)
         if self._settings.report_only:
             return self._warned(
-                Verdict(action, (*filter(None, [refusal]), *notes, *self._excess(action))), path
+                SafetyVerdict(action, (*filter(None, [refusal]), *notes, *self._excess(action))), path
             )
         violation = self._violation(reachable, state) or self._arrival(action, reachable, state, path)
         if violation:
-            return Verdict(None, (*notes, violation))
-        return self._warned(self._changed(action, reachable, notes) if notes else Verdict(reachable), path)
+            return SafetyVerdict(None, (*notes, violation))
+        return self._warned(
+            self._changed(action, reachable, notes) if notes else SafetyVerdict(reachable), path
+        )
 
     def _refusal(self, action: Float64, state: RobotState, path: Path) -> str:
-        blind = self.blind(state)
+        blind = self.unknown_state_reason(state)
         if path == "motion":  # of ours: needs no pictures
-            return blind or self._place(action, state, path) or self._runs_away(action, state)
+            return blind or self._place(action, state, path) or self._exceeds_following_error(action, state)
         return (
             blind
             or self._stale(state)
             or self._place(action, state, path)
-            or self._runs_away(action, state)
+            or self._exceeds_following_error(action, state)
             or self._jumps(action, state)
         )
 
-    def blind(self, state: RobotState) -> str:
+    def unknown_state_reason(self, state: RobotState) -> str:
         """Why nobody knows where the robot is, "" where that is known."""
-        return state.doubt or self.unseen(state)
+        return state.implausible_reason or self.unseen(state)
 
     def unseen(self, state: RobotState) -> str:
         """How old the joints are where they are too old, and nothing speaks against the last ones; else ""."""
         allowed = self._settings.joint_age_s
-        if state.doubt or state.joint_age <= allowed:
+        if state.implausible_reason or state.joint_age <= allowed:
             return ""
         return _JOINTS_OLD(seconds=state.joint_age, allowed=allowed)
 
@@ -178,18 +180,22 @@ class SafetyFilter:
     def _collides(self, action: Float64, state: RobotState, path: Path) -> str:
         if self._collisions is None or (path == "policy" and self._settings.collision != "refuse"):
             return ""
-        found = self._collisions.approached(action, state.previous)
+        found = self._collisions.closer_pair(action, state.previous)
         return "" if found is None else str(found)
 
-    def _warned(self, verdict: Verdict, path: Path) -> Verdict:
+    def _warned(self, verdict: SafetyVerdict, path: Path) -> SafetyVerdict:
         """The verdict, with what the action brings near each other where that is no reason to refuse it."""
         if self._collisions is None or path == "motion" or self._settings.collision != "warn":
             return verdict
         assert verdict.action is not None
         near = self._collisions.nearest(verdict.action)
-        return verdict if near is None else replace(verdict, notes=(*verdict.notes, str(near)), near=near)
+        return (
+            verdict
+            if near is None
+            else replace(verdict, notes=(*verdict.notes, str(near)), near_collision=near)
+        )
 
-    def _runs_away(self, action: Float64, state: RobotState) -> str:
+    def _exceeds_following_error(self, action: Float64, state: RobotState) -> str:
         allowed = self._settings.following_error
         error = np.abs(action - state.measured)
         if ((error <= allowed) | ~self._angles).all():  # NaN, a joint that is measured nowhere, is not
@@ -223,10 +229,10 @@ class SafetyFilter:
     def _on_way(self, brake: Brake, state: RobotState, path: Path) -> str:
         """Why the robot must not be on the way that it brakes on; a box is left between points that are far apart."""
         if self._outside is not None:
-            left = self._leaves_box(brake.way(_BOX_STEP, _BOX_POINTS), state, path)
+            left = self._leaves_box(brake.sample_path(_BOX_STEP, _BOX_POINTS), state, path)
             if left:
                 return left
-        ends = brake.way(_COLLISION_STEP, _COLLISION_POINTS)
+        ends = brake.sample_path(_COLLISION_STEP, _COLLISION_POINTS)
         return next(filter(None, (self._collides(point, state, path) for point in ends)), "")
 
     def reachable(self, action: Float64, state: RobotState, path: Path = "policy") -> Float64:
@@ -248,7 +254,9 @@ class SafetyFilter:
             braking = np.minimum(np.maximum(stops, now - hard), now + hard)
             fastest, slowest = np.where(crossed, braking, fastest), np.where(crossed, braking, slowest)
         wanted = (action - state.previous) / dt
-        velocity = np.minimum(np.maximum(self._in_time(wanted, action, state, path), slowest), fastest)
+        velocity = np.minimum(
+            np.maximum(self._catch_up_velocity(wanted, action, state, path), slowest), fastest
+        )
         changed = np.abs(velocity - wanted) * dt > _TOLERANCE
         if self._switching:
             changed &= ~self._limits.binary
@@ -258,13 +266,13 @@ class SafetyFilter:
             reachable = np.where(self._limits.binary, within, reachable)
         return reachable
 
-    def _in_time(self, wanted: Float64, action: Float64, state: RobotState, path: Path) -> Float64:
+    def _catch_up_velocity(self, wanted: Float64, action: Float64, state: RobotState, path: Path) -> Float64:
         """Velocities that catch up with a target so that they can be in step with it when they reach it.
 
         Who is behind a target that jumped must not arrive with all the speed gathered on the way: beside the
         target's own velocity there may be as much as can still be braked away within the distance.
         """
-        aim = state.previous if state.aim is None else state.aim
+        aim = state.previous if state.previous_target is None else state.previous_target
         behind = aim - state.previous
         if not (np.abs(behind) > _TOLERANCE).any():
             return wanted
@@ -285,17 +293,17 @@ class SafetyFilter:
     def _change(self, i: int | np.intp, action: Float64, reachable: Float64) -> str:
         return _LIMITED(joint=self._limits.names[i], wanted=action[i], reachable=reachable[i])
 
-    def _changed(self, action: Float64, reachable: Float64, notes: tuple[str, ...]) -> Verdict:
+    def _changed(self, action: Float64, reachable: Float64, notes: tuple[str, ...]) -> SafetyVerdict:
         change = np.abs(reachable - action) / self._reach
         worst = change.argmax()
-        return Verdict(reachable, notes, self._change(worst, action, reachable), float(change[worst]))
+        return SafetyVerdict(reachable, notes, self._change(worst, action, reachable), float(change[worst]))
 
     def _violation(self, action: Float64, state: RobotState) -> str:
         limits = self._limits
-        excess = limits.outside(action)
+        excess = limits.excess(action)
         if not (excess > _TOLERANCE).any():
             return ""
-        worse = (excess > _TOLERANCE) & (excess > limits.outside(state.previous) + _TOLERANCE)
+        worse = (excess > _TOLERANCE) & (excess > limits.excess(state.previous) + _TOLERANCE)
         if not worse.any():
             return ""
         i = int(np.flatnonzero(worse)[0])
@@ -305,7 +313,7 @@ class SafetyFilter:
         limits = self._limits
         return tuple(
             _OUTSIDE(joint=limits.names[i], value=action[i], lower=limits.lower[i], upper=limits.upper[i])
-            for i in np.flatnonzero(limits.outside(action) > _TOLERANCE)
+            for i in np.flatnonzero(limits.excess(action) > _TOLERANCE)
         )
 
 
@@ -313,8 +321,8 @@ def braking(position: Float64, velocity: Float64, limits: Limits, settings: Safe
     """A stop from `position` at `velocity` [D], as hard as needed to stay within the joint limits."""
     ahead = np.where(velocity > 0, limits.upper - position, position - limits.lower)
     needed = velocity * velocity / (2.0 * np.maximum(ahead, 1e-9))
-    softest = settings.brake_acceleration * limits.reach
-    rate = np.clip(needed, softest, np.maximum(softest, settings.acceleration * limits.reach))
+    softest = settings.brake_acceleration * limits.radian_scale
+    rate = np.clip(needed, softest, np.maximum(softest, settings.acceleration * limits.radian_scale))
     return Brake(
         position.copy(), velocity.copy(), rate, limits.lower, limits.upper, limits.speeds, limits.velocity
     )

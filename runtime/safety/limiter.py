@@ -17,7 +17,7 @@ _MARGIN = 1.05  # rounding, and ticks that are not alike, are no excess
 _TOLERANCE = 1e-6  # [rad, or what a gripper's travel is worth]
 
 
-class Limited(NamedTuple):
+class LimitedCommand(NamedTuple):
     """Command that may be sent, float64 [D], and what was changed: a sentence each joint."""
 
     action: Float64
@@ -34,16 +34,16 @@ class CommandLimiter:
 
     def __init__(self, limits: Limits, settings: SafetySettings) -> None:
         self._limits = limits
-        self._reach = limits.reach
+        self._reach = limits.radian_scale
         self._top = limits.velocity * _MARGIN
         hardest = max(settings.acceleration, settings.motion_acceleration, settings.brake_acceleration)
-        self._rate = hardest * limits.reach * _MARGIN
+        self._rate = hardest * limits.radian_scale * _MARGIN
         self._speeds = np.zeros(len(limits.names), bool)
         self._speeds[list(limits.speeds)] = True
 
     def __call__(
         self, action: Float64, previous: Float64, velocity: Float64, elapsed: float, stop: bool
-    ) -> Limited:
+    ) -> LimitedCommand:
         """Part of `action` [D] that may follow `previous`, moving at `velocity`, `elapsed` seconds later.
 
         `stop`: the e-stop sends it.
@@ -59,8 +59,8 @@ class CommandLimiter:
         sent = np.clip(moved, np.minimum(lower, previous), np.maximum(upper, previous))
         changed = ~(np.abs(sent - action) <= _TOLERANCE * self._reach)
         if not changed.any():
-            return Limited(action)
-        return Limited(np.where(changed, sent, action), self._notes(action, sent, changed))
+            return LimitedCommand(action)
+        return LimitedCommand(np.where(changed, sent, action), self._notes(action, sent, changed))
 
     def _velocities(self, velocity: Float64, elapsed: float, stop: bool) -> tuple[Float64, Float64]:
         gain = self._rate * elapsed

@@ -29,13 +29,13 @@ class Limits:
     speeds: tuple[int, ...] = ()
 
     @property
-    def places(self) -> np.ndarray:
+    def position_mask(self) -> np.ndarray:
         """Which dimensions are places of joints, bool [D]: neither grippers nor speeds."""
         places = ~self.grippers
         places[list(self.speeds)] = False
         return places
 
-    def standing(self, position: Float64) -> Float64:
+    def with_zero_speeds(self, position: Float64) -> Float64:
         """`position` [D] with everything that is a speed at 0."""
         if not self.speeds:
             return position
@@ -43,12 +43,12 @@ class Limits:
         standing[list(self.speeds)] = 0.0
         return standing
 
-    def outside(self, position: Float64) -> Float64:
+    def excess(self, position: Float64) -> Float64:
         """Distance of `position` [..., D] beyond its bounds, 0 within them."""
         return np.maximum(np.maximum(self.lower - position, position - self.upper), 0.0)
 
     @property
-    def reach(self) -> Float64:
+    def radian_scale(self) -> Float64:
         """Worth of one radian in each dimension [D]: 1 for angles.
 
         A gripper's accelerations are scaled so that its whole travel counts as much as GRIPPER_TRAVEL radians,

@@ -26,10 +26,10 @@ class Workspace:
 
     def __call__(self, q: Float64) -> tuple[str, ...]:
         """The names of the arms that are outside with any of the joints q [..., D]."""
-        outside = self.outside(q)
+        outside = self.is_outside(q)
         return tuple(name for index, name in enumerate(self.arms) if outside[..., index].any())
 
-    def outside(self, q: Float64) -> NDArray[np.bool_]:
+    def is_outside(self, q: Float64) -> NDArray[np.bool_]:
         """True for each of `arms` that is outside, bool [..., arms], with the joints q [..., D]."""
         return np.asarray(self.excess(q) > 0.0)
 
@@ -41,11 +41,11 @@ class Workspace:
         beyond: Float64 = np.maximum(self._lower - points, points - self._upper).max(axis=-1)
         return np.maximum(beyond, 0.0)
 
-    def left_on(self, way: Float64) -> str:
+    def arm_leaving_on(self, way: Float64) -> str:
         """The arm that leaves its box somewhere on a `way` [T, D] in joints; "" where none does.
 
         Who begins outside may go anywhere until it is inside.
         """
-        outside = self.outside(way)
+        outside = self.is_outside(way)
         left = (~outside[:-1] & outside[1:]).any(axis=0)
         return self.arms[int(left.argmax())] if left.any() else ""

@@ -14,8 +14,8 @@ import numpy as np
 
 from runtime.core.errors import RuntimeFault
 from runtime.core.types import Float64
-from runtime.sim.eyes import Eye, wrist_eye
-from runtime.sim.limbs import limbs
+from runtime.sim.eyes import CameraPlacement, place_wrist_camera
+from runtime.sim.limbs import arm_frames
 
 if TYPE_CHECKING:
     from robots import Camera, Group, Robot
@@ -42,7 +42,7 @@ class Belt:
     x: tuple[float, float] = (-0.10, 0.30)
     y: float = 0.34
     width: float = 0.08
-    beside: tuple[float, float, float] = (0.0, -0.07, 0.08)
+    fingertip_offset: tuple[float, float, float] = (0.0, -0.07, 0.08)
     colour: Colour = (70, 74, 80)
 
 
@@ -66,7 +66,7 @@ class Bench:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class BenchLayout:
     """Places of blocks (x, y, yaw) and plate (x, y) after a reset; the first block is the task's."""
 
     blocks: tuple[tuple[float, float, float], ...]
@@ -120,7 +120,7 @@ class PinholeCamera:
         return float(x), float(y)
 
 
-def on_table(block: tuple[float, float, float], bench: Bench) -> Float64:
+def block_pose(block: tuple[float, float, float], bench: Bench) -> Float64:
     """The pose [4, 4] of a block that lies flat on the table at (x, y, yaw)."""
     x, y, yaw = block
     pose = np.eye(4)
@@ -138,7 +138,7 @@ def yaw_of(pose: Float64) -> float:
 
 def tip_in_world(robot: Robot, arm: Group, q: Float64) -> Float64:
     """An arm's fingertips in the world, [4, 4], at the robot's joints q [D]: z ahead, y the way they open."""
-    return limbs(robot)[arm.name].tip(q)
+    return arm_frames(robot)[arm.name].tip(q)
 
 
 def camera_arm(robot: Robot, camera: Camera) -> Group | None:
@@ -158,7 +158,7 @@ def cameras(robot: Robot, q: Float64, width: int, height: int) -> dict[str, Pinh
     return {
         key: overhead_camera(width, height)
         if arm is None
-        else wrist_camera(tip_in_world(robot, arm, q), width, height, wrist_eye(robot, arm.name))
+        else wrist_camera(tip_in_world(robot, arm, q), width, height, place_wrist_camera(robot, arm.name))
         for key, arm in carriers.items()
     }
 
@@ -169,9 +169,9 @@ def overhead_camera(width: int, height: int) -> PinholeCamera:
     return _camera(pose, _OVERHEAD_FOCAL, width, height)
 
 
-def wrist_camera(tip: Float64, width: int, height: int, eye: Eye | None = None) -> PinholeCamera:
+def wrist_camera(tip: Float64, width: int, height: int, eye: CameraPlacement | None = None) -> PinholeCamera:
     """The camera beside the fingers of an arm whose fingertips are at `tip` [4, 4]."""
-    eye = eye or Eye()
+    eye = eye or CameraPlacement()
     return _camera(tip @ _looking(eye.place, eye.aim, eye.up), _WRIST_FOCAL, width, height)
 
 

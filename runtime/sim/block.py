@@ -76,7 +76,7 @@ class Block:
         self._falling = 0.0
         self._grip = np.linalg.inv(tip) @ self.pose
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """From now on it falls."""
         self.held_by = ""
 
@@ -111,7 +111,7 @@ class Block:
         share = 1.0 if angle < 10 * _LEVEL else -math.expm1(-seconds / _LEVELLING)
         self.pose[:3, :3] = _about(axis / sine * (share * angle)) @ self.pose[:3, :3]
 
-    def rest(self, seconds: float) -> None:
+    def update_rest(self, seconds: float) -> None:
         """Note whether it has moved since the last time this was asked."""
         moved = float(np.abs(self.pose - self._before).max()) > _MOVED
         self.still = 0.0 if moved or self.held_by else self.still + seconds

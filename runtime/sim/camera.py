@@ -7,7 +7,7 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.sim import standin
 from runtime.sim.camera_server import FAULTS, CameraServer
 from runtime.sim.mjpeg_server import MjpegServer
@@ -33,11 +33,11 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until told to end; 2 where the port is taken."""
     options = parser().parse_args(arguments)
-    told = standin.ending(options.lifeline)
+    told = standin.stop_event(options.lifeline)
     server = KINDS[options.kind](options.width, options.height, options.rate, options.port)
     server.fault = options.fault
     with contextlib.closing(server):
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except OSError as error:
             print(f"--port {options.port} cannot be taken: {error.strerror}", file=sys.stderr)
             return 2
-        standin.announce({"kind": options.kind, "url": url}, options.ready_file)
+        standin.announce_ready({"kind": options.kind, "url": url}, options.ready_file)
         told.wait()
     return 0
 

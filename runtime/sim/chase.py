@@ -21,7 +21,7 @@ from runtime.sim.bench import Belt, Bench
 from runtime.sim.pick_place import ScriptError
 from runtime.sim.postures import Postures
 from runtime.sim.script import Answer, Script
-from runtime.sim.sight import Overhead
+from runtime.sim.sight import OverheadDetector
 
 if TYPE_CHECKING:
     from robots import Group, Robot
@@ -35,7 +35,7 @@ _BEYOND = 0.02  # m to either side of where blocks ride
 _NODES = (16, 5)  # of the map from places to joints, along and across the belt
 
 
-class Chase(Script):
+class ChaseScript(Script):
     """The policy for every connection; `places` are those of the belt that it has learnt."""
 
     def __init__(
@@ -45,11 +45,11 @@ class Chase(Script):
         rate: float,
         name: str | None = None,
         clock: Clock | None = None,
-        places: Places | None = None,
+        places: PlaceMap | None = None,
     ) -> None:
         self.clock = clock or MonotonicClock()
-        self.places = places or Places(robot, Belt())
-        self.overhead = Overhead(robot, Bench(belt=self.places.belt))
+        self.places = places or PlaceMap(robot, Belt())
+        self.overhead = OverheadDetector(robot, Bench(belt=self.places.belt))
         self.times = np.arange(horizon) / rate
         self.metadata = {
             "name": name or "chase",
@@ -59,20 +59,20 @@ class Chase(Script):
 
     def begin(self) -> Answer:
         """A connection that has seen nothing."""
-        return Follower(self)
+        return ChaseEpisode(self)
 
 
-class Follower:
+class ChaseEpisode:
     """One connection: where the block was seen, and when."""
 
-    def __init__(self, policy: Chase) -> None:
+    def __init__(self, policy: ChaseScript) -> None:
         self._policy = policy
         self._seen: deque[tuple[float, float, float]] = deque(maxlen=64)  # time [s], x, y [m]
 
     def __call__(self, q: Float64, pictures: Mapping[str, UInt8], prompt: str) -> Float32:
         """Rows float32 [H, D] beside where the block will be; the joints themselves before it was ever seen."""
         policy, now = self._policy, self._policy.clock.now()
-        self._look(pictures, now)
+        self._detect(pictures, now)
         if not self._seen:
             return np.repeat(q[None], len(policy.times), axis=0).astype(np.float32)
         x, y = self._ahead(now + policy.times + LEAD)
@@ -80,11 +80,11 @@ class Follower:
         rows = q + np.clip(policy.places.joints(x, y) - q, -reach, reach)
         return rows.astype(np.float32)
 
-    def _look(self, pictures: Mapping[str, UInt8], now: float) -> None:
+    def _detect(self, pictures: Mapping[str, UInt8], now: float) -> None:
         key = self._policy.overhead.key
         if key not in pictures:
             raise ScriptError(f"the request has no picture {key!r}; it has {', '.join(pictures) or 'none'}")
-        block = self._policy.overhead.look(pictures[key]).block
+        block = self._policy.overhead.detect(pictures[key]).block
         while self._seen and now - self._seen[0][0] > _FORGOTTEN:
             self._seen.popleft()
         if block is not None:
@@ -102,7 +102,7 @@ class Follower:
         return np.clip(x, *self._policy.places.belt.x), np.full(len(times), newest[2])
 
 
-class Places:
+class PlaceMap:
     """From places of the block to joints with fingertips beside it: solved at some, interpolated between."""
 
     def __init__(self, robot: Robot, belt: Belt) -> None:
@@ -132,7 +132,7 @@ class Places:
     def _solved(self, robot: Robot, postures: Postures, arm: Group) -> Float64 | None:
         """Joints [along, across, D]; None where the arm does not reach one of the places."""
         rest = robot.poses.get("ready", robot.poses["home"])
-        dx, dy, height = self.belt.beside
+        dx, dy, height = self.belt.fingertip_offset
         found = []
         for x in self._x:
             for y in self._y:

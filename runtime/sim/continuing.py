@@ -20,7 +20,7 @@ _TRANSITION = 8  # rows over which its own plan takes over
 
 
 @dataclass(frozen=True, slots=True)
-class Prefix:
+class CommittedPrefix:
     """The robot's commitment: joint rows [L, D], of which the first `delay` will have been executed.
 
     `end` is the row from which on nothing of it shows, at the latest.
@@ -31,7 +31,7 @@ class Prefix:
     end: int
 
 
-def continued(plan: Float32, prefix: Prefix, switched: Sequence[int] = ()) -> Float32:
+def continue_prefix(plan: Float32, prefix: CommittedPrefix, switched: Sequence[int] = ()) -> Float32:
     """`plan` [H, D] with the prefix's first rows in place of its own, and over to its own rows after them.
 
     Dimensions in `switched` (binary grippers) are the plan's own after the delay.
@@ -60,7 +60,7 @@ class ModelSpace:
         """Numbers of a joint row."""
         return len(self._centre)
 
-    def of(self, joints: Float32) -> Float32:
+    def encode(self, joints: Float32) -> Float32:
         """Model rows [H, width] of joint rows [H, D]."""
         made = np.zeros((len(joints), self.width), np.float32)
         made[:, : joints.shape[1]] = (joints - self._centre) / self._half

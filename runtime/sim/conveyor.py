@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from runtime.core.types import Float64
-from runtime.sim.bench import Belt, Bench, BenchError, Layout
-from runtime.sim.course import Course, course_of
-from runtime.sim.tabletop import Reset, Tabletop
+from runtime.sim.bench import Belt, Bench, BenchError, BenchLayout
+from runtime.sim.course import BeltMotion, draw_belt_motion
+from runtime.sim.tabletop import ResetRequest, Tabletop
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -33,19 +33,19 @@ _ON_BELT = 1e-3  # m above the belt, at most
 
 
 @dataclass(slots=True)
-class Escort:
+class TrackingErrors:
     """Fingertips' tracking of the block: distances [m] from their place beside it, in order of size."""
 
     distances: list[float] = field(default_factory=list)
     total: float = 0.0  # m
 
-    def note(self, distance: float) -> None:
+    def add(self, distance: float) -> None:
         """One more step of the physics."""
         insort(self.distances, distance)
         self.total += distance
 
     @property
-    def share(self) -> float:
+    def on_target_share(self) -> float:
         """Of the time, within the tolerance; 0 before there was any."""
         return bisect_right(self.distances, TOLERANCE_M) / max(1, len(self.distances))
 
@@ -87,7 +87,7 @@ class Conveyor(Tabletop):
     @property
     def success(self) -> bool:
         """True if the course is over and fingertips were in their place for long enough."""
-        return self.over and self.escort.share >= REQUIRED
+        return self.over and self.escort.on_target_share >= REQUIRED
 
     def truth(self) -> dict[str, object]:
         """The node's report of its bench; `chase` covers the course since the last reset, in mm and s."""
@@ -97,7 +97,7 @@ class Conveyor(Tabletop):
             "success": self.success,
             "chase": {
                 "seconds": self._elapsed,
-                "share": self.escort.share,
+                "share": self.escort.on_target_share,
                 "distance": 1e3 * distance if math.isfinite(distance) else None,
                 "mean": 1e3 * self.escort.mean,
                 "p95": 1e3 * self.escort.quantile(0.95),
@@ -109,23 +109,23 @@ class Conveyor(Tabletop):
     def distance(self) -> float:
         """From the nearest fingertips to their place beside the block [m]; inf before anything has moved."""
         block = self._blocks[0].pose[:3, 3] - (0.0, 0.0, self.bench.block_edge / 2)
-        place = block + self.belt.beside
+        place = block + self.belt.fingertip_offset
         tips = [hand.tip[:3, 3] for hand in self._hands.values()]
         return min((float(np.linalg.norm(tip - place)) for tip in tips), default=math.inf)
 
-    def _layout(self, wish: Reset) -> Layout:
+    def _layout(self, wish: ResetRequest) -> BenchLayout:
         if wish.positions:
             raise BenchError(
                 f"positions name {', '.join(sorted(map(str, wish.positions)))}; "
                 "allowed on a conveyor: none, the seed decides where the block rides"
             )
-        self._course: Course = course_of(wish.seed, self.belt, COURSE_S)
+        self._course: BeltMotion = draw_belt_motion(wish.seed, self.belt, COURSE_S)
         self._elapsed = 0.0
-        self.escort = Escort()
-        return Layout(((self._course.x(0.0), self.belt.y, 0.0),), _PLATE)
+        self.escort = TrackingErrors()
+        return BenchLayout(((self._course.x(0.0), self.belt.y, 0.0),), _PLATE)
 
-    def _lay(self, wish: Reset) -> None:
-        super()._lay(wish)
+    def _place_objects(self, wish: ResetRequest) -> None:
+        super()._place_objects(wish)
         self._reached = {"beside": False}
 
     def _step(self, q: Float64, seconds: float) -> None:
@@ -149,5 +149,5 @@ class Conveyor(Tabletop):
         """Note where the fingertips are, while the belt runs; start it where they are beside the block."""
         distance = self.distance()
         if self.running:
-            self.escort.note(distance)
+            self.escort.add(distance)
         self._reached["beside"] |= distance <= TOLERANCE_M

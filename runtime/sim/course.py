@@ -16,7 +16,7 @@ ACCELERATION = 0.6  # m/s^2, with which the belt changes its speed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Course:
+class BeltMotion:
     """Pieces of constant acceleration, one after the other: `knots` [n, 4] of time [s], x [m], speed, acceleration.
 
     The belt stands before the first and after the last.
@@ -44,7 +44,7 @@ class Course:
         return float(x + speed * passed + acceleration * passed * passed / 2)
 
 
-def course_of(seed: int, belt: Belt, seconds: float) -> Course:
+def draw_belt_motion(seed: int, belt: Belt, seconds: float) -> BeltMotion:
     """The course of a seed, always the same one for the same arguments; BenchError for a belt that is too short.
 
     After so many seconds it comes to a stand.
@@ -57,7 +57,7 @@ def course_of(seed: int, belt: Belt, seconds: float) -> Course:
         )
     chance = np.random.default_rng(seed)
     x = float(chance.uniform(low + room, high - room))
-    run = _Run([], 0.0, x, 0.0)
+    run = _BeltMotionBuilder([], 0.0, x, 0.0)
     while run.time < seconds:
         ends = chance.uniform(low + room, high - room, 64)
         end = float(ends[np.abs(ends - run.x) >= SHORTEST][0])
@@ -66,11 +66,11 @@ def course_of(seed: int, belt: Belt, seconds: float) -> Course:
         run.cruise(min(abs(end - run.x) / abs(speed), seconds - run.time))
     run.change(0.0)
     run.knots.append((run.time, run.x, 0.0, 0.0))
-    return Course(np.array(run.knots))
+    return BeltMotion(np.array(run.knots))
 
 
 @dataclass(slots=True)
-class _Run:
+class _BeltMotionBuilder:
     """A course that is being drawn, up to `time`, where the block is at `x` and has `speed`."""
 
     knots: list[tuple[float, float, float, float]]

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.clients.headless import RESULT_NAME
 from runtime.config import loader as deployment
 from runtime.core.errors import RuntimeFault, SetupError
@@ -57,7 +57,7 @@ class StandIns:
                 child.wait()
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where the run went well."""
     parser = argparse.ArgumentParser(prog="python -m runtime.sim.demo", description=__doc__)

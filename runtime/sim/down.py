@@ -16,7 +16,7 @@ Place = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Down:
+class DownwardTip:
     """Fingertips over a place at a height [m], pointing down, `tilt` [rad] outwards along `bearing` from the arm.
 
     The jaws open along `yaw`.
@@ -40,7 +40,7 @@ class Down:
         tip[:3, 3] = *self.place, self.height
         return tip
 
-    def towards(self, other: Down) -> Iterator[Down]:
+    def interpolate(self, other: DownwardTip) -> Iterator[DownwardTip]:
         """The points on the way to another one, without either end."""
         numbers = np.array([*self.place, self.height, self.yaw, self.bearing, self.tilt])
         way = np.array([*other.place, other.height, other.yaw, other.bearing, other.tilt]) - numbers
@@ -51,4 +51,4 @@ class Down:
         )
         for step in range(1, count):
             x, y, *rest = (numbers + way * step / count).tolist()
-            yield Down((x, y), *rest)
+            yield DownwardTip((x, y), *rest)

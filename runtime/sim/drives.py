@@ -14,7 +14,7 @@ from typing import Any
 
 import zmq
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core import msgpack_arrays
 from runtime.transports.node_messages import DRIVE_FAULT_LENGTH, DRIVE_FAULTS_LIMIT
 
@@ -23,20 +23,20 @@ _PATIENCE_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Switch:
+class DriveSwitch:
     """Switching of the drives: on, which clears all faults; off; off because of `fault`."""
 
     on: bool
     fault: str = ""
 
 
-def read(word: str, message: Mapping[Any, Any]) -> Switch | None:
+def parse_word(word: str, message: Mapping[Any, Any]) -> DriveSwitch | None:
     """Switch that one of WORDS asks for; None if its fault is invalid."""
     if word != "drives_fault":
-        return Switch(word == "drives_enable")
+        return DriveSwitch(word == "drives_enable")
     fault = message.get("fault")
     fits = isinstance(fault, str) and 0 < len(fault) <= DRIVE_FAULT_LENGTH
-    return Switch(False, str(fault)) if fits else None
+    return DriveSwitch(False, str(fault)) if fits else None
 
 
 class Drives:
@@ -46,18 +46,18 @@ class Drives:
         self._faults = list(faults)
         self.enabled = enabled and not faults
 
-    def obey(self, switch: Switch) -> None:
+    def apply(self, switch: DriveSwitch) -> None:
         """Go on, off, or off with one more fault, of which the newest are kept."""
         self.enabled = switch.on
         faults = [] if switch.on else [*self._faults, *([switch.fault] if switch.fault else [])]
         self._faults = faults[-DRIVE_FAULTS_LIMIT:]
 
-    def said(self) -> dict[str, object]:
+    def status(self) -> dict[str, object]:
         """The node's report of its drives."""
         return {"enabled": self.enabled, "faults": list(self._faults)}
 
 
-def tell(endpoint: str, word: str, fault: str = "") -> bool:
+def send_word(endpoint: str, word: str, fault: str = "") -> bool:
     """Say one of WORDS to the node that takes commands at `endpoint`; False where no node came to listen."""
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.XPUB)
     try:
@@ -71,7 +71,7 @@ def tell(endpoint: str, word: str, fault: str = "") -> bool:
         socket.close()
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit code 0 where the node was told, 1 where none listens."""
     line = argparse.ArgumentParser(
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     line.add_argument("--fault", default="drive 1: over-current", metavar="TEXT", help="fault: what it says")
     given = line.parse_args(arguments)
-    if tell(given.action_endpoint, f"drives_{given.what}", given.fault):
+    if send_word(given.action_endpoint, f"drives_{given.what}", given.fault):
         return 0
     print(f"no node listens at {given.action_endpoint}", file=sys.stderr)
     return 1

@@ -10,7 +10,7 @@ import numpy as np
 
 from robots import scene_of
 from runtime.core.types import Float64
-from runtime.sim.limbs import limbs
+from runtime.sim.limbs import arm_frames
 
 if TYPE_CHECKING:
     from robots import Robot, RobotScene
@@ -31,7 +31,7 @@ _SHORT = 0.995  # of a way, at which it counts as gone: what is looked at does n
 
 
 @dataclass(frozen=True, slots=True)
-class Eye:
+class CameraPlacement:
     """A camera's place, what it is aimed at, and what is up in its picture, in the frame of the fingertips [m]."""
 
     place: Point = (-0.095, 0.0, -0.125)
@@ -40,15 +40,15 @@ class Eye:
 
 
 @lru_cache(maxsize=64)  # cache: a search, for robots that do not change
-def wrist_eye(robot: Robot, arm: str) -> Eye:
+def place_wrist_camera(robot: Robot, arm: str) -> CameraPlacement:
     """Of an arm: the nearest place from which enough is in view, else that with most, judged in the ready posture."""
     q = robot.poses.get("ready", robot.poses["home"])
-    tip = limbs(robot)[arm].tip(q)
+    tip = arm_frames(robot)[arm].tip(q)
     boxes = _Boxes(scene_of(robot), q)
-    best, most = Eye(), -1.0
+    best, most = CameraPlacement(), -1.0
     for aside, ahead in _BESIDE:
         for side in (-1.0, 1.0):
-            eye = Eye((side * aside, 0.0, ahead), (side * 0.005, 0.0, _AHEAD), (side, 0.0, 0.0))
+            eye = CameraPlacement((side * aside, 0.0, ahead), (side * 0.005, 0.0, _AHEAD), (side, 0.0, 0.0))
             share = boxes.share_seen(_placed(tip, np.array(eye.place)), _placed(tip, _SEEN))
             if share >= _ENOUGH:
                 return eye

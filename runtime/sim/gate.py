@@ -18,7 +18,7 @@ from runtime.core.clock import ClockMap
 from runtime.core.errors import CodecError
 from runtime.core.types import Float64
 from runtime.sim import drives
-from runtime.sim.tabletop import Reset
+from runtime.sim.tabletop import ResetRequest
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -33,16 +33,16 @@ _MESSAGE_LIMIT = 1024 * 1024  # bytes; a command has a few hundred
 
 
 @dataclass(frozen=True, slots=True)
-class Accepted:
+class AcceptedCommand:
     """A message that counts: a target [D] to go to, a control word, a wish to lay the bench anew, a switch."""
 
     target: Float64 | None = None
     control: Control | None = None
-    reset: Reset | None = None
-    switch: drives.Switch | None = None
+    reset: ResetRequest | None = None
+    switch: drives.DriveSwitch | None = None
 
 
-class Gate:
+class CommandGate:
     """Judges commands by their arrival on our own clock; `refused` counts what it sent away, by reason.
 
     A target that was sent more than `deadline` seconds ago is refused as well, by the master's own clock, where that
@@ -62,7 +62,7 @@ class Gate:
         self.ack: int | None = None
         self.refused: Counter[str] = Counter()
 
-    def judge(self, payload: bytes, arrival: float) -> Accepted | None:
+    def accept(self, payload: bytes, arrival: float) -> AcceptedCommand | None:
         """The message if it may take effect, else None and one more in `refused`."""
         message = self._message(payload)
         if message is None:
@@ -78,18 +78,18 @@ class Gate:
             self.ack = number if type(number) is int else None
         return accepted
 
-    def _accept(self, word: str, message: dict[Any, Any], arrival: float) -> Accepted | None:
+    def _accept(self, word: str, message: dict[Any, Any], arrival: float) -> AcceptedCommand | None:
         if word == "real":
             return self._target(message, arrival)
         if word in get_args(Control):
-            return Accepted(control=cast(Control, word))
+            return AcceptedCommand(control=cast(Control, word))
         if word == _RESET:
             return self._reset(message)
         if word != "sim":
             self.refused["unknown_target"] += 1
         return None
 
-    def silent(self, now: float) -> bool:
+    def is_silent(self, now: float) -> bool:
         """True if no target was accepted within the deadline: the robot has to hold."""
         return now - self._accepted > self._deadline
 
@@ -116,15 +116,15 @@ class Gate:
         self._heard = arrival
         return True
 
-    def _switch(self, word: str, message: dict[Any, Any]) -> Accepted | None:
+    def _switch(self, word: str, message: dict[Any, Any]) -> AcceptedCommand | None:
         """Whoever stands at the robot switches its drives; that does not make them its master."""
-        switch = drives.read(word, message)
+        switch = drives.parse_word(word, message)
         if switch is None:
             self.refused["malformed"] += 1
             return None
-        return Accepted(switch=switch)
+        return AcceptedCommand(switch=switch)
 
-    def _reset(self, message: dict[Any, Any]) -> Accepted | None:
+    def _reset(self, message: dict[Any, Any]) -> AcceptedCommand | None:
         name, seed, positions = (message.get(key) for key in ("id", "seed", "positions"))
         if not self._bench:
             self.refused["no_bench"] += 1
@@ -134,16 +134,18 @@ class Gate:
         if not (named and seeded and (positions is None or isinstance(positions, dict))):
             self.refused["malformed"] += 1
             return None
-        return Accepted(reset=Reset(str(name), int(seed or 0), positions))
+        return AcceptedCommand(reset=ResetRequest(str(name), int(seed or 0), positions))
 
-    def _target(self, message: dict[Any, Any], arrival: float) -> Accepted | None:
+    def _target(self, message: dict[Any, Any], arrival: float) -> AcceptedCommand | None:
         action = message.get("action")
         reason = "stale" if self._late(message.get("t"), arrival) else self._wrong(action)
         if reason:
             self.refused[reason] += 1
             return None
         self._accepted = arrival
-        return Accepted(target=np.clip(np.asarray(action, np.float64), self._robot.lower, self._robot.upper))
+        return AcceptedCommand(
+            target=np.clip(np.asarray(action, np.float64), self._robot.lower, self._robot.upper)
+        )
 
     def _late(self, stamp: object, arrival: float) -> bool:
         """True if the target was sent too long ago; never where the sender's clock says nothing."""

@@ -42,7 +42,7 @@ class Gesture:
             self._speed[dim] = (robot.upper - robot.lower)[dim] / _GRIPPER_TIME
         self._speed[list(robot.binary_dims)] = np.inf
 
-    def at(self, phase: float, q: Float64) -> Float64:
+    def joints_at(self, phase: float, q: Float64) -> Float64:
         """Joints [D] on the path; places that do not take part are those of `q`."""
         target = self._centre + self._room * np.sin(phase + self._lags)
         for arm in self._robot.arms:
@@ -60,7 +60,7 @@ class Gesture:
     def towards(self, phase: float, q: Float64, seconds: float) -> Float64:
         """The joints [D] that are reached from `q` on the way to the path within `seconds`."""
         reach = self._speed * seconds
-        return np.asarray(q + np.clip(self.at(phase, q) - q, -reach, reach))
+        return np.asarray(q + np.clip(self.joints_at(phase, q) - q, -reach, reach))
 
     def chunk(self, q: Float64, horizon: int, rate: float) -> Float32:
         """float32 [horizon, D] from the joints `q` on, at `rate` [Hz]: the same for the same joints."""

@@ -18,7 +18,7 @@ from runtime.core.errors import SetupError
 from runtime.core.types import Float32, Float64, UInt8
 from runtime.sim import gr00t_wire as wire
 from runtime.sim.faults import NONE, TOO_LARGE, Fault
-from runtime.sim.script import Answer, Script, Waving
+from runtime.sim.script import Answer, Script, WavingScript
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -64,7 +64,7 @@ class Gr00tServer:
         self._robot = robot
         self._behaviour = behaviour
         self._port = port
-        self._script = script or Waving(robot, behaviour.horizon, behaviour.rate, behaviour.seed)
+        self._script = script or WavingScript(robot, behaviour.horizon, behaviour.rate, behaviour.seed)
         self._in_poses = self._script.metadata.get("action_space") == "eef"
         self._answer: Answer | None = None
         self._asked = 0

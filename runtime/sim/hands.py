@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.core.types import Float64
 from runtime.sim.bench import BenchError
-from runtime.sim.limbs import limbs
+from runtime.sim.limbs import arm_frames
 
 if TYPE_CHECKING:
     from robots import Gripper, Group, Robot
@@ -50,7 +50,7 @@ class Jaws:
         if arm.gripper is None or arm.gripper_dim is None:
             raise BenchError(f"group {arm.name} has no gripper; allowed: an arm with one")
         self.name = arm.name
-        self._limb = limbs(robot)[arm.name]
+        self._limb = arm_frames(robot)[arm.name]
         self._dim = arm.gripper_dim
         self._opening = Opening(arm.gripper)
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from robots import Group, Robot
 
 
-class InPoses(Script):
+class PoseScript(Script):
     """Is asked as the other script is, with joints and pictures; says in its metadata how its rows are written.
 
     `rate` [Hz] is that of its rows. SetupError where the format does not fit the robot.
@@ -42,11 +42,11 @@ class InPoses(Script):
         answer = self._script.begin()
 
         def posed(q: Float64, pictures: Mapping[str, UInt8], prompt: str) -> Float32:
-            return self.of(answer(q, pictures, prompt).astype(np.float64), q)
+            return self.to_poses(answer(q, pictures, prompt).astype(np.float64), q)
 
         return posed
 
-    def of(self, joints: Float64, q: Float64) -> Float32:
+    def to_poses(self, joints: Float64, q: Float64) -> Float32:
         """Rows float32 [H, width] of joint rows [H, D].
 
         What carries a declared frame stands as in q [D], unless its joints follow the poses.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.sim.bench import Bench, BenchError, Layout
+from runtime.sim.bench import Bench, BenchError, BenchLayout
 
 NOISE_M = 0.005  # by which things lie beside where they were asked for, at most, in x and in y
 NOISE_RAD = math.radians(4.0)
@@ -19,7 +19,7 @@ _SIDES = ((-0.25, 0.0), (0.25, 0.0))  # where arms stand, and how far they reach
 _REACH = 0.42
 
 
-def layout_of(seed: int, positions: Mapping[str, Any] | None = None, blocks: int = 1) -> Layout:
+def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: int = 1) -> BenchLayout:
     """The layout of a seed: always the same one for the same arguments.
 
     `positions` may say where the task's block ("block": [x, y, yaw in degrees]) and the plate ("plate":
@@ -35,7 +35,7 @@ def layout_of(seed: int, positions: Mapping[str, Any] | None = None, blocks: int
     placed = [placed_block]
     for _ in range(blocks - 1):
         placed.append(_distractor(chance, placed, placed_plate))
-    return Layout(tuple(placed), placed_plate)
+    return BenchLayout(tuple(placed), placed_plate)
 
 
 def _wanted(positions: Mapping[str, Any]) -> tuple[list[float] | None, list[float] | None]:
@@ -78,8 +78,8 @@ def _pair(
 ) -> tuple[tuple[float, float, float], tuple[float, float]]:
     """Block and plate, tried until they are far enough apart and reached from one side."""
     for _ in range(_TRIES):
-        block_x, block_y, yaw = _somewhere(chance) if block is None else _near(chance, block)
-        plate_x, plate_y, _ = _somewhere(chance) if plate is None else _near(chance, [*plate, 0.0])
+        block_x, block_y, yaw = _random_place(chance) if block is None else _random_near(chance, block)
+        plate_x, plate_y, _ = _random_place(chance) if plate is None else _random_near(chance, [*plate, 0.0])
         asked = block is not None and plate is not None
         apart = math.dist((block_x, block_y), (plate_x, plate_y)) >= APART_M
         if asked or (apart and _one_side((block_x, block_y), (plate_x, plate_y))):
@@ -91,13 +91,13 @@ def _one_side(*places: tuple[float, float]) -> bool:
     return any(all(math.dist(side, place) <= _REACH for place in places) for side in _SIDES)
 
 
-def _somewhere(chance: np.random.Generator) -> tuple[float, float, float]:
+def _random_place(chance: np.random.Generator) -> tuple[float, float, float]:
     x_from, x_to, y_from, y_to = Bench().area
     x, y = chance.uniform((x_from, y_from), (x_to, y_to))
     return float(x), float(y), float(chance.uniform(-math.pi / 4, math.pi / 4))
 
 
-def _near(chance: np.random.Generator, place: list[float]) -> tuple[float, float, float]:
+def _random_near(chance: np.random.Generator, place: list[float]) -> tuple[float, float, float]:
     noise = chance.uniform(-1.0, 1.0, 3) * (NOISE_M, NOISE_M, NOISE_RAD)
     x, y, yaw = np.add(place, noise)
     return float(x), float(y), float(yaw)
@@ -107,7 +107,7 @@ def _distractor(
     chance: np.random.Generator, placed: list[tuple[float, float, float]], plate: tuple[float, float]
 ) -> tuple[float, float, float]:
     for _ in range(_TRIES):
-        x, y, yaw = _somewhere(chance)
+        x, y, yaw = _random_place(chance)
         clear = all(math.dist((x, y), other[:2]) >= _CROWD_M for other in placed)
         if clear and math.dist((x, y), plate) >= APART_M:
             return x, y, yaw

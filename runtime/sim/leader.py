@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import zmq
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault
@@ -24,7 +24,7 @@ from runtime.core.types import Float64
 from runtime.sim import standin
 from runtime.sim.node import positive, run, start_pose
 from runtime.sim.pick_place import PickPlace, Skill
-from runtime.sim.script import Script, Waving
+from runtime.sim.script import Script, WavingScript
 from runtime.sim.sockets import address, bound
 from runtime.teleoperators.base import Leader
 from runtime.transports import zmq as node
@@ -49,7 +49,7 @@ class SimulatedLeader:
         self._rows: Float64 | None = None
         self._asked = float("-inf")
 
-    def see(self, observation: Observation, now: float) -> None:
+    def update(self, observation: Observation, now: float) -> None:
         """The bench and the robot now; the script is asked five times a second."""
         if now - self._asked < _ASKS_S:
             return
@@ -57,7 +57,7 @@ class SimulatedLeader:
         self._rows = np.asarray(self._answer(q, observation.pictures, self._task), np.float64)
         self._asked = now
 
-    def at(self, now: float) -> Float64:
+    def joints_at(self, now: float) -> Float64:
         """The leader's joints [D]."""
         if self._rows is not None:
             row = int((now - self._asked + _AHEAD_S) * self._rate)
@@ -66,7 +66,7 @@ class SimulatedLeader:
 
     def message(self, now: float) -> bytes:
         """The leader's message, packed."""
-        parts = self._robot.split(self.at(now)).items()
+        parts = self._robot.split(self.joints_at(now)).items()
         return msgpack_arrays.pack(
             {"t": now, "state": {name: part.astype(np.float32) for name, part in parts}}
         )
@@ -89,8 +89,8 @@ class AttachedLeader(Leader):
     def see(self, observation: Observation) -> None:
         """The bench and the robot now."""
         now = self._clock.now()
-        self._simulated.see(observation, now)
-        self._take(self._simulated.at(now), now)
+        self._simulated.update(observation, now)
+        self._take(self._simulated.joints_at(now), now)
 
     def close(self) -> None:
         """There is nothing to release."""
@@ -102,13 +102,13 @@ def demonstrator(
     """Who shows the robot the task, by the script of that behaviour; before it sees the bench at the pose `start`."""
     rate = robot.control_rate
     horizon = round(_HORIZON_S * rate)
-    script: Script = Waving(robot, horizon, rate, seed)
+    script: Script = WavingScript(robot, horizon, rate, seed)
     if behaviour == "pick_place":
         script = PickPlace(robot, horizon, rate, Skill(seed=seed))
     return SimulatedLeader(robot, script, task, rate, start_pose(robot, start))
 
 
-class Publishing:
+class LeaderPublisher:
     """A leader on its socket; `tick` hears the node and says where the leader is."""
 
     def __init__(self, leader: SimulatedLeader, source: NodeSource, endpoint: str, clock: Clock) -> None:
@@ -125,7 +125,7 @@ class Publishing:
         now = self._clock.now()
         seen = self._source.receive(0.0)
         if seen is not None:
-            self._leader.see(seen, now)
+            self._leader.update(seen, now)
         with contextlib.suppress(zmq.Again):  # the next one is newer
             self._socket.send(self._leader.message(now), zmq.NOBLOCK)
 
@@ -159,22 +159,22 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a leader until SIGTERM, SIGINT or the end of the lifeline."""
     import robots
 
     options = parser().parse_args(arguments)
-    told = standin.ending(options.lifeline)
+    told = standin.stop_event(options.lifeline)
     clock = MonotonicClock()
     try:
-        robot = robots.load(options.robot, options.groups)
+        robot = robots.load_robot(options.robot, options.groups)
         source = node.source(node.Config(sub_endpoint=options.obs_endpoint, simulated=True), robot, clock)
         leader = demonstrator(robot, options.task, options.seed, options.behaviour, options.start_pose)
-        publishing = Publishing(leader, source, options.endpoint, clock)
+        publishing = LeaderPublisher(leader, source, options.endpoint, clock)
         with contextlib.closing(publishing):
             source.connect()
-            standin.announce({"endpoint": publishing.address}, options.ready_file)
+            standin.announce_ready({"endpoint": publishing.address}, options.ready_file)
             run(publishing, clock, options.rate, told)
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)

@@ -18,7 +18,7 @@ from runtime.core.errors import SetupError
 from runtime.core.types import Float32
 from runtime.sim import lerobot_wire as wire
 from runtime.sim.faults import NONE, TOO_LARGE, Fault
-from runtime.sim.script import Answer, Script, Waving
+from runtime.sim.script import Answer, Script, WavingScript
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -52,7 +52,7 @@ class LerobotServer:
         self._behaviour = behaviour
         self._robot = robot
         self._port = port
-        self._script = script or Waving(robot, behaviour.horizon, behaviour.rate, behaviour.seed)
+        self._script = script or WavingScript(robot, behaviour.horizon, behaviour.rate, behaviour.seed)
         self._waiting: queue.Queue[Any] = queue.Queue(maxsize=1)
         self._told: Any = None
         self._answer: Answer | None = None
@@ -116,7 +116,7 @@ class LerobotServer:
 
     def _instructed(self, request: Any, context: Any) -> Any:
         fault = self._behaviour.fault.name
-        told = wire.read(
+        told = wire.unpickle(
             request.data, "lerobot.scripts.server.helpers" if fault == "no_name" else wire.HELPERS
         )
         if told.policy_type not in _KINDS:
@@ -135,7 +135,7 @@ class LerobotServer:
         data = b""
         for message in messages:
             data = message.data if message.transfer_state == 1 else data + message.data
-        observation = wire.read(data)
+        observation = wire.unpickle(data)
         if observation.must_go or self._last is None or self._is_news(observation):
             if self._waiting.full():
                 self._waiting.get_nowait()
@@ -181,7 +181,7 @@ class LerobotServer:
         if fault.name == "malformed":
             return b"\x80\x04]\x93."
         if fault.name == "foreign_name":
-            return wire.command("touch unpickled")
+            return wire.command_pickle("touch unpickled")
         return self._actions(observation, self._rows(observation))
 
     def _rows(self, observation: Any) -> Float32:

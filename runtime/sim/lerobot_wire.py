@@ -45,7 +45,7 @@ def _messages() -> dict[str, Any]:
 MESSAGES = _messages()
 
 
-class Told:
+class UnpickledObject:
     """Whatever class of LeRobot's a pickle has: its fields as attributes."""
 
 
@@ -58,13 +58,13 @@ class _Reader(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if module == self._helpers and name in ("TimedObservation", "RemotePolicyConfig"):
-            return type(name, (Told,), {})
+            return type(name, (UnpickledObject,), {})
         if module.partition(".")[0] == "numpy" and name in self._numpy:
             return super().find_class(module, name)
         raise ModuleNotFoundError(f"No module named {module!r}")
 
 
-def read(data: bytes, helpers: str = HELPERS) -> Any:
+def unpickle(data: bytes, helpers: str = HELPERS) -> Any:
     """The instance that a client pickled."""
     return _Reader(data, helpers).load()
 
@@ -82,7 +82,7 @@ def timed_actions(rows: Float32, timesteps: list[int], timestamps: list[float]) 
     ) + b"e."  # fmt: skip
 
 
-def command(line: str) -> bytes:
+def command_pickle(line: str) -> bytes:
     """A pickle that runs a command where it is read without care."""
     return b"\x80\x04" + _name("os", "system") + b"(" + _text(line) + b"tR."
 

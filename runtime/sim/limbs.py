@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _UPRIGHT = 0.999  # of a unit vector, along the vertical
 
 
-class Limb:
+class ArmFrames:
     """One arm; everything is a transform [4, 4] in the world, the robot's scene, for the robot's joints q [D].
 
     What no joint moves is computed once, so that an arm on a base that stands still costs its own chain alone.
@@ -63,9 +63,9 @@ class Limb:
 
 
 @lru_cache(maxsize=32)  # cache: reads the description of a robot, which does not change
-def limbs(robot: Robot) -> Mapping[str, Limb]:
+def arm_frames(robot: Robot) -> Mapping[str, ArmFrames]:
     """The robot's arms by name."""
-    return MappingProxyType({arm.name: Limb(robot, arm) for arm in robot.arms})
+    return MappingProxyType({arm.name: ArmFrames(robot, arm) for arm in robot.arms})
 
 
 @lru_cache(maxsize=32)  # cache: reads the description of a robot, which does not change

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _NAME = "lockstep"
 
 
-class Link(Source, Sink):
+class InProcessNode(Source, Sink):
     """Both halves of a transport around a node that is not opened.
 
     The node moves when it is looked at: it obeys what was sent since the last time, then lets that time pass. So
@@ -77,7 +77,7 @@ class Link(Source, Sink):
         """The node obeys it when it is looked at next."""
         self._say({"t": command.time, "target": "real", "action": command.action})
 
-    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+    def send_control_word(self, word: str, data: Mapping[str, Any]) -> None:
         """The same for a control word."""
         self._say({**data, "t": self._clock.now(), "target": word})
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import robots
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.config import loader
 from runtime.core import environment
 from runtime.core import logs as log
@@ -30,11 +30,11 @@ from runtime.processes.lockstep.server import ServedLockstep
 from runtime.processes.reception.process import make_source
 from runtime.sim import serve, standin, surroundings
 from runtime.sim.leader import AttachedLeader, demonstrator
-from runtime.sim.link import Link
+from runtime.sim.link import InProcessNode
 from runtime.sim.node import Node
 from runtime.sim.node import parser as node_parser
-from runtime.sim.surroundings import Surroundings
-from runtime.station.checks import checked_spec
+from runtime.sim.surroundings import Environment
+from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 
 REST_S = 1.0  # of success, after which nothing more is to be seen
@@ -42,7 +42,7 @@ REST_S = 1.0  # of success, after which nothing more is to be seen
 _PATIENT = ["policy.connect_deadline=60.0", "policy.inference_deadline=60.0"]
 
 
-class Rested:
+class SuccessDetector:
     """Says when a run is over: the bench's truth has said success for a while."""
 
     def __init__(self, truth: Callable[[], Mapping[str, Any] | None], clock: Clock) -> None:
@@ -59,7 +59,9 @@ class Rested:
         return f"the simulated bench has said success for {REST_S:g} s" if rested else ""
 
 
-def linked(made: StationSpec, clock: Clock, around: Surroundings, options: argparse.Namespace) -> Peers:
+def in_process_peers(
+    made: StationSpec, clock: Clock, around: Environment, options: argparse.Namespace
+) -> Peers:
     """A simulated node in this process in the place of the transport, and a simulated leader in that of the leader.
 
     SetupError where the deployment declares no simulated node.
@@ -70,7 +72,7 @@ def linked(made: StationSpec, clock: Clock, around: Surroundings, options: argpa
             f"transport.kind = {transport.kind!r} with a bench in lockstep; allowed: zmq with simulated = true"
         )
     leader = AttachedLeader(made.robot, clock, demonstrator(made.robot, made.deployment.task, options.seed))
-    link = Link(Node(made.robot, options, clock, around), made.robot, clock, leader.see)
+    link = InProcessNode(Node(made.robot, options, clock, around), made.robot, clock, leader.see)
     return Peers(
         source=lambda spec, clock: make_source(spec, clock, lambda *of: link),
         sink=lambda spec, clock: link,
@@ -84,12 +86,12 @@ def station(
     """The station of a deployment at its bench, which has the options of a simulated node; RuntimeFault where it
     cannot be. A paced one is no faster than life, and the bench's truth ends none of its runs.
     """
-    made = checked_spec(loader.load(path, assignments))
+    made = check_deployment(loader.load(path, assignments))
     given = ("--robot", made.robot.name, "--bench", "tabletop", *bench_options)
     options = node_parser().parse_args(given)
-    around = surroundings.surroundings(made.robot, options)
-    peers = linked(made, clock, around, options)
-    over = (lambda running: "") if paced else Rested(around.truth, clock)
+    around = surroundings.make_environment(made.robot, options)
+    peers = in_process_peers(made, clock, around, options)
+    over = (lambda running: "") if paced else SuccessDetector(around.truth, clock)
     return ServedLockstep(made, clock, over, peers=peers, paced=paced)
 
 
@@ -117,12 +119,12 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until SIGTERM, SIGINT or the end of the lifeline."""
     options = parser().parse_args(arguments)
-    log.start("lockstep")
-    told = standin.ending(options.lifeline)
+    log.configure_logging("lockstep")
+    told = standin.stop_event(options.lifeline)
     clock = VirtualClock()
     try:
         with ExitStack() as stack:
@@ -137,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 options.deployment, [*own, *options.assignments], clock, *map(str, bench), paced=options.paced
             )
             stack.enter_context(closing(served))
-            standin.announce({"policies": urls}, options.ready_file)
+            standin.announce_ready({"policies": urls}, options.ready_file)
             served.serve(told.is_set)
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)
@@ -146,5 +148,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    environment.shed()
+    environment.restart_without_web_secrets()
     sys.exit(main())

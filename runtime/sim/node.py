@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault, SetupError
@@ -25,17 +25,17 @@ from runtime.core.types import Float64, UInt8
 from runtime.sim import standin, surroundings
 from runtime.sim.bench import BenchError
 from runtime.sim.drives import Drives
-from runtime.sim.gate import Accepted, Gate
+from runtime.sim.gate import AcceptedCommand, CommandGate
 from runtime.sim.gestures import Gesture
 from runtime.sim.plant import Plant, poses
 from runtime.sim.sockets import Sockets
-from runtime.sim.tabletop import Reset
+from runtime.sim.tabletop import ResetRequest
 
 if TYPE_CHECKING:
     from threading import Event
 
     from robots import Robot
-    from runtime.sim.surroundings import Surroundings
+    from runtime.sim.surroundings import Environment
 
 LONGEST_STEP = 0.2  # s; a node that was stopped does not make up for it in one leap
 _GARBAGE = b"\x85\xa1t"  # a map of five that ends after half an entry
@@ -56,7 +56,7 @@ class Node:
     """
 
     def __init__(
-        self, robot: Robot, options: argparse.Namespace, clock: Clock, around: Surroundings | None = None
+        self, robot: Robot, options: argparse.Namespace, clock: Clock, around: Environment | None = None
     ) -> None:
         known = [camera.key for camera in robot.cameras]
         for key in (options.freeze_camera, options.drop_camera):
@@ -67,8 +67,8 @@ class Node:
         self._clock = clock
         self._plant = Plant(robot, start=start_pose(robot, options.start_pose))
         self._drives = Drives(not options.drives_disabled, options.drive_fault)
-        self._gate = Gate(robot, options.deadline, bench=options.bench != "none")
-        self._surroundings = around or surroundings.surroundings(robot, options)
+        self._gate = CommandGate(robot, options.deadline, bench=options.bench != "none")
+        self._surroundings = around or surroundings.make_environment(robot, options)
         self._leader = Gesture(robot, options.seed)
         self._leader_phase: float | None = None  # None unless it collects
         self._hil_error = ""
@@ -109,13 +109,13 @@ class Node:
         """Judge everything that has come; of the targets only the newest counts."""
         newest = None
         for payload in payloads:
-            accepted = self._gate.judge(payload, self._clock.now())
+            accepted = self._gate.accept(payload, self._clock.now())
             if accepted is not None and accepted.control is not None:
                 self._control(accepted)
             elif accepted is not None and accepted.reset is not None:
                 self._lay(accepted.reset)
             elif accepted is not None and accepted.switch is not None:
-                self._drives.obey(accepted.switch)
+                self._drives.apply(accepted.switch)
             elif accepted is not None:
                 newest = accepted.target
         if newest is not None and self._leader_phase is not None:
@@ -123,7 +123,7 @@ class Node:
         elif newest is not None:
             self._plant.target = newest
 
-    def _control(self, accepted: Accepted) -> None:
+    def _control(self, accepted: AcceptedCommand) -> None:
         """Control words come several times; a repetition changes nothing."""
         if accepted.control == "collect_start" and self._leader_phase is None:
             self._leader_phase = self._leader.phase_of(self._plant.q)
@@ -135,14 +135,14 @@ class Node:
         elif accepted.control == "hil_stop":
             self._hil_error = ""
 
-    def _lay(self, wish: Reset) -> None:
+    def _lay(self, wish: ResetRequest) -> None:
         try:
             self._surroundings.reset(wish)
         except BenchError:
             self._gate.refused["bench_layout"] += 1
 
     def _move(self, seconds: float) -> None:
-        silent = self._gate.silent(self._clock.now())
+        silent = self._gate.is_silent(self._clock.now())
         if not self._drives.enabled:
             self._plant.hold()
         elif self._leader_phase is not None:
@@ -172,7 +172,7 @@ class Node:
         message |= {"proto": 1, "seq": self._sequence, "encoding": "bgr", "holding": self._holding}
         message |= {"refused": dict(self._gate.refused), "master": self._gate.master or ""}
         message |= {} if self._gate.ack is None else {"ack": self._gate.ack}
-        message["drives"] = self._drives.said()
+        message["drives"] = self._drives.status()
         truth = self._surroundings.truth()
         return message if truth is None else message | {"truth": truth}
 
@@ -251,18 +251,18 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a node until SIGTERM, SIGINT or the end of the lifeline."""
     import robots
 
     options = parser().parse_args(arguments)
-    told = standin.ending(options.lifeline)
+    told = standin.stop_event(options.lifeline)
     clock = MonotonicClock()
     try:
-        node = Node(robots.load(options.robot, options.groups), options, clock)
+        node = Node(robots.load_robot(options.robot, options.groups), options, clock)
         with contextlib.closing(node):
-            standin.announce(node.open(), options.ready_file)
+            standin.announce_ready(node.open(), options.ready_file)
             run(node, clock, options.rate, told)
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)

@@ -10,11 +10,11 @@ import numpy as np
 
 from runtime.core.types import UInt8
 from runtime.sim.arrays import packed, unpacked
-from runtime.sim.continuing import ModelSpace, continued
+from runtime.sim.continuing import ModelSpace, continue_prefix
 from runtime.sim.faults import NONE, Fault
-from runtime.sim.rtc_wires import WIRES, Asked, Name
-from runtime.sim.script import Answer, Script, Waving
-from runtime.sim.websocket_server import Answering, Frames, WebsocketServer, spoilt
+from runtime.sim.rtc_wires import WIRES, Name, ParsedRequest
+from runtime.sim.script import Answer, Script, WavingScript
+from runtime.sim.websocket_server import Answering, Frames, WebsocketServer, apply_fault
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -49,7 +49,7 @@ class OpenpiServer(WebsocketServer):
         super().__init__("openpi", behaviour.fault, port)
         self._robot = robot
         self._behaviour = behaviour
-        self._script = script or Waving(robot, behaviour.horizon, behaviour.rate, behaviour.seed)
+        self._script = script or WavingScript(robot, behaviour.horizon, behaviour.rate, behaviour.seed)
         self._space = ModelSpace(robot)
         self._wire = WIRES[behaviour.rtc](self._space, behaviour.horizon, behaviour.fault)
 
@@ -64,7 +64,7 @@ class OpenpiServer(WebsocketServer):
         """One connection of the script."""
         return _Conversation(self, self._script.begin())
 
-    def answered(self, answer: Answering, seconds: float) -> None:
+    def on_answered(self, answer: Answering, seconds: float) -> None:
         """The next answer says how long this one took."""
         assert isinstance(answer, _Conversation)
         answer.previous_ms = 1e3 * seconds
@@ -84,19 +84,19 @@ class OpenpiServer(WebsocketServer):
         asked = self._wire.read(unpacked(request))
         return self._wire.answer(self._result(answer, asked, previous_ms), asked)
 
-    def _result(self, answer: Answer, asked: Asked, previous_ms: float | None) -> dict[str, object]:
+    def _result(self, answer: Answer, asked: ParsedRequest, previous_ms: float | None) -> dict[str, object]:
         started = time.monotonic()
         observation = asked.observation
         state, pictures = self._state(observation), self._pictures(observation)
         actions = answer(state, pictures, str(observation.get("prompt", "")))
         if asked.prefix is not None:
-            actions = continued(actions, asked.prefix, self._robot.binary_dims)
+            actions = continue_prefix(actions, asked.prefix, self._robot.binary_dims)
         took = 1e3 * self._took(started)
         timing = {} if self._behaviour.declared else {"infer_ms": took}  # nobody measures what is declared
         timing |= {} if previous_ms is None else {"prev_total_ms": previous_ms}
-        own = {"origin_actions": self._space.of(actions)} if self._behaviour.rtc != "none" else {}
+        own = {"origin_actions": self._space.encode(actions)} if self._behaviour.rtc != "none" else {}
         return {
-            "actions": spoilt(self._behaviour.fault, actions),
+            "actions": apply_fault(self._behaviour.fault, actions),
             **own,
             "policy_timing": {"infer_ms": took},
             "server_timing": timing,

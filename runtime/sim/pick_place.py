@@ -22,9 +22,9 @@ from runtime.core.types import Float32, Float64, UInt8
 from runtime.sim.bench import Bench
 from runtime.sim.hands import Opening
 from runtime.sim.postures import gripper_dim, jaws
-from runtime.sim.routes import Planner, Route, Slip
+from runtime.sim.routes import PlannedFailure, Route, RoutePlanner
 from runtime.sim.script import Answer, Script
-from runtime.sim.sight import Overhead, Sight
+from runtime.sim.sight import Detection, OverheadDetector
 
 if TYPE_CHECKING:
     from robots import Group, Robot
@@ -84,8 +84,8 @@ class PickPlace(Script):
         self.apart = apart or joints_apart(robot)
         self.horizon, self.rate, self.skill = horizon, rate, skill
         self.table = Bench()
-        self.overhead = Overhead(robot, self.table)
-        self.planner = Planner(robot, rate, self.table)
+        self.overhead = OverheadDetector(robot, self.table)
+        self.planner = RoutePlanner(robot, rate, self.table)
         self._episodes = itertools.count()
         self.metadata = {
             "name": name or "pick-and-place",
@@ -98,14 +98,14 @@ class PickPlace(Script):
 
     def begin(self) -> Answer:
         """A connection that remembers nothing."""
-        return Pursuit(self)
+        return PickPlaceEpisode(self)
 
-    def luck(self) -> Luck:
+    def next_episode_noise(self) -> EpisodeNoise:
         """Luck of the next episode."""
-        return Luck(self.skill, next(self._episodes), self.table.block_edge)
+        return EpisodeNoise(self.skill, next(self._episodes), self.table.block_edge)
 
 
-class Luck:
+class EpisodeNoise:
     """The chances of one episode: the same for the same seed and number."""
 
     def __init__(self, skill: Skill, episode: int, edge: float) -> None:
@@ -113,32 +113,32 @@ class Luck:
         self._noise = skill.noise * np.array([1.0, 1.0, 1.0 / edge])
         fails, lets_go = self._chance.random(2)
         slips = fails < skill.failure_rate
-        self.slip = Slip(_SHORT * (slips and lets_go >= 0.5), bool(slips and lets_go < 0.5))
+        self.slip = PlannedFailure(_SHORT * (slips and lets_go >= 0.5), bool(slips and lets_go < 0.5))
 
-    def perceived(self, block: tuple[float, float, float]) -> tuple[float, float, float]:
+    def perceive(self, block: tuple[float, float, float]) -> tuple[float, float, float]:
         """The block's place and turn as one attempt takes them to be."""
         x, y, yaw = np.array(block) + self._chance.normal(0.0, self._noise)
         return float(x), float(y), float(yaw)
 
 
-class Pursuit:
+class PickPlaceEpisode:
     """One connection's errand: no route, or a route and how far along it the robot is."""
 
     def __init__(self, policy: PickPlace) -> None:
         self._policy = policy
         self._prompt = ""
-        self._luck: Luck | None = None
+        self._luck: EpisodeNoise | None = None
         self._resigned = False  # the episode has failed; it knows, and does nothing more about it
-        self._left: Sight | None = None  # how things lay when it resigned
+        self._left: Detection | None = None  # how things lay when it resigned
         self._route: Route | None = None
-        self._seen = Sight()  # where things were when the route was made
+        self._seen = Detection()  # where things were when the route was made
         self._leg = 0
         self._row = 0.0  # of the whole route, at the last request
         self._asked = 0.0  # s, the last request
 
     def __call__(self, q: Float64, pictures: Mapping[str, UInt8], prompt: str) -> Float32:
         """Rows float32 [H, D]: the rest of the route, or the joints themselves where there is nothing to do."""
-        sight = self._look(pictures)
+        sight = self._detect(pictures)
         now = self._policy.clock.now()
         elapsed, self._asked = now - self._asked, now
         if prompt != self._prompt or self._is_over(elapsed) or self._elsewhere(q, sight):
@@ -153,15 +153,15 @@ class Pursuit:
             self._decide(q, sight)
         return self._still(q) if self._route is None else self._ahead(self._route)
 
-    def _look(self, pictures: Mapping[str, UInt8]) -> Sight:
+    def _detect(self, pictures: Mapping[str, UInt8]) -> Detection:
         key = self._policy.overhead.key
         if key not in pictures:
             raise ScriptError(f"the request has no picture {key!r}; it has {', '.join(pictures) or 'none'}")
-        return self._policy.overhead.look(pictures[key])
+        return self._policy.overhead.detect(pictures[key])
 
     # --- deciding ------------------------------------------------------------------------------------------
 
-    def _decide(self, q: Float64, sight: Sight) -> None:
+    def _decide(self, q: Float64, sight: Detection) -> None:
         """Make a route if there is a block to pick, a plate to put it on, and it is not there already."""
         if sight.block is None or sight.plate is None:
             return
@@ -174,8 +174,8 @@ class Pursuit:
                 return
             self._forget()
         if self._luck is None:
-            self._luck = self._policy.luck()
-        block = self._luck.perceived(sight.block)
+            self._luck = self._policy.next_episode_noise()
+        block = self._luck.perceive(sight.block)
         route = self._policy.planner.pick_and_place(q, block, sight.plate, self._luck.slip)
         if route is not None:
             self._seen = sight
@@ -194,7 +194,7 @@ class Pursuit:
         leaving = self._route is None or self._route.legs[self._leg].name in _LEAVING
         return leaving and pause > _PAUSED
 
-    def _elsewhere(self, q: Float64, sight: Sight) -> bool:
+    def _elsewhere(self, q: Float64, sight: Detection) -> bool:
         """True if robot or things are not where they should be in the episode so far."""
         if self._route is None:
             return False
@@ -292,7 +292,7 @@ def poses_apart(arm: Group, rows: Float64, q: Float64) -> Float64:
     return np.asarray(np.maximum(shift, turn))
 
 
-def _differs(sight: Sight, before: Sight) -> bool:
+def _differs(sight: Detection, before: Detection) -> bool:
     """True if the block or the plate is seen where it was not."""
     pairs = ((sight.block, before.block), (sight.plate, before.plate))
     return any(now and then and math.dist(now[:2], then[:2]) > _MOVED for now, then in pairs)

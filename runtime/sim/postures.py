@@ -18,8 +18,8 @@ from runtime.core.errors import SetupError
 from runtime.core.types import Float64
 from runtime.kinematics.compiled import CompiledKinematics
 from runtime.sim.bench import Bench
-from runtime.sim.down import Down, Place
-from runtime.sim.limbs import limbs
+from runtime.sim.down import DownwardTip, Place
+from runtime.sim.limbs import arm_frames
 
 if TYPE_CHECKING:
     from robots import Gripper, Group, Robot
@@ -46,7 +46,7 @@ class Nominal:
     """A posture of an arm's `joints` [n] with its fingertips `down`; the jaws open `across` its bearing there."""
 
     joints: Float64
-    down: Down
+    down: DownwardTip
     across: float
 
 
@@ -61,7 +61,7 @@ class Postures:
         self._table = table
         self._kinematics = CompiledKinematics(robot)
         self._rest = robot.poses.get("ready", robot.poses["home"])
-        self._limbs = limbs(robot)
+        self._limbs = arm_frames(robot)
         self._shoulders = {name: limb.shoulder(self._rest)[:2, 3] for name, limb in self._limbs.items()}
         self._nominal: dict[str, Nominal] = {}
         faults = [fault for arm in robot.arms if (fault := self._learn(arm))]
@@ -119,7 +119,7 @@ class Postures:
         place = float(tip[0, 3]), float(tip[1, 3])
         yaw, bearing = math.atan2(tip[1, 1], tip[0, 1]), self._bearing(arm, place)
         for _, tilt in TILTS:
-            found = self._solved(arm, [Down(place, CLEAR, yaw, bearing, tilt)], q)
+            found = self._solved(arm, [DownwardTip(place, CLEAR, yaw, bearing, tilt)], q)
             if found is not None:
                 return np.asarray(found[0])
         return q
@@ -145,10 +145,12 @@ class Postures:
         bearing = self._bearing(arm, place)
         yaw = bearing + self._nominal[arm.name].across + twist
         way = np.linspace((heights[1], tilts[1]), (heights[0], tilts[0]), _STATIONS)
-        stations = [Down(place, height, yaw, bearing, tilt) for height, tilt in way.tolist()]
+        stations = [DownwardTip(place, height, yaw, bearing, tilt) for height, tilt in way.tolist()]
         return self._descent(arm, q, self._nominal[arm.name], stations)
 
-    def _descent(self, arm: Group, q: Float64, nominal: Nominal, stations: Sequence[Down]) -> Float64 | None:
+    def _descent(
+        self, arm: Group, q: Float64, nominal: Nominal, stations: Sequence[DownwardTip]
+    ) -> Float64 | None:
         """Joints [stations, D]: from the nominal posture turned about an upright shoulder, else led there."""
         start = opened(arm, q)
         start[arm.joint_dims] = nominal.joints
@@ -158,10 +160,10 @@ class Postures:
             found = self._solved(arm, stations, np.clip(turned, self._robot.lower, self._robot.upper))
             if found is not None:
                 return found
-        return self._solved(arm, stations, start, list(nominal.down.towards(stations[0])))
+        return self._solved(arm, stations, start, list(nominal.down.interpolate(stations[0])))
 
     def _solved(
-        self, arm: Group, stations: Sequence[Down], seed: Float64, before: Sequence[Down] = ()
+        self, arm: Group, stations: Sequence[DownwardTip], seed: Float64, before: Sequence[DownwardTip] = ()
     ) -> Float64 | None:
         """Joints [T, D] for the stations, by way of what comes `before`; None where one of them is not reached."""
         index = self._robot.arms.index(arm)
@@ -204,7 +206,7 @@ class Postures:
             for place in self._ahead(arm):
                 bearing = self._bearing(arm, place)
                 for across in (_ACROSS, -_ACROSS):
-                    down = Down(place, CLEAR, bearing + across, bearing, TILTS[0][1])
+                    down = DownwardTip(place, CLEAR, bearing + across, bearing, TILTS[0][1])
                     found = self._solved(arm, [down], seed)
                     if found is not None:
                         yield Nominal(found[0, arm.joint_dims], down, across)
@@ -219,7 +221,7 @@ class Postures:
         """True if the fingertips go straight down on a place of the table."""
         bearing = self._bearing(arm, place)
         low = _GRASP * self._table.block_edge
-        above = Down(place, CLEAR, bearing + nominal.across, bearing, TILTS[0][1])
+        above = DownwardTip(place, CLEAR, bearing + nominal.across, bearing, TILTS[0][1])
         below = replace(above, height=low, tilt=TILTS[0][0])
         return self._descent(arm, self._rest, nominal, [above, below]) is not None
 

@@ -13,8 +13,8 @@ from websockets.sync.server import ServerConnection
 from runtime.sim.arrays import packed, unpacked
 from runtime.sim.droid_robot import DroidRobot
 from runtime.sim.faults import NONE, Fault
-from runtime.sim.script import Answer, Script, Waving
-from runtime.sim.websocket_server import Answering, Frames, WebsocketServer, spoilt
+from runtime.sim.script import Answer, Script, WavingScript
+from runtime.sim.websocket_server import Answering, Frames, WebsocketServer, apply_fault
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -24,7 +24,7 @@ _IDLE = 30.0  # s, vLLM-Omni's own
 
 
 @dataclass(frozen=True, slots=True)
-class Arena:
+class RoboarenaBehaviour:
     """Behaviour of the server: its wants, its answers, its fault.
 
     `reply` is the form of an answer: a map with `actions`, the bare array, or named parts. `numbering` is the
@@ -49,7 +49,7 @@ class Arena:
 
 
 @dataclass
-class Heard:
+class RequestLog:
     """Requests so far, in order: (endpoint, session) pairs, and the frames that each session has sent."""
 
     calls: list[tuple[str, str | None]] = field(default_factory=list)
@@ -59,13 +59,15 @@ class Heard:
 class RoboarenaServer(WebsocketServer):
     """Serves on loopback; plays `script`, a gesture where none is given. `heard` is for tests."""
 
-    def __init__(self, robot: Robot, arena: Arena, port: int = 0, script: Script | None = None) -> None:
+    def __init__(
+        self, robot: Robot, arena: RoboarenaBehaviour, port: int = 0, script: Script | None = None
+    ) -> None:
         idle = arena.idle or (_IDLE if arena.variant == "vllm" else None)
         super().__init__("roboarena", arena.fault, port, idle)
-        self.heard = Heard()
+        self.heard = RequestLog()
         self._arena = arena
         self._robot = DroidRobot(robot, arena.space, arena.numbering)
-        self._script = script or Waving(robot, arena.horizon, arena.rate, arena.seed)
+        self._script = script or WavingScript(robot, arena.horizon, arena.rate, arena.seed)
 
     def start(self) -> dict[str, object]:
         """Listen, and return the address; vLLM-Omni has a path."""
@@ -73,7 +75,7 @@ class RoboarenaServer(WebsocketServer):
         path = VLLM_PATH if self._arena.variant == "vllm" else ""
         return found | {"url": f"{found['url']}{path}"}
 
-    def admits(self, path: str) -> bool:
+    def serves_path(self, path: str) -> bool:
         """RoboArena's server takes any path."""
         return self._arena.variant == "roboarena" or path == VLLM_PATH
 
@@ -137,7 +139,7 @@ class RoboarenaServer(WebsocketServer):
         q = self._robot.joints(message)
         rows = self._robot.rows(answer(q, self._robot.pictures(message), message["prompt"]), q)
         time.sleep(max(0.0, self._arena.latency - (time.monotonic() - started)))
-        return spoilt(self._arena.fault, rows)
+        return apply_fault(self._arena.fault, rows)
 
     def _formed(self, rows: Any) -> object:
         if self._arena.reply == "bare":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robots.clearance import MARGIN, clearance_of
+from robots.clearance import MARGIN, get_clearance
 from robots.description import TABLE
 from runtime.core.types import Float64
 
@@ -19,11 +19,11 @@ _BETWEEN = 0.03  # m that arms leave each other
 _OWN = MARGIN + 0.001  # m that an arm leaves between its links, and to the body that it stands on
 
 
-class Room:
+class Clearance:
     """Clearance that safety would warn of, with some margin; without the table, for hands go down to it."""
 
     def __init__(self, robot: Robot) -> None:
-        self._clearance = clearance_of(robot)
+        self._clearance = get_clearance(robot)
         pairs = self._clearance.pairs
         arms = {arm.name for arm in robot.arms}
         owners = [{part.partition("/")[0] for part in pair} & arms for pair in pairs]
@@ -33,7 +33,7 @@ class Room:
         wanted = np.array([_BETWEEN if len(owner) > 1 else _OWN for owner in owners])
         self._wanted = wanted[self._links]
 
-    def spare(self, rows: Float64) -> float:
+    def margin_along(self, rows: Float64) -> float:
         """Room on the way float64 [n, D] beyond what there should be, at its narrowest [m]."""
         if not len(self._links):
             return np.inf
@@ -42,6 +42,6 @@ class Room:
 
 
 @lru_cache(maxsize=32)  # cache: reads the meshes of a robot, which do not change
-def room_of(robot: Robot) -> Room:
+def clearance_for(robot: Robot) -> Clearance:
     """That of a robot, made once."""
-    return Room(robot)
+    return Clearance(robot)

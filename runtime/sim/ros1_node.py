@@ -19,13 +19,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault, SetupError
 from runtime.core.types import UInt8
 from runtime.sim import ros1_modules, ros_robot, standin
 from runtime.sim.node import run
-from runtime.sim.ros_robot import RosRobot, Told
+from runtime.sim.ros_robot import ReceivedCommand, RosRobot
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -43,7 +43,7 @@ class Ros1Node(RosRobot):
     def __init__(self, robot: Robot, options: argparse.Namespace, clock: Clock) -> None:
         super().__init__(robot, options, clock)
         self._publishers: dict[str, Any] = {}
-        self._inbox: deque[Told] = deque(maxlen=_COMMANDS_KEPT)
+        self._inbox: deque[ReceivedCommand] = deque(maxlen=_COMMANDS_KEPT)
 
     def open(self) -> dict[str, object]:
         """Register with the master, and return it with the topics of the pictures."""
@@ -73,10 +73,12 @@ class Ros1Node(RosRobot):
         rospy.signal_shutdown("the end")
         self._publishers = {}
 
-    def _taker(self, outlet: ros_robot.Outlet) -> Any:
-        return lambda message: self._inbox.append(Told(outlet, tuple(message.name), list(message.position)))
+    def _taker(self, outlet: ros_robot.JointTopic) -> Any:
+        return lambda message: self._inbox.append(
+            ReceivedCommand(outlet, tuple(message.name), list(message.position))
+        )
 
-    def _told(self) -> Iterator[Told]:
+    def _received_commands(self) -> Iterator[ReceivedCommand]:
         while self._inbox:
             yield self._inbox.popleft()
 
@@ -130,18 +132,18 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until SIGTERM, SIGINT or the end of the lifeline; then print the truth of the bench as JSON."""
     import robots
 
     options = parser().parse_args(arguments)
-    told = standin.ending(options.lifeline)
+    told = standin.stop_event(options.lifeline)
     clock = MonotonicClock()
     try:
-        node = Ros1Node(robots.load(options.robot, options.groups), options, clock)
+        node = Ros1Node(robots.load_robot(options.robot, options.groups), options, clock)
         with ros1_modules.lent(options.python), contextlib.closing(node):
-            standin.announce(node.open(), options.ready_file)
+            standin.announce_ready(node.open(), options.ready_file)
             run(node, clock, options.rate, told)
             print(json.dumps({"truth": node.truth(), "refused": node.refused}), flush=True)
     except (RuntimeFault, robots.RobotError) as error:

@@ -14,13 +14,13 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault
 from runtime.core.types import UInt8
 from runtime.sim import ros_robot, standin
 from runtime.sim.node import run
-from runtime.sim.ros_robot import Outlet, RosRobot, Told
+from runtime.sim.ros_robot import JointTopic, ReceivedCommand, RosRobot
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -42,7 +42,7 @@ class Ros2Node(RosRobot):
     def __init__(self, robot: Robot, options: argparse.Namespace, clock: Clock) -> None:
         super().__init__(robot, options, clock)
         self._writers: dict[str, Any] = {}
-        self._readers: list[tuple[Outlet, Any]] = []
+        self._readers: list[tuple[JointTopic, Any]] = []
         self._entities: list[Any] = []
 
     def open(self) -> dict[str, object]:
@@ -60,11 +60,11 @@ class Ros2Node(RosRobot):
             entity.__del__()  # with all that it has made, whoever still holds that
         self._entities, self._writers, self._readers = [], {}, []
 
-    def _told(self) -> Iterator[Told]:
+    def _received_commands(self) -> Iterator[ReceivedCommand]:
         for outlet, reader in self._readers:
             for sample in reader.take(_COMMANDS_TAKEN):
                 if hasattr(sample, "position"):  # else a publisher has gone
-                    yield Told(outlet, tuple(sample.name), sample.position)
+                    yield ReceivedCommand(outlet, tuple(sample.name), sample.position)
 
     def _say_joints(self, topic: str, stamp: int, names: list[str], position: list[float]) -> None:
         from runtime.sim import ros2_types as types
@@ -134,18 +134,18 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until SIGTERM, SIGINT or the end of the lifeline; then print the truth of the bench as JSON."""
     import robots
 
     options = parser().parse_args(arguments)
-    told = standin.ending(options.lifeline)
+    told = standin.stop_event(options.lifeline)
     clock = MonotonicClock()
     try:
-        node = Ros2Node(robots.load(options.robot, options.groups), options, clock)
+        node = Ros2Node(robots.load_robot(options.robot, options.groups), options, clock)
         with contextlib.closing(node):
-            standin.announce(node.open(), options.ready_file)
+            standin.announce_ready(node.open(), options.ready_file)
             run(node, clock, options.rate, told)
             print(json.dumps({"truth": node.truth(), "refused": node.refused}), flush=True)
     except ImportError as error:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from robots import Group, Robot
 
 
-class Outlet(NamedTuple):
+class JointTopic(NamedTuple):
     """A topic of joints: its name, the places in the robot's vector, and what the joints are called."""
 
     topic: str
@@ -31,10 +31,10 @@ class Outlet(NamedTuple):
     joints: tuple[str, ...]
 
 
-class Told(NamedTuple):
+class ReceivedCommand(NamedTuple):
     """A command as it came."""
 
-    outlet: Outlet
+    outlet: JointTopic
     names: tuple[str, ...]
     position: list[float]
 
@@ -60,7 +60,7 @@ class RosRobot(ABC):
     def __init__(self, robot: Robot, options: argparse.Namespace, clock: Clock) -> None:
         self._robot, self._options, self._clock = robot, options, clock
         self._plant = Plant(robot, start=start_pose(robot, options.start_pose))
-        self._surroundings = surroundings.surroundings(robot, options)
+        self._surroundings = surroundings.make_environment(robot, options)
         self._pictures, self._groups = topics(robot, options.topics_of or self.VERSION)
         known = [*self._pictures.values(), *(group.state for group in self._groups.values())]
         if options.silence is not None and options.silence not in known:
@@ -79,7 +79,7 @@ class RosRobot(ABC):
         """Leave; safe to call twice."""
 
     @abstractmethod
-    def _told(self) -> Iterable[Told]:
+    def _received_commands(self) -> Iterable[ReceivedCommand]:
         """The commands that have come since the last tick."""
 
     @abstractmethod
@@ -113,7 +113,7 @@ class RosRobot(ABC):
         """Ground truth of its bench."""
         return self._surroundings.truth()
 
-    def outlets(self) -> Iterator[Outlet]:
+    def outlets(self) -> Iterator[JointTopic]:
         """Outlets on which it takes commands."""
         for group in self._robot.groups:
             topic = self._groups[group.name]
@@ -123,7 +123,7 @@ class RosRobot(ABC):
                 yield from _split(group, topic.command, topic.gripper_command)
 
     def _obey(self) -> None:
-        for outlet, names, position in self._told():
+        for outlet, names, position in self._received_commands():
             numbers = np.array(position)
             fits = names == outlet.joints and len(numbers) == len(outlet.dims) and np.isfinite(numbers).all()
             if not fits:
@@ -165,15 +165,15 @@ class RosRobot(ABC):
         return bool(topic == self._options.silence and self._sequence >= self._options.silence_from)
 
 
-def _split(group: Group, whole: str | None, hand: str | None) -> Iterator[Outlet]:
+def _split(group: Group, whole: str | None, hand: str | None) -> Iterator[JointTopic]:
     """The topics of a group's joints, the gripper's apart where it has one of its own."""
     dims, joints = list(range(group.slice.start, group.slice.stop)), group.joints
     if hand and group.gripper is not None:
         place = group.gripper.index
-        yield Outlet(hand, dims[place : place + 1], joints[place : place + 1])
+        yield JointTopic(hand, dims[place : place + 1], joints[place : place + 1])
         dims, joints = dims[:place] + dims[place + 1 :], joints[:place] + joints[place + 1 :]
     if whole:
-        yield Outlet(whole, dims, joints)
+        yield JointTopic(whole, dims, joints)
 
 
 def add_arguments(line: argparse.ArgumentParser) -> None:

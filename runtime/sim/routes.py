@@ -20,7 +20,7 @@ from runtime.sim.bench import Bench
 from runtime.sim.down import Place
 from runtime.sim.hands import Opening
 from runtime.sim.postures import CLEAR, TILTS, Postures, closed, gripper_dim, jaws, opened
-from runtime.sim.room import room_of
+from runtime.sim.room import clearance_for
 
 if TYPE_CHECKING:
     from robots import Group, Robot
@@ -56,7 +56,7 @@ class Leg:
 
 
 @dataclass(frozen=True, slots=True)
-class Slip:
+class PlannedFailure:
     """Deliberate failure: the jaws close `short` of the block [m], or let it go on the way."""
 
     short: float = 0.0
@@ -82,20 +82,20 @@ class Route:
         return tuple(itertools.accumulate((len(leg.rows) for leg in self.legs[:-1]), initial=0))
 
 
-class Planner:
+class RoutePlanner:
     """Plans for one robot at one bench, `rate` rows per second."""
 
     def __init__(self, robot: Robot, rate: float, table: Bench) -> None:
         self._robot = robot
         self._rate = rate
         self._postures = Postures(robot, table)
-        self._room = room_of(robot)
+        self._room = clearance_for(robot)
         self._speed = np.minimum(0.5 * robot.velocity, _SPEED)
         for arm in self._postures.arms:
             self._speed[gripper_dim(arm)] = min(0.5 * robot.velocity[gripper_dim(arm)], _jaw_speed(arm))
 
     def pick_and_place(
-        self, q: Float64, block: tuple[float, float, float], plate: Place, slip: Slip
+        self, q: Float64, block: tuple[float, float, float], plate: Place, slip: PlannedFailure
     ) -> Route | None:
         """The route from joints q [D], by the arm nearest the block that reaches all of it; None if none does.
 
@@ -104,7 +104,7 @@ class Planner:
         """
         found, most = None, -math.inf
         for route in self._routes(q, block, plate, slip):
-            spare = self._room.spare(route.rows)
+            spare = self._room.margin_along(route.rows)
             if spare >= 0:
                 return route
             if spare > most:
@@ -112,13 +112,13 @@ class Planner:
         return found
 
     def _routes(
-        self, q: Float64, block: tuple[float, float, float], plate: Place, slip: Slip
+        self, q: Float64, block: tuple[float, float, float], plate: Place, slip: PlannedFailure
     ) -> Iterator[Route]:
         """By each arm that can, the nearest first: while the others stay, then with those at rest that are not."""
         nearest = sorted(self._postures.arms, key=lambda arm: self._postures.distance(arm, block))
         for makes_way in (False, True):
             for arm in nearest:
-                before = self._made_way(arm, q) if makes_way else []
+                before = self._clear_other_arms(arm, q) if makes_way else []
                 if makes_way and not before:
                     continue
                 start = before[-1].end if before else q
@@ -127,7 +127,7 @@ class Planner:
                     if down is not None and over is not None:
                         yield self._begun(arm, [*before, *self._legs(arm, start, down, over, slip)])
 
-    def _made_way(self, arm: Group, q: Float64) -> list[Leg]:
+    def _clear_other_arms(self, arm: Group, q: Float64) -> list[Leg]:
         """The legs by which all other arms that are not at rest go there, up from the table first; [] where none is."""
         others = tuple(
             other
@@ -156,7 +156,7 @@ class Planner:
             arm, [self._leg("back off", q, high), self._leg("retreat", high, self._postures.rested(arm, q))]
         )
 
-    def _legs(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: Slip) -> list[Leg]:
+    def _legs(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: PlannedFailure) -> list[Leg]:
         """From the stations above to below the block, `down`, and the plate, `over`, [stations, D], jaws open."""
         held, lowered = (closed(arm, way) for way in (down, over))
         legs = []

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from runtime.sim.arrays import packed
-from runtime.sim.continuing import STAND_IN, ModelSpace, Prefix
+from runtime.sim.continuing import STAND_IN, CommittedPrefix, ModelSpace
 from runtime.sim.faults import Fault
 
 Name = Literal["none", "prev_action", "openpi_rtc", "kai0", "async_rtc"]
@@ -25,11 +25,11 @@ _FIELDS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ParsedRequest:
     """A request, read: the observation, what it is to continue, its number where it has one."""
 
     observation: dict[str, Any]
-    prefix: Prefix | None = None
+    prefix: CommittedPrefix | None = None
     number: int | None = None
 
 
@@ -46,11 +46,11 @@ class Wire(ABC):
         """The server's metadata of the wire, sent on connect."""
 
     @abstractmethod
-    def read(self, message: Any) -> Asked:
+    def read(self, message: Any) -> ParsedRequest:
         """The request; an exception where it is none."""
 
     @abstractmethod
-    def answer(self, result: dict[str, object], asked: Asked) -> bytes:
+    def answer(self, result: dict[str, object], asked: ParsedRequest) -> bytes:
         """The frame that answers it."""
 
     @abstractmethod
@@ -62,41 +62,41 @@ class Wire(ABC):
         return self._fault.name != "no_rtc"
 
 
-class Ignorant(Wire):
+class NoRtcWire(Wire):
     """Wire of most servers: keys that they do not know are dropped, without a word."""
 
     def metadata(self) -> dict[str, object]:
         return {}
 
-    def read(self, message: Any) -> Asked:
-        return Asked(message)
+    def read(self, message: Any) -> ParsedRequest:
+        return ParsedRequest(message)
 
-    def answer(self, result: dict[str, object], asked: Asked) -> bytes:
+    def answer(self, result: dict[str, object], asked: ParsedRequest) -> bytes:
         return packed(result)
 
     def failure(self, traceback: str, message: Any) -> str | bytes:
         return traceback
 
 
-class Flat(Ignorant):
+class PrevActionWire(NoRtcWire):
     """Keys of the observation; it names no delay, so as many rows are kept as were consumed since the last request."""
 
     def metadata(self) -> dict[str, object]:
         dialect = "prev_action" if self._continues else "none"
         return {"rtc": {"dialect": dialect, "stand_in": STAND_IN}}
 
-    def read(self, message: Any) -> Asked:
+    def read(self, message: Any) -> ParsedRequest:
         if not self._continues or "prev_action" not in message:
-            return Asked(message)
+            return ParsedRequest(message)
         rows = self._space.joints(message["prev_action"])
         consumed = message["rtc_params"]["s"]
         if not isinstance(consumed, int) or not 0 <= consumed < len(rows):
             raise ValueError(f"rtc_params.s is {consumed!r}, expected 0 to {len(rows) - 1}")
         left = rows[: len(rows) - consumed]
-        return Asked(message, Prefix(left, consumed, len(left)))
+        return ParsedRequest(message, CommittedPrefix(left, consumed, len(left)))
 
 
-class Ancestor(Ignorant):
+class OpenpiRtcWire(NoRtcWire):
     """openpi-rtc: takes a fixed number of rows off the chunk before, whatever the robot has executed."""
 
     @property
@@ -107,33 +107,33 @@ class Ancestor(Ignorant):
         dialect = "openpi_rtc" if self._continues else "none"
         return {"rtc": {"dialect": dialect, "stand_in": STAND_IN, "shift": self._shift}}
 
-    def read(self, message: Any) -> Asked:
+    def read(self, message: Any) -> ParsedRequest:
         observation = message.get("obs", message)
         if not self._continues or not message.get("is_rtc") or "prev_action" not in message:
-            return Asked(observation)
+            return ParsedRequest(observation)
         left = self._space.joints(message["prev_action"])[self._shift :]
-        return Asked(observation, Prefix(left, min(_FROZEN, len(left)), len(left)))
+        return ParsedRequest(observation, CommittedPrefix(left, min(_FROZEN, len(left)), len(left)))
 
 
-class Kai0Flat(Ignorant):
+class Kai0Flat(NoRtcWire):
     """kai0: row n of the chunk before is row n of the new one."""
 
     def metadata(self) -> dict[str, object]:
         return {"rtc": {"dialect": "kai0" if self._continues else "none", "stand_in": STAND_IN}}
 
-    def read(self, message: Any) -> Asked:
+    def read(self, message: Any) -> ParsedRequest:
         delay, end = message["inference_delay"], message["execute_horizon"]
         if not isinstance(delay, int) or not isinstance(end, int) or delay < 0 or end < 1:
             raise ValueError(f"inference_delay {delay!r}, execute_horizon {end!r}: expected 0 and 1 or more")
         if not self._continues or "prev_action_chunk" not in message:
-            return Asked(message)
+            return ParsedRequest(message)
         rows = np.asarray(message["prev_action_chunk"], np.float64)
         if rows.ndim != 2 or rows.shape[1] < self._space.dim:
             raise ValueError(
                 f"prev_action_chunk has shape {rows.shape}, expected [T, {self._space.dim}] or wider"
             )
         end = max(delay, min(end, len(rows)))
-        return Asked(message, Prefix(rows[:, : self._space.dim], delay, end))
+        return ParsedRequest(message, CommittedPrefix(rows[:, : self._space.dim], delay, end))
 
 
 class Envelope(Wire):
@@ -151,7 +151,7 @@ class Envelope(Wire):
             },
         }
 
-    def read(self, message: Any) -> Asked:
+    def read(self, message: Any) -> ParsedRequest:
         found = (message.get("protocol"), message.get("protocol_version"))
         if found != (_ENVELOPE, _VERSION):
             raise ValueError(f"protocol {found[0]!r} version {found[1]!r}; expected {_ENVELOPE!r} version 2")
@@ -162,9 +162,9 @@ class Envelope(Wire):
             raise ValueError(f"image_transport.codec is {codec!r}, expected 'raw'")
         rtc = message.get("rtc")
         prefix = None if rtc is None or not self._continues else self._prefix(rtc)
-        return Asked(message["observation"], prefix, number)
+        return ParsedRequest(message["observation"], prefix, number)
 
-    def answer(self, result: dict[str, object], asked: Asked) -> bytes:
+    def answer(self, result: dict[str, object], asked: ParsedRequest) -> bytes:
         number = asked.number
         if self._fault.name == "request_id" and number is not None:
             number += 1
@@ -183,7 +183,7 @@ class Envelope(Wire):
             version = int(self._fault.number(_VERSION + 1))
         return {"protocol": _ENVELOPE, "protocol_version": version}
 
-    def _prefix(self, rtc: Any) -> Prefix:
+    def _prefix(self, rtc: Any) -> CommittedPrefix:
         missing = [name for name in _FIELDS if name not in rtc]
         if missing:
             raise KeyError(f"rtc has no {', '.join(missing)}")
@@ -194,13 +194,13 @@ class Envelope(Wire):
                 f"inference_delay {delay} and execution_horizon {end}: expected 0 <= delay <= execution_horizon "
                 f"<= {self._horizon}"
             )
-        return Prefix(rows, delay, end)
+        return CommittedPrefix(rows, delay, end)
 
 
 WIRES: dict[Name, type[Wire]] = {
-    "none": Ignorant,
-    "prev_action": Flat,
-    "openpi_rtc": Ancestor,
+    "none": NoRtcWire,
+    "prev_action": PrevActionWire,
+    "openpi_rtc": OpenpiRtcWire,
     "kai0": Kai0Flat,
     "async_rtc": Envelope,
 }

@@ -26,7 +26,7 @@ class Script(ABC):
         """Answers to the requests of one connection, in their order."""
 
 
-class Waving(Script):
+class WavingScript(Script):
     """A gesture around home: depends on nothing but the joints."""
 
     def __init__(

@@ -9,10 +9,10 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Protocol
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.errors import RuntimeFault, SetupError
 from runtime.sim import faults, standin
-from runtime.sim.script import Script, Waving
+from runtime.sim.script import Script, WavingScript
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -103,16 +103,16 @@ def parser() -> argparse.ArgumentParser:
     return line
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until SIGTERM, SIGINT or the end of the lifeline."""
     import robots
 
     options = parser().parse_args(arguments)
-    told = standin.ending(options.lifeline)
+    told = standin.stop_event(options.lifeline)
     try:
         with contextlib.closing(made(options)) as server:
-            standin.announce(server.start(), options.ready_file)
+            standin.announce_ready(server.start(), options.ready_file)
             told.wait()
     except (RuntimeFault, robots.RobotError) as error:
         print(error, file=sys.stderr)
@@ -132,7 +132,7 @@ def made(options: argparse.Namespace, clock: Clock | None = None) -> StandInServ
         raise SetupError(
             f"{options.protocol} with --behaviour {options.behaviour} in lockstep; allowed: openpi with pick_place"
         )
-    robot = robots.load(options.robot, options.groups)
+    robot = robots.load_robot(options.robot, options.groups)
     rate = options.rate or robot.control_rate
     played = _spoken(_script(robot, rate, options, clock), robot, rate, options)
     options.declared = clock is not None
@@ -169,9 +169,9 @@ def _gr00t(robot: Robot, rate: float, script: Script, options: argparse.Namespac
 
 
 def _roboarena(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
-    from runtime.sim.roboarena_server import Arena, RoboarenaServer
+    from runtime.sim.roboarena_server import RoboarenaBehaviour, RoboarenaServer
 
-    arena = Arena(
+    arena = RoboarenaBehaviour(
         options.horizon,
         rate,
         options.latency_ms / 1e3,
@@ -190,9 +190,9 @@ def _roboarena(robot: Robot, rate: float, script: Script, options: argparse.Name
 
 
 def _starvla(robot: Robot, rate: float, script: Script, options: argparse.Namespace) -> StandInServer:
-    from runtime.sim.starvla_server import Star, StarvlaServer
+    from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
 
-    star = Star(options.horizon, rate, options.latency_ms / 1e3, options.fault, options.seed)
+    star = StarvlaBehaviour(options.horizon, rate, options.latency_ms / 1e3, options.fault, options.seed)
     return StarvlaServer(robot, star, options.port, script)
 
 
@@ -234,13 +234,13 @@ def _spoken(script: Script, robot: Robot, rate: float, options: argparse.Namespa
         if options.pose:
             raise SetupError(f"--pose {' '.join(options.pose)}: allowed with --space eef")
         return script
-    from runtime.sim.in_poses import InPoses, pose_format
+    from runtime.sim.in_poses import PoseScript, pose_format
 
-    return InPoses(script, robot, rate, pose_format(options.pose))
+    return PoseScript(script, robot, rate, pose_format(options.pose))
 
 
 def _script(robot: Robot, rate: float, options: argparse.Namespace, clock: Clock | None) -> Script:
-    from runtime.sim.chase import Chase
+    from runtime.sim.chase import ChaseScript
     from runtime.sim.pick_place import PickPlace, Skill, poses_apart
 
     if options.behaviour != "pick_place" and (options.noise or options.failure_rate):
@@ -248,9 +248,9 @@ def _script(robot: Robot, rate: float, options: argparse.Namespace, clock: Clock
             "--noise and --failure-rate are for --behaviour pick_place; no other fails on purpose"
         )
     if options.behaviour == "chase":
-        return Chase(robot, options.horizon, rate, options.name)
+        return ChaseScript(robot, options.horizon, rate, options.name)
     if options.behaviour == "gesture":
-        return Waving(robot, options.horizon, rate, options.seed, options.name)
+        return WavingScript(robot, options.horizon, rate, options.seed, options.name)
     skill = Skill(options.noise / 1e3, options.failure_rate, options.seed)
     apart = poses_apart if options.space == "eef" else None
     return PickPlace(robot, options.horizon, rate, skill, options.name, clock, apart)

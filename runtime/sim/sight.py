@@ -37,7 +37,7 @@ Matrix = NDArray[Any]  # what OpenCV's own annotations call a picture or a mask
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class Detection:
     """Block (x, y, yaw) and plate (x, y) in the world [m, rad], each None where it is not seen whole.
 
     The yaw is that of a square: within 45 degrees of zero. `dark`: there was nothing but black.
@@ -48,7 +48,7 @@ class Sight:
     dark: bool = False
 
 
-class Overhead:
+class OverheadDetector:
     """The overhead camera of a robot's bench: `key` names its picture among those of a request."""
 
     def __init__(self, robot: Robot, table: Bench | None = None) -> None:
@@ -59,13 +59,13 @@ class Overhead:
         self._bench = table or Bench()
         self._camera = bench.overhead_camera(_NATIVE_WIDTH, _NATIVE_HEIGHT)
 
-    def look(self, picture: UInt8) -> Sight:
+    def detect(self, picture: UInt8) -> Detection:
         """Block and plate in an RGB picture [H, W, 3] or [3, H, W] of any size, letterboxed or not."""
         shown = _without_bars(_channels_last(picture))
         if int(shown.max(initial=0)) < _DARKEST:
-            return Sight(dark=True)
+            return Detection(dark=True)
         hsv = cv2.cvtColor(np.ascontiguousarray(shown), cv2.COLOR_RGB2HSV)
-        return Sight(self._block(shown, hsv), self._plate(hsv))
+        return Detection(self._block(shown, hsv), self._plate(hsv))
 
     def _block(self, shown: UInt8, hsv: Matrix) -> tuple[float, float, float] | None:
         """The silhouette's middle lies half-way up the block; its narrowest rectangle gives the yaw."""

@@ -24,7 +24,7 @@ def names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")]
 
 
-def announce(ready: Mapping[str, object], path: Path | None) -> None:
+def announce_ready(ready: Mapping[str, object], path: Path | None) -> None:
     """Write the addresses to `path`, whole or not at all, then print them as one JSON line."""
     line = json.dumps(dict(ready))
     if path is not None:
@@ -34,7 +34,7 @@ def announce(ready: Mapping[str, object], path: Path | None) -> None:
     print(line, flush=True)
 
 
-def ending(lifeline: bool) -> threading.Event:
+def stop_event(lifeline: bool) -> threading.Event:
     """An event that SIGTERM, SIGINT and, if asked for, the end of standard input set; main thread only."""
     told = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

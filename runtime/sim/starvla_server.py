@@ -11,15 +11,15 @@ import numpy as np
 from runtime.core.types import Float32, UInt8
 from runtime.sim.arrays import packed, unpacked
 from runtime.sim.faults import NONE, Fault
-from runtime.sim.script import Answer, Script, Waving
-from runtime.sim.websocket_server import Answering, Frames, WebsocketServer, spoilt
+from runtime.sim.script import Answer, Script, WavingScript
+from runtime.sim.websocket_server import Answering, Frames, WebsocketServer, apply_fault
 
 if TYPE_CHECKING:
     from robots import Robot
 
 
 @dataclass(frozen=True, slots=True)
-class Star:
+class StarvlaBehaviour:
     """Behaviour of the server: `views` are the robot's cameras in the order of the request, all where None.
 
     `size` is the picture size of its training, as it states it; `batched`: answers are [1, T, D]. `old`: as
@@ -41,14 +41,16 @@ class Star:
 class StarvlaServer(WebsocketServer):
     """Serves on loopback; plays `script`, a gesture where none is given. `seen` and `pings` are for tests."""
 
-    def __init__(self, robot: Robot, star: Star, port: int = 0, script: Script | None = None) -> None:
+    def __init__(
+        self, robot: Robot, star: StarvlaBehaviour, port: int = 0, script: Script | None = None
+    ) -> None:
         super().__init__("starvla", star.fault, port)
         self.seen: list[dict[str, Any]] = []
         self.pings = 0
         self._star = star
         self._robot = robot
         self._views = star.views or tuple(camera.key for camera in robot.cameras)
-        self._script = script or Waving(robot, star.horizon, star.rate, star.seed)
+        self._script = script or WavingScript(robot, star.horizon, star.rate, star.seed)
         # What -1 and 1 stand for; without limits a turn.
         self.low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
         self.high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
@@ -136,7 +138,7 @@ class StarvlaServer(WebsocketServer):
         if normalized:
             rows = (2 * (rows - self.low) / (self.high - self.low) - 1).astype(np.float32)
         well = fault.name in ("none", "normalized")
-        made = spoilt(fault, rows if normalized or not well else rows.astype(np.float64))
+        made = apply_fault(fault, rows if normalized or not well else rows.astype(np.float64))
         plain = isinstance(made, np.ndarray) and made.ndim == 2 and well
         name = "normalized_actions" if normalized else "actions"
         return {name: made[None] if plain and self._star.batched else made}

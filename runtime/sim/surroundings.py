@@ -13,7 +13,7 @@ from runtime.core.types import Float64, UInt8
 from runtime.sim.conveyor import Conveyor
 from runtime.sim.pictures import Scene
 from runtime.sim.plant import Plant
-from runtime.sim.tabletop import Reset, Tabletop
+from runtime.sim.tabletop import ResetRequest, Tabletop
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 NAMES = ("none", "tabletop", "conveyor")
 
 
-class Surroundings(ABC):
+class Environment(ABC):
     """Effects of time on everything but the node itself, and the pictures of its cameras."""
 
     @abstractmethod
@@ -37,11 +37,11 @@ class Surroundings(ABC):
         """Ground truth of the bench; None where there is none."""
 
     @abstractmethod
-    def reset(self, wish: Reset) -> None:
+    def reset(self, wish: ResetRequest) -> None:
         """Lay the bench anew; BenchError where that cannot be."""
 
 
-class TestCard(Surroundings):
+class TestPatternEnvironment(Environment):
     """Moving test pictures and nothing to touch."""
 
     __test__ = False  # no test case, whatever its name begins with
@@ -60,12 +60,12 @@ class TestCard(Surroundings):
     def truth(self) -> None:
         """Nothing lies anywhere."""
 
-    def reset(self, wish: Reset) -> None:
+    def reset(self, wish: ResetRequest) -> None:
         """There is nothing to lay; the gate lets no wish come here."""
         raise AssertionError(f"reset {wish.id} of a bench that is not there")
 
 
-class Workbench(Surroundings):
+class BenchEnvironment(Environment):
     """A tabletop, and its pictures."""
 
     def __init__(self, robot: Robot, options: argparse.Namespace, tabletop: Tabletop) -> None:
@@ -96,19 +96,19 @@ class Workbench(Surroundings):
         """Places of things on the bench, and progress of the task."""
         return self._tabletop.truth()
 
-    def reset(self, wish: Reset) -> None:
+    def reset(self, wish: ResetRequest) -> None:
         """Lay the bench as wished."""
         self._tabletop.reset(wish)
 
 
-def surroundings(robot: Robot, options: argparse.Namespace) -> Surroundings:
+def make_environment(robot: Robot, options: argparse.Namespace) -> Environment:
     """Those that `options.bench` names; SetupError for more blocks than it takes."""
     if options.bench == "conveyor":
         if options.blocks != 1:
             raise SetupError(
                 f"--blocks {options.blocks} with --bench conveyor: one block rides on the belt; allowed: 1"
             )
-        return Workbench(robot, options, Conveyor(robot, options.seed))
+        return BenchEnvironment(robot, options, Conveyor(robot, options.seed))
     if options.bench == "tabletop":
-        return Workbench(robot, options, Tabletop(robot, options.seed, options.blocks))
-    return TestCard(robot, options)
+        return BenchEnvironment(robot, options, Tabletop(robot, options.seed, options.blocks))
+    return TestPatternEnvironment(robot, options)

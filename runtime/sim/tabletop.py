@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from runtime.core.types import Float64
-from runtime.sim.bench import Bench, BenchState, Layout, on_table, yaw_of
+from runtime.sim.bench import Bench, BenchLayout, BenchState, block_pose, yaw_of
 from runtime.sim.block import Block
 from runtime.sim.grasp import RELEASE, push, squeeze
 from runtime.sim.hands import Hand, Jaws
-from runtime.sim.layout import layout_of
+from runtime.sim.layout import draw_layout
 from runtime.sim.plant import Plant
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _RIM = 0.002  # m below the plate's top at which a block stands beside it
 
 
 @dataclass(frozen=True, slots=True)
-class Reset:
+class ResetRequest:
     """A wish to lay the bench anew; `id` tells repetitions from new wishes."""
 
     id: str
@@ -59,14 +59,14 @@ class Tabletop:
         self._blocks: list[Block] = []
         self._plate = np.zeros(2)
         self._reached: dict[str, bool] = {}
-        self._reset = Reset("", seed)
-        self._lay(self._reset)
+        self._reset = ResetRequest("", seed)
+        self._place_objects(self._reset)
 
-    def reset(self, wish: Reset) -> None:
+    def reset(self, wish: ResetRequest) -> None:
         """Lay the bench as wished; the same `id` again changes nothing. BenchError where that cannot be."""
         if wish.id == self._reset.id:
             return
-        self._lay(wish)
+        self._place_objects(wish)
         self._reset = wish
 
     def advance(self, plant: Plant, seconds: float) -> None:
@@ -94,14 +94,14 @@ class Tabletop:
             "success": self._on_plate(MARGIN_M),
         }
 
-    def _layout(self, wish: Reset) -> Layout:
+    def _layout(self, wish: ResetRequest) -> BenchLayout:
         """Layout for a reset; BenchError where it cannot be, and then nothing has changed."""
-        return layout_of(wish.seed, wish.positions, self._count)
+        return draw_layout(wish.seed, wish.positions, self._count)
 
-    def _lay(self, wish: Reset) -> None:
+    def _place_objects(self, wish: ResetRequest) -> None:
         layout = self._layout(wish)
         edge = self.bench.block_edge
-        self._blocks = [Block(on_table(place, self.bench), edge) for place in layout.blocks]
+        self._blocks = [Block(block_pose(place, self.bench), edge) for place in layout.blocks]
         self._plate = np.array(layout.plate)
         self._reached = {"grasped": False, "lifted": False, "over_plate": False}
 
@@ -109,12 +109,12 @@ class Tabletop:
         for jaws in self._jaws:
             self._handle(jaws, q, seconds)
         for first, second in itertools.permutations(self._blocks, 2):
-            self._part(first, second, seconds)
+            self._separate(first, second, seconds)
         for block in self._blocks:
             if not block.held_by:
                 self._clear_rim(block, seconds)
                 block.fall(self._support(block), seconds)
-            block.rest(seconds)
+            block.update_rest(seconds)
         self._note()
 
     def _handle(self, jaws: Jaws, q: Float64, seconds: float) -> None:
@@ -137,7 +137,7 @@ class Tabletop:
         if block.held_by not in ("", hand.arm):
             return None
         if block.held_by and hand.opening > block.edge + RELEASE:
-            block.let_go()
+            block.release()
         if not block.held_by:
             width = squeeze(hand, before, block)
             if width is None:
@@ -159,7 +159,7 @@ class Tabletop:
                 heights.append(other.top)
         return max(heights)
 
-    def _part(self, block: Block, other: Block, seconds: float) -> None:
+    def _separate(self, block: Block, other: Block, seconds: float) -> None:
         """Slide a block out of another one beside it."""
         if block.held_by or abs(block.pose[2, 3] - other.pose[2, 3]) > 0.9 * block.edge:
             return

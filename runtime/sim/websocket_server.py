@@ -57,7 +57,7 @@ class WebsocketServer(ABC):
     def begin(self) -> Answering:
         """Answers to the requests of one connection."""
 
-    def admits(self, path: str) -> bool:
+    def serves_path(self, path: str) -> bool:
         """True if a policy is served at this path."""
         return True
 
@@ -91,7 +91,7 @@ class WebsocketServer(ABC):
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         if self.says_well and request.path == "/healthz":
             return connection.respond(http.HTTPStatus.OK, "OK\n")
-        if self._fault.name == "http_404" or not self.admits(request.path):
+        if self._fault.name == "http_404" or not self.serves_path(request.path):
             return connection.respond(http.HTTPStatus.NOT_FOUND, "there is no policy here\n")
         return None
 
@@ -110,9 +110,9 @@ class WebsocketServer(ABC):
                 started = time.monotonic()
                 if not self._answer(connection, answer, request):
                     return
-                self.answered(answer, time.monotonic() - started)
+                self.on_answered(answer, time.monotonic() - started)
 
-    def answered(self, answer: Answering, seconds: float) -> None:  # noqa: B027  # most keep no account of it
+    def on_answered(self, answer: Answering, seconds: float) -> None:  # noqa: B027  # most keep no account of it
         """An answer has been sent, so long after its request."""
 
     def refusal(self) -> Frames:
@@ -164,7 +164,7 @@ class WebsocketServer(ABC):
         return True
 
 
-def spoilt(fault: Fault, actions: Float32) -> Any:
+def apply_fault(fault: Fault, actions: Float32) -> Any:
     """Rows [T, D], or what the fault makes of them."""
     name = fault.name
     if name == "nan":

@@ -10,14 +10,14 @@ from robots import Robot
 from runtime.core.types import Float64
 from runtime.safety.limits import Limits
 
-DWELL_S = 0.2  # between two switches of one gripper
+MIN_SWITCH_INTERVAL_S = 0.2  # between two switches of one gripper
 _SAME = 1e-3  # of its travel
 _ROUNDING = 1.0 - 1e-9  # an end of the travel may be the edge of the hysteresis, and must count
 _EARLY_S = 1e-6  # moments are sums of floats
 
 
 @dataclass(frozen=True, slots=True)
-class Switch:
+class BinaryGripper:
     """One binary gripper: its place in the robot's vector, its two numbers, and where it goes from one to the other.
 
     A number farther than half the `hysteresis` from the `threshold` opens or closes it, one nearer leaves it as it
@@ -34,19 +34,19 @@ class Switch:
         """On which side of the threshold `number` is."""
         return number >= self.threshold if self.open > self.close else number <= self.threshold
 
-    def told(self, wanted: float, before: float) -> float:
+    def snap(self, wanted: float, before: float) -> float:
         """`wanted` as `open` or `close`; `before` is what it was told to be until then."""
         beyond = (wanted - self.threshold) * (1.0 if self.open > self.close else -1.0)
         half = 0.5 * self.hysteresis * _ROUNDING
         opens = beyond >= half or (beyond > -half and self.is_open(before))
         return self.open if opens else self.close
 
-    def snapped(self, wanted: Float64, before: float) -> Float64:
+    def snap_sequence(self, wanted: Float64, before: float) -> Float64:
         """The same of `wanted` [H], one after the other."""
-        return np.array([before := self.told(number, before) for number in wanted.tolist()], np.float64)
+        return np.array([before := self.snap(number, before) for number in wanted.tolist()], np.float64)
 
 
-def switches(robot: Robot) -> tuple[Switch, ...]:
+def binary_grippers_of(robot: Robot) -> tuple[BinaryGripper, ...]:
     """Those of all its binary grippers."""
     made = []
     for group in robot.groups:
@@ -54,16 +54,16 @@ def switches(robot: Robot) -> tuple[Switch, ...]:
         if gripper is None or dim is None or gripper.threshold is None or gripper.hysteresis is None:
             continue
         width = gripper.hysteresis * abs(gripper.open - gripper.close)
-        made.append(Switch(dim, gripper.open, gripper.close, gripper.threshold, width))
+        made.append(BinaryGripper(dim, gripper.open, gripper.close, gripper.threshold, width))
     return tuple(made)
 
 
-def open_or_closed(switches: tuple[Switch, ...], action: Float64, commanded: Float64) -> Float64:
+def snap_grippers(switches: tuple[BinaryGripper, ...], action: Float64, commanded: Float64) -> Float64:
     """`action` [D] with every binary gripper open or closed, after it was `commanded` [D]; what is no number stays."""
     if action.shape != commanded.shape:
         return action
     numbers = [switch for switch in switches if np.isfinite(action[switch.dim])]
-    ends = {one.dim: one.told(action[one.dim], commanded[one.dim]) for one in numbers}
+    ends = {one.dim: one.snap(action[one.dim], commanded[one.dim]) for one in numbers}
     if all(action[dim] == end for dim, end in ends.items()):
         return action
     action = action.copy()
@@ -82,19 +82,20 @@ class Dwell:
 
     def apply(self, action: Float64, commanded: Float64, now: float) -> tuple[Float64, tuple[str, ...]]:
         """`action` [D] with grippers that would switch too soon where they are `commanded` [D], and notes on these."""
-        early = now - self._switched < DWELL_S - _EARLY_S
+        early = now - self._switched < MIN_SWITCH_INTERVAL_S - _EARLY_S
         if not early.any() or action.shape != commanded.shape:
             return action, ()
         kept = early & self._switches(action, commanded)
         if not kept.any():
             return action, ()
         notes = tuple(
-            f"{self._names[i]} kept at {round(float(commanded[i]), 4):g}: it switches once per {DWELL_S:g} s at most"
+            f"{self._names[i]} kept at {round(float(commanded[i]), 4):g}: it switches once per "
+            f"{MIN_SWITCH_INTERVAL_S:g} s at most"
             for i in np.flatnonzero(kept)
         )
         return np.where(kept, commanded, action), notes
 
-    def sent(self, before: Float64, now_sent: Float64, now: float) -> None:
+    def record_command(self, before: Float64, now_sent: Float64, now: float) -> None:
         """The robot was told `now_sent` [D] after `before` [D]."""
         self._switched[self._switches(now_sent, before)] = now
 

@@ -14,11 +14,11 @@ from runtime.core.errors import NotFiniteError, SetupError, ShapeError
 from runtime.core.pose_format import CANONICAL, PoseFormat
 from runtime.core.types import EEF_WIDTH, ActionChunk, Float64, Observation
 from runtime.kinematics.base import IkResult, Kinematics
-from runtime.motion.resampling import length, resample
-from runtime.spaces.binary_grippers import switches
+from runtime.motion.resampling import resample, resampled_length
+from runtime.spaces.binary_grippers import binary_grippers_of
 from runtime.spaces.end_effectors import EndEffectors
-from runtime.spaces.pose_rows import PoseRows, continuous
-from runtime.spaces.relative_poses import absolute
+from runtime.spaces.pose_rows import PoseRows, continuous_quaternions
+from runtime.spaces.relative_poses import to_absolute
 
 _GRIPPER = EEF_WIDTH - 1
 _SAME_PLACE, _SAME_TURN = 0.02, 5.0  # [m, degrees] within which a measured pose is that of the described link
@@ -26,7 +26,7 @@ _LONGEST = 2000  # rows of a chunk, given and at control rate: they are solved o
 
 
 @dataclass(frozen=True, slots=True)
-class Onset:
+class ChunkStart:
     """Point at which a chunk takes over from the present command; vectors float64 [D].
 
     `held` is what is commanded: grippers and joints of which a row says nothing stay there. `anchor` is the command
@@ -34,9 +34,9 @@ class Onset:
     than its limit. A robot that stands is anchored where it is measured.
     """
 
-    held: Float64
-    anchor: Float64
-    row: int = 0
+    commanded: Float64
+    previous_command: Float64
+    first_row: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +49,13 @@ class CommandRows:
     """
 
     rows: Float64
-    source: NDArray[np.int64]
-    solved: IkResult | None
+    source_rows: NDArray[np.int64]
+    ik_result: IkResult | None
     first: Float64 | None = None
     targets: Float64 | None = None
 
     @property
-    def meant(self) -> Float64:
+    def intended_start(self) -> Float64:
         """Joints at which the policy means to begin [D], even if the robot cannot be there in one step."""
         return self.rows[0] if self.first is None else self.first
 
@@ -85,11 +85,11 @@ class ActionSpaces(EndEffectors):
         self._quaternions = [EEF_WIDTH * arm + 3 for arm in range(self._count)]
         pairs = zip(self._gripped, self._grippers, strict=True)
         self._gripper_columns = {dim: EEF_WIDTH * arm + _GRIPPER for arm, dim in pairs}
-        self._switches = switches(robot)
+        self._switches = binary_grippers_of(robot)
         self._layout: PoseRows | None = None
 
     def to_command(
-        self, chunk: ActionChunk, observation: Observation, onset: Onset | None = None
+        self, chunk: ActionChunk, observation: Observation, onset: ChunkStart | None = None
     ) -> CommandRows:
         """The chunk, which answers `observation`, as absolute joint rows at control rate.
 
@@ -104,40 +104,44 @@ class ActionSpaces(EndEffectors):
         """
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         rate = chunk.rate or self._control_rate
-        onset = onset or Onset(qpos, qpos)
+        onset = onset or ChunkStart(qpos, qpos)
         if chunk.space == "joint":
-            rows = self._checked(chunk, rate, self._robot.dim, self._robot.joint_names)
+            rows = self._check_rows(chunk, rate, self._robot.dim, self._robot.joint_names)
             rows = self._absolute_joints(rows, chunk, qpos, self._all)
-            held = self._snap(rows, {int(dim): int(dim) for dim in self._all}, onset, rate)
+            held = self._snap_grippers(rows, {int(dim): int(dim) for dim in self._all}, onset, rate)
             rows, source = resample(rows, rate, self._control_rate, held)
             return CommandRows(rows, source, None)
         layout = self._layout_of(chunk.pose)
-        rows = self._checked(chunk, rate, layout.width, layout.names)
+        rows = self._check_rows(chunk, rate, layout.width, layout.names)
         rows = self._absolute_poses(rows, layout, chunk, observation)
         following = {int(dim): self._count * EEF_WIDTH + place for place, dim in enumerate(layout.dims)}
-        held = self._snap(rows, self._gripper_columns | following, onset, rate)
+        held = self._snap_grippers(rows, self._gripper_columns | following, onset, rate)
         rows, source = resample(rows, rate, self._control_rate, held, self._quaternions)
-        onset = self._near(onset, qpos)
+        onset = self._unwrap_start(onset, qpos)
         return self._solved(rows, source, layout, qpos, onset)
 
-    def _snap(self, rows: Float64, columns: Mapping[int, int], onset: Onset, rate: float) -> list[int]:
+    def _snap_grippers(
+        self, rows: Float64, columns: Mapping[int, int], onset: ChunkStart, rate: float
+    ) -> list[int]:
         """Let binary grippers in `rows` [H, W] be open or closed; `columns` by dimension. Returns their columns.
 
         What is commanded now is what the first row that can still be executed follows, and not rows before it.
         """
-        first = int(onset.row * rate / self._control_rate + 1e-9)
+        first = int(onset.first_row * rate / self._control_rate + 1e-9)
         found = [(switch, columns[switch.dim]) for switch in self._switches if switch.dim in columns]
         for switch, column in found:
             for part in (slice(0, first), slice(first, None)):
-                rows[part, column] = switch.snapped(rows[part, column], float(onset.held[switch.dim]))
+                rows[part, column] = switch.snap_sequence(
+                    rows[part, column], float(onset.commanded[switch.dim])
+                )
         return [column for _, column in found]
 
-    def disagreement(self, measured: ArrayLike, q: ArrayLike) -> str:
+    def pose_mismatch(self, measured: ArrayLike, q: ArrayLike) -> str:
         """Sentence on the gap of measured poses [8 * arms] to those of q [D], worst arm; "" if they agree."""
         joints = np.asarray(q, dtype=np.float64)
         expected = self.vectors(joints)
         given = np.asarray(measured, dtype=np.float64).reshape(self._count, EEF_WIDTH)
-        given = self._layout_of(None).upright(given[None])[0]
+        given = self._layout_of(None).normalize_quaternions(given[None])[0]
         metres = np.linalg.norm(given[:, :3] - expected[:, :3], axis=-1)
         cosines = np.abs(np.sum(given[:, 3:7] * expected[:, 3:7], axis=-1))
         degrees = np.degrees(2.0 * np.arccos(np.clip(cosines, 0.0, 1.0)))
@@ -179,35 +183,35 @@ class ActionSpaces(EndEffectors):
         joints = self._absolute_joints(joints, chunk, qpos, layout.dims)
         at = qpos[None]
         if chunk.mode != "absolute":
-            start = layout.frame.express(self._seen(layout, chunk, observation), at)[0]
-            vectors = absolute(vectors, start, chunk.mode, chunk.frame)
+            start = layout.frame.express(self._reference_vectors(layout, chunk, observation), at)[0]
+            vectors = to_absolute(vectors, start, chunk.mode, chunk.frame)
         elif len(layout.dims):
-            at = self._with(qpos, layout, joints)
+            at = self._with_joints(qpos, layout, joints)
         if not layout.frame.own:
             vectors = layout.frame.resolve(vectors, at)
-            vectors[..., 3:7] = continuous(vectors[..., 3:7])
+            vectors[..., 3:7] = continuous_quaternions(vectors[..., 3:7])
         return np.concatenate([vectors.reshape(len(rows), -1), joints], axis=1)
 
-    def _seen(self, layout: PoseRows, chunk: ActionChunk, observation: Observation) -> Float64:
+    def _reference_vectors(self, layout: PoseRows, chunk: ActionChunk, observation: Observation) -> Float64:
         """The vectors [1, arms, 8] that a chunk is relative to."""
         seen = self.eef_of(observation.qpos) if observation.eef is None else observation.eef
         vectors = np.asarray(seen, dtype=np.float64).reshape(1, self._count, EEF_WIDTH)
-        return layout.upright(vectors, f"the chunk is {chunk.mode} to an observation with")
+        return layout.normalize_quaternions(vectors, f"the chunk is {chunk.mode} to an observation with")
 
-    def _with(self, qpos: Float64, layout: PoseRows, joints: Float64) -> Float64:
+    def _with_joints(self, qpos: Float64, layout: PoseRows, joints: Float64) -> Float64:
         """`qpos` [D], row by row with the joints that follow the poses: [H, D]."""
         made = np.tile(qpos, (len(joints), 1))
         made[:, layout.dims] = joints
         return made
 
     def _solved(
-        self, rows: Float64, source: NDArray[np.int64], layout: PoseRows, qpos: Float64, onset: Onset
+        self, rows: Float64, source: NDArray[np.int64], layout: PoseRows, qpos: Float64, onset: ChunkStart
     ) -> CommandRows:
         poses = rows[:, : self._count * EEF_WIDTH].reshape(len(rows), self._count, EEF_WIDTH)
         joints = rows[:, self._count * EEF_WIDTH :]
-        targets = self._carried(poses[..., :_GRIPPER], layout, joints, qpos)
-        row = min(onset.row, max(0, len(rows) - 1))
-        solved = self._kinematics.solve(targets, qpos, 1.0 / self._control_rate, onset.anchor, row)
+        targets = self._compensate_carrier(poses[..., :_GRIPPER], layout, joints, qpos)
+        row = min(onset.first_row, max(0, len(rows) - 1))
+        solved = self._kinematics.solve(targets, qpos, 1.0 / self._control_rate, onset.previous_command, row)
         commands = self._assembled(solved.q, poses, layout, joints, onset)
         first = None
         if row == 0 and len(rows):  # the velocity box would hide from everybody that it begins far away
@@ -218,24 +222,26 @@ class ActionSpaces(EndEffectors):
 
     def meet(self, made: CommandRows, row: int) -> tuple[IkResult, float]:
         """The pose of a row as joints near that row's would meet it however fast, and how far those are away [rad]."""
-        assert made.solved is not None
+        assert made.ik_result is not None
         assert made.targets is not None
-        free = self._kinematics.solve(made.targets[row : row + 1], made.solved.q[row])
-        return free, float(np.abs(free.q[0] - made.solved.q[row]).max())
+        free = self._kinematics.solve(made.targets[row : row + 1], made.ik_result.q[row])
+        return free, float(np.abs(free.q[0] - made.ik_result.q[row]).max())
 
     def _assembled(
-        self, solved: Float64, poses: Float64, layout: PoseRows, joints: Float64, onset: Onset
+        self, solved: Float64, poses: Float64, layout: PoseRows, joints: Float64, onset: ChunkStart
     ) -> Float64:
         """Solved arms, grippers and joints of the rows, and everything else held; a base stands."""
         commands = solved.copy()
-        commands[:, self._still] = onset.held[self._still]
+        commands[:, self._still] = onset.commanded[self._still]
         commands[:, self._speeds] = 0.0  # a base of which the rows say nothing stands
         if layout.pose.gripper:
             commands[:, self._grippers] = poses[:, self._gripped, _GRIPPER]
         commands[:, layout.dims] = joints
         return commands
 
-    def _carried(self, poses: Float64, layout: PoseRows, joints: Float64, qpos: Float64) -> Float64:
+    def _compensate_carrier(
+        self, poses: Float64, layout: PoseRows, joints: Float64, qpos: Float64
+    ) -> Float64:
         """Poses [H, arms, 7] as they are to be solved for, while what carries the arms stands as observed.
 
         Where the rows move a torso, each pose is taken along: the arm's joints are those that it will need there.
@@ -244,14 +250,14 @@ class ActionSpaces(EndEffectors):
         for index, arm in enumerate(self._robot.arms):
             if arm.carrier is None or not np.isin(arm.carrier_dims, layout.dims).any():
                 continue
-            there = arm.carried(self._with(qpos, layout, joints))
+            there = arm.carried(self._with_joints(qpos, layout, joints))
             wanted = arm.carried(qpos) @ np.linalg.inv(there) @ transform_of(poses[:, index])
             made = made.copy() if made is poses else made
             made[:, index, :3] = wanted[..., :3, 3]
             made[:, index, 3:] = quaternion_of_matrix(wanted[..., :3, :3])
         return made
 
-    def _near(self, onset: Onset, qpos: Float64) -> Onset:
+    def _unwrap_start(self, onset: ChunkStart, qpos: Float64) -> ChunkStart:
         """The onset with endless joints on the branch that they were observed on."""
 
         def on_branch(joints: Float64) -> Float64:
@@ -260,7 +266,7 @@ class ActionSpaces(EndEffectors):
             made[self._wrapping] -= 2 * np.pi * np.round(apart / (2 * np.pi))
             return made
 
-        return Onset(on_branch(onset.held), on_branch(onset.anchor), onset.row)
+        return ChunkStart(on_branch(onset.commanded), on_branch(onset.previous_command), onset.first_row)
 
     def _unwrapped(self, rows: Float64, qpos: Float64, dims: NDArray[np.intp]) -> Float64:
         """Rows of the joints `dims`, endless ones on the branch that is nearest to `qpos`, without jumps from there."""
@@ -269,14 +275,14 @@ class ActionSpaces(EndEffectors):
         rows[:, endless] = np.unwrap(turning, axis=0)[1:]
         return rows
 
-    def _checked(self, chunk: ActionChunk, rate: float, width: int, names: tuple[str, ...]) -> Float64:
+    def _check_rows(self, chunk: ActionChunk, rate: float, width: int, names: tuple[str, ...]) -> Float64:
         rows = np.array(chunk.actions, dtype=np.float64)
         if rows.ndim != 2 or rows.shape[1] != width or not len(rows):
             raise ShapeError(
                 f"the policy answered with {chunk.space} actions of shape {rows.shape}; "
                 f"{self._robot.name} takes [H, {width}] with at least one row"
             )
-        _check_length(len(rows), length(len(rows), rate, self._control_rate))
+        _check_length(len(rows), resampled_length(len(rows), rate, self._control_rate))
         wrong = np.argwhere(~np.isfinite(rows))
         if len(wrong):
             row, column = wrong[0]

@@ -75,7 +75,7 @@ class Frame:
         return relation[..., :3, :3], relation[..., :3, 3]
 
 
-def names(robot: Robot) -> list[str]:
+def frame_names(robot: Robot) -> list[str]:
     """The frames that may be declared for a robot."""
     return [robot.mount_frame, *sorted(urdf.read(robot.urdf).links)]
 
@@ -85,7 +85,7 @@ def _require_standing(tree: Urdf, robot: Robot, arm: Group, link: str, key: str)
     try:
         above = tree.between(tree.root, link)
     except RobotError:
-        allowed = ", ".join(names(robot))
+        allowed = ", ".join(frame_names(robot))
         raise ConfigurationError(
             f"{key}.frame = {link!r} is no frame of {robot.name}; "
             f'allowed: "" for each arm\'s own, {robot.mount_frame} (what mounts are given in), or a link: {allowed}'

@@ -38,7 +38,7 @@ class Orientation(ABC):
         """Unit quaternions, and where [T, arms] the numbers determine one; elsewhere they are the identity."""
 
 
-class QuaternionNumbers(Orientation):
+class QuaternionOrientation(Orientation):
     """Four numbers, the scalar first or last; a sign is kept from row to row, as it comes at the first."""
 
     def __init__(self, scalar_first: bool) -> None:
@@ -159,7 +159,7 @@ class EulerAngles(Orientation):
         return third if self._proper else third * self._sign
 
 
-class SixNumbers(Orientation):
+class SixD(Orientation):
     """The first two columns of the rotation matrix, one after the other, or its first two rows.
 
     Decoded by Gram-Schmidt, so that any two vectors that are not in line will do. Zhou et al., On the Continuity

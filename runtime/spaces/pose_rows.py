@@ -18,9 +18,9 @@ from runtime.spaces.frames import Frame
 from runtime.spaces.orientations import (
     EulerAngles,
     Orientation,
-    QuaternionNumbers,
+    QuaternionOrientation,
     RotationVector,
-    SixNumbers,
+    SixD,
     continuous_signs,
 )
 
@@ -37,8 +37,8 @@ def orientation_of(pose: PoseFormat) -> Orientation:
     if pose.orientation == "rotation_vector":
         return RotationVector(pose.degrees)
     if pose.orientation == "6d":
-        return SixNumbers(pose.sixd == "columns")
-    return QuaternionNumbers(pose.orientation == "wxyz")
+        return SixD(pose.sixd == "columns")
+    return QuaternionOrientation(pose.orientation == "wxyz")
 
 
 class PoseRows:
@@ -86,7 +86,7 @@ class PoseRows:
         its own one of `previous` [T, width] where there are as many.
         Raises PolicyError for a quaternion without direction.
         """
-        upright = self.upright(vectors)
+        upright = self.normalize_quaternions(vectors)
         appended = np.broadcast_to(joints, (len(vectors), joints.shape[-1]))[:, self.dims]
         return self.written(self.frame.express(upright, joints), appended, previous)
 
@@ -120,7 +120,7 @@ class PoseRows:
         given = poses[..., self._turning]
         quaternions, determined = self._numbers.decode(given)
         self._require(determined, given, whose)
-        vectors[..., _QUATERNION] = continuous(quaternions)
+        vectors[..., _QUATERNION] = continuous_quaternions(quaternions)
         if self.pose.gripper:
             vectors[..., _GRIPPER] = np.where(self._gripped, poses[..., -1], 0.0)
         return vectors, rows[:, len(self._arms) * self._each :]
@@ -128,12 +128,12 @@ class PoseRows:
     def _poses_of(self, rows: Float64) -> Float64:
         return rows[:, : len(self._arms) * self._each].reshape(len(rows), len(self._arms), self._each)
 
-    def upright(self, vectors: Float64, whose: str = "the robot measured") -> Float64:
+    def normalize_quaternions(self, vectors: Float64, whose: str = "the robot measured") -> Float64:
         """The vectors [T, arms, 8] with unit quaternions; signs are kept: those that a robot measures are its own.
 
         Raises PolicyError for a quaternion without direction.
         """
-        codec = QuaternionNumbers(scalar_first=True)
+        codec = QuaternionOrientation(scalar_first=True)
         made = vectors.copy()
         made[..., _QUATERNION], determined = codec.decode(vectors[..., _QUATERNION])
         self._require(determined, vectors[..., _QUATERNION], whose, codec)
@@ -153,7 +153,7 @@ class PoseRows:
         )
 
 
-def continuous(quaternions: Float64) -> Float64:
+def continuous_quaternions(quaternions: Float64) -> Float64:
     """Unit quaternions [T, arms, 4] with w >= 0 in the first row and signs continuous along T."""
     made = quaternions.copy()
     made[:1] *= np.where(made[:1, :, :1] < 0, -1.0, 1.0)

@@ -14,7 +14,7 @@ from runtime.spaces.orientations import continuous_signs
 _POSITION, _QUATERNION = slice(0, 3), slice(3, 7)
 
 
-def absolute(vectors: Float64, start: Float64, mode: ActionMode, frame: RelativeFrame) -> Float64:
+def to_absolute(vectors: Float64, start: Float64, mode: ActionMode, frame: RelativeFrame) -> Float64:
     """`vectors` with unit quaternions as absolute poses, from the pose `start` [arms, 8] that they are relative to.
 
     "relative": each from `start`; "delta": each from the one before. "base": p0 + dp, dq q0; "tool":
@@ -30,7 +30,7 @@ def absolute(vectors: Float64, start: Float64, mode: ActionMode, frame: Relative
         turned = _after(before[..., _QUATERNION], turns, frame)
     else:
         every = np.concatenate([start[None, :, _QUATERNION], turns])
-        turned = _running(every, frame)[1:]
+        turned = _cumulative_products(every, frame)[1:]
         before = np.concatenate([start[None], vectors[:-1]])
         before[1:, :, _QUATERNION] = turned[:-1]
     if frame == "tool":
@@ -68,7 +68,7 @@ def _after(before: Float64, turns: Float64, frame: RelativeFrame) -> Float64:
     return unit
 
 
-def _running(turns: Float64, frame: RelativeFrame) -> Float64:
+def _cumulative_products(turns: Float64, frame: RelativeFrame) -> Float64:
     """Running products of the turns [T, arms, 4], by doubling (Hillis and Steele, 1986): log2 T products."""
     made, span = turns, 1
     while span < len(made):

@@ -6,13 +6,13 @@ from runtime.config import collection
 from runtime.config.loader import Resolved
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.plugins import variants
-from runtime.core.pose_format import refuse_format
-from runtime.station.spec import StationSpec, unchecked
+from runtime.core.pose_format import reject_pose_format
+from runtime.station.spec import StationSpec, build_spec
 
 
-def checked_spec(resolved: Resolved) -> StationSpec:
+def check_deployment(resolved: Resolved) -> StationSpec:
     """Check that the parts of a deployment fit each other; raises ConfigurationError or SetupError."""
-    settings, made = resolved.deployment, unchecked(resolved)
+    settings, made = resolved.deployment, build_spec(resolved)
     robot = made.robot
     if settings.setup.pose not in robot.poses:
         raise ConfigurationError(
@@ -51,7 +51,7 @@ def checked_spec(resolved: Resolved) -> StationSpec:
 def _check_collection(made: StationSpec) -> None:
     """A node that drives by itself must be one that can be told to, and to leave off, and says what it applied."""
     wanted, capabilities = made.deployment.collection, made.capabilities
-    if wanted is not None and wanted.source == "node" and not capabilities.leads:
+    if wanted is not None and wanted.source == "node" and not capabilities.drives_itself:
         kind = made.deployment.transport.kind
         leads = kind if kind in variants("runtime.teleoperators") else "zmq"
         raise SetupError(
@@ -71,7 +71,7 @@ def _check_publication(made: StationSpec) -> None:
             f"allowed: {', '.join(sorted(capabilities.spaces))}"
         )
     if wanted.space == "joint":
-        refuse_format(wanted.pose, "publication.pose")
+        reject_pose_format(wanted.pose, "publication.pose")
         return
     from runtime.spaces.pose_rows import PoseRows
 

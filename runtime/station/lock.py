@@ -9,15 +9,15 @@ from runtime.core.errors import SetupError
 from runtime.ipc.station_lock import Taken, take
 
 
-def hold(settings: Deployment) -> IO[str]:
+def acquire_station_lock(settings: Deployment) -> IO[str]:
     """The lock of a station, for as long as it runs; SetupError names the process that has it, or why it cannot be."""
     try:
         return _locked(settings)
     except OSError as error:
-        raise unwritable(settings, error) from None
+        raise unwritable_error(settings, error) from None
 
 
-def unwritable(settings: Deployment, error: OSError) -> SetupError:
+def unwritable_error(settings: Deployment, error: OSError) -> SetupError:
     """Error for a station whose folder cannot be written."""
     return SetupError(
         f"{settings.station_dir} cannot be written ({error.strerror}): make room there, or name another folder with "

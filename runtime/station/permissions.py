@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from runtime.config.loader import Resolved, changed
+from runtime.config.loader import Resolved, apply_changes
 from runtime.config.schema import Deployment
 from runtime.core.errors import ConfigurationError, RuntimeFault
-from runtime.core.machine_names import Names, named
+from runtime.core.machine_names import HostReference, find_host_references
 from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.identity import LOCAL, SCRIPT
 from runtime.ipc.messages import Command
@@ -66,42 +66,42 @@ def require(command: Command, own: Resolved) -> None:
     table = command.args.get("policy")
     if isinstance(table, Mapping):
         try:
-            wanted = changed(own, {"policy": table}, command.kind)
+            wanted = apply_changes(own, {"policy": table}, command.kind)
         except ConfigurationError:  # told by who carries the command out, of a preflight in its report
             return
-        require_named(own.deployment, wanted.deployment)
+        require_allowed_references(own.deployment, wanted.deployment)
 
 
-def require_named(own: Deployment, given: Deployment) -> None:
+def require_allowed_references(own: Deployment, given: Deployment) -> None:
     """ConfigurationError where the policy of `given` names a variable or a file that is not for others to name.
 
     What the deployment's own [policy] names stays allowed.
     """
-    said = {(what, value) for _, what, value in named(own.policy)}
-    for key, what, value in named(given.policy):
+    said = {(what, value) for _, what, value in find_host_references(own.policy)}
+    for key, what, value in find_host_references(given.policy):
         if (what, value) not in said and not _is_allowed(own, what, value):
             raise ConfigurationError(f"policy.{key} = {value!r:.200}: {_advice(own, what)}")
 
 
-def _is_allowed(own: Deployment, what: Names, value: str) -> bool:
-    if what is Names.VARIABLE:
+def _is_allowed(own: Deployment, what: HostReference, value: str) -> bool:
+    if what is HostReference.VARIABLE:
         return any(fnmatchcase(value, pattern) for pattern in own.security.variables)
-    if what is Names.RECORDING:
-        ours = _within(value, _recordings(own)) and _is_recording(value)
-        return ours or _within(value, own.security.files)
-    listed = own.security.files if what is Names.FILE else ()
+    if what is HostReference.RECORDING:
+        ours = _is_inside(value, _recordings(own)) and _is_recording(value)
+        return ours or _is_inside(value, own.security.files)
+    listed = own.security.files if what is HostReference.FILE else ()
     if value == "none":  # of ssh's configuration: none is read
         return True
-    return _within(value, (own.ssh_dir, *listed))
+    return _is_inside(value, (own.ssh_dir, *listed))
 
 
-def _advice(own: Deployment, what: Names) -> str:
-    if what is Names.VARIABLE:
+def _advice(own: Deployment, what: HostReference) -> str:
+    if what is HostReference.VARIABLE:
         allowed = ", ".join(own.security.variables) or "none"
         return _VARIABLES_OF_WEB(allowed=allowed)
-    if what is Names.WRITTEN:
+    if what is HostReference.WRITTEN:
         return _WRITTEN_FILES_OF_WEB(folder=own.ssh_dir)
-    if what is Names.RECORDING:
+    if what is HostReference.RECORDING:
         return _RECORDINGS_OF_WEB(where=own.data, listed=_LISTED_FILES)
     return _FILES_OF_WEB(where=own.ssh_dir, listed=_LISTED_FILES)
 
@@ -113,18 +113,18 @@ def _recordings(own: Deployment) -> Iterable[Path]:
 
 def _is_recording(value: str) -> bool:
     """True for the folder of a recording or of a dataset: the data folder has other files, which nobody names."""
-    path = _place(value)
+    path = _resolved(value)
     return (path / "manifest.json").is_file() or (path / "meta" / "info.json").is_file()
 
 
-def _within(value: str, allowed: Iterable[str | Path]) -> bool:
+def _is_inside(value: str, allowed: Iterable[str | Path]) -> bool:
     """True if a path leads to one of these files or below one of these folders, links and `..` followed."""
     try:
-        path = _place(value)
-        return any(path.is_relative_to(_place(one)) for one in allowed)
+        path = _resolved(value)
+        return any(path.is_relative_to(_resolved(one)) for one in allowed)
     except (OSError, RuntimeError, ValueError):  # no path, or links in a circle
         return False
 
 
-def _place(path: str | Path) -> Path:
+def _resolved(path: str | Path) -> Path:
     return Path(os.path.expanduser(path)).resolve()

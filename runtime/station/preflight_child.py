@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from runtime.config.loader import Resolved, changed
+from runtime.config.loader import Resolved, apply_changes
 from runtime.config.schema import Deployment
-from runtime.core.environment import without_secrets
+from runtime.core.environment import without_web_secrets
 from runtime.core.errors import RuntimeFault
 from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.command_arguments import PreflightRequest
@@ -41,14 +41,14 @@ Spawn = Callable[[], "subprocess.Popen[bytes]"]
 
 
 @dataclass(slots=True)
-class Flight:
+class PreflightRun:
     """One preflight: under way as long as `told` is empty, then a report, or a `failure` without one."""
 
     id: str
     about: str
     child: subprocess.Popen[bytes]
     ends: float  # on time.monotonic, when it is killed
-    told: dict[str, Any] = field(default_factory=dict)
+    finished: dict[str, Any] = field(default_factory=dict)
     failure: str = ""
     over: threading.Event = field(default_factory=threading.Event)
 
@@ -57,22 +57,22 @@ class Flight:
         self.failure = why
         self.child.kill()
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """As an answer: `running`, `report` or null, and why there is none."""
-        return {"running": not self.over.is_set(), "report": self.told or None, "failure": self.failure}
+        return {"running": not self.over.is_set(), "report": self.finished or None, "failure": self.failure}
 
 
 class Preflights:
     """One at a time; `look` is cheap, and returns each that has ended once. Not for several threads."""
 
     def __init__(self, spawn: Spawn | None = None, now: Callable[[], float] = time.monotonic) -> None:
-        self._spawn = spawn or _spawn
+        self._spawn = spawn or _spawn_child
         self._now = now
-        self._flight: Flight | None = None
-        self._kept: dict[str, Flight] = {}
+        self._flight: PreflightRun | None = None
+        self._kept: dict[str, PreflightRun] = {}
 
     @property
-    def under_way(self) -> str:
+    def current(self) -> str:
         """Name of what is being looked at, "" where nothing is."""
         return self._flight.about if self._flight else ""
 
@@ -87,21 +87,21 @@ class Preflights:
             return max(0.0, self._kept[asked.id].ends - self._now())
         if self._flight is not None:
             raise RuntimeFault(_UNDER_WAY(about=self._flight.about))
-        deadline = asked.deadline_s or _patience(resolved, asked)
+        deadline = asked.deadline_s or _deadline_for(resolved, asked)
         line = {"tree": dict(resolved.tree), "changes": asked.changes, "deadline_s": deadline}
         try:
             child = self._spawn()
         except OSError as error:
             raise RuntimeFault(_NOT_STARTED(error=error)) from error
         longest = deadline + _GRACE_S
-        self._flight = flight = Flight(asked.id, asked.about, child, self._now() + longest)
+        self._flight = flight = PreflightRun(asked.id, asked.about, child, self._now() + longest)
         self._kept[asked.id] = flight
         for old in list(self._kept)[:-_KEPT]:
             del self._kept[old]
-        threading.Thread(target=_attend, args=(flight, line), name="preflight", daemon=True).start()
+        threading.Thread(target=_supervise, args=(flight, line), name="preflight", daemon=True).start()
         return longest
 
-    def look(self) -> Flight | None:
+    def poll(self) -> PreflightRun | None:
         """The one that has ended since the last look; ends one whose time is over."""
         flight = self._flight
         if flight is None:
@@ -119,10 +119,10 @@ class Preflights:
             self._flight.end(f"cancelled: {why}")
 
     def report(self, id: str) -> dict[str, Any]:
-        """The preflight of that id, as by `Flight.plain`; RuntimeFault where it is not known (any more)."""
+        """The preflight of that id, as by `PreflightRun.to_dict`; RuntimeFault where it is not known (any more)."""
         if id not in self._kept:
             raise RuntimeFault(_UNKNOWN(identity=id, kept=_KEPT))
-        return self._kept[id].plain()
+        return self._kept[id].to_dict()
 
     def close(self) -> None:
         """End what is under way, and wait for it."""
@@ -132,29 +132,29 @@ class Preflights:
             flight.over.wait(2.0)
 
 
-def _patience(resolved: Resolved, asked: PreflightRequest) -> float:
+def _deadline_for(resolved: Resolved, asked: PreflightRequest) -> float:
     """Sum of the policy's own deadlines [s]; where it is no deployment, its process says so at once."""
     try:
-        return patience(changed(resolved, asked.changes, "preflight").deployment)
+        return default_deadline(apply_changes(resolved, asked.changes, "preflight").deployment)
     except RuntimeFault:
         return 30.0
 
 
-def _spawn() -> subprocess.Popen[bytes]:
+def _spawn_child() -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [sys.executable, "-m", "runtime.preflight", "--given"],
         stdin=subprocess.PIPE,  # its end is ours
         stdout=subprocess.PIPE,
-        env=without_secrets(os.environ),  # a worker's has the web's
+        env=without_web_secrets(os.environ),  # a worker's has the web's
     )
 
 
-def fly(asked: Mapping[str, Any], longest: float) -> dict[str, Any]:
+def run_preflight(asked: Mapping[str, Any], longest: float) -> dict[str, Any]:
     """The report about what is asked as by `python -m runtime.preflight --given`; waits for it at most so long [s].
 
     RuntimeFault where its process ends without one.
     """
-    child = _spawn()
+    child = _spawn_child()
     late = threading.Timer(longest, child.kill)
     late.start()
     try:
@@ -166,7 +166,7 @@ def fly(asked: Mapping[str, Any], longest: float) -> dict[str, Any]:
     return report
 
 
-def _attend(flight: Flight, asked: Mapping[str, Any]) -> None:
+def _supervise(flight: PreflightRun, asked: Mapping[str, Any]) -> None:
     """Whatever becomes of the child, the flight is over at its end."""
     report: dict[str, Any] = {}
     failure: str = _UNREADABLE
@@ -174,7 +174,7 @@ def _attend(flight: Flight, asked: Mapping[str, Any]) -> None:
         report, failure = _told(flight.child, asked)
     finally:
         if not flight.failure:
-            flight.told, flight.failure = report, failure
+            flight.finished, flight.failure = report, failure
         flight.over.set()
 
 
@@ -202,7 +202,7 @@ def _report(said: bytes) -> dict[str, Any]:
     return dict(found) if isinstance(found, Mapping) else {}
 
 
-def patience(settings: Deployment) -> float:
+def default_deadline(settings: Deployment) -> float:
     """Time that a preflight may take where none is given [s]: what the policy's own deadlines come to."""
     policy = settings.policy.model_dump()
     return _ROOM_S + _deadlines(policy) + float(policy.get("inference_deadline", 0.0))  # it is asked twice

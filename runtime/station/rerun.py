@@ -11,11 +11,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from runtime.config.loader import Resolved, assigned, digest_of
-from runtime.config.schema import GONE_FROM_BUS
+from runtime.config.loader import Resolved, apply_assignments, config_digest
+from runtime.config.schema import REMOVED_BUS_KEYS
 from runtime.core.errors import ConfigurationError, RecordingError
 from runtime.core.git_revision import revision
-from runtime.recording.files import read_document
+from runtime.recording.files import read_json
 from runtime.station.run import installed_versions
 
 _LISTED = 8  # runs, or keys, that a sentence names
@@ -39,19 +39,19 @@ def rerun(run: str, data: Path, assignments: Sequence[str] = ()) -> Rerun:
     What was asked for with the run (mode, simulated state, duration) is part of it. What it writes goes to
     `data`. ConfigurationError says what is missing, was altered since, or is no setting any more.
     """
-    folder = find(run, data)
+    folder = find_episode(run, data)
     try:
-        manifest = read_document(folder / "manifest.json")
+        manifest = read_json(folder / "manifest.json")
     except RecordingError as error:
         raise ConfigurationError(str(error)) from None
     stored = _configuration(folder, manifest)
     source = f"the configuration of run {folder.name}"
-    wanted = _wanted(deepcopy(stored), manifest, data)
-    resolved = assigned(wanted, {}, source, assignments)
+    wanted = _requested_settings(deepcopy(stored), manifest, data)
+    resolved = apply_assignments(wanted, {}, source, assignments)
     return Rerun(resolved, tuple(_lines(folder.name, manifest, stored, resolved)))
 
 
-def find(run: str, data: Path) -> Path:
+def find_episode(run: str, data: Path) -> Path:
     """The folder of the one episode in `data` whose uuid begins with `run`."""
     episodes = data / "episodes"
     wanted = run.strip().lower()
@@ -80,7 +80,7 @@ def _configuration(folder: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
         raise ConfigurationError(f"{path} has no configuration: that run cannot be started again")
     if not isinstance(digest, str) or not digest:
         raise ConfigurationError(f"{path} has no configuration_hash: its configuration cannot be verified")
-    found = digest_of(stored)
+    found = config_digest(stored)
     if found != digest:
         raise ConfigurationError(
             f"{path}: configuration has the hash {_short(found)}, the run was made with {_short(digest)}: "
@@ -89,14 +89,14 @@ def _configuration(folder: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
     return stored
 
 
-def _wanted(tree: dict[str, Any], manifest: Mapping[str, Any], data: Path) -> dict[str, Any]:
+def _requested_settings(tree: dict[str, Any], manifest: Mapping[str, Any], data: Path) -> dict[str, Any]:
     """The configuration with what the run itself was asked for; other modes (observe) are no runs."""
     run = tree.get("run")
     if isinstance(run, dict) and manifest.get("mode") != "observe":
         for key in ("mode", "sim_state", "duration_s"):
             if key in manifest and key in run:
                 run[key] = manifest[key]
-    for key in GONE_FROM_BUS:  # says nothing of what was done
+    for key in REMOVED_BUS_KEYS:  # says nothing of what was done
         tree.get("bus", {}).pop(key, None)
     if data_folder(tree.get("data_dir")) != data:
         tree["data_dir"] = str(data)

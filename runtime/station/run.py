@@ -31,13 +31,13 @@ class Run:
 
     number: int
     uuid: str
-    asked: float
+    requested: float
     duration_s: float | None = None  # after which it ends by itself
     mode: Mode = "continuous"
     trial: bool = False  # it is one of a trial
-    approaching: bool = False  # a motion to the chunk that is shown
-    begun: float | None = None  # control follows
-    followed: float = -math.inf  # since when it does, without a hold between
+    is_approaching: bool = False  # a motion to the chunk that is shown
+    begun_at: float | None = None  # control follows
+    followed_at: float = -math.inf  # since when it does, without a hold between
     held_since: float | None = None
     held: float = 0.0  # in total
     command: str = ""  # uuid of the command that asked for it
@@ -57,9 +57,9 @@ class Run:
         return {**now, **({} if min(since.values()) < 0 else since)}
 
     @property
-    def unbegun(self) -> dict[str, Any]:
+    def never_began_data(self) -> dict[str, Any]:
         """Data for the client of a run that ended before control followed; {} where it began."""
-        if self.begun is not None:
+        if self.begun_at is not None:
             return {}
         return {"unbegun": {"command": self.command, "episode": self.uuid, "unopened": self.unopened}}
 
@@ -81,17 +81,17 @@ class Run:
 
     def approach(self) -> None:
         """The robot goes to where the chunk that is shown begins."""
-        self.approaching = True
+        self.is_approaching = True
 
     def arrive(self) -> None:
         """The robot is there, or does something else."""
-        self.approaching = False
+        self.is_approaching = False
 
     def begin(self, now: float) -> None:
         """Control follows: its clock starts."""
         self.waiting = False
-        self.begun, self.held_since, self.held = now, None, 0.0
-        self.followed = now
+        self.begun_at, self.held_since, self.held = now, None, 0.0
+        self.followed_at = now
 
     def hold(self, now: float) -> None:
         """Its clock is paused; one that waits begins when it is resumed."""
@@ -104,13 +104,13 @@ class Run:
         if self.held_since is not None:
             self.held += now - self.held_since
             self.held_since = None
-            self.followed = now
+            self.followed_at = now
 
     def elapsed(self, now: float) -> float:
         """Time it has run, without the time it was held."""
-        if self.begun is None:
+        if self.begun_at is None:
             return 0.0
-        return (now if self.held_since is None else self.held_since) - self.begun - self.held
+        return (now if self.held_since is None else self.held_since) - self.begun_at - self.held
 
     def status(self, now: float) -> dict[str, Any]:
         """Which run it is, how long it has run and been held [s], and its limit."""

@@ -82,7 +82,7 @@ class StationSpec:
         return DimensionKinds(self.robot.binary_dims, tuple(endless.tolist()))
 
 
-def delivered(settings: Deployment, robot: Robot) -> tuple[str, ...]:
+def delivered_cameras(settings: Deployment, robot: Robot) -> tuple[str, ...]:
     """Keys of the cameras that the transport delivers: the robot's, unless it names fewer."""
     named = getattr(variants("runtime.transports")[settings.transport.kind], "cameras", None)
     if named is None:
@@ -91,7 +91,7 @@ def delivered(settings: Deployment, robot: Robot) -> tuple[str, ...]:
     return fewer
 
 
-def unchecked(resolved: Resolved, capabilities: Capabilities | None = None) -> StationSpec:
+def build_spec(resolved: Resolved, capabilities: Capabilities | None = None) -> StationSpec:
     """A deployment with its robot, whose parts are known to fit each other; ConfigurationError for no such robot.
 
     Its transport is asked for its `capabilities` where they are not given; SetupError where it lacks what it needs.
@@ -101,10 +101,10 @@ def unchecked(resolved: Resolved, capabilities: Capabilities | None = None) -> S
         grippers = {
             name: robots.GripperChoice(**given.model_dump()) for name, given in settings.grippers.items()
         }
-        robot = robots.load(settings.robot, settings.groups, grippers)
+        robot = robots.load_robot(settings.robot, settings.groups, grippers)
     except robots.RobotError as error:
         raise ConfigurationError(str(error)) from None
-    has = {*delivered(settings, robot), *settings.cameras}
+    has = {*delivered_cameras(settings, robot), *settings.cameras}
     cameras = tuple(camera.key for camera in robot.cameras if camera.key in has)
     if capabilities is None:
         capabilities = variants("runtime.transports")[settings.transport.kind].capabilities(
@@ -113,10 +113,10 @@ def unchecked(resolved: Resolved, capabilities: Capabilities | None = None) -> S
     return StationSpec(resolved, robot, capabilities, cameras)
 
 
-def planned(path: str, capabilities: str, unread: Collection[str] = ()) -> StationSpec:
+def load_checked_spec(path: str, capabilities: str, unread: Collection[str] = ()) -> StationSpec:
     """The plan that a supervisor has checked: the resolved deployment in a file, its capabilities in JSON.
 
     Tables of the packages `unread` stay as they are written, and none of their kinds is loaded.
     """
-    resolved = loader.resolve(json.loads(Path(path).read_text("utf-8")), {}, path, unread)
-    return unchecked(resolved, CAPABILITIES.validate_json(capabilities))
+    resolved = loader.resolve_deployment(json.loads(Path(path).read_text("utf-8")), {}, path, unread)
+    return build_spec(resolved, CAPABILITIES.validate_json(capabilities))

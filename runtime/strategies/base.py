@@ -19,9 +19,9 @@ from runtime.motion.timeline import (
     DimensionKinds,
     Fade,
     Timeline,
-    fading,
-    on_branch,
-    single,
+    fade_weights,
+    single_contribution,
+    unwrap_onto,
 )
 
 BlendShape = Literal["linear", "cosine", "exponential"]
@@ -60,7 +60,7 @@ class Progress:
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class ArrivedChunk:
     """A chunk at the control loop: rows [H, D] in command space and control rate.
 
     Row 0 is for `observation_step`; where it `waited` nothing of it is stale, and row 0 is for the first free step.
@@ -69,11 +69,11 @@ class Arrival:
     chunk_id: int
     observation_step: int
     rows: Float64
-    waited: bool = False
+    requested_while_stopped: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Merged:
+class MergeResult:
     """Place of a chunk on the timeline.
 
     `arrival_step` is the first tick not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H]
@@ -92,7 +92,7 @@ class Merged:
     overlap: int = (
         0  # steps from arrival_step on that more than one chunk makes, or a chunk and a held target
     )
-    shares: Float64 | None = None
+    contributions: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ class Placement:
     """
 
     rows: Float64
-    merged: Merged
+    merged: MergeResult
     before: Float64 | None = None
 
     @property
@@ -115,11 +115,13 @@ class Placement:
 class Query(ABC):
     """Decides when the policy is asked."""
 
-    waits: bool = False  # it asks while the robot stands, so that nothing of the answer is stale
-    continues: bool = False  # its requests carry what the robot is committed to (RTC)
+    requests_while_stopped: bool = (
+        False  # it asks while the robot stands, so that nothing of the answer is stale
+    )
+    uses_rtc: bool = False  # its requests carry what the robot is committed to (RTC)
 
     @abstractmethod
-    def wants(self, progress: Progress) -> bool:
+    def should_request(self, progress: Progress) -> bool:
         """True if the policy is to be asked now."""
 
 
@@ -129,25 +131,27 @@ class Paced(Query):
     def __init__(self, inference_rate: float | None) -> None:
         self._period = 0.0 if inference_rate is None else 1.0 / inference_rate
 
-    def wants(self, progress: Progress) -> bool:
+    def should_request(self, progress: Progress) -> bool:
         return not progress.in_flight and progress.since_request >= self._period - 1e-6
 
 
 class Merge(ABC):
     """Lets a chunk join the timeline; a pure function of timeline, chunk and first free step."""
 
-    waits: bool = False  # an empty timeline is this strategy's way of waiting, not starvation
-    continues: bool = False  # its chunks are continued (RTC): what makes each step is told
+    requests_while_stopped: bool = (
+        False  # an empty timeline is this strategy's way of waiting, not starvation
+    )
+    uses_rtc: bool = False  # its chunks are continued (RTC): what makes each step is told
 
     @abstractmethod
-    def place(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Placement:
+    def place(self, timeline: Timeline, arrival: ArrivedChunk, free_step: int) -> Placement:
         """Which rows fall on which steps, or why none does; changes nothing."""
 
     @abstractmethod
-    def lay(self, timeline: Timeline, placed: Placement) -> None:
+    def apply(self, timeline: Timeline, placed: Placement) -> None:
         """Change what is planned from `placed.first` on; never called for a chunk that is dropped."""
 
-    def __call__(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Merged:
+    def __call__(self, timeline: Timeline, arrival: ArrivedChunk, free_step: int) -> MergeResult:
         """Change `timeline` from `free_step` on and say where the rows went; nothing is joined to."""
         return join(self, timeline, arrival, free_step, None, DimensionKinds())
 
@@ -155,14 +159,14 @@ class Merge(ABC):
 def join(
     merge: Merge,
     timeline: Timeline,
-    arrival: Arrival,
+    arrival: ArrivedChunk,
     free_step: int,
     held: Float64 | None,
     dims: DimensionKinds,
     *,
     joining: bool = False,
     commanded: Float64 | None = None,
-) -> Merged:
+) -> MergeResult:
     """Merge a chunk; where it does not continue what came before it, fade over from that: no strategy may jump.
 
     `held` [D] is the target that is held because nothing was planned (starvation, a run's far first chunk): the
@@ -184,18 +188,18 @@ def join(
     standing = commanded if held is None and joining and planned is None else held
     going_on = commanded if planned is None else planned.action
     before = going_on if standing is None else standing
-    placed = replace(placed, rows=on_branch(placed.rows, before, dims.wrapping))
+    placed = replace(placed, rows=unwrap_onto(placed.rows, before, dims.wrapping))
     if standing is not None:
         _fade(timeline, free_step, standing[None], [], min(JOIN_WINDOW, len(placed.rows)), dims)
     elif joining and planned is not None:
-        _fade(timeline, free_step, *timeline.span(free_step), JOIN_WINDOW, dims)
-    merge.lay(timeline, placed)
-    made = timeline.span(free_step)[1]
-    shares = _shares(free_step, made, placed.merged.chunk_id) if merge.continues else None
-    return replace(placed.merged, overlap=sum(len(makers) > 1 for makers in made), shares=shares)
+        _fade(timeline, free_step, *timeline.executed_rows(free_step), JOIN_WINDOW, dims)
+    merge.apply(timeline, placed)
+    made = timeline.executed_rows(free_step)[1]
+    shares = _contributions(free_step, made, placed.merged.chunk_id) if merge.uses_rtc else None
+    return replace(placed.merged, overlap=sum(len(makers) > 1 for makers in made), contributions=shares)
 
 
-def _shares(first: int, made: Sequence[Contributions], chunk_id: int) -> Float64 | None:
+def _contributions(first: int, made: Sequence[Contributions], chunk_id: int) -> Float64 | None:
     alone = ((chunk_id, 1.0),)
     told = [
         (step, maker, weight)
@@ -219,5 +223,5 @@ def _fade(
     Rows beyond `makers` are held targets.
     """
     last = np.minimum(np.arange(count), len(rows) - 1)
-    made = [*makers[:count], *single(HELD, max(0, count - len(makers)))]
-    timeline.begin_fade(Fade(step, rows[last], tuple(made), fading(count), dims))
+    made = [*makers[:count], *single_contribution(HELD, max(0, count - len(makers)))]
+    timeline.begin_fade(Fade(step, rows[last], tuple(made), fade_weights(count), dims))

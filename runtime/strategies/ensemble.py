@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.core.types import Float64
 from runtime.motion.timeline import Contributions, DimensionKinds, PlacedChunk, Timeline, difference
-from runtime.strategies.base import Arrival, Merge, Paced, Placement, Query, StrategyParameters
+from runtime.strategies.base import ArrivedChunk, Merge, Paced, Placement, Query, StrategyParameters
 from runtime.strategies.placing import place
 
 USES = frozenset({"inference_rate", "k_max", "ensemble_m", "ensemble_horizon"})
@@ -35,10 +35,10 @@ class EnsembleMerge(Merge):
         self._horizon = horizon
         self._dims = dims
 
-    def place(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Placement:
+    def place(self, timeline: Timeline, arrival: ArrivedChunk, free_step: int) -> Placement:
         return place(arrival, free_step, k_max=self._k_max)
 
-    def lay(self, timeline: Timeline, placed: Placement) -> None:
+    def apply(self, timeline: Timeline, placed: Placement) -> None:
         step = placed.first
         older = (
             PlacedChunk(old.chunk_id, step, old.rows[step - old.first :])

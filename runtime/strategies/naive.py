@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from runtime.motion.timeline import DimensionKinds, Timeline, single
-from runtime.strategies.base import Arrival, Merge, Paced, Placement, Query, StrategyParameters
+from runtime.motion.timeline import DimensionKinds, Timeline, single_contribution
+from runtime.strategies.base import ArrivedChunk, Merge, Paced, Placement, Query, StrategyParameters
 from runtime.strategies.placing import place
 
 USES = frozenset({"execution_horizon", "inference_rate", "k_max"})
@@ -24,11 +24,13 @@ class NaiveMerge(Merge):
         self._horizon = execution_horizon
         self._k_max = k_max
 
-    def place(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Placement:
+    def place(self, timeline: Timeline, arrival: ArrivedChunk, free_step: int) -> Placement:
         return place(arrival, free_step, self._horizon, self._k_max)
 
-    def lay(self, timeline: Timeline, placed: Placement) -> None:
-        timeline.replace(placed.first, placed.rows, single(placed.merged.chunk_id, len(placed.rows)))
+    def apply(self, timeline: Timeline, placed: Placement) -> None:
+        timeline.replace(
+            placed.first, placed.rows, single_contribution(placed.merged.chunk_id, len(placed.rows))
+        )
 
 
 def query(config: Config) -> Query:

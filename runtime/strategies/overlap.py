@@ -8,8 +8,14 @@ from __future__ import annotations
 
 from typing import Literal
 
-from runtime.motion.timeline import DimensionKinds, Timeline, mixed, overlap_blend, single
-from runtime.strategies.base import Arrival, Merge, Paced, Placement, Query, StrategyParameters
+from runtime.motion.timeline import (
+    DimensionKinds,
+    Timeline,
+    mix_contributions,
+    overlap_blend,
+    single_contribution,
+)
+from runtime.strategies.base import ArrivedChunk, Merge, Paced, Placement, Query, StrategyParameters
 from runtime.strategies.placing import place
 
 USES = frozenset({"execution_horizon", "inference_rate", "k_max", "blend_window", "blend_shape"})
@@ -31,15 +37,15 @@ class OverlapMerge(Merge):
         self._shape = parameters.blend_shape
         self._dims = dims
 
-    def place(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Placement:
+    def place(self, timeline: Timeline, arrival: ArrivedChunk, free_step: int) -> Placement:
         return place(arrival, free_step, self._horizon, self._k_max)
 
-    def lay(self, timeline: Timeline, placed: Placement) -> None:
+    def apply(self, timeline: Timeline, placed: Placement) -> None:
         old, makers = timeline.plan(placed.first)
         rows, weights = overlap_blend(old, placed.rows, self._window, self._dims, self._shape)
-        made = single(placed.merged.chunk_id, len(rows))
+        made = single_contribution(placed.merged.chunk_id, len(rows))
         for index, weight in enumerate(weights.tolist()):
-            made[index] = mixed(makers[index], made[index], weight)
+            made[index] = mix_contributions(makers[index], made[index], weight)
         timeline.replace(placed.first, rows, made)
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.strategies.base import Arrival, Merged, Placement
+from runtime.strategies.base import ArrivedChunk, MergeResult, Placement
 
 
 def place(
-    arrival: Arrival, free_step: int, horizon: int | None = None, k_max: int | None = None
+    arrival: ArrivedChunk, free_step: int, horizon: int | None = None, k_max: int | None = None
 ) -> Placement:
     """Row i is for observation_step + i; rows for steps before `free_step` are stale and dropped.
 
@@ -18,25 +18,25 @@ def place(
     """
     delay = free_step - arrival.observation_step
     count = len(arrival.rows) if horizon is None else min(horizon, len(arrival.rows))
-    due = 0 if arrival.waited else delay
+    due = 0 if arrival.requested_while_stopped else delay
     if due >= count:
-        return dropped(arrival, free_step, _past(delay, count, len(arrival.rows)))
+        return drop(arrival, free_step, _stale_rows(delay, count, len(arrival.rows)))
     stale = max(0, due if k_max is None else min(due, k_max))
     targets = np.full(len(arrival.rows), -1, np.int64)
     targets[stale:count] = free_step + np.arange(count - stale)
-    merged = Merged(arrival.chunk_id, free_step, delay, targets, mistimed=due - stale)
+    merged = MergeResult(arrival.chunk_id, free_step, delay, targets, mistimed=due - stale)
     before = arrival.rows[stale - 1] if stale else None
     return Placement(arrival.rows[stale:count], merged, before)
 
 
-def dropped(arrival: Arrival, free_step: int, why: str) -> Placement:
+def drop(arrival: ArrivedChunk, free_step: int, why: str) -> Placement:
     """A chunk that is not used."""
     nowhere = np.full(len(arrival.rows), -1, np.int64)
     delay = free_step - arrival.observation_step
-    return Placement(arrival.rows[:0], Merged(arrival.chunk_id, free_step, delay, nowhere, dropped=why))
+    return Placement(arrival.rows[:0], MergeResult(arrival.chunk_id, free_step, delay, nowhere, dropped=why))
 
 
-def _past(delay: int, count: int, rows: int) -> str:
+def _stale_rows(delay: int, count: int, rows: int) -> str:
     used = (
         f"its {rows} rows"
         if count == rows

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from runtime.motion.timeline import DimensionKinds, Timeline, difference, single
+from runtime.motion.timeline import DimensionKinds, Timeline, difference, single_contribution
 from runtime.strategies.base import Merge, Paced, Placement, Query, StrategyParameters
 from runtime.strategies.overlap import OverlapMerge
 
@@ -30,20 +30,22 @@ class Config(StrategyParameters):
 class RtcQuery(Paced):
     """Asks back to back, or at a rate; its requests carry what the robot is committed to."""
 
-    continues = True
+    uses_rtc = True
 
 
 class RtcMerge(OverlapMerge):
     """Lays a chunk as it is where it passes through the step that is executed last before it, else blended."""
 
-    continues = True
+    uses_rtc = True
 
-    def lay(self, timeline: Timeline, placed: Placement) -> None:
+    def apply(self, timeline: Timeline, placed: Placement) -> None:
         if not self._continues(timeline, placed):
-            super().lay(timeline, placed)
+            super().apply(timeline, placed)
             return
         timeline.fade = None  # the chunk continues what was made of it
-        timeline.replace(placed.first, placed.rows, single(placed.merged.chunk_id, len(placed.rows)))
+        timeline.replace(
+            placed.first, placed.rows, single_contribution(placed.merged.chunk_id, len(placed.rows))
+        )
 
     def _continues(self, timeline: Timeline, placed: Placement) -> bool:
         last = timeline.at(placed.first - 1)

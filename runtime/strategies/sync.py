@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from runtime.motion.timeline import DimensionKinds, Timeline, single
-from runtime.strategies.base import Arrival, Merge, Placement, Progress, Query, StrategyParameters
-from runtime.strategies.placing import dropped, place
+from runtime.motion.timeline import DimensionKinds, Timeline, single_contribution
+from runtime.strategies.base import ArrivedChunk, Merge, Placement, Progress, Query, StrategyParameters
+from runtime.strategies.placing import drop, place
 
 USES = frozenset({"execution_horizon"})
 
@@ -20,31 +20,33 @@ class Config(StrategyParameters):
 class SyncQuery(Query):
     """Asks when nothing is left to execute."""
 
-    waits = True
+    requests_while_stopped = True
 
-    def wants(self, progress: Progress) -> bool:
+    def should_request(self, progress: Progress) -> bool:
         return progress.remaining == 0 and not progress.in_flight
 
 
 class SyncMerge(Merge):
     """Executes what was asked while the robot stood, whole; refuses what was asked while it moved."""
 
-    waits = True
+    requests_while_stopped = True
 
     def __init__(self, execution_horizon: int | None) -> None:
         self._horizon = execution_horizon
 
-    def place(self, timeline: Timeline, arrival: Arrival, free_step: int) -> Placement:
-        if arrival.waited:
+    def place(self, timeline: Timeline, arrival: ArrivedChunk, free_step: int) -> Placement:
+        if arrival.requested_while_stopped:
             return place(arrival, free_step, self._horizon)
         left = timeline.remaining(free_step)
         then = (
             f"the {left} steps still planned are finished first" if left else "the next is asked as it stands"
         )
-        return dropped(arrival, free_step, f"asked while the robot moved, and sync waits: {then}")
+        return drop(arrival, free_step, f"asked while the robot moved, and sync waits: {then}")
 
-    def lay(self, timeline: Timeline, placed: Placement) -> None:
-        timeline.replace(placed.first, placed.rows, single(placed.merged.chunk_id, len(placed.rows)))
+    def apply(self, timeline: Timeline, placed: Placement) -> None:
+        timeline.replace(
+            placed.first, placed.rows, single_contribution(placed.merged.chunk_id, len(placed.rows))
+        )
 
 
 def query(config: Config) -> Query:

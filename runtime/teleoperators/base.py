@@ -56,7 +56,7 @@ class Leader(ABC):
         """Stop listening; safe to call twice."""
 
     @property
-    def newest(self) -> LeaderPose | None:
+    def latest_pose(self) -> LeaderPose | None:
         """Newest pose of the leader; None where it has given none since it was connected."""
         with self._lock:
             return self._newest
@@ -71,7 +71,7 @@ class Leader(ABC):
         return (len(times) - 1) / max(times[-1] - times[0], 1e-9)
 
     @property
-    def refused(self) -> str:
+    def problem(self) -> str:
         """Why its newest message could not be used, "" where it could."""
         with self._lock:
             return self._refused
@@ -91,7 +91,7 @@ class Leader(ABC):
             self._refused = why
 
 
-def joints_of(state: Mapping[str, object], robot: Robot) -> Float64:
+def joints_from_state(state: Mapping[str, object], robot: Robot) -> Float64:
     """Joints [D] of the groups in `state`, NaN for those that are absent; CodecError names what does not fit."""
     known = [group.name for group in robot.groups]
     unknown = [str(name) for name in state if name not in known]

@@ -35,13 +35,13 @@ _NODE_DRIVES = fixed(
     "the node drives the robot by its own leader: there is nothing to ask",
 )
 
-Following = Literal["absolute", "relative"]
+FollowMode = Literal["absolute", "relative"]
 _FOUND_S = 5.0  # for a leader to say something when the station is set up
 _LOOK_S = 0.02
 _SPARE_ROWS = 2  # beyond the age limit: silence is told by its age, not by starvation
 
 
-class Relay(Policy):
+class LeaderPolicy(Policy):
     """Follows a leader: to where it is ("absolute"), or by as much as it moved since the engagement ("relative").
 
     The engagement is the first question after a reset, or after the robot was held: what the leader did meanwhile is
@@ -50,13 +50,13 @@ class Relay(Policy):
     read, gravity would lower the arm at each engagement.
     """
 
-    sees_pictures = False
+    uses_images = False
 
     def __init__(
         self,
         leader: Leader,
         robot: Robot,
-        mode: Following,
+        mode: FollowMode,
         max_age: float,
         rate: float,
         clock: Clock,
@@ -78,15 +78,15 @@ class Relay(Policy):
         """Listen, and wait for the leader to say where it is; PolicyLostError where it does not."""
         self.leader.connect()
         deadline = self._clock.now() + _FOUND_S
-        while self.leader.newest is None:
+        while self.leader.latest_pose is None:
             if self._clock.now() > deadline:
-                raise PolicyLostError(self.silence() or _SAYS_NOTHING(who=self.leader.name))
+                raise PolicyLostError(self.leader_problem() or _SAYS_NOTHING(who=self.leader.name))
             self._clock.sleep_until(self._clock.now() + _LOOK_S)
         return PolicyInfo(self.leader.name, action_space="joint")
 
-    def silence(self) -> str:
+    def leader_problem(self) -> str:
         """Why the leader cannot be followed just now, "" where it can."""
-        newest, why = self.leader.newest, self.leader.refused
+        newest, why = self.leader.latest_pose, self.leader.problem
         because = _BECAUSE(why=why) if why else ""
         if newest is None:
             return _SAID_NOTHING(who=self.leader.name, because=because)
@@ -105,12 +105,12 @@ class Relay(Policy):
         target = self._follow(pose)
         return ActionChunk(np.tile(target, (self._rows, 1)).astype(np.float32))
 
-    def aim(self, qpos: Float64, commanded: Float64 | None) -> Float64 | None:
+    def first_goal(self, qpos: Float64, commanded: Float64 | None) -> Float64 | None:
         """First goal of a robot at `qpos` that is told to be at `commanded` [D], None where it is told nothing.
 
         None if the leader is silent, or leads from where it is.
         """
-        if self.mode == "relative" or self.silence():
+        if self.mode == "relative" or self.leader_problem():
             return None
         joints = self._pose().joints
         return np.where(np.isnan(joints), self._engaged_at(qpos, commanded), joints)
@@ -122,7 +122,7 @@ class Relay(Policy):
         return np.where(off <= self._steady_error, commanded, qpos)
 
     def _pose(self) -> LeaderPose:
-        newest, why = self.leader.newest, self.silence()
+        newest, why = self.leader.latest_pose, self.leader_problem()
         if newest is None or why:
             raise PolicyLostError(why)
         return newest
@@ -151,11 +151,11 @@ class Relay(Policy):
         self.leader.close()
 
 
-class NodeLed(Policy):
+class NodeDrivenPolicy(Policy):
     """The robot's own node reads the leader and drives: nobody is asked here, what it applied is recorded."""
 
-    answers = False
-    sees_pictures = False
+    is_queried = False
+    uses_images = False
 
     def connect(self) -> PolicyInfo:
         return PolicyInfo(_NODE_LEADER)

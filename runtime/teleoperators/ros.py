@@ -16,8 +16,8 @@ from runtime.teleoperators.base import Leader
 from runtime.transports.ros.messages import JointState, Wire
 from runtime.transports.ros.middleware import Match, Middleware, Quality
 from runtime.transports.ros.reading import JointOrder, Names
-from runtime.transports.ros.source import Heard, subscriptions
-from runtime.transports.ros.topics import Part
+from runtime.transports.ros.source import Subscription, subscriptions
+from runtime.transports.ros.topics import StreamSpec
 
 if TYPE_CHECKING:
     from robots import Group, Robot
@@ -27,7 +27,7 @@ NODE = "eva_web_leader"
 TABLE = "collection.leader"
 
 
-class LedGroup(Settings):
+class LeaderGroup(Settings):
     """Topic and joints of the leader of one group."""
 
     topic: Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$")] | None = None
@@ -37,10 +37,10 @@ class LedGroup(Settings):
     """What the messages call the group's joints, in its order, where that is not what the robot's description does."""
 
 
-class LedGroups(Settings):
+class LeaderGroups(Settings):
     """Settings of a leader that both generations of ROS have in common."""
 
-    groups: dict[str, LedGroup] = Field(min_length=1)
+    groups: dict[str, LeaderGroup] = Field(min_length=1)
     """By the robot's groups; one that is absent is not led."""
     joint_names: Names = "check"
     """"check" takes joints by their names, in any order; "ignore" takes the first numbers as they come."""
@@ -57,7 +57,7 @@ class RosLeader(Leader):
 
     def __init__(
         self,
-        config: LedGroups,
+        config: LeaderGroups,
         version: Literal[1, 2],
         robot: Robot,
         clock: Clock,
@@ -90,7 +90,7 @@ class RosLeader(Leader):
         self._begin()
         self._middleware = self._open()
         for heard in subscriptions(tuple(self._parts.values()), lambda _: self._quality):
-            self._middleware.subscribe(heard.topic, self._taker(heard))
+            self._middleware.subscribe(heard.topic, self._make_callback(heard))
 
     def close(self) -> None:
         if self._middleware is not None:
@@ -98,9 +98,9 @@ class RosLeader(Leader):
             self._middleware = None
 
     @property
-    def refused(self) -> str:
+    def problem(self) -> str:
         """Why a message could not be used, else which topics say nothing new and why, "" where all do."""
-        if said := super().refused:
+        if said := super().problem:
             return said
         waiting = [part.topic for group, part in self._parts.items() if group not in self._fresh]
         if self._middleware is None or not waiting:
@@ -115,7 +115,7 @@ class RosLeader(Leader):
         self._stamps: dict[str, int] = {}  # by topic
         self._fresh: dict[str, tuple[Float64, float]] = {}  # by group: joints, and when they arrived
 
-    def _taker(self, heard: Heard) -> Callable[[bytes], None]:
+    def _make_callback(self, heard: Subscription) -> Callable[[bytes], None]:
         topic = heard.topic.name
 
         def take(payload: bytes) -> None:
@@ -126,16 +126,18 @@ class RosLeader(Leader):
                 if message.stamp and message.stamp == self._stamps.get(topic):
                     return
                 self._stamps[topic] = message.stamp
-                said = {part.of: self._orders[part.of].read(message)[0] for part in heard.parts}
+                said = {
+                    part.source_key: self._orders[part.source_key].read(message)[0] for part in heard.parts
+                }
             except CodecError as error:
                 self._refuse(f"{topic}: {error}")
                 return
             for group, position in said.items():
-                self._said(group, position, arrived)
+                self._add_reading(group, position, arrived)
 
         return take
 
-    def _said(self, group: str, position: Float64, arrived: float) -> None:
+    def _add_reading(self, group: str, position: Float64, arrived: float) -> None:
         self._fresh[group] = position, arrived
         if len(self._fresh) < len(self._parts):
             return
@@ -153,7 +155,7 @@ def _silence(topic: str, match: Match) -> str:
     return match.refused or f"nobody publishes {topic}"
 
 
-def _known(led: Mapping[str, LedGroup], robot: Robot) -> dict[str, Group]:
+def _known(led: Mapping[str, LeaderGroup], robot: Robot) -> dict[str, Group]:
     groups = {group.name: group for group in robot.groups}
     unknown = [name for name in led if name not in groups]
     if unknown:
@@ -163,7 +165,7 @@ def _known(led: Mapping[str, LedGroup], robot: Robot) -> dict[str, Group]:
     return groups
 
 
-def _part(group: Group, led: LedGroup, own: RosGroupTable | None) -> Part:
+def _part(group: Group, led: LeaderGroup, own: RosGroupTable | None) -> StreamSpec:
     names = group.joints if led.joints is None else tuple(led.joints)
     if len(names) != group.dof or len(set(names)) != len(names):
         raise ConfigurationError(
@@ -175,4 +177,4 @@ def _part(group: Group, led: LedGroup, own: RosGroupTable | None) -> Part:
         raise ConfigurationError(
             f"{TABLE}.groups.{group.name}.topic is missing, and the robot's description names no `leader` of that group"
         )
-    return Part("joints", group.name, topic, "JointState", names)
+    return StreamSpec("joints", group.name, topic, "JointState", names)

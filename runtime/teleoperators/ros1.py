@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from runtime.core.clock import Clock
-from runtime.teleoperators.ros import NODE, TABLE, LedGroups, RosLeader
+from runtime.teleoperators.ros import NODE, TABLE, LeaderGroups, RosLeader
 from runtime.transports import ros1
 from runtime.transports.ros import packed
 from runtime.transports.ros.middleware import Quality
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _NEWEST = Quality(depth=1)
 
 
-class Config(ros1.Link, LedGroups):
+class Config(ros1.Link, LeaderGroups):
     """A leader whose arms publish on ROS 1 topics."""
 
     table: ClassVar[str] = TABLE

@@ -8,7 +8,7 @@ from pydantic import model_validator
 
 from runtime.core.clock import Clock
 from runtime.core.errors import ConfigurationError
-from runtime.teleoperators.ros import NODE, TABLE, LedGroups, RosLeader
+from runtime.teleoperators.ros import NODE, TABLE, LeaderGroups, RosLeader
 from runtime.transports import ros2
 from runtime.transports.ros import cdr
 from runtime.transports.ros.middleware import SENSOR_QUALITY, Quality
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from robots import Robot
 
 
-class Config(ros2.Link, LedGroups):
+class Config(ros2.Link, LeaderGroups):
     """A leader whose arms publish on ROS 2 topics."""
 
     table: ClassVar[str] = TABLE
@@ -37,5 +37,5 @@ class Config(ros2.Link, LedGroups):
 
 def build(config: Config, robot: Robot, clock: Clock) -> RosLeader:
     """The leader, not yet connected; ConfigurationError names a group or joint that is not the robot's."""
-    quality = config.qos.otherwise(SENSOR_QUALITY)
+    quality = config.qos.merged_over(SENSOR_QUALITY)
     return RosLeader(config, 2, robot, clock, quality, cdr, lambda: ros2.middleware(config, NODE))

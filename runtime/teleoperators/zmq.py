@@ -19,7 +19,7 @@ from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.errors import CodecError, ConfigurationError, TransportError
 from runtime.core.settings import Settings
-from runtime.teleoperators.base import Leader, joints_of
+from runtime.teleoperators.base import Leader, joints_from_state
 from runtime.transports import node_link
 from runtime.transports.node_settings import Endpoint
 from runtime.transports.zmq import is_loopback
@@ -79,7 +79,7 @@ class ZmqLeader(Leader):
         self._stamp = math.nan
         self._ending.clear()
         try:
-            socket = self._subscribed()
+            socket = self._open_subscriber()
         except zmq.ZMQError as error:
             raise TransportError(f"cannot listen to {self.name}: {error}") from error
         self._thread = threading.Thread(target=self._read, args=(socket,), name="leader", daemon=True)
@@ -91,22 +91,22 @@ class ZmqLeader(Leader):
             self._thread.join()
             self._thread = None
 
-    def _subscribed(self) -> zmq.Socket[bytes]:
+    def _open_subscriber(self) -> zmq.Socket[bytes]:
         options: dict[int, int | bytes] = {
             zmq.CONFLATE: 1,
             zmq.MAXMSGSIZE: _LIMIT,
             zmq.SUBSCRIBE: b"",
         }
-        return node_link.opened(zmq.SUB, self._endpoint, options)
+        return node_link.open_socket(zmq.SUB, self._endpoint, options)
 
     def _read(self, socket: zmq.Socket[bytes] | None) -> None:
         """The thread: nothing that happens in it may end it, because nobody else listens to the leader."""
         while not self._ending.is_set():
             try:
                 if socket is None:
-                    socket = self._subscribed()
+                    socket = self._open_subscriber()
                 if socket.poll(_WAKE_MS):
-                    self.hear(socket.recv())
+                    self.handle_message(socket.recv())
             except zmq.ZMQError as error:
                 self._refuse(f"the socket failed and is opened anew: {error}")
                 if socket is not None:
@@ -116,10 +116,10 @@ class ZmqLeader(Leader):
         if socket is not None:
             socket.close()
 
-    def hear(self, payload: bytes) -> None:
+    def handle_message(self, payload: bytes) -> None:
         """Take one message; one that cannot be used is remembered as the reason for which nothing comes."""
         try:
-            stamp, joints = self._understood(payload)
+            stamp, joints = self._parse(payload)
         except CodecError as error:
             self._refuse(str(error))
             return
@@ -127,7 +127,7 @@ class ZmqLeader(Leader):
             self._stamp = stamp
             self._take(joints, self._clock.now())
 
-    def _understood(self, payload: bytes) -> tuple[float, np.ndarray]:
+    def _parse(self, payload: bytes) -> tuple[float, np.ndarray]:
         message = msgpack_arrays.unpack(payload, _LIMIT)
         if not isinstance(message, dict):
             raise CodecError(f"the leader's message is a {type(message).__name__}; expected a map")
@@ -138,4 +138,4 @@ class ZmqLeader(Leader):
             isinstance(part, np.ndarray) and part.dtype.kind == "f" for part in state.values()
         ):
             raise CodecError("the leader's state is no map of float arrays by group")
-        return float(stamp), joints_of(state, self._robot)
+        return float(stamp), joints_from_state(state, self._robot)

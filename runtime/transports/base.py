@@ -18,7 +18,7 @@ class Capabilities:
     """Abilities of a transport; a deployment that asks for more is refused at set-up."""
 
     moves_robot: bool  # commands reach something that can break: report-only safety is refused
-    ends: bool = False  # the source runs out (a recording)
+    is_finite: bool = False  # the source runs out (a recording)
     measures_eef: bool = False
     spaces: frozenset[str] = frozenset(
         {"joint"}
@@ -26,7 +26,9 @@ class Capabilities:
     poses: tuple[
         PoseFormat, ...
     ] = ()  # formats of poses that it takes where it publishes "eef"; any where empty
-    leads: bool = False  # its robot reads a leader of its own when it is told to, and reports what it applied
+    drives_itself: bool = (
+        False  # its robot reads a leader of its own when it is told to, and reports what it applied
+    )
     resets_bench: bool = (
         False  # declared simulated: it lays out its bench when told, and says the truth of it
     )
@@ -60,7 +62,7 @@ class Source(ABC):
         """Counts by name of what went wrong since connect, e.g. {"clock_backwards": 1, "malformed": 3}."""
         return {}
 
-    def why(self, fault: str) -> str:
+    def describe_fault(self, fault: str) -> str:
         """The newest sentence about one of `faults`; "" where its name says all there is to say."""
         return ""
 
@@ -68,7 +70,7 @@ class Source(ABC):
         """Health of each camera of the deployment's own; {} where all pictures come from the transport."""
         return {}
 
-    def news(self) -> list[Event]:
+    def pop_events(self) -> list[Event]:
         """Events since the last call of which the operator is told."""
         return []
 
@@ -84,14 +86,14 @@ class Sink(ABC):
     def send(self, command: RobotCommand) -> None:
         """Hand over one command without waiting for anybody."""
 
-    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+    def send_control_word(self, word: str, data: Mapping[str, Any]) -> None:
         """Hand over a control word with its fields, without waiting; raises TransportError where it takes none.
 
         A word may be lost like a command: who needs it obeyed repeats it until the observations show that it was.
         """
         raise TransportError(f"this transport takes no control words; {word!r} was to be sent")
 
-    def unheard(self) -> dict[str, str]:
+    def missing_subscribers(self) -> dict[str, str]:
         """Places of commands that no peer takes, each with a sentence on why, or "" where nothing is known.
 
         {} also where a transport cannot know. Asks no peer and waits for nothing; raises TransportError.

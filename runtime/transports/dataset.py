@@ -16,7 +16,7 @@ from runtime.transports.base import Capabilities, Sink, Source
 
 if TYPE_CHECKING:
     from robots import Robot
-    from runtime.datasets.pictures import PictureSequence
+    from runtime.datasets.pictures import ImageSequence
     from runtime.datasets.reader import RecordedEpisode
 
 TOLERANCE = 1e-6  # a frame counts as due this much early [s]: due times are sums of floats
@@ -50,7 +50,7 @@ class DatasetSource(Source):
         self._robot = robot
         self._clock = clock
         self._episode: RecordedEpisode | None = None
-        self._pictures: dict[str, PictureSequence] = {}
+        self._pictures: dict[str, ImageSequence] = {}
         self._sequence = 0
         self._skipped = 0
         self._start: float | None = None  # of the run; None: before it
@@ -118,10 +118,10 @@ class DatasetSource(Source):
             raise TransportError(f"the dataset {self._config.path} is not connected")
         deadline = self._clock.now() + max(timeout, 0.0)
         if self._start is None:
-            return self._receive_standing(episode, deadline)
+            return self._receive_idle(episode, deadline)
         return self._receive_running(episode, self._start, deadline)
 
-    def _receive_standing(self, episode: RecordedEpisode, deadline: float) -> Observation | None:
+    def _receive_idle(self, episode: RecordedEpisode, deadline: float) -> Observation | None:
         if not self._wait(self._standing_due, deadline):
             return None
         now = self._clock.now()
@@ -135,7 +135,7 @@ class DatasetSource(Source):
             return None
         due = start + self._next / episode.fps
         if self._clock.now() + TOLERANCE < due:
-            self._decode_ahead(self._config.start_frame + self._next)
+            self._prefetch(self._config.start_frame + self._next)
         if not self._wait(due, deadline):
             return None
         newest = int((self._clock.now() + TOLERANCE - start) * episode.fps)
@@ -150,7 +150,7 @@ class DatasetSource(Source):
             self._clock.sleep_until(min(due, deadline))
         return self._clock.now() + TOLERANCE >= due
 
-    def _decode_ahead(self, row: int) -> None:
+    def _prefetch(self, row: int) -> None:
         """Use the time until `row` is due; what is broken is told when it is."""
         with suppress(RecordingError):
             self._decode(row)
@@ -214,7 +214,7 @@ class DatasetSink(Sink):
 
 def capabilities(config: Config) -> Capabilities:
     """A recording moves nothing and ends; it measures poses where the mapping names their column."""
-    return Capabilities(moves_robot=False, ends=True, measures_eef=config.mapping.eef is not None)
+    return Capabilities(moves_robot=False, is_finite=True, measures_eef=config.mapping.eef is not None)
 
 
 def source(config: Config, robot: Robot, clock: Clock) -> DatasetSource:

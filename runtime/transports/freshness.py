@@ -12,7 +12,7 @@ FROZEN_S = 0.5  # after which a camera counts as frozen; nothing is decided by i
 _SAMPLED_ROWS = 16  # every so many rows are compared first: two pictures of a live camera differ there
 
 
-class Freshness:
+class FrozenCameraDetector:
     """Since when each camera shows what it shows; for the pictures of one source, in their order."""
 
     def __init__(self) -> None:

@@ -16,7 +16,7 @@ _ALIVE = {
 }
 
 
-def opened(kind: int, endpoint: str, options: Mapping[int, int | bytes]) -> zmq.Socket[bytes]:
+def open_socket(kind: int, endpoint: str, options: Mapping[int, int | bytes]) -> zmq.Socket[bytes]:
     """A connected socket of that kind; raises ZMQError for an address that libzmq refuses."""
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
     try:

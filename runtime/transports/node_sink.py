@@ -51,7 +51,7 @@ class NodeSink(Sink):
             zmq.IMMEDIATE: 1,
         }
         try:
-            self._socket = node_link.opened(zmq.PUB, self._endpoint, options)
+            self._socket = node_link.open_socket(zmq.PUB, self._endpoint, options)
         except zmq.ZMQError as error:
             raise TransportError(f"cannot reach the node at {self._endpoint}: {error}") from error
 
@@ -66,7 +66,7 @@ class NodeSink(Sink):
         self._send({"t": float(command.time), "action": action, "target": "real"})
         self._newest = action
 
-    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+    def send_control_word(self, word: str, data: Mapping[str, Any]) -> None:
         """Hand over the control word `word`: it stands where a command says its target, its fields beside it.
 
         Words that older nodes know come with a vector, as those want it: the newest command, 0 where there was none.

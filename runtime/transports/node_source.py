@@ -23,7 +23,7 @@ from runtime.ipc.messages import Event
 from runtime.ipc.readable import readable
 from runtime.transports import node_link
 from runtime.transports.base import Source
-from runtime.transports.freshness import FROZEN_S, Freshness
+from runtime.transports.freshness import FROZEN_S, FrozenCameraDetector
 from runtime.transports.node_messages import (
     MESSAGE_LIMIT,
     MessageRefused,
@@ -146,7 +146,7 @@ class NodeSource(Source):
         self._forget()
         self._ending.clear()
         try:
-            socket = self._subscribed()
+            socket = self._open_subscriber()
         except zmq.ZMQError as error:
             raise TransportError(_CANNOT_LISTEN(endpoint=self._endpoint, error=error)) from error
         self._thread = threading.Thread(target=self._read, args=(socket,), name="node-source", daemon=True)
@@ -178,7 +178,7 @@ class NodeSource(Source):
             refused = {f"node_refused.{reason}": n for reason, n in self._status.refused.items()}
             return dict(self._faults) | refused
 
-    def why(self, fault: str) -> str:
+    def describe_fault(self, fault: str) -> str:
         """The newest sentence of a fault; of what the node refused, what that means."""
         if fault == "node_refused.other_master":
             return _SEVERAL_CLIENTS(client=self._status.master)
@@ -187,7 +187,7 @@ class NodeSource(Source):
         with self._changed:
             return self._sentences.get(fault, "")
 
-    def news(self) -> list[Event]:
+    def pop_events(self) -> list[Event]:
         """Why no usable frame comes, once for each reason."""
         now = self._clock.now()
         with self._changed:
@@ -198,7 +198,7 @@ class NodeSource(Source):
             self._told = reason
         if not fresh:
             return []
-        return [Event("source_waiting", self._waiting(silent, refused and refused[1]), now)]
+        return [Event("source_waiting", self._no_frame_reason(silent, refused and refused[1]), now)]
 
     @property
     def last_fault(self) -> str:
@@ -213,7 +213,7 @@ class NodeSource(Source):
     def _forget(self) -> None:
         self._map = ClockMap(tolerance=_BACKWARDS_S)
         self._stamp = -math.inf  # of the newest message
-        self._freshness = Freshness()
+        self._freshness = FrozenCameraDetector()
         self._faults: Counter[str] = Counter()
         self._sentences: dict[str, str] = {}  # by fault, the newest
         self._last_fault = ""
@@ -225,58 +225,58 @@ class NodeSource(Source):
         self._refused: tuple[str, str] | None = None  # the newest message that was, and why
         self._told = ""
 
-    def _waiting(self, silent: float, refusal: str | None) -> str:
+    def _no_frame_reason(self, silent: float, refusal: str | None) -> str:
         told = {"endpoint": self._endpoint, "seconds": silent}
         if refusal:
             return _NOTHING_USABLE(**told, why=refusal)
         return _STOPPED(**told) if self._count else _NEVER_CAME(**told)
 
-    def _subscribed(self) -> zmq.Socket[bytes]:
+    def _open_subscriber(self) -> zmq.Socket[bytes]:
         """A socket that hears the node; raises ZMQError."""
         options: dict[int, int | bytes] = {
             zmq.RCVHWM: _QUEUED_FRAMES,
             zmq.MAXMSGSIZE: MESSAGE_LIMIT,
             zmq.SUBSCRIBE: b"",
         }
-        return node_link.opened(zmq.SUB, self._endpoint, options)
+        return node_link.open_socket(zmq.SUB, self._endpoint, options)
 
     def _read(self, socket: zmq.Socket[bytes] | None) -> None:
         """The thread: nothing that happens in it may end it, because nobody else listens to the node."""
         while not self._ending.is_set():
             try:
                 if socket is None:
-                    socket = self._subscribed()
+                    socket = self._open_subscriber()
                 if socket.poll(_WAKE_MS):
-                    self._take(_drain(socket), self._clock.now())
+                    self._handle_messages(_drain(socket), self._clock.now())
             except zmq.ZMQError as error:
-                self._blame("socket_failed", f"the socket failed and is opened anew: {error}")
+                self._count_fault("socket_failed", f"the socket failed and is opened anew: {error}")
                 if socket is not None:
                     socket.close()
                     socket = None
                 self._ending.wait(_REOPEN_S)
             except Exception as error:
-                self._blame_ourselves(error)
+                self._count_internal_error(error)
                 self._ending.wait(_WAKE_MS / 1000)  # so that an error that stays does not spin
         if socket is not None:
             socket.close()
 
-    def _take(self, payloads: list[memoryview], arrived: float) -> None:
+    def _handle_messages(self, payloads: list[memoryview], arrived: float) -> None:
         """Keep the newest usable message; a partial or broken one never displaces an older complete one."""
         self._heard_at = arrived
         for payload in reversed(payloads):
             try:
                 frame = self._messages.read(payload)
             except MessageRefused as error:
-                self._blame(error.fault, str(error))
+                self._count_fault(error.fault, str(error))
                 self._refused = error.fault, str(error)
             else:
-                if self._keep(frame, arrived):
+                if self._store_frame(frame, arrived):
                     return
 
-    def _keep(self, frame: NodeFrame, arrived: float) -> bool:
+    def _store_frame(self, frame: NodeFrame, arrived: float) -> bool:
         """Keep it for who receives; False where it is older than what came before it."""
         for fault, text in frame.remarks:
-            self._blame(fault, text)
+            self._count_fault(fault, text)
         if frame.truth is not None and not self._simulated:
             self._ignore_truth()
             frame = replace(frame, truth=None)
@@ -284,7 +284,7 @@ class NodeSource(Source):
         if time is None:
             with self._changed:
                 self._count_lost(frame.sequence)
-            self._blame("not_newer", _NOT_NEWER)
+            self._count_fault("not_newer", _NOT_NEWER)
             self._refused = "not_newer", _NOT_NEWER
             return False
         captured = self._captured(frame, time)
@@ -301,7 +301,7 @@ class NodeSource(Source):
         """Said once: every message of such a node has it."""
         if "truth_ignored" not in self._faults:
             text = _TRUTH_UNDECLARED
-            self._blame("truth_ignored", text)
+            self._count_fault("truth_ignored", text)
 
     def _captured(self, frame: NodeFrame, time: float) -> dict[str, float]:
         """The time of each stream: the message's, but for pictures that are no new ones."""
@@ -309,7 +309,7 @@ class NodeSource(Source):
         if self._detect_frozen:
             times |= self._freshness.captured(frame.pictures, time)
             for camera in self._freshness.newly_frozen(time):
-                self._blame(f"frozen_{camera}", _FROZEN_PICTURE(camera=camera, seconds=FROZEN_S))
+                self._count_fault(f"frozen_{camera}", _FROZEN_PICTURE(camera=camera, seconds=FROZEN_S))
         return times
 
     def _mapped(self, stamp: float, arrived: float) -> float | None:
@@ -320,9 +320,9 @@ class NodeSource(Source):
         restarts, leaps = self._map.restarts, self._map.leaps
         time = self._map.map(stamp, arrived)
         if self._map.restarts > restarts:
-            self._blame("clock_backwards", _CLOCK_BACK)
+            self._count_fault("clock_backwards", _CLOCK_BACK)
         if self._map.leaps > leaps:
-            self._blame("clock_forwards", _CLOCK_AHEAD)
+            self._count_fault("clock_forwards", _CLOCK_AHEAD)
         if self._map.restarts == restarts and stamp < self._stamp:
             return None
         self._stamp = stamp
@@ -334,17 +334,17 @@ class NodeSource(Source):
             self._sentences["frames_lost"] = _FRAMES_LOST
         self._peer_sequence = sequence
 
-    def _blame(self, fault: str, text: str) -> None:
+    def _count_fault(self, fault: str, text: str) -> None:
         with self._changed:
             self._faults[fault] += 1
             self._sentences[fault] = text
             self._last_fault = f"{self._endpoint}: {text}"
 
-    def _blame_ourselves(self, error: Exception) -> None:
+    def _count_internal_error(self, error: Exception) -> None:
         text = f"reading failed: {type(error).__name__}: {error}"
         if not self._last_fault.endswith(text):  # once, not thirty times a second
             log.error("%s: %s", self._endpoint, text, exc_info=error)
-        self._blame("reader_failed", text)
+        self._count_fault("reader_failed", text)
 
 
 def _drain(socket: zmq.Socket[bytes]) -> list[memoryview]:
@@ -364,7 +364,7 @@ def _observation(
 ) -> Observation:
     pictures = frame.pictures
     if frame.encoding == "bgr":
-        pictures = {key: _swapped(picture) for key, picture in pictures.items()}
+        pictures = {key: _bgr_to_rgb(picture) for key, picture in pictures.items()}
     return Observation(
         sequence=sequence,
         arrived=arrived,
@@ -379,7 +379,7 @@ def _observation(
     )
 
 
-def _swapped(bgr: UInt8) -> UInt8:
+def _bgr_to_rgb(bgr: UInt8) -> UInt8:
     """RGB from BGR, ten times as fast as numpy would; imported here, as control locks all that it imports."""
     import cv2
 

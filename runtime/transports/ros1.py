@@ -19,12 +19,12 @@ from runtime.core.settings import Settings
 from runtime.transports.base import Capabilities
 from runtime.transports.ros import packed
 from runtime.transports.ros.middleware import COMMAND_QUALITY, Middleware, Quality
-from runtime.transports.ros.rospy_process import Site, require
+from runtime.transports.ros.rospy_process import RosEnvironment, require
 from runtime.transports.ros.settings import RosSettings, camera_keys
 from runtime.transports.ros.sink import RosSink
-from runtime.transports.ros.source import Heard, RosSource, subscriptions
+from runtime.transports.ros.source import RosSource, Subscription, subscriptions
 from runtime.transports.ros.tcpros import TcpRosMiddleware
-from runtime.transports.ros.topics import Part
+from runtime.transports.ros.topics import StreamSpec
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -82,7 +82,7 @@ class Config(Link, RosSettings):
 def capabilities(config: Config) -> Capabilities:
     """A robot hangs on it; SetupError where rospy is not installed."""
     require(config.python)
-    return config.offers
+    return config.capabilities
 
 
 def cameras(config: Config, robot: Robot) -> tuple[str, ...]:
@@ -95,7 +95,7 @@ def source(config: Config, robot: Robot, clock: Clock) -> RosSource:
     """The robot's topics as observations; ConfigurationError names a topic that is not known."""
     parts, _ = config.streams(robot, 1)
     opener = lambda: middleware(config, f"{NODE}_source")  # noqa: E731
-    return RosSource(robot, _heard(parts), config.terms, clock, packed, opener)
+    return RosSource(robot, _heard(parts), config.acceptance_limits, clock, packed, opener)
 
 
 def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
@@ -107,10 +107,10 @@ def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
 
 def middleware(config: Link, name: str) -> Middleware:
     """A node, as soon as the master is there; SetupError where rospy is not installed."""
-    return TcpRosMiddleware(Site(config.python, config.master, config.address), name)
+    return TcpRosMiddleware(RosEnvironment(config.python, config.master, config.address), name)
 
 
-def _heard(parts: tuple[Part, ...]) -> tuple[Heard, ...]:
+def _heard(parts: tuple[StreamSpec, ...]) -> tuple[Subscription, ...]:
     pictured = {part.topic for part in parts if part.kind == "camera"}
     return subscriptions(parts, lambda topic: _PICTURES if topic in pictured else _NUMBERS)
 

@@ -20,7 +20,7 @@ from runtime.transports.ros.middleware import COMMAND_QUALITY, SENSOR_QUALITY, M
 from runtime.transports.ros.settings import RosSettings, camera_keys
 from runtime.transports.ros.sink import RosSink
 from runtime.transports.ros.source import RosSource, subscriptions
-from runtime.transports.ros.topics import Outlet, Part
+from runtime.transports.ros.topics import CommandTopic, StreamSpec
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -74,7 +74,7 @@ class Config(Link, RosSettings):
 def capabilities(config: Config) -> Capabilities:
     """A robot hangs on it; SetupError where the middleware is not installed."""
     (dds.require if config.middleware == "dds" else rcl.require)()
-    return config.offers
+    return config.capabilities
 
 
 def cameras(config: Config, robot: Robot) -> tuple[str, ...]:
@@ -87,7 +87,9 @@ def source(config: Config, robot: Robot, clock: Clock) -> RosSource:
     """The robot's topics as observations; ConfigurationError names a topic that is not known."""
     parts, _ = _checked(config, robot)
     heard = subscriptions(parts, _quality(config, SENSOR_QUALITY))
-    return RosSource(robot, heard, config.terms, clock, cdr, lambda: middleware(config, f"{NODE}_source"))
+    return RosSource(
+        robot, heard, config.acceptance_limits, clock, cdr, lambda: middleware(config, f"{NODE}_source")
+    )
 
 
 def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
@@ -104,7 +106,7 @@ def middleware(config: Link, name: str) -> Middleware:
     return dds.DdsMiddleware(config.domain, config.network, tuple(config.peers))
 
 
-def _checked(config: Config, robot: Robot) -> tuple[tuple[Part, ...], tuple[Outlet, ...]]:
+def _checked(config: Config, robot: Robot) -> tuple[tuple[StreamSpec, ...], tuple[CommandTopic, ...]]:
     """Topics that are listened to and those that are spoken on, the simulation's first."""
     parts, outlets = config.streams(robot, 2)
     heard, told = {part.topic for part in parts}, {outlet.topic for outlet in outlets}
@@ -124,4 +126,4 @@ def _checked(config: Config, robot: Robot) -> tuple[tuple[Part, ...], tuple[Outl
 
 
 def _quality(config: Config, usual: Quality) -> Callable[[str], Quality]:
-    return lambda topic: config.qos.get(topic, Quality()).otherwise(usual)
+    return lambda topic: config.qos.get(topic, Quality()).merged_over(usual)

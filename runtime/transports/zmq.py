@@ -70,7 +70,9 @@ def _has_port(endpoint: str) -> bool:
 
 def capabilities(config: Config) -> Capabilities:
     """A real robot may hang on it; poses are delivered where the node sends them."""
-    return Capabilities(moves_robot=True, measures_eef=True, leads=True, resets_bench=config.simulated)
+    return Capabilities(
+        moves_robot=True, measures_eef=True, drives_itself=True, resets_bench=config.simulated
+    )
 
 
 def cameras(config: Config, robot: Robot) -> tuple[str, ...]:

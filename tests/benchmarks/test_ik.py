@@ -13,10 +13,10 @@ import pytest
 from benchmarks.ik import _Call, _case, _compared, _enough, _figures
 from benchmarks.ik_paths import CHUNKS, OUT_OF_REACH, ROWS, Chunk, arm_dims, invented
 from benchmarks.ik_postures import path, worst
-from robots import Robot, load
+from robots import Robot, load_robot
 from runtime.kinematics.base import IkFlag, IkResult, Kinematics
 
-ROBOT = load("agilex_piper")
+ROBOT = load_robot("agilex_piper")
 DIMS = arm_dims(ROBOT)
 
 

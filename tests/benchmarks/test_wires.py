@@ -25,7 +25,7 @@ from runtime.sim import camera_server
 from runtime.sim.pictures import Scene, frame_number
 from tests.processes import PATIENCE_S
 
-PIPER = robots.load("agilex_piper")
+PIPER = robots.load_robot("agilex_piper")
 SCENE = Scene(PIPER, 480, 640)
 
 

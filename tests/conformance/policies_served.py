@@ -17,9 +17,9 @@ from runtime.policies.base import Policy
 from runtime.sim.faults import NONE, Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.roboarena_server import Arena, RoboarenaServer
+from runtime.sim.roboarena_server import RoboarenaBehaviour, RoboarenaServer
 from runtime.sim.serve import StandInServer
-from runtime.sim.starvla_server import Star, StarvlaServer
+from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 
 SIZE = (48, 64)  # of the pictures of `seen`
@@ -66,7 +66,7 @@ class Served:
 def _arena(variant: str, reply: str) -> Callable[[Fault], StandInServer]:
     return lambda fault: RoboarenaServer(
         FRANKA,
-        Arena(fault=fault, variant=variant, reply=reply, resolution=SIZE),  # type: ignore[arg-type]
+        RoboarenaBehaviour(fault=fault, variant=variant, reply=reply, resolution=SIZE),  # type: ignore[arg-type]
     )
 
 
@@ -104,14 +104,14 @@ WEBSOCKETS = {
     "starvla": Served(
         "starvla",
         "ws",
-        lambda fault: StarvlaServer(FRANKA, Star(fault=fault, size=SIZE)),
+        lambda fault: StarvlaServer(FRANKA, StarvlaBehaviour(fault=fault, size=SIZE)),
         settings={"cameras": [camera.key for camera in FRANKA.cameras], "ping_every": None},
         first=1,  # a ping
     ),
     "starvla-old": Served(
         "starvla",
         "ws",
-        lambda fault: StarvlaServer(FRANKA, Star(fault=fault, old=True)),
+        lambda fault: StarvlaServer(FRANKA, StarvlaBehaviour(fault=fault, old=True)),
         settings={
             "cameras": [camera.key for camera in FRANKA.cameras],
             "ping_every": None,

@@ -29,7 +29,7 @@ from runtime.transports.ros.topics import GroupTopics, Topics
 from tests.processes import PATIENCE_S
 from tests.runtime.ros_master import PYTHON, absent
 
-ROBOT = robots.load("ur5e")
+ROBOT = robots.load_robot("ur5e")
 (ARM,) = ROBOT.groups
 WRIST, HIGH = (camera.key for camera in ROBOT.cameras)
 STALLED_S = 0.3

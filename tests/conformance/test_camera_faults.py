@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runtime.cameras.base import Condition
+from runtime.cameras.base import CameraCondition
 from runtime.sim.camera_server import FAULTS
 from runtime.sim.mjpeg_server import MjpegServer
 from tests.runtime.cameras.movies import until
@@ -63,8 +63,8 @@ def test_what_was_found_in_its_place_is_said(kind: str, fault: str) -> None:
     with watched(kind, fault, open_s=_looked_for(fault)) as (_, camera):
         until(lambda: camera.health().failed)
         health = camera.health()
-        assert (health.condition, health.why) == (Condition.OPENING, ON_OPENING[kind][fault])
-        assert camera.newest() is None
+        assert (health.condition, health.why) == (CameraCondition.OPENING, ON_OPENING[kind][fault])
+        assert camera.latest() is None
 
 
 @pytest.mark.some(2)
@@ -75,13 +75,13 @@ def test_what_breaks_while_it_plays_is_lost_and_comes_back(kind: str, fault: str
         until(lambda: live(camera))
         server.fault = fault
         until(lambda: lost(camera))
-        health, kept = camera.health(), camera.newest()
+        health, kept = camera.health(), camera.latest()
         assert health.losses == 1
         assert health.why.startswith(WHILE_IT_PLAYS[fault])
         assert kept is not None, "the newest picture stays, and grows old"
         server.fault = ""
         until(lambda: live(camera))
-        assert camera.newest().captured > kept.captured  # type: ignore[union-attr]
+        assert camera.latest().captured > kept.captured  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
@@ -102,8 +102,8 @@ def test_pictures_are_seen_whatever_their_parts_are_called(headers: tuple[str, .
         server.headers = headers
         server.hang_up()  # that of before, if it was quick
         until(lambda: live(camera) and server.sent > 0)
-        until(lambda: camera.newest() is not None)
-        assert camera.newest().picture.shape == (120, 160, 3)  # type: ignore[union-attr]
+        until(lambda: camera.latest() is not None)
+        assert camera.latest().picture.shape == (120, 160, 3)  # type: ignore[union-attr]
 
 
 @both
@@ -124,7 +124,7 @@ def test_a_server_that_stops_and_comes_back_is_found_again(kind: str) -> None:
         server.close()
         until(lambda: "refused" in camera.health().why)
         since = camera.health().since
-        assert camera.health().condition is Condition.LOST
+        assert camera.health().condition is CameraCondition.LOST
         server.start()
         until(lambda: live(camera))
         assert camera.health().since > since
@@ -137,6 +137,6 @@ def test_another_resolution_is_refused_until_it_is_set_back(kind: str) -> None:
         server.size = (80, 60)
         until(lambda: lost(camera))
         assert "were 160x120 and are 80x60 now" in camera.health().why
-        assert camera.newest().picture.shape == (120, 160, 3)  # type: ignore[union-attr]
+        assert camera.latest().picture.shape == (120, 160, 3)  # type: ignore[union-attr]
         server.size = (160, 120)
         until(lambda: live(camera))

@@ -22,7 +22,7 @@ from runtime.transports import zmq as link
 from runtime.transports.node_source import NodeSource
 from tests.processes import eventually, joined
 
-ROBOT = robots.load("ur5e")
+ROBOT = robots.load_robot("ur5e")
 HOME = ROBOT.poses["home"].astype(np.float32)
 AWAY = np.clip(HOME + 0.2, ROBOT.lower + 0.01, ROBOT.upper - 0.01).astype(np.float32)
 FREE = ["--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0"]
@@ -169,7 +169,7 @@ def test_of_two_clients_one_rules_and_the_other_is_told_whom_the_node_obeys(benc
 
     eventually(refused, "other_master")
     assert np.abs(bench.stands() - AWAY).max() < 0.01
-    assert bench.source.why("node_refused.other_master") == (
+    assert bench.source.describe_fault("node_refused.other_master") == (
         "several clients command the node, which obeys first alone"
     )
 

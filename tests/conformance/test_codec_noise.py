@@ -19,12 +19,12 @@ from runtime.policies.async_inference import messages, pickles
 from runtime.policies.async_inference.tensors import Tensors
 from runtime.policies.groot import arrays as groot
 from runtime.sim import arrays
-from runtime.sim.gate import Accepted, Gate
+from runtime.sim.gate import AcceptedCommand, CommandGate
 from runtime.transports.node_messages import MESSAGE_LIMIT, NodeFrame, NodeMessages
 from tests.conformance.test_recorded_bytes import MNP, NPY, OPENPI, PICKLED_ACTIONS, vector
 from tests.examples import some
 
-ROBOT = robots.load("ur5e")
+ROBOT = robots.load_robot("ur5e")
 NODE = NodeMessages(ROBOT, "bgr", frozenset(), MESSAGE_LIMIT)
 JOINTS = np.linspace(-0.5, 0.5, 7).astype(np.float32)
 POSE = np.array([0.1, 0, 0.2, 1, 0, 0, 0, 0.05], np.float32)
@@ -90,10 +90,10 @@ def _text(word: str) -> bytes:
     return b"X" + struct.pack("<I", len(word)) + word.encode()
 
 
-def judged(payload: bytes) -> Accepted | None:
+def judged(payload: bytes) -> AcceptedCommand | None:
     """What a node takes; a target that it takes is one that the robot may have."""
-    gate = Gate(ROBOT, 0.3, bench=True)
-    accepted = gate.judge(payload, 10.0)
+    gate = CommandGate(ROBOT, 0.3, bench=True)
+    accepted = gate.accept(payload, 10.0)
     if accepted is not None and accepted.target is not None:
         assert accepted.target.shape == (ROBOT.dim,)
         assert ((ROBOT.lower <= accepted.target) & (accepted.target <= ROBOT.upper)).all()
@@ -118,9 +118,9 @@ class Reading(NamedTuple):
 READERS = {
     "openpi": Reading(msgpack_arrays.unpack, [vector(name) for name in OPENPI]),
     "gr00t": Reading(lambda data: groot.unpack(data, 2**20), [vector(name) for name in (*NPY, *MNP)]),
-    "lerobot_message": Reading(messages.actions, [messages.setup(vector(PICKLED_ACTIONS[0]))]),
+    "lerobot_message": Reading(messages.decode_actions, [messages.encode_setup(vector(PICKLED_ACTIONS[0]))]),
     "lerobot_pickle": Reading(
-        lambda data: pickles.read_actions(data, 2**20), [vector(name) for name in PICKLED_ACTIONS]
+        lambda data: pickles.load_actions(data, 2**20), [vector(name) for name in PICKLED_ACTIONS]
     ),
     "lerobot_tensor": Reading(lambda data: Tensors(pickles.Reader).storage(data), [storage_file()]),
     "node": Reading(framed, FRAMES),

@@ -22,7 +22,7 @@ from runtime.transports.node_messages import MESSAGE_LIMIT, NodeMessages
 from runtime.transports.node_sink import NodeSink
 from tests.processes import eventually
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 PERIOD = 1 / 30
 # {"t": 1.5, "action": zeros(2, "<f4"), "target": "real"}, as an existing client's own codec wrote it
 COMMAND = bytes.fromhex(
@@ -65,7 +65,7 @@ def test_our_words_are_an_existing_clients_with_two_fields_after_them() -> None:
     with heard_by(1) as (sink, node):
 
         def sent() -> bytes | None:
-            sink.tell("hil_start", {"mode": "relative"})
+            sink.send_control_word("hil_start", {"mode": "relative"})
             return node.recv() if node.poll(20) else None
 
         payload = eventually(sent, "a word")

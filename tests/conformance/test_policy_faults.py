@@ -16,8 +16,8 @@ from websockets.sync.server import ServerConnection
 from runtime.core import msgpack_arrays
 from runtime.core.errors import (
     ContradictionError,
+    PolicyDisconnected,
     PolicyError,
-    PolicyGone,
     PolicyLostError,
     PolicyTimeout,
 )
@@ -38,8 +38,8 @@ WEBSOCKET: Faults = {
     "http_404": (PolicyError, "HTTP 404"),
     "mute_on_infer:0": (PolicyTimeout, r"within 0\.4 s"),
     "mute_on_infer:1": (PolicyTimeout, r"within 0\.4 s"),
-    "close_mid_reply:0": (PolicyGone, "closed the connection"),
-    "close_mid_reply:1": (PolicyGone, "closed the connection"),
+    "close_mid_reply:0": (PolicyDisconnected, "closed the connection"),
+    "close_mid_reply:1": (PolicyDisconnected, "closed the connection"),
     "wrong_dim": (PolicyError, "rows of 7 numbers; this robot needs 8"),
     "nan": (PolicyError, "nan at row 3, column 2"),
     "empty": (PolicyError, "actions is empty"),
@@ -70,7 +70,7 @@ GR00T: Faults = {
     "two_frames": (PolicyError, "2 frames; expected one"),
     "missing_key": (PolicyError, r"no action 'left_arm'; it has (action\.)?right_arm"),
     "uneven": (PolicyError, "different numbers of rows: left_arm 49, right_arm 50"),
-    "too_large": (PolicyGone, "sends no more than 67108864 bytes"),
+    "too_large": (PolicyDisconnected, "sends no more than 67108864 bytes"),
 }
 STARVLA = {key: value for key, value in WEBSOCKET.items() if key != "exception"} | {
     "refused": (PolicyError, "CUDA out of memory"),

@@ -15,7 +15,7 @@ import zmq
 
 import robots
 from runtime.core import msgpack_arrays
-from runtime.core.errors import CodecError, PolicyError, ServerSaysError, WrongProtocolError
+from runtime.core.errors import CodecError, PolicyError, ServerReportedError, WrongProtocolError
 from runtime.core.types import Conditioning
 from runtime.policies.async_inference import messages, pickles
 from runtime.policies.groot import arrays as groot
@@ -26,7 +26,7 @@ from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from tests.conformance.policies_served import PROTOCOLS, WEBSOCKETS, Served
 from tests.runtime.policies.peers import answering, seen, serving
 
-ARM = robots.load("agilex_piper", ["left_arm"])
+ARM = robots.load_robot("agilex_piper", ["left_arm"])
 VECTORS = Path(__file__).parents[1] / "runtime" / "vectors"
 LIMIT = 2**20
 OPENPI = [
@@ -101,7 +101,7 @@ def test_gr00ts_arrays_are_the_same_in_both_forms(npy: str, mnp: str) -> None:
 
 @pytest.mark.parametrize("name", PICKLED_ACTIONS)
 def test_lerobots_actions_are_read(name: str) -> None:
-    actions = pickles.read_actions(vector(name), LIMIT)
+    actions = pickles.load_actions(vector(name), LIMIT)
     steps = [one.timestep for one in actions]
     assert steps == list(range(steps[0], steps[0] + len(steps)))
     assert all(np.isfinite(one.action).all() for one in actions)
@@ -110,7 +110,7 @@ def test_lerobots_actions_are_read(name: str) -> None:
 @pytest.mark.parametrize("name", PICKLED_REQUESTS)
 def test_lerobots_requests_are_no_actions(name: str) -> None:
     with pytest.raises(CodecError):
-        pickles.read_actions(vector(name), LIMIT)
+        pickles.load_actions(vector(name), LIMIT)
 
 
 @pytest.mark.parametrize("name", [*OPENPI, *NPY, *MNP])
@@ -130,11 +130,11 @@ def test_pickled_actions_cut_anywhere_are_refused(name: str) -> None:
     recorded = vector(name)
     for size in range(0, len(recorded), 1 if len(recorded) < 2000 else 23):
         with pytest.raises(CodecError):
-            pickles.read_actions(recorded[:size], LIMIT)
-    message = messages.setup(recorded)  # of the same form as Actions
+            pickles.load_actions(recorded[:size], LIMIT)
+    message = messages.encode_setup(recorded)  # of the same form as Actions
     for size in range(1, len(message), 13):
         with pytest.raises(CodecError):
-            messages.actions(message[:size])
+            messages.decode_actions(message[:size])
 
 
 # Real-time chunking
@@ -149,9 +149,9 @@ OBSERVATION = {
 
 def test_the_second_request_with_prev_action_is_the_recorded_one() -> None:
     before = msgpack_arrays.unpack(vector("openpi_infer_reply"))["origin_actions"]
-    request = PrevAction().request(OBSERVATION, Conditioning(np.array(before), 1, 1, 3))
+    request = PrevAction().wrap(OBSERVATION, Conditioning(np.array(before), 1, 1, 3))
     assert msgpack_arrays.pack(request) == vector("rtc_a_request_next")
-    assert msgpack_arrays.pack(PrevAction().request(OBSERVATION, None)) == vector("openpi_infer_request")
+    assert msgpack_arrays.pack(PrevAction().wrap(OBSERVATION, None)) == vector("openpi_infer_request")
 
 
 def test_an_envelope_has_all_that_the_recorded_one_has() -> None:
@@ -159,7 +159,7 @@ def test_an_envelope_has_all_that_the_recorded_one_has() -> None:
     rows = np.concatenate([np.zeros((1, 2), np.float32), recorded["rtc"]["prev_chunk_left_over"]])
     dialect = AsyncRtc(recorded["rtc"]["prefix_attention_schedule"], recorded["rtc"]["max_guidance_weight"])
     dialect._number, dialect._horizon = 6, 50
-    request = dialect.request(recorded["observation"], Conditioning(rows, 1, 4, 10))
+    request = dialect.wrap(recorded["observation"], Conditioning(rows, 1, 4, 10))
     assert recorded["image_transport"].pop("jpeg_quality") == 90  # informative
     recorded["rtc"]["inference_delay"] = 2  # no more rows are left; the recorded one says 4 of 2
     assert same(request, recorded)
@@ -167,7 +167,7 @@ def test_an_envelope_has_all_that_the_recorded_one_has() -> None:
 
 def test_a_first_envelope_has_no_rtc() -> None:
     recorded = msgpack_arrays.unpack(vector("rtc_d_request_jpeg_first"))
-    request = AsyncRtc("exp", 10.0).request({}, None)
+    request = AsyncRtc("exp", 10.0).wrap({}, None)
     assert list(request) == list(recorded)
     assert request["rtc"] is recorded["rtc"] is None
     assert request["request_id"] == recorded["request_id"] == 0
@@ -176,11 +176,11 @@ def test_a_first_envelope_has_no_rtc() -> None:
 def test_the_recorded_answer_to_an_envelope_is_read_and_only_under_its_number() -> None:
     dialect = AsyncRtc("exp", 10.0)
     dialect._number = 7
-    result = dialect.result(msgpack_arrays.unpack(vector("rtc_d_reply")))
+    result = dialect.unwrap(msgpack_arrays.unpack(vector("rtc_d_reply")))
     np.testing.assert_array_equal(result["actions"], np.arange(6, dtype=np.float32).reshape(3, 2))
     dialect._number = 8
     with pytest.raises(WrongProtocolError, match="request_id 7"):
-        dialect.result(msgpack_arrays.unpack(vector("rtc_d_reply")))
+        dialect.unwrap(msgpack_arrays.unpack(vector("rtc_d_reply")))
 
 
 def test_the_recorded_error_in_an_envelope_is_the_servers_own() -> None:
@@ -188,8 +188,8 @@ def test_the_recorded_error_in_an_envelope_is_the_servers_own() -> None:
         "84a870726f746f636f6cb06f70656e70692d6173796e632d727463b070726f746f636f6c5f76657273696f6e02"
         "aa726571756573745f696407a56572726f72ad54726163656261636b202e2e2e"
     )
-    with pytest.raises(ServerSaysError, match="reports an error: Traceback"):
-        AsyncRtc("exp", 10.0).result(msgpack_arrays.unpack(recorded))
+    with pytest.raises(ServerReportedError, match="reports an error: Traceback"):
+        AsyncRtc("exp", 10.0).unwrap(msgpack_arrays.unpack(recorded))
 
 
 # Short messages

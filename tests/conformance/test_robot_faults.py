@@ -49,7 +49,7 @@ def said(robot: Played, words: str, act: Callable[[], object] = lambda: None) ->
     def found() -> str:
         act()
         robot.source.receive(0.01)
-        told.extend(event.text for event in robot.source.news())
+        told.extend(event.text for event in robot.source.pop_events())
         return next((text for text in told if words in text), "")
 
     return eventually(found, f"news with {words!r}; told: {told}")
@@ -72,11 +72,11 @@ def test_a_fault_is_counted_by_name_and_the_next_frame_comes(robot: Played, faul
         robot.play(2, fault)
         observation = robot.source.receive(0.02)
         assert observation is None or mark_of(observation) == 1, "a spoilt frame was delivered"
-        robot.source.news()
+        robot.source.pop_events()
         return robot.source.faults().get(name, 0) >= (1 if name.startswith("stalled") else 2)
 
     eventually(counted, name)
-    assert words in robot.source.why(name)
+    assert words in robot.source.describe_fault(name)
     seen(robot, 3)
 
 
@@ -105,7 +105,7 @@ def test_a_robot_that_is_mute_is_named(robot: Played) -> None:
     sentence = said(robot, "waiting for")
     assert ": nothing " in sentence
     assert robot.source.receive(0.05) is None
-    assert robot.source.news() == [], "said twice"
+    assert robot.source.pop_events() == [], "said twice"
 
 
 @on_every_transport
@@ -139,7 +139,7 @@ def test_a_clock_that_jumps_is_named_and_ages_nothing(robot: Played, jump: float
         observation = seen(robot, mark)
     assert all(0 <= observation.arrived - at < 1 for at in observation.captured.values())
     assert robot.source.faults()[name] >= 1
-    assert "clock" in robot.source.why(name)
+    assert "clock" in robot.source.describe_fault(name)
 
 
 @pytest.mark.some(1)
@@ -155,7 +155,7 @@ def test_a_frozen_camera_is_named_while_all_else_goes_on(
         mark = mark % 200 + 1
         observation = seen(robot, mark)
     assert min(observation.captured.values()) < observation.captured["joints"]
-    assert "shows the same picture" in robot.source.why("frozen_cam_wrist")
+    assert "shows the same picture" in robot.source.describe_fault("frozen_cam_wrist")
 
 
 @pytest.mark.exhaustive

@@ -19,7 +19,7 @@ from runtime.core.types import RobotCommand
 from runtime.transports import zmq as link
 from tests.processes import eventually
 
-ROBOT = robots.load("ur5e")
+ROBOT = robots.load_robot("ur5e")
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "transports.md").read_text("utf-8")
 SECTION = DOCUMENT.partition("\n## Execution nodes over ZMQ\n")[2].partition("\n## ")[0]
 PORTS = ("5555", "5556")

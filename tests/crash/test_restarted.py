@@ -77,7 +77,7 @@ def within_limits(targets):
     """Whether these targets [N, D] can be followed from rest, each tick on time or after missed ones."""
     limits = body(ROBOT).limits
     top = MARGIN * limits.velocity
-    rate = MARGIN * SafetySettings().acceleration * limits.reach
+    rate = MARGIN * SafetySettings().acceleration * limits.radian_scale
     before = [np.zeros(len(top))]  # velocities that may be the last one's
     for step in np.diff(targets, axis=0):
         possible = [(step / elapsed, elapsed) for elapsed in ELAPSED if (np.abs(step) <= top * elapsed).all()]
@@ -88,7 +88,7 @@ def within_limits(targets):
         ]
         if not before:
             return False
-    return bool(np.isfinite(targets).all()) and not (limits.outside(np.array(targets)) > 1e-5).any()
+    return bool(np.isfinite(targets).all()) and not (limits.excess(np.array(targets)) > 1e-5).any()
 
 
 @pytest.mark.parametrize("what", [pytest.param("run", marks=pytest.mark.story), "motion"])

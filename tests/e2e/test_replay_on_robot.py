@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from runtime.datasets.journal import read_journal
+from runtime.datasets.journal import read_finished_episode
 from runtime.datasets.published import publish
 from tests.e2e.by_hand import ByHand
 from tests.e2e.lab import STATION, WIDE
@@ -27,7 +27,7 @@ def recorded(patient):
     folder = built.record_of(root, ROBOT, swing, ROWS, started_wall=time.time(), station=STATION)
     publish(folder, patient.data / "datasets" / "swings", success=True)
     patient.python("from evaweb.episodes.reconcile import reconcile; reconcile()")
-    actions = read_journal(folder).finite_vectors("action")
+    actions = read_finished_episode(folder).finite_vectors("action")
     return {"recording": f"/replay/{folder.name}/", "dataset": "/replay/datasets/swings/-/0/"}, actions
 
 
@@ -74,4 +74,4 @@ def test_it_is_set_up_approached_and_run_to_its_last_row(operator, patient, reco
 def executed(folder):
     """The actions [N, D] of the run that was recorded there."""
     eventually((folder / "outcome.json").exists, "its recording has ended")
-    return read_journal(folder).finite_vectors("action")
+    return read_finished_episode(folder).finite_vectors("action")

@@ -28,7 +28,7 @@ from evaweb.trials import services as trials
 from evaweb.trials.models import Checkpoint, Trial
 from runtime.core.sentences import Pattern, within
 from runtime.processes.coordinator.session.transitions import SessionEvent
-from runtime.recording.export import export
+from runtime.recording.export import write_export
 from tests.evaweb.trials import builders
 from tests.runtime.recording.samples import resealed
 
@@ -200,7 +200,7 @@ class Lab:
                 json.dumps({"kind": "command", "text": f"stop by ann: failed, {ERROR}", "time": 1.0}) + "\n"
             )
         resealed(folder)
-        export(folder, self.data)
+        write_export(folder, self.data)
         self.episode = Episode.objects.create(
             uuid=folder.name,
             station=self.station,

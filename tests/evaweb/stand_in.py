@@ -16,7 +16,7 @@ import zmq
 
 from runtime.core.sentences import Pattern, within
 from runtime.ipc.bus import CommandServer, Endpoints, EventLog, Key, Publisher
-from runtime.ipc.identity import forged, identified, lacking
+from runtime.ipc.identity import authenticate, missing_role, unverified_reason
 from runtime.ipc.messages import Ack, AckStatus, Command, Event
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
@@ -139,9 +139,9 @@ class StandIn:
 
     def _happen(self, happening: SessionEvent, reason: str) -> None:
         before = self.session.state
-        if self.session.observe(happening, reason):
+        if self.session.handle_event(happening, reason):
             text = _CHANGED(before=before, after=self.session.state, reason=reason)
-            data = {"state": str(self.session.state), "state_is": self.session.told()}
+            data = {"state": str(self.session.state), "state_is": self.session.state_meaning()}
             self.events.append(Event("state", text, time.monotonic(), data=data))
 
     def _run(self, ended: threading.Event) -> None:
@@ -161,9 +161,11 @@ class StandIn:
     def _serve(self, server: CommandServer, answer: Any) -> None:
         while (received := server.receive()) is not None:
             call, said = received
-            command = identified(said, call.payload, call.signature, call.uid, self.key)
+            command = authenticate(said, call.payload, call.signature, call.uid, self.key)
             if not self.mute and command.kind not in self.swallows:
-                refusal = "" if command.kind in STOPPING else forged(command) or lacking(command)
+                refusal = (
+                    "" if command.kind in STOPPING else unverified_reason(command) or missing_role(command)
+                )
                 ack = Ack(command.uuid, "refused", refusal) if refusal else answer(command)
                 server.answer(call, ack)
 

@@ -24,7 +24,7 @@ from evaweb.plans.models import Slot
 from evaweb.results.models import Judgement
 from evaweb.stations.models import Command
 from evaweb.trials.models import Checkpoint, Scene, Trial
-from runtime.recording.export import export
+from runtime.recording.export import write_export
 from tests.evaweb.blind_lab import KEYS, NAMES, in_the_other_world
 from tests.evaweb.crawling import _read, everything
 from tests.evaweb.unguarded import unguarded
@@ -47,7 +47,7 @@ def swap(lab: Any) -> None:
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     for folder in lab.data.glob("episodes/*"):  # none before the first run
         resealed(folder)
-        export(folder, lab.data)
+        write_export(folder, lab.data)
     lab.swapped = not lab.swapped
     for name in ("trial", "episode", "command"):
         if getattr(lab, name) is not None:

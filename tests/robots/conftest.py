@@ -17,7 +17,7 @@ def edited(tmp_path: Path) -> Edit:
 
     def copy(*replacements: tuple[str, str]) -> Path:
         folder = tmp_path / "copy"
-        shutil.copytree(robots.load("agilex_piper").folder, folder)
+        shutil.copytree(robots.load_robot("agilex_piper").folder, folder)
         file = folder / "robot.toml"
         text = file.read_text()
         for old, new in replacements:

@@ -102,10 +102,10 @@ def at_ready(robot: Robot) -> Iterator[Ready]:
 def lowest(robot: Robot) -> dict[str, float]:
     """How low each link's drawn shapes come in the scene [m], over all named poses."""
     body, found = Body(robot), dict[str, float]()
-    for shape in shapes.read(robot.urdf):
+    for shape in shapes.read_shapes(robot.urdf):
         corners = np.array([[*corner, 1.0] for corner in itertools.product(*np.transpose(shape.bounds()))])
         for pose in robot.poses.values():
-            for part in body.parts_of(shape.link):
+            for part in body.parts_showing(shape.link):
                 z = float((body.poses(pose)[part] @ shape.origin @ corners.T)[2].min())
                 found[shape.link] = min(found.get(shape.link, np.inf), z)
     return found
@@ -114,7 +114,7 @@ def lowest(robot: Robot) -> dict[str, float]:
 def extents(robot: Robot, link: str) -> tuple[Float64, Float64]:
     """The corners [3] of the box around a link's drawn shapes, in the link's frame [m]."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for shape in shapes.read(robot.urdf):
+    for shape in shapes.read_shapes(robot.urdf):
         if shape.link == link:
             turn, middle = shape.origin[:3, :3], shape.origin[:3, 3]
             if shape.kind == "box":

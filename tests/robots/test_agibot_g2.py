@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robots import Body, load
+from robots import Body, load_robot
 from robots.clearance import MARGIN, Clearance
 from robots.rotations import matrix_of_quaternion, rotation_vector, transform_of
 from tests.robots.standing import lowest
 
-ROBOT = load("agibot_g2")
+ROBOT = load_robot("agibot_g2")
 MIRROR = np.array([-1, 1, -1, 1, -1, 1, -1])  # of the arm's joints
 CHECKS = {  # arm, joints: position and wxyz in body_link5, then from the floor
     "left home": (

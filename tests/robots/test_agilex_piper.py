@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robots import load
+from robots import load_robot
 
 HOME = ([0.0] * 6, [0.056142472, -5.6e-08, 0.213193093], [0.737256126, 2.326e-06, 0.675613354, -4.995e-06])
 LEFT = (
@@ -30,7 +30,7 @@ def test_forward_kinematics_agrees_with_another_implementation(
     arm: str, check: tuple[list[float], list[float], list[float]]
 ) -> None:
     q, position, wxyz = check
-    chain = load("agilex_piper").group(arm).chain
+    chain = load_robot("agilex_piper").group(arm).chain
     assert chain is not None
     pose = chain.pose(np.array(q))
     np.testing.assert_allclose(pose[:3], position, rtol=0, atol=2e-9)
@@ -44,7 +44,7 @@ def test_forward_kinematics_of_recorded_joints_agrees_with_recorded_poses() -> N
     file = next(Path(os.environ["EVA_SAMPLE_EPISODE"]).glob("data/*/*.parquet"))
     table = pyarrow.parquet.read_table(file, columns=["observation.qpos", "observation.eef"])
     qpos, recorded = (np.array(column.to_pylist(), dtype=np.float64) for column in table.columns)
-    for index, arm in enumerate(load("agilex_piper").arms):
+    for index, arm in enumerate(load_robot("agilex_piper").arms):
         assert arm.chain is not None
         pose = arm.chain.pose(qpos[:, arm.joint_dims])
         wanted = recorded[:, 8 * index : 8 * index + 8]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from robots import load
+from robots import load_robot
 
-ROBOT = load("arx_r5")
+ROBOT = load_robot("arx_r5")
 
 
 def test_it_has_two_arms_of_seven_numbers() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from robots.broken_pipe import UNREAD, UNWRITTEN, unread_ends
+from robots.broken_pipe import EXIT_BROKEN_PIPE, EXIT_WRITE_ERROR, exit_on_broken_pipe
 from tests.runtime.datasets.small import record
 
 ROOT = Path(__file__).parents[2]
@@ -67,7 +67,7 @@ def test_the_help_of_every_program_may_be_read_in_part(program: str, monkeypatch
         return
     with nobody_reads(monkeypatch), monkeypatch.context() as patch:
         patch.setattr("sys.argv", [name, "--help"])
-        assert module.main() == UNREAD
+        assert module.main() == EXIT_BROKEN_PIPE
 
 
 def test_all_programs_are_known() -> None:
@@ -98,7 +98,7 @@ def test_what_commands_print_may_be_read_in_part(
 ) -> None:
     main = importlib.import_module(f"{program}.__main__").main
     with nobody_reads(monkeypatch):
-        assert main(words(episode)) == UNREAD
+        assert main(words(episode)) == EXIT_BROKEN_PIPE
 
 
 @pytest.mark.exhaustive
@@ -114,7 +114,7 @@ def test_a_process_whose_output_nobody_reads_says_nothing_at_its_end(words: list
         [sys.executable, *words], cwd=ROOT, stdout=written, stderr=subprocess.PIPE, text=True, check=False
     )
     os.close(written)
-    assert (ended.returncode, ended.stderr) == (UNREAD, "")
+    assert (ended.returncode, ended.stderr) == (EXIT_BROKEN_PIPE, "")
 
 
 @pytest.mark.exhaustive
@@ -129,11 +129,11 @@ def test_a_full_disk_behind_standard_output_is_said_in_a_sentence(words: list[st
             [sys.executable, *words], cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
     said = "standard output cannot be written: No space left on device\n"
-    assert (ended.returncode, ended.stderr) == (UNWRITTEN, said)
+    assert (ended.returncode, ended.stderr) == (EXIT_WRITE_ERROR, said)
 
 
 def test_the_full_disk_of_anything_else_is_an_error() -> None:
-    @unread_ends
+    @exit_on_broken_pipe
     def main() -> int:
         print("said before")
         raise OSError(errno.ENOSPC, "No space left on device", "/data/episodes")
@@ -143,7 +143,7 @@ def test_the_full_disk_of_anything_else_is_an_error() -> None:
 
 
 def test_the_break_of_any_other_pipe_is_an_error() -> None:
-    @unread_ends
+    @exit_on_broken_pipe
     def main() -> int:
         raise BrokenPipeError("the robot has gone")
 
@@ -191,4 +191,4 @@ def test_what_is_opened_takes_no_number_of_a_stream_and_children_have_them_too()
 
 def test_a_command_without_standard_output_ends_as_it_would(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdout", None)
-    assert unread_ends(lambda: 3)() == 3
+    assert exit_on_broken_pipe(lambda: 3)() == 3

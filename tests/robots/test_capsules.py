@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 import robots
 from robots import RobotError
-from robots.capsules import PIECES, Capsule, about, around, capsules
+from robots.capsules import PIECES, Capsule, capsules, covering_capsules, smallest_capsule
 from robots.rotations import Float64, matrix_of_rpy
 from robots.shapes import PLAIN, Shape
-from robots.shapes import read as drawn
+from robots.shapes import read_shapes as drawn
 from tests.robots.conftest import Edit
 
 length = st.floats(0.01, 0.4)
@@ -57,25 +57,25 @@ def depth(points: Float64, capsule: Capsule) -> Float64:
 
 @given(st.lists(shapes(), min_size=1, max_size=4))
 def test_one_capsule_covers_every_shape_whole(shown: list[Shape]) -> None:
-    capsule = around(shown)
+    capsule = smallest_capsule(shown)
     for shape in shown:
         assert depth(surface(shape), capsule).min() > -1e-9
 
 
 @given(st.lists(shapes(), min_size=1, max_size=5))
 def test_the_capsules_of_a_link_cover_each_of_its_shapes_and_are_few(shown: list[Shape]) -> None:
-    made = about(shown)
+    made = covering_capsules(shown)
     assert 1 <= len(made) <= PIECES
     for shape in shown:
         assert max(depth(surface(shape), capsule).min() for capsule in made) > -1e-9
 
 
 def test_what_is_round_is_hugged() -> None:
-    rod = around([Shape("link", "cylinder", (0.05, 0.4), np.eye(4), PLAIN)])
+    rod = smallest_capsule([Shape("link", "cylinder", (0.05, 0.4), np.eye(4), PLAIN)])
     assert rod.radius == pytest.approx(0.05, rel=0.01)
     assert np.allclose([rod.start[:2], rod.end[:2]], 0, atol=1e-6)
     assert rod.end[2] - rod.start[2] <= 0.4 + 1e-9
-    ball = around([Shape("link", "sphere", (0.1,), np.eye(4), PLAIN)])
+    ball = smallest_capsule([Shape("link", "sphere", (0.1,), np.eye(4), PLAIN)])
     assert (ball.radius, ball.start.tolist(), ball.end.tolist()) == (0.1, [0, 0, 0], [0, 0, 0])
 
 
@@ -86,19 +86,21 @@ def test_a_link_round_a_corner_is_two_thin_capsules_and_not_a_fat_one() -> None:
         Shape("link", "box", (0.4, 0.06, 0.06), arm, PLAIN),
         Shape("link", "box", (0.06, 0.06, 0.4), forearm, PLAIN),
     ]
-    assert max(capsule.radius for capsule in about(shown)) < 0.045 < around(shown).radius
+    assert (
+        max(capsule.radius for capsule in covering_capsules(shown)) < 0.045 < smallest_capsule(shown).radius
+    )
 
 
 def test_a_link_has_the_capsule_that_its_robot_declares_or_none(edited: Edit) -> None:
     declared = """capsules.link1 = { start = [0.0, 0.0, -0.1], end = [0.0, 0.0, 0.1], radius = 0.2 }
 without = ["link5"]
 ignore = ["""
-    robot = robots.load(edited(("ignore = [", declared)))
+    robot = robots.load_robot(edited(("ignore = [", declared)))
     made = capsules(robot)
     (own,) = made["link1"]
     assert (own.start.tolist(), own.end.tolist(), own.radius) == ([0, 0, -0.1], [0, 0, 0.1], 0.2)
     assert "link5" not in made
-    assert set(made) == set(capsules(robots.load("agilex_piper"))) - {"link5"}
+    assert set(made) == set(capsules(robots.load_robot("agilex_piper"))) - {"link5"}
 
 
 @pytest.mark.parametrize(
@@ -112,7 +114,7 @@ ignore = ["""
     ],
 )
 def test_capsules_that_are_declared_of_a_link_cover_its_shapes(name: str, link: str) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     made = capsules(robot)[link]
     assert len(made) == len(robot.collision.capsules[link])
     for shape in drawn(robot.urdf):
@@ -152,6 +154,6 @@ def test_a_link_that_there_is_not_is_named_with_file_and_key(
     head = file.read_text().partition("[collision]")[0]
     file.write_text(f"{head}\n[collision]\n{table}\n")
     with pytest.raises(RobotError) as error:
-        robots.load(folder)
+        robots.load_robot(folder)
     assert str(file) in str(error.value)
     assert said in str(error.value)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from robots import Chain, RobotError, load, urdf
+from robots import Chain, RobotError, load_robot, urdf
 
 TREE = """<robot name="t">
   <link name="base"/><link name="torso"/><link name="arm"/><link name="slide"/>
@@ -82,7 +82,7 @@ def test_the_jacobian_is_the_derivative_of_the_pose_with_mimics_and_slides(chain
 
 
 def test_the_jacobian_of_a_real_arm_is_the_derivative_of_its_pose() -> None:
-    arm = load("agilex_piper").arms[0].chain
+    arm = load_robot("agilex_piper").arms[0].chain
     assert arm is not None
     for q in np.random.default_rng(2).uniform(-1, 1, (10, 6)):
         np.testing.assert_allclose(arm.jacobian(q)[1], _numeric_jacobian(arm, q), atol=1e-8)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from robots import Group, Robot, load, urdf
+from robots import Group, Robot, load_robot, urdf
 from robots.chain import Chain
 from robots.rotations import matrix_of_quaternion, transform_of
 
@@ -116,7 +116,7 @@ PINNED = {  # joints of a torso or body and of a head, as they stood for the che
 
 @pytest.mark.parametrize(("check", "frame"), CASES)
 def test_the_end_effector_is_where_another_program_has_it(check: Check, frame: str) -> None:
-    robot = load(check.robot)
+    robot = load_robot(check.robot)
     arm = robot.group(check.arm)
     tree = urdf.read(robot.urdf)
     start = tree.root if frame == robot.mount_frame else frame
@@ -130,7 +130,7 @@ def test_the_end_effector_is_where_another_program_has_it(check: Check, frame: s
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: f"{check.robot}-{check.arm}-{check.q[0]}")
 def test_the_pose_in_the_frame_that_the_arm_declares_is_among_the_checks(check: Check) -> None:
-    robot = load(check.robot)
+    robot = load_robot(check.robot)
     arm = robot.group(check.arm)
     assert arm.frame in check.poses
     _assert_same(arm.transform(_standing(robot, arm, check)), check.poses[arm.frame])

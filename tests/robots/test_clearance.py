@@ -15,18 +15,18 @@ import robots
 from robots import Robot
 from robots.body import Body
 from robots.capsules import Capsule, capsules
-from robots.clearance import MARGIN, Clearance, problems
+from robots.clearance import MARGIN, Clearance, collision_problems
 from robots.description import TABLE
 from robots.rotations import Float64
 from tests.examples import some
 from tests.robots.conftest import Edit
 
-NAMES = robots.names()
+NAMES = robots.robot_names()
 
 
 @cache
 def clearance(name: str = "agilex_piper") -> Clearance:
-    return Clearance(robots.load(name))
+    return Clearance(robots.load_robot(name))
 
 
 def between(one: str, other: str, name: str = "agilex_piper") -> list[int]:
@@ -43,13 +43,13 @@ def balls(capsule: Capsule, pose: Float64, count: int = 300) -> Float64:
 def fingers(robot: Robot) -> set[str]:
     """What grippers move, with what is fixed to it."""
     body = Body(robot)
-    moved = body.moved()[:, list(robot.gripper_dims)].any(axis=1)
+    moved = body.moving_mask()[:, list(robot.gripper_dims)].any(axis=1)
     return {part for part, moves in zip(body.parts, moved, strict=True) if moves}
 
 
 def sampled(name: str, one: str, other: str, q: Float64) -> float:
     """The distance of two links, or of a link and the table, from many points along their capsules."""
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     body, made = Body(robot), capsules(robot)
     poses = body.poses(q)
 
@@ -72,7 +72,7 @@ def sampled(name: str, one: str, other: str, q: Float64) -> float:
 @given(seed=st.integers(0, 10**6))
 @pytest.mark.parametrize("name", ["agilex_piper", "ur5e"])
 def test_distances_are_those_of_many_points_along_the_capsules(name: str, seed: int) -> None:
-    robot, looked = robots.load(name), clearance(name)
+    robot, looked = robots.load_robot(name), clearance(name)
     rng = np.random.default_rng(seed)
     q = rng.uniform(robot.lower, robot.upper)
     found = looked.distances(q)
@@ -82,7 +82,7 @@ def test_distances_are_those_of_many_points_along_the_capsules(name: str, seed: 
 
 
 def test_a_path_is_judged_as_each_of_its_postures_alone() -> None:
-    robot, looked = robots.load("agilex_piper"), clearance()
+    robot, looked = robots.load_robot("agilex_piper"), clearance()
     way = np.random.default_rng(3).uniform(robot.lower, robot.upper, (130, robot.dim))
     together = looked.distances(way)
     assert together.shape == (130, len(looked.pairs))
@@ -118,12 +118,12 @@ def test_the_table_is_looked_at_under_what_can_come_down_to_it() -> None:
 @pytest.mark.some(2)
 @pytest.mark.parametrize("name", NAMES)
 def test_fingers_may_touch_the_table_and_dip_in_a_little_but_no_more(name: str) -> None:
-    robot, looked = robots.load(name), clearance(name)
+    robot, looked = robots.load_robot(name), clearance(name)
     jaws = fingers(robot)
     over = {one for one, other in looked.pairs if other == TABLE}
     assert jaws
     assert jaws & {part for pair in looked.pairs for part in pair} <= over
-    for (one, other), least in zip(looked.pairs, looked.least(0.02), strict=True):
+    for (one, other), least in zip(looked.pairs, looked.touch_thresholds(0.02), strict=True):
         assert least == (-0.01 if other == TABLE and one in jaws else 0.02)
 
 
@@ -134,14 +134,14 @@ def test_what_touches_at_nearly_every_posture_is_left_out_alike_in_both_arms() -
     ]
     assert own[0] == [tuple(part.replace("right", "left") for part in pair) for pair in own[1]]
     assert own[0]
-    robot = robots.load("agilex_piper")
+    robot = robots.load_robot("agilex_piper")
     way = np.random.default_rng(7).uniform(robot.lower, robot.upper, (400, robot.dim))
     assert (clearance().distances(way) < MARGIN).mean(axis=0).max() < 0.99
 
 
 def test_ignored_pairs_are_of_one_arm_unless_they_name_two(edited: Edit) -> None:
     ignored = '["link3", "link7"], ["left_arm/link8", "right_arm/link8"], ["link4", "table"], '
-    looked = Clearance(robots.load(edited(("ignore = [", f"ignore = [{ignored}"))))
+    looked = Clearance(robots.load_robot(edited(("ignore = [", f"ignore = [{ignored}"))))
     pairs = {frozenset(pair) for pair in looked.pairs}
     every = {frozenset(pair) for pair in clearance().pairs}
     gone = {
@@ -157,8 +157,8 @@ def test_ignored_pairs_are_of_one_arm_unless_they_name_two(edited: Edit) -> None
 
 @pytest.mark.parametrize("name", NAMES)
 def test_no_robot_touches_itself_or_the_table_at_a_named_pose(name: str) -> None:
-    robot = robots.load(name)
-    assert problems(robot) == []
+    robot = robots.load_robot(name)
+    assert collision_problems(robot) == []
     looked = clearance(name)
     assert looked.distances(robot.poses["home"]).min() >= MARGIN
     if len(robot.arms) > 1:
@@ -178,8 +178,8 @@ def test_nothing_touches_in_a_real_demonstration() -> None:
 
 
 def test_a_pose_that_touches_is_named_with_the_pair_and_what_to_do(edited: Edit) -> None:
-    robot = robots.load(edited(('ignore = [["link2", "link4"], ', "ignore = [")))
-    said = problems(robot)
+    robot = robots.load_robot(edited(('ignore = [["link2", "link4"], ', "ignore = [")))
+    said = collision_problems(robot)
     assert len(said) == 2
     assert said[0].startswith("poses.home: left_arm/link2 and left_arm/link4 are -18 mm apart, needed: 5")
     assert "collision.ignore" in said[0]
@@ -187,13 +187,13 @@ def test_a_pose_that_touches_is_named_with_the_pair_and_what_to_do(edited: Edit)
 
 def test_a_robot_of_which_nothing_is_looked_at_is_a_problem(edited: Edit) -> None:
     folder = edited()
-    robot = robots.load(folder)
+    robot = robots.load_robot(folder)
     links = sorted(capsules(robot))
     file = folder / "robot.toml"
     head = file.read_text().partition("[collision]")[0]
     file.write_text(f"{head}\n[collision]\nwithout = {links}\n")
-    bare = robots.load(folder)
+    bare = robots.load_robot(folder)
     assert Clearance(bare).distances(bare.poses["home"]).shape == (0,)
-    assert problems(bare) == [
+    assert collision_problems(bare) == [
         "collision: no two links are looked at; links need shapes, or capsules in robot.toml"
     ]

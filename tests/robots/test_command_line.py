@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robots import load
+from robots import load_robot
 from robots.__main__ import main
 
 Edit = Callable[..., Path]
@@ -72,7 +72,7 @@ def test_fk_answers_json(capsys: pytest.CaptureFixture[str]) -> None:
     q = ["-1e-3", "0.5", "-0.25", "-.1", "0", "1"]
     assert main(["fk", "agilex_piper", "right_arm", *q]) == 0
     answer = json.loads(capsys.readouterr().out)
-    chain = load("agilex_piper").group("right_arm").chain
+    chain = load_robot("agilex_piper").group("right_arm").chain
     assert chain is not None
     pose = chain.pose(np.array([float(value) for value in q]))
     assert answer["position"] == pose[:3].tolist()

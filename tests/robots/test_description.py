@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from robots import RobotError, load
+from robots import RobotError, load_robot
 
 Edit = Callable[..., Path]
 
@@ -139,7 +139,7 @@ def test_a_wrong_key_or_value_is_named_with_what_is_allowed(
 ) -> None:
     folder = edited((old, new))
     with pytest.raises(RobotError) as error:
-        load(folder)
+        load_robot(folder)
     assert said in str(error.value)
     assert str(folder / "robot.toml") in str(error.value)
 
@@ -147,7 +147,7 @@ def test_a_wrong_key_or_value_is_named_with_what_is_allowed(
 def test_every_wrong_key_is_named_at_once(edited: Edit) -> None:
     folder = edited(("control_rate = 30.0", "control_rate = 0.0"), ("index = 6", "index = -1"))
     with pytest.raises(RobotError) as error:
-        load(folder)
+        load_robot(folder)
     assert "control_rate = 0.0" in str(error.value)
     assert "groups.0.gripper.index = -1" in str(error.value)
 
@@ -155,4 +155,4 @@ def test_every_wrong_key_is_named_at_once(edited: Edit) -> None:
 def test_a_file_that_is_no_toml_is_refused(edited: Edit) -> None:
     folder = edited(("[cameras]", "[cameras"))
     with pytest.raises(RobotError, match=r"robot\.toml: cannot be read as TOML"):
-        load(folder)
+        load_robot(folder)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from robots import load
+from robots import load_robot
 from tests.robots.standing import (
     tip_in_scene,
 )
 
-ROBOT = load("dual_franka")
+ROBOT = load_robot("dual_franka")
 SHIPPED = (-1.88733017, -0.98627802, 1.34066187, -1.77472402, 0.08241637, 1.8024626, 0.79725709)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import robots
-from robots import load
+from robots import load_robot
 from robots.clearance import MARGIN
 from tests.robots.standing import at_ready, extents, from_home_to_ready, gap_as_said, off_mirror, unreached
 
@@ -37,7 +37,7 @@ STANDING = {
     "ur5e": Stands(("left_finger_pad", "right_finger_pad"), 2e-4, 0.19, 1, 1.0, 0.0, None),
 }
 every_standing = pytest.mark.parametrize("name", STANDING)
-robot = cache(load)
+robot = cache(load_robot)
 
 
 @pytest.mark.some(3)

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from robots import RobotError, names
-from robots.inspection import Inspection, inspect
+from robots import RobotError, robot_names
+from robots.inspection import Inspection, inspect_robot
 
 Edit = Callable[..., Path]
 FAST = '[[groups.overrides]]\njoint = "joint5"\nvelocity = 20.0\nreason = "a placeholder"\n\n[groups.mount]'
@@ -20,9 +20,9 @@ def said(found: Inspection, part: str) -> str:
 
 
 @pytest.mark.some(2)
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", robot_names())
 def test_every_robot_is_told_whole(name: str) -> None:
-    found = inspect(name)
+    found = inspect_robot(name)
     text = "\n".join(found.lines)
     for word in (
         "numbers, ",
@@ -37,7 +37,7 @@ def test_every_robot_is_told_whole(name: str) -> None:
 
 
 def test_everything_that_a_person_wants_to_know_is_in_its_lines() -> None:
-    found = inspect("agilex_piper")
+    found = inspect_robot("agilex_piper")
     assert found.errors == ()
     assert said(found, "left_arm.joint1 ").split("(")[1].startswith("URDF joint2)")
     assert "left_arm (arm): 7 numbers" in found.lines
@@ -57,7 +57,7 @@ def test_optional_groups_are_looked_at_too(edited: Edit) -> None:
         ("left_arm = [0.0,", "left_arm = [9.0,"),
     )
     with pytest.raises(RobotError, match=r"poses\.home\.left_arm: joint0 = 9\.0; allowed"):
-        inspect(folder)
+        inspect_robot(folder)
 
 
 def test_what_somebody_should_look_at_is_a_warning(edited: Edit) -> None:
@@ -68,7 +68,7 @@ def test_what_somebody_should_look_at_is_a_warning(edited: Edit) -> None:
         ("control_rate = 30.0 #", "control_rate = 30.0 # GUESS:"),
     )
     (folder / "README.md").unlink()
-    found = inspect(folder)
+    found = inspect_robot(folder)
     assert found.errors == ()
     assert said(found, 'no "ready"')
     assert "left_arm.overrides: joint5" in said(found, "placeholders, or are some")
@@ -86,12 +86,12 @@ def test_a_joint_without_an_end_is_a_warning(edited: Edit) -> None:
     file = folder / "agilex_piper.urdf"
     before, after = file.read_text().split('<joint name="joint6" type="revolute">')
     file.write_text(before + '<joint name="joint6" type="continuous">' + after)
-    endless = [warning for warning in inspect(folder).warnings if "no position limit" in warning]
+    endless = [warning for warning in inspect_robot(folder).warnings if "no position limit" in warning]
     assert ["left_arm: joint5" in endless[0], "right_arm: joint5" in endless[1]] == [True, True]
 
 
 def test_poses_at_which_links_touch_are_errors(edited: Edit) -> None:
-    found = inspect(edited(('["link2", "link4"], ', "")))
+    found = inspect_robot(edited(('["link2", "link4"], ', "")))
     assert len(found.errors) == 2
     assert "robot.toml: poses.home: left_arm/link2 and left_arm/link4 are -18 mm apart" in found.errors[0]
 
@@ -103,11 +103,11 @@ def test_a_mesh_that_is_missing_is_an_error(edited: Edit) -> None:
     box = text[text.index("<geometry>") : text.index("</geometry>")]
     file.write_text(text.replace(box, '<geometry><mesh filename="meshes/gone.stl"/>', 1))
     with pytest.raises(RobotError, match=r"'meshes/gone\.stl' is missing; looked for"):
-        inspect(folder)
+        inspect_robot(folder)
 
 
 def test_fingertips_below_the_table_are_a_warning(edited: Edit) -> None:
-    found = inspect(
+    found = inspect_robot(
         edited(("[cameras]", "[stand]\nxyz = [0.0, 0.0, -0.3]\nwxyz = [1.0, 0.0, 0.0, 0.0]\n[cameras]"))
     )
     low = [warning for warning in found.warnings if "below the table; see stand" in warning]

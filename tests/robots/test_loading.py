@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import robots
-from robots import RobotError, load
+from robots import RobotError, load_robot
 
 Edit = Callable[..., Path]
 FIRST = 'eef_link = "gripper_base"\n'
@@ -16,8 +16,8 @@ OVERRIDE = '[[groups.overrides]]\njoint = "{joint}"\n{key} = {value}\nreason = "
 
 
 def test_the_piper_comes_with_the_program() -> None:
-    assert "agilex_piper" in robots.names()
-    robot = load("agilex_piper")
+    assert "agilex_piper" in robots.robot_names()
+    robot = load_robot("agilex_piper")
     assert robot.name == "agilex_piper"
     assert robot.dim == 14
     assert robot.control_rate == 30.0
@@ -25,26 +25,26 @@ def test_the_piper_comes_with_the_program() -> None:
 
 def test_a_folder_is_as_good_as_a_name(edited: Edit) -> None:
     folder = edited()
-    assert load(folder).name == "copy"
-    assert load(str(folder)).joint_names == load("agilex_piper").joint_names
+    assert load_robot(folder).name == "copy"
+    assert load_robot(str(folder)).joint_names == load_robot("agilex_piper").joint_names
 
 
 def test_an_unknown_robot_is_answered_with_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match=r"no robot 'pipper'; known: .*agilex_piper"):
-        load("pipper")
+        load_robot("pipper")
     with pytest.raises(RobotError, match=r"or a folder with robot\.toml"):
-        load(tmp_path)
+        load_robot(tmp_path)
 
 
 def test_every_robot_that_comes_with_the_program_loads_and_has_a_readme() -> None:
-    for name in robots.names():
-        robot = load(name)
+    for name in robots.robot_names():
+        robot = load_robot(name)
         assert (robot.folder / "README.md").is_file()
         assert robot.lower.shape == robot.upper.shape == robot.velocity.shape == (robot.dim,)
 
 
 def test_limits_come_from_the_urdf_and_grippers_from_the_file() -> None:
-    robot = load("agilex_piper")
+    robot = load_robot("agilex_piper")
     lower = [-2.618, 0.0, -2.967, -1.745, -1.22, -2.0944, 0.0]
     upper = [2.618, 3.14, 0.0, 1.745, 1.22, 2.0944, 0.1]
     velocity = [5.0, 5.0, 5.0, 5.0, 5.0, 3.0, 1.0]
@@ -56,21 +56,21 @@ def test_limits_come_from_the_urdf_and_grippers_from_the_file() -> None:
 
 def test_an_override_replaces_a_limit_of_one_arm_and_keeps_its_reason(edited: Edit) -> None:
     override = OVERRIDE.format(joint="joint5", key="upper", value=1.5)
-    robot = load(edited(("[groups.mount]", override + "\n[groups.mount]")))
+    robot = load_robot(edited(("[groups.mount]", override + "\n[groups.mount]")))
     assert robot.upper[5] == 1.5
     assert robot.upper[12] == 2.0944
     assert robot.overrides == ("left_arm.joint5 upper 2.0944 -> 1.5: the mount is in the way",)
 
 
 def test_nothing_that_was_loaded_can_be_changed_by_accident() -> None:
-    robot = load("agilex_piper")
+    robot = load_robot("agilex_piper")
     for array in (robot.lower, robot.upper, robot.velocity, robot.poses["home"], robot.groups[0].mount):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1.0
 
 
 def test_a_robot_travels_between_processes() -> None:
-    robot = load("agilex_piper")
+    robot = load_robot("agilex_piper")
     copy = pickle.loads(pickle.dumps(robot))
     assert copy.joint_names == robot.joint_names
     q = np.full(6, 0.3)
@@ -185,7 +185,7 @@ def test_a_robot_travels_between_processes() -> None:
 def test_what_does_not_fit_together_is_named(edited: Edit, old: str, new: str, said: str) -> None:
     folder = edited((old, new))
     with pytest.raises(RobotError) as error:
-        load(folder)
+        load_robot(folder)
     assert said in str(error.value)
     assert str(folder) in str(error.value)
 
@@ -204,7 +204,7 @@ def test_an_override_that_makes_no_sense_is_refused(
 ) -> None:
     override = OVERRIDE.format(joint=joint, key=key, value=value)
     with pytest.raises(RobotError) as error:
-        load(edited(("[groups.mount]", override + "\n[groups.mount]")))
+        load_robot(edited(("[groups.mount]", override + "\n[groups.mount]")))
     assert said in str(error.value)
 
 
@@ -216,11 +216,11 @@ def test_a_joint_without_a_limit_needs_an_override(edited: Edit) -> None:
     assert limit in text
     file.write_text(text.replace(limit, ""))
     with pytest.raises(RobotError, match="'joint5': the URDF gives no lower for joint6; needed: an override"):
-        load(folder)
+        load_robot(folder)
 
 
 def test_fingertips_lie_between_the_fingers_of_the_urdf() -> None:
-    for arm in load("agilex_piper").arms:
+    for arm in load_robot("agilex_piper").arms:
         assert arm.tip is not None
         np.testing.assert_allclose(arm.tip[:3, 3], [0.0, 0.0, 0.1358], atol=1e-12)
         np.testing.assert_allclose(arm.tip[:3, :3], np.eye(3), atol=1e-5)
@@ -234,7 +234,7 @@ def test_the_way_in_which_the_fingers_slide_is_the_tips_y(edited: Edit) -> None:
     finger = '<origin xyz="0.0 0.0 0.1358" rpy="1.5708 0.0 0.0"/>'
     assert finger in text
     file.write_text(text.replace(finger, '<origin xyz="0.02 0.0 0.1" rpy="1.5707963267949 0.0 0.7"/>'))
-    tip = load(folder).arms[0].tip
+    tip = load_robot(folder).arms[0].tip
     assert tip is not None
     np.testing.assert_allclose(tip[:3, 3], [0.01, 0.0, 0.1179], atol=1e-9)
     np.testing.assert_allclose(tip[:3, 1], [-np.sin(0.7), np.cos(0.7), 0.0], atol=1e-9)
@@ -246,14 +246,14 @@ def test_without_sliding_fingers_the_end_effector_is_the_fingertip(edited: Edit)
     folder = edited()
     file = folder / "agilex_piper.urdf"
     file.write_text(file.read_text().replace('type="prismatic"', 'type="revolute"'))
-    tip = load(folder).arms[0].tip
+    tip = load_robot(folder).arms[0].tip
     assert tip is not None
     np.testing.assert_array_equal(tip, np.eye(4))
 
 
 def test_fingertips_that_are_declared_count(edited: Edit) -> None:
     declared = "[groups.gripper.tip]\nxyz = [0.0, 0.01, 0.2]\nwxyz = [0.0, 0.0, 0.0, 1.0]\n\n[groups.mount]"
-    left, right = load(edited(("[groups.mount]", declared))).arms
+    left, right = load_robot(edited(("[groups.mount]", declared))).arms
     assert left.tip is not None
     assert right.tip is not None
     np.testing.assert_allclose(left.tip[:3, 3], [0.0, 0.01, 0.2])
@@ -264,7 +264,7 @@ def test_fingertips_that_are_declared_count(edited: Edit) -> None:
 def test_a_declared_fingertip_needs_a_unit_quaternion(edited: Edit) -> None:
     declared = "[groups.gripper.tip]\nxyz = [0.0, 0.0, 0.2]\nwxyz = [1.0, 1.0, 0.0, 0.0]\n\n[groups.mount]"
     with pytest.raises(RobotError, match=r"left_arm\.gripper\.tip\.wxyz has length 1\.41.*allowed: 1"):
-        load(edited(("[groups.mount]", declared)))
+        load_robot(edited(("[groups.mount]", declared)))
 
 
 def test_an_override_that_changes_nothing_is_refused(edited: Edit) -> None:
@@ -272,17 +272,17 @@ def test_an_override_that_changes_nothing_is_refused(edited: Edit) -> None:
     with pytest.raises(
         RobotError, match=r"left_arm\.overrides: joint1 changes nothing; needed: lower, upper or"
     ):
-        load(edited(("[groups.mount]", override)))
+        load_robot(edited(("[groups.mount]", override)))
 
 
 def test_a_robot_whose_groups_are_all_optional_is_refused(edited: Edit) -> None:
     folder = edited(('name = "left_arm"', 'name = "left_arm"\noptional = true'))
-    assert [group.name for group in load(folder).groups] == ["right_arm"]
+    assert [group.name for group in load_robot(folder).groups] == ["right_arm"]
     file = folder / "robot.toml"
     file.write_text(file.read_text().replace('name = "right_arm"', 'name = "right_arm"\noptional = true'))
     with pytest.raises(RobotError, match="groups: all are optional; needed: one that is always part"):
-        load(folder)
-    assert [group.name for group in load(folder, ["left_arm"]).groups] == ["left_arm"]
+        load_robot(folder)
+    assert [group.name for group in load_robot(folder, ["left_arm"]).groups] == ["left_arm"]
 
 
 def test_groups_of_one_copy_of_the_urdf_stand_in_one_place(edited: Edit) -> None:
@@ -304,18 +304,18 @@ def test_groups_of_one_copy_of_the_urdf_stand_in_one_place(edited: Edit) -> None
         right = right.replace(zeros, "right_arm = [0.0, 0.0]")
     file.write_text(before + 'name = "right_arm"\n' + right)
     with pytest.raises(RobotError, match=r"groups\.right_arm\.mount differs from that of left_arm"):
-        load(folder)
+        load_robot(folder)
 
 
 def test_what_is_chosen_has_to_be_there(edited: Edit) -> None:
     with pytest.raises(RobotError, match=r"groups \['head'\] were chosen; allowed: left_arm, right_arm"):
-        load(edited(), ["head"])
+        load_robot(edited(), ["head"])
     with pytest.raises(RobotError, match=r"groups \[\] were chosen"):
-        load("agilex_piper", [])
+        load_robot("agilex_piper", [])
     with pytest.raises(
         RobotError, match=r"grippers of head were chosen; groups with a gripper: left_arm, right"
     ):
-        load("agilex_piper", grippers={"head": robots.GripperChoice(binary=True)})
+        load_robot("agilex_piper", grippers={"head": robots.GripperChoice(binary=True)})
 
 
 def test_robots_of_ones_own_lie_in_the_folders_of_an_environment_variable(
@@ -323,7 +323,7 @@ def test_robots_of_ones_own_lie_in_the_folders_of_an_environment_variable(
 ) -> None:
     folder = edited()
     monkeypatch.setenv("EVA_ROBOTS", str(folder.parent))
-    assert "copy" in robots.names()
-    assert load("copy").folder == folder
+    assert "copy" in robots.robot_names()
+    assert load_robot("copy").folder == folder
     folder.rename(folder.parent / "agilex_piper")
-    assert load("agilex_piper").folder != folder.parent / "agilex_piper"
+    assert load_robot("agilex_piper").folder != folder.parent / "agilex_piper"

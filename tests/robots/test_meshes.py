@@ -55,14 +55,14 @@ def no_other_meshes(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_the_box_around_a_mesh_is_read_from_its_file(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / name).write_bytes(content)
-    lower, upper = meshes.bounds(tmp_path / name)
+    lower, upper = meshes.mesh_bounds(tmp_path / name)
     np.testing.assert_allclose(lower, [0, 0, -0.3], atol=1e-7)
     np.testing.assert_allclose(upper, [0.1, 0.2, 0], atol=1e-7)
 
 
 def test_the_box_around_a_collada_follows_its_scene_and_its_unit(tmp_path: Path) -> None:
     (tmp_path / "a.dae").write_text(DAE)
-    lower, upper = meshes.bounds(tmp_path / "a.dae")
+    lower, upper = meshes.mesh_bounds(tmp_path / "a.dae")
     np.testing.assert_allclose(lower, [0.05 - 0.2, 0, -0.3], atol=1e-12)
     np.testing.assert_allclose(upper, [0.1, 0.2, 1.0], atol=1e-12)
 
@@ -72,16 +72,16 @@ def test_a_collada_is_read_in_any_encoding(tmp_path: Path) -> None:
         'id="kept"', 'id="手"'
     )
     (tmp_path / "a.dae").write_bytes(text.replace("#kept", "#手").encode("gbk"))
-    assert meshes.bounds(tmp_path / "a.dae")[1].tolist() == pytest.approx([0.1, 0.2, 1.0])
+    assert meshes.mesh_bounds(tmp_path / "a.dae")[1].tolist() == pytest.approx([0.1, 0.2, 1.0])
 
 
 def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
     file = tmp_path / "a.obj"
     file.write_text("v 0 0 0\nv 1 1 1\n")
-    assert meshes.bounds(file)[1].tolist() == [1, 1, 1]
+    assert meshes.mesh_bounds(file)[1].tolist() == [1, 1, 1]
     file.write_text("v 0 0 0\nv 2 2 2\n")
     os.utime(file, ns=(1, 1))
-    assert meshes.bounds(file)[1].tolist() == [2, 2, 2]
+    assert meshes.mesh_bounds(file)[1].tolist() == [2, 2, 2]
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
 def test_what_is_no_mesh_is_refused_by_name(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(RobotError, match=f"{name}: cannot be read as a mesh"):
-        meshes.bounds(tmp_path / name)
+        meshes.mesh_bounds(tmp_path / name)
 
 
 @pytest.mark.parametrize(("name", "content"), [("a.obj", OBJ), ("a.stl", STL)])
@@ -106,7 +106,7 @@ def test_empty_lines_cost_nothing(tmp_path: Path, name: str, content: str) -> No
     """300,000 of them would take hours if the space before a word could be theirs."""
     first, rest = content.split("\n", 1)
     (tmp_path / name).write_text(first + 300_000 * "\n" + rest)
-    assert meshes.bounds(tmp_path / name)[0].tolist() == pytest.approx([0, 0, -0.3])
+    assert meshes.mesh_bounds(tmp_path / name)[0].tolist() == pytest.approx([0, 0, -0.3])
 
 
 def test_a_collada_that_shows_one_mesh_a_billion_times_is_refused(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_a_collada_that_shows_one_mesh_a_billion_times_is_refused(tmp_path: Path
         DAE.replace('<node id="kept">', f'{nodes}<node id="kept">').replace("#kept", "#n0")
     )
     with pytest.raises(RobotError, match="more than 20000 nodes"):
-        meshes.bounds(tmp_path / "a.dae")
+        meshes.mesh_bounds(tmp_path / "a.dae")
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_a_mesh_is_found_in_the_robots_folder_or_in_that_of_its_name(
     (tmp_path / "library").mkdir(exist_ok=True)
     file.write_text(OBJ)
     path = robot(tmp_path / "thing", mesh(filename.format(folder=tmp_path / root), ' scale="2 1 -1"'))
-    (shape,) = shapes.read(path)
+    (shape,) = shapes.read_shapes(path)
     assert (shape.kind, shape.size, shape.file) == ("mesh", (2, 1, -1), file)
     lower, upper = shape.bounds()
     np.testing.assert_allclose((lower, upper), [[0, 0, 0], [0.2, 0.2, 0.3]], atol=1e-12)
@@ -164,7 +164,7 @@ def test_a_mesh_elsewhere_is_refused_even_where_it_exists(tmp_path: Path, filena
     path = robot(tmp_path / "thing", mesh(filename.format(folder=tmp_path)))
     (tmp_path / "thing/link.obj").symlink_to(other)
     with pytest.raises(RobotError, match=f"link 'a': mesh .* allowed: files in {tmp_path / 'thing'}"):
-        shapes.read(path)
+        shapes.read_shapes(path)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_a_mesh_elsewhere_is_refused_even_where_it_exists(tmp_path: Path, filena
 )
 def test_what_is_wrong_with_a_mesh_is_named(tmp_path: Path, visual: str, said: str) -> None:
     with pytest.raises(RobotError) as error:
-        shapes.read(robot(tmp_path / "thing", visual))
+        shapes.read_shapes(robot(tmp_path / "thing", visual))
     assert said.format(folder=tmp_path / "thing") in str(error.value)
 
 
@@ -189,7 +189,7 @@ def test_a_folder_of_meshes_that_is_not_there_is_named(
 ) -> None:
     monkeypatch.setenv(meshes.ENVIRONMENT, str(tmp_path / "gone"))
     with pytest.raises(RobotError, match=r"EVA_ROBOT_MESHES = '.*gone' is no folder"):
-        shapes.shown(robot(tmp_path / "thing", mesh("a.stl")))
+        shapes.displayed_shapes(robot(tmp_path / "thing", mesh("a.stl")))
 
 
 BOX = '<visual><origin xyz="1 0 0"/><geometry><box size="1 1 1"/></geometry>{material}</visual>'
@@ -204,11 +204,14 @@ def test_a_mesh_of_a_links_name_is_shown_instead_of_its_shapes_and_never_collide
     file.parent.mkdir(parents=True)
     file.write_text(OBJ)
     monkeypatch.setenv(meshes.ENVIRONMENT, str(tmp_path / "library"))
-    (shape,) = shapes.shown(path)
+    (shape,) = shapes.displayed_shapes(path)
     assert (shape.link, shape.kind, shape.size, shape.file) == ("a", "mesh", (1, 1, 1), file)
     assert shape.colour == (1, 0, 0, 1)
     np.testing.assert_array_equal(shape.origin, np.eye(4))
-    assert [shape.kind for shape in shapes.read(path)] == ["box", "box"]  # what collides is the description's
+    assert [shape.kind for shape in shapes.read_shapes(path)] == [
+        "box",
+        "box",
+    ]  # what collides is the description's
 
 
 def test_a_mesh_of_a_links_name_stands_for_one_that_the_urdf_names_and_that_is_missing(
@@ -219,7 +222,7 @@ def test_a_mesh_of_a_links_name_stands_for_one_that_the_urdf_names_and_that_is_m
     file.parent.mkdir(parents=True)
     file.write_text(STL)
     monkeypatch.setenv(meshes.ENVIRONMENT, str(tmp_path / "library"))
-    assert [shape.file for shape in shapes.read(path)] == [file]
+    assert [shape.file for shape in shapes.read_shapes(path)] == [file]
 
 
 def test_a_link_name_leads_to_no_file_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,7 +230,7 @@ def test_a_link_name_leads_to_no_file_elsewhere(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "library/thing").mkdir(parents=True)
     (tmp_path / "library/secret.obj").write_text(OBJ)
     monkeypatch.setenv(meshes.ENVIRONMENT, str(tmp_path / "library"))
-    assert [shape.kind for shape in shapes.shown(path)] == ["box"]
+    assert [shape.kind for shape in shapes.displayed_shapes(path)] == ["box"]
 
 
 def test_those_who_can_draw_no_mesh_draw_the_box_around_it(tmp_path: Path) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robots import Body, load, shapes
+from robots import Body, load_robot, shapes
 from robots.clearance import MARGIN, Clearance
 from robots.rotations import matrix_of_quaternion, rotation_vector, transform_of
 from tests.robots.standing import lowest
 
-ROBOT = load("r1_lite")
-WHOLE = load("r1_lite", groups=["left_arm", "right_arm", "torso", "base"])
+ROBOT = load_robot("r1_lite")
+WHOLE = load_robot("r1_lite", groups=["left_arm", "right_arm", "torso", "base"])
 MIRROR = np.array([-1, 1, 1, 1, -1, -1])  # of the arm's joints
 CHECKS = {  # arm, joints: position and wxyz in base_link, then in torso_link3
     "left home": (
@@ -139,7 +139,7 @@ def test_fingertips_are_where_the_fingers_end_and_point_the_way_the_hand_does() 
     for arm in ROBOT.arms:
         ends = [
             shape.origin[0, 3] + shape.bounds()[1][0] + 0.03689
-            for shape in shapes.read(ROBOT.urdf)
+            for shape in shapes.read_shapes(ROBOT.urdf)
             if shape.link.startswith(arm.name.removesuffix("_arm") + "_gripper_finger")
         ]
         assert arm.tip[0, 3] == pytest.approx(max(ends), abs=1e-3)

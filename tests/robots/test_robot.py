@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robots import Camera, RobotError, load
+from robots import Camera, RobotError, load_robot
 
 Edit = Callable[..., Path]
 
 
 def test_names_are_in_the_order_of_the_vector() -> None:
-    robot = load("agilex_piper")
+    robot = load_robot("agilex_piper")
     joints = [f"joint{index}" for index in range(7)]
     expected = [f"left_arm.{joint}" for joint in joints] + [f"right_arm.{joint}" for joint in joints]
     assert list(robot.joint_names) == expected
@@ -23,7 +23,7 @@ def test_names_are_in_the_order_of_the_vector() -> None:
 
 
 def test_the_piper_is_what_the_wire_expects() -> None:
-    robot = load("agilex_piper")
+    robot = load_robot("agilex_piper")
     assert robot.cameras == (
         Camera("front", "cam_high"),
         Camera("left_wrist", "cam_left_wrist"),
@@ -43,13 +43,13 @@ def test_the_piper_is_what_the_wire_expects() -> None:
 
 
 def test_a_binary_gripper_is_listed(edited: Edit) -> None:
-    robot = load(edited(("binary = false", "binary = true\nthreshold = 0.05")))
+    robot = load_robot(edited(("binary = false", "binary = true\nthreshold = 0.05")))
     assert robot.binary_dims == (6,)
     assert robot.gripper_dims == (6, 13)
 
 
 def test_join_undoes_split_for_single_vectors_and_for_rows() -> None:
-    robot = load("agilex_piper")
+    robot = load_robot("agilex_piper")
     rows = np.arange(28, dtype=np.float32).reshape(2, 14)
     for vector in (rows[0], rows):
         parts = robot.split(vector)
@@ -60,7 +60,7 @@ def test_join_undoes_split_for_single_vectors_and_for_rows() -> None:
 
 
 def test_a_vector_or_a_part_of_another_length_is_refused() -> None:
-    robot = load("agilex_piper")
+    robot = load_robot("agilex_piper")
     with pytest.raises(RobotError, match=r"shape \(16,\) was given; allowed: \[..., 14\]"):
         robot.split(np.zeros(16))
     with pytest.raises(RobotError, match=r"right_arm was given \(6,\); allowed: \[..., 7\]"):
@@ -73,12 +73,12 @@ def test_a_vector_or_a_part_of_another_length_is_refused() -> None:
 
 def test_an_unknown_group_is_answered_with_the_known_ones() -> None:
     with pytest.raises(RobotError, match="no group 'head'; it has left_arm, right_arm"):
-        load("agilex_piper").group("head")
+        load_robot("agilex_piper").group("head")
 
 
 def test_a_group_without_an_end_effector_is_no_arm(edited: Edit) -> None:
     folder = edited(('frame = "base_link"\neef_link = "gripper_base"\n', ""))
-    robot = load(folder)
+    robot = load_robot(folder)
     assert [arm.name for arm in robot.arms] == ["right_arm"]
     assert robot.eef_dim == 8
     assert robot.gripper_dims == (6, 13)

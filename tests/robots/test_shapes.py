@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robots import RobotError, load, names, shapes
+from robots import RobotError, load_robot, robot_names, shapes
 
 VISUAL = '<link name="a"><visual>{body}</visual></link>'
 BOX = '<geometry><box size="1 2 3"/></geometry>'
@@ -23,7 +23,7 @@ def test_every_kind_is_read_with_size_origin_and_colour(tmp_path: Path) -> None:
     body += '<visual><geometry><cylinder radius="0.1" length="0.4"/></geometry></visual></link>'
     body += '<link name="b"><visual><geometry><sphere radius="0.2"/></geometry>'
     body += '<material name=""><color rgba="0 1 0 1"/></material></visual></link>'
-    box, cylinder, sphere = shapes.read(write(tmp_path, body))
+    box, cylinder, sphere = shapes.read_shapes(write(tmp_path, body))
     assert (box.link, box.kind, box.size, box.colour) == ("a", "box", (1, 2, 3), (1, 0, 0, 0.5))
     np.testing.assert_allclose(
         box.origin, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-12
@@ -50,7 +50,7 @@ def test_every_kind_is_read_with_size_origin_and_colour(tmp_path: Path) -> None:
 def test_what_is_wrong_is_named(tmp_path: Path, body: str, said: str) -> None:
     path = write(tmp_path, VISUAL.format(body=body))
     with pytest.raises(RobotError) as error:
-        shapes.read(path)
+        shapes.read_shapes(path)
     assert said in str(error.value)
     assert str(path) in str(error.value)
 
@@ -67,12 +67,12 @@ def test_bounds_are_around_the_shape_in_its_own_frame(
     tmp_path: Path, body: str, half: tuple[float, ...]
 ) -> None:
     origin = '<origin xyz="1 2 3" rpy="1 0 0"/>'
-    (shape,) = shapes.read(write(tmp_path, VISUAL.format(body=origin + body)))
+    (shape,) = shapes.read_shapes(write(tmp_path, VISUAL.format(body=origin + body)))
     lower, upper = shape.bounds()
     np.testing.assert_allclose(lower, np.negative(half))
     np.testing.assert_allclose(upper, half)
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", robot_names())
 def test_every_robot_can_be_seen(name: str) -> None:
-    assert len(shapes.read(load(name).urdf)) > 0
+    assert len(shapes.read_shapes(load_robot(name).urdf)) > 0

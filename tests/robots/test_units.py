@@ -6,9 +6,9 @@ import robots
 from robots.units import units_of
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_grippers_have_their_own_unit_and_joints_that_turn_rad(name):
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     units = units_of(robot)
     assert len(units) == robot.dim
     for group in robot.groups:
@@ -48,4 +48,4 @@ body = [0.0, 0.0]
 base = [0.0]
 """
     )
-    assert units_of(robots.load(folder)) == ("m", "rad", "")
+    assert units_of(robots.load_robot(folder)) == ("m", "rad", "")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robots import load
+from robots import load_robot
 from robots.body import Body
 from tests.robots.standing import extents, tip_in_scene
 
-ROBOT = load("ur5e")
+ROBOT = load_robot("ur5e")
 JAWS = ("left_finger_pad", "right_finger_pad")
 
 

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robots import Group, RobotError, load, scene_of
+from robots import Group, RobotError, load_robot, scene_of
 from robots.rotations import matrix_of_quaternion
 
 Edit = Callable[..., Path]
 
-PIPER = load("agilex_piper")
+PIPER = load_robot("agilex_piper")
 SCENE = scene_of(PIPER)
 MOVED = np.array([0.3, 0.9, -1.1, 0.4, -0.5, 0.6, 0.06, -0.2, 1.2, -0.8, -0.3, 0.7, 1.1, 0.1])
 
@@ -63,7 +63,7 @@ def test_wrong_shapes_and_names_are_refused_with_what_is_allowed() -> None:
 
 def test_a_finger_that_cannot_move_by_itself_is_refused(edited: Edit) -> None:
     with pytest.raises(RobotError, match="fingers: joint8 is fixed or a mimic; allowed: joints that move"):
-        load(edited(("{ joint7 = [0.0, 0.05] }", "{ joint8 = [0.0, 0.05] }")))
+        load_robot(edited(("{ joint7 = [0.0, 0.05] }", "{ joint8 = [0.0, 0.05] }")))
 
 
 WHOLE = """<robot name="whole"><link name="base"/><link name="chest"/><link name="l"/><link name="r"/>
@@ -104,7 +104,7 @@ def test_a_urdf_of_the_whole_body_is_shown_once_with_pinned_joints_and_mimics(tm
         + ARM.format(name="right", link="r")
         + "[poses.home]\nleft_arm = [0.0, 0.0]\nright_arm = [0.0, 0.0]\n"
     )
-    scene = scene_of(load(tmp_path))
+    scene = scene_of(load_robot(tmp_path))
     assert sorted(scene.parts) == [
         "left_arm/base",
         "left_arm/chest",

@@ -16,7 +16,7 @@ from runtime.core.errors import PolicyLostError
 from runtime.core.types import Float64, Observation
 from runtime.processes.coordinator.builders import make_policy
 from runtime.processes.lockstep.lockstep import Peers
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 from runtime.teleoperators.base import Leader
 from runtime.transports.base import Capabilities
@@ -67,7 +67,7 @@ class SelfDriven(StubRobot):
             return seen
         return replace(seen, reported_action=(self.position + 0.01).astype(np.float32))
 
-    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+    def send_control_word(self, word: str, data: Mapping[str, Any]) -> None:
         self.told.append((word, dict(data)))
         self.collects = word == "collect_start"
 
@@ -79,7 +79,7 @@ class CollectStubs(Stubs):
     mute: bool = False  # the leader says nothing
 
     def __post_init__(self) -> None:
-        self.spec = replace(self.spec, capabilities=Capabilities(moves_robot=True, leads=True))
+        self.spec = replace(self.spec, capabilities=Capabilities(moves_robot=True, drives_itself=True))
 
     @property
     def peers(self) -> Peers:
@@ -135,5 +135,5 @@ def collecting(data: Path, source: str = "relay", **changes: Any) -> CollectStat
     on_top: dict[str, Any] = {"collection": {"source": source, **leader, **changes}}
     if source == "node":  # a recording drives no robot, and its deployment is refused
         on_top["transport"] = {"kind": "zmq"}
-    resolved = loader.changed(stubbed(data, **tables).spec.resolved, on_top, "test")
-    return CollectStation(CollectStubs(checked_spec(resolved)))
+    resolved = loader.apply_changes(stubbed(data, **tables).spec.resolved, on_top, "test")
+    return CollectStation(CollectStubs(check_deployment(resolved)))

@@ -18,7 +18,7 @@ GRIPPERS = [6, 13]
 
 @cache
 def robot() -> Robot:
-    return robots.load("agilex_piper")
+    return robots.load_robot("agilex_piper")
 
 
 @cache

@@ -21,7 +21,7 @@ from runtime.processes.coordinator.assembly import assemble
 from runtime.processes.coordinator.builders import make_policy
 from runtime.processes.lockstep.lockstep import Lockstep, Peers
 from runtime.recording.reader import Episode, open_episode
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Capabilities, Sink, Source
 from tests.runtime.recording.samples import numbered
@@ -82,9 +82,9 @@ class StubRobot(Source, Sink):
         if not self.blocked:
             self.position = command.action.astype(np.float64) + self.bias
 
-    def tell(self, word: str, data: Mapping[str, Any]) -> None:
+    def send_control_word(self, word: str, data: Mapping[str, Any]) -> None:
         if self.wordless:
-            super().tell(word, data)
+            super().send_control_word(word, data)
         self.told.append((word, dict(data)))
         if len(self.told) > self.deaf:
             self.truth = {"reset": data["id"], "seed": data["seed"], "milestones": {}, "success": False}
@@ -196,7 +196,7 @@ def stubbed(
     for table, values in settings.items():
         tree[table] = {**tree.get(table, {}), **values} if isinstance(values, dict) else values
     can = Capabilities(moves_robot=moves_robot, resets_bench=simulated)
-    spec = replace(checked_spec(loader.resolve(tree, {}, "test")), capabilities=can)
+    spec = replace(check_deployment(loader.resolve_deployment(tree, {}, "test")), capabilities=can)
     return Stubs(spec, start, rows, space, absent, real)
 
 

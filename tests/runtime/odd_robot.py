@@ -73,6 +73,6 @@ def odd_robot(folder: Path) -> Robot:
     """The robot, described in `folder`; D = 17, arms "bare" and "armed"."""
     place = folder / "odd"
     place.mkdir()
-    shutil.copy(robots.load("agilex_piper").urdf, place)
+    shutil.copy(robots.load_robot("agilex_piper").urdf, place)
     (place / "robot.toml").write_text(_TABLE)
-    return robots.load(str(place))
+    return robots.load_robot(str(place))

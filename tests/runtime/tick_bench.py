@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.config.schema import Answer
+from runtime.config.schema import FaultResponse
 from runtime.core.clock import VirtualClock
 from runtime.core.types import Float64, Observation, RobotCommand
 from runtime.ipc.messages import (
@@ -25,11 +25,11 @@ from runtime.ipc.messages import (
 )
 from runtime.ipc.shared_state import EStop, SharedState, SharedStateLayout
 from runtime.motion.timeline import DimensionKinds
-from runtime.processes.control.chunk_execution import Strategy, strategy
+from runtime.processes.control.chunk_execution import Strategy, build_strategy
 from runtime.processes.control.tick import Tick, TickSettings
 from runtime.safety.filter import Limits, SafetyFilter, SafetySettings
 from runtime.safety.workspace import Workspace
-from runtime.spaces.binary_grippers import Switch
+from runtime.spaces.binary_grippers import BinaryGripper
 from runtime.transports.base import Sink
 
 PERIOD = 1 / 30
@@ -58,9 +58,9 @@ class RecordingSink(Sink):
     def send(self, command: RobotCommand) -> None:
         self.sent.append(command.action.copy())
 
-    def tell(self, word: str, data: Any) -> None:
+    def send_control_word(self, word: str, data: Any) -> None:
         if not self.takes_words:
-            super().tell(word, data)
+            super().send_control_word(word, data)
         self.told.append((word, dict(data)))
 
     def close(self) -> None:
@@ -79,10 +79,10 @@ class Bench:
         chosen: dict[str, Any] | None = None,
         limits: Limits = TWO_JOINTS,
         dims: DimensionKinds | None = None,
-        starvation: Answer = "slow",
+        starvation: FaultResponse = "slow",
         seen: bool = True,
         workspace: Workspace | None = None,
-        switches: tuple[Switch, ...] = (),
+        switches: tuple[BinaryGripper, ...] = (),
         **safety: Any,
     ) -> None:
         self.limits, self.workspace = limits, workspace
@@ -93,9 +93,9 @@ class Bench:
         self.shared.set_estop(EStop.CLEAR)
         self.step, self.order, self.sequence = 0, 0, 0
         self.dims = dims or DimensionKinds()
-        self.chosen: Strategy = strategy(chosen or {"kind": "async"}, self.dims)
+        self.chosen: Strategy = build_strategy(chosen or {"kind": "async"}, self.dims)
         self.safety = SafetySettings(**safety)
-        self.starvation: Answer = starvation
+        self.starvation: FaultResponse = starvation
         self.switches = switches
         self.before_send: Callable[[], object] = lambda: None
         self.tick = self.new_tick()

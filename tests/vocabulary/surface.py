@@ -221,6 +221,7 @@ def journals() -> dict[str, Any]:
 
 
 def _below(kind: type) -> Iterator[Any]:
+    one: type
     for one in kind.__subclasses__():
         if one.__module__.startswith("evaweb."):
             yield one
@@ -248,7 +249,7 @@ def snapshot() -> dict[str, Any]:
             else ""
         )
 
-    return keys({name: part for name, part in state.items() if name != "sentences"})
+    return {name: keys(part) for name, part in sorted(state.items()) if name != "sentences"}
 
 
 def columns() -> dict[str, list[str]]:

@@ -12,7 +12,7 @@ from urllib.parse import unquote, urlsplit
 from django.conf import settings
 
 from evaweb.blinding import HIDDEN
-from runtime.core.environment import without_secrets
+from runtime.core.environment import without_web_secrets
 
 REMOVED = "(removed)"
 _SHORTEST = 6  # characters of a value that is looked for everywhere: a shorter one stands in every word
@@ -122,7 +122,7 @@ def known_secrets() -> set[str]:
     found = {settings.SECRET_KEY, *(_read(path) for path in files)}
     database = settings.DATABASES["default"]
     found.add(str(database.get("PASSWORD") or ""))
-    kept = without_secrets(os.environ)
+    kept = without_web_secrets(os.environ)
     for name, value in os.environ.items():
         if name not in kept or _KEY.search(name) or _VARIABLES.search(name):
             found |= {value, *_passwords(value)}

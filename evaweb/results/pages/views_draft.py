@@ -158,8 +158,8 @@ def _saved(request: HttpRequest, plan: Plan) -> HttpResponse:
 
 def _was(request: HttpRequest) -> dict[str, Any]:
     try:
-        found = bounded.from_json(request.POST.get("was", "{}"), "was", _LARGEST)
-    except bounded.Unreadable as error:
+        found = bounded.parse_json(request.POST.get("was", "{}"), "was", _LARGEST)
+    except bounded.UnreadableDocument as error:
         raise EvaError(str(error)) from None
     if not isinstance(found, dict):
         raise EvaError(_ALLOWED_WHAT_PAGE_SHOWN_BY)

@@ -6,7 +6,7 @@ from evaweb.episodes.models import Episode
 from evaweb.episodes.preview import jpeg_of
 from evaweb.episodes.videos import video_file
 from evaweb.results.judges.base import Still
-from runtime.datasets.pictures import Pictures
+from runtime.datasets.pictures import VideoFrames
 
 CAMERAS = 4  # the first of the recording
 OF_EACH = 8  # evenly over the run, with the first and the last that there are
@@ -20,7 +20,7 @@ def stills_of(episode: Episode) -> tuple[Still, ...]:
         video = video_file(episode.uuid, camera)
         if not video.exists():  # lost before its first picture
             continue
-        with Pictures(video) as pictures:
+        with VideoFrames(video) as pictures:
             times = pictures.times
             for index in sample(len(pictures)):
                 pixels = pictures[index]

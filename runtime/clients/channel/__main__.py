@@ -18,8 +18,8 @@ from pathlib import Path
 
 import zmq
 
-from robots.broken_pipe import unread_ends
-from runtime.clients.channel.names import Names
+from robots.broken_pipe import exit_on_broken_pipe
+from runtime.clients.channel.names import HolderNames
 from runtime.clients.channel.server import ChannelServer
 from runtime.clients.client import StationClient
 from runtime.config import loader as deployment
@@ -35,11 +35,11 @@ _POLL_S = 0.1
 _AGAIN_S = 1.0
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until the supervisor is gone, or a signal; exit code 2 where the station is not known."""
     given = _parser().parse_args(arguments)
-    log.start("channel")
+    log.configure_logging("channel")
     station_dir = data_folder(given.data_dir) / "stations" / given.station
     try:
         settings = _settings(station_dir)
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, frame: ended.append(number))
     lifeline = Lifeline() if given.lifeline else None
-    serve(station_dir, settings, lambda: bool(ended) or (lifeline is not None and lifeline.cut))
+    serve(station_dir, settings, lambda: bool(ended) or (lifeline is not None and lifeline.is_cut))
     return 0
 
 
@@ -71,13 +71,13 @@ def _settings(station_dir: Path) -> ControlChannelSettings:
             f"station {station_dir.name!r} is not known here ({path}: {error.__class__.__name__}); start it "
             "with python -m runtime DEPLOYMENT, or name another data folder"
         ) from None
-    return deployment.resolve(tree, {}, str(path)).deployment.control_channel
+    return deployment.resolve_deployment(tree, {}, str(path)).deployment.control_channel
 
 
 def serve(station_dir: Path, settings: ControlChannelSettings, ended: Callable[[], bool]) -> None:
     """Listen until `ended`; a port that is taken is tried again every second."""
     operator = settings.operator or f"{getpass.getuser()}@{socket.gethostname()}"
-    names = Names(operator, settings.scripts)
+    names = HolderNames(operator, settings.scripts)
     door = _open(station_dir, settings, names, ended)
     if door is None:
         return
@@ -89,7 +89,7 @@ def serve(station_dir: Path, settings: ControlChannelSettings, ended: Callable[[
 
 
 def _open(
-    station_dir: Path, settings: ControlChannelSettings, names: Names, ended: Callable[[], bool]
+    station_dir: Path, settings: ControlChannelSettings, names: HolderNames, ended: Callable[[], bool]
 ) -> ChannelServer | None:
     told = ""
     while not ended():

@@ -9,7 +9,9 @@ from runtime.clients.channel.message import Message
 from runtime.clients.channel.outcomes import Outcome
 
 
-def told(message: Message, outcome: Outcome, data: Mapping[str, Any], state: str | None) -> dict[str, Any]:
+def command_answer(
+    message: Message, outcome: Outcome, data: Mapping[str, Any], state: str | None
+) -> dict[str, Any]:
     """The answer to a command; `state` is that of the station after it, None where that is not known."""
     result = {"id": outcome.id, "result": outcome.result}
     if outcome.result in ("refused", "failed", "unknown"):
@@ -24,6 +26,6 @@ def told(message: Message, outcome: Outcome, data: Mapping[str, Any], state: str
     }
 
 
-def error(why: str) -> dict[str, Any]:
+def error_answer(why: str) -> dict[str, Any]:
     """The answer to what is no command."""
     return {"ok": False, "error": why}

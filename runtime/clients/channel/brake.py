@@ -9,7 +9,7 @@ from typing import Any
 from runtime.clients.channel import answers
 from runtime.clients.channel.message import Message
 from runtime.clients.channel.outcomes import Outcome, Outcomes
-from runtime.clients.channel.scripts import Lives
+from runtime.clients.channel.scripts import ScriptActivity
 from runtime.clients.channel.verbs import stops
 from runtime.clients.client import Refused, StationClient
 from runtime.core.errors import RuntimeFault, TransportError
@@ -29,10 +29,12 @@ def is_estop(message: Message) -> bool:
     return message.form != "query" and message.name == "estop"
 
 
-class Brake:
+class StopHandler:
     """Stops at the coordinator: also what another script of this channel has begun, whose lease it then uses."""
 
-    def __init__(self, open_client: Callable[[str], StationClient], lives: Lives, outcomes: Outcomes) -> None:
+    def __init__(
+        self, open_client: Callable[[str], StationClient], lives: ScriptActivity, outcomes: Outcomes
+    ) -> None:
         self._open, self._lives, self._outcomes = open_client, lives, outcomes
 
     def answer(self, holder: str, message: Message) -> dict[str, Any]:
@@ -43,23 +45,23 @@ class Brake:
         try:
             state = self._stop(holder, kind)
         except TransportError as fault:
-            outcome.become("unknown", f"{fault}; {_ANYBODY}")
+            outcome.resolve("unknown", f"{fault}; {_ANYBODY}")
         except Refused as refusal:
-            outcome.become("refused", f"{refusal}; {_ANYBODY}")
-        self._outcomes.keep(outcome)
-        return answers.told(message, outcome, {}, state)
+            outcome.resolve("refused", f"{refusal}; {_ANYBODY}")
+        self._outcomes.add(outcome)
+        return answers.command_answer(message, outcome, {}, state)
 
     def _stop(self, holder: str, kind: str) -> str:
         """Under the lease that a script of the channel holds, else under one of the asker's own."""
         client = self._open(holder)
         try:
             held = client.status()["lease"]["holder"]
-            if held != holder and self._lives.knows(held):
+            if held != holder and self._lives.is_known(held):
                 client.close()
                 client = self._open(held)
             client.claim()
             client.status()
-            client.give(kind, {})
+            client.send_command(kind, {})
             return str(client.status()["state"])
         finally:
             client.close()
@@ -68,7 +70,7 @@ class Brake:
         """Nothing is kept open."""
 
 
-class EStop:
+class EStopHandler:
     """Presses the e-stop at the guard."""
 
     def __init__(self, open_client: Callable[[str], StationClient], outcomes: Outcomes) -> None:
@@ -80,13 +82,13 @@ class EStop:
         client = self._open(holder)
         try:
             ack = client.estop(str(message.arguments["why"]))
-            outcome.become("done" if ack.status == "done" else "failed", ack.reason)
+            outcome.resolve("done" if ack.status == "done" else "failed", ack.reason)
         except RuntimeFault as fault:
-            outcome.become("unknown", str(fault))
+            outcome.resolve("unknown", str(fault))
         finally:
             client.close()
-        self._outcomes.keep(outcome)
-        return answers.told(message, outcome, {}, None)
+        self._outcomes.add(outcome)
+        return answers.command_answer(message, outcome, {}, None)
 
     def close(self) -> None:
         """Nothing is kept open."""

@@ -12,10 +12,10 @@ from typing import Any
 from runtime.clients.channel import answers
 from runtime.clients.channel import status as older
 from runtime.clients.channel.message import Message
-from runtime.clients.channel.outcomes import Outcome, Outcomes, lasts
-from runtime.clients.channel.scripts import Lives, Script, Scripts
-from runtime.clients.channel.verb_commands import NotOurs, Scene
-from runtime.clients.channel.verbs import VERBS, deed
+from runtime.clients.channel.outcomes import Outcome, Outcomes, is_long_running
+from runtime.clients.channel.scripts import Script, ScriptActivity, Scripts
+from runtime.clients.channel.verb_commands import UnsupportedVerb, VerbContext
+from runtime.clients.channel.verbs import VERBS, commands_for_verb
 from runtime.clients.client import Refused, StationClient
 from runtime.core.errors import RuntimeFault, TransportError
 from runtime.ipc.command_arguments import ARGUMENTS
@@ -37,7 +37,7 @@ class CommandExecutor:
     def __init__(
         self,
         open_client: Callable[[str], StationClient],
-        lives: Lives,
+        lives: ScriptActivity,
         outcomes: Outcomes,
         silence_s: float,
         now: Callable[[], float] = time.monotonic,
@@ -49,7 +49,7 @@ class CommandExecutor:
 
     def answer(self, holder: str, message: Message) -> dict[str, Any]:
         """The answer to one message; every fault is a sentence in it."""
-        script = self._scripts.of(holder)
+        script = self._scripts.get_or_create(holder)
         if message.form == "query":
             return self._asked(script, message)
         outcome = Outcome(message.id or str(uuid.uuid4()), message.name, "", "done")
@@ -58,23 +58,23 @@ class CommandExecutor:
             return self._repeated(message, known, script)
         data: Mapping[str, Any] = {}
         try:
-            data = (self._verb if message.form == "cmd" else self._own)(script, message, outcome)
+            data = (self._verb if message.form == "cmd" else self._run_command)(script, message, outcome)
         except RuntimeFault as fault:
             self._newest = str(fault)
-            outcome.become("unknown" if isinstance(fault, TransportError) else "refused", self._newest)
-        self._outcomes.keep(outcome)
+            outcome.resolve("unknown" if isinstance(fault, TransportError) else "refused", self._newest)
+        self._outcomes.add(outcome)
         if message.name == "select_collect_task" and outcome.result == "done":
             return {"ok": True, **data}  # as it always was
         special = dict(data) if message.name == "tab_switch" else {}
-        return answers.told(message, outcome, data, self._state(script, outcome)) | special
+        return answers.command_answer(message, outcome, data, self._state(script, outcome)) | special
 
     def _repeated(self, message: Message, known: Outcome, script: Script) -> dict[str, Any]:
         """Answer with what came of it the first time, as far as it has come now."""
         if known.said != message.name:
             why = f"its id was given to {known.said!r} before"
             other = Outcome(known.id, message.name, "", "refused", why)
-            return answers.told(message, other, {}, None)
-        return answers.told(message, known, {}, self._state(script, known))
+            return answers.command_answer(message, other, {}, None)
+        return answers.command_answer(message, known, {}, self._state(script, known))
 
     def _state(self, script: Script, outcome: Outcome) -> str | None:
         """After a command; None where the station has just gone, and the answer is still worth having."""
@@ -85,23 +85,23 @@ class CommandExecutor:
         except TransportError:
             return None
 
-    def keep(self) -> None:
+    def poll(self) -> None:
         """Do what is due beside messages: leases, and the outcomes of commands that go on."""
-        for sentence in self._scripts.keep():
+        for sentence in self._scripts.poll():
             log.warning("%s", sentence)
         if self._now() - self._looked >= _LOOK_S:
             self._looked = self._now()
-            self._look()
+            self._poll_outcomes()
 
-    def _look(self) -> None:
-        going_on = self._outcomes.open
+    def _poll_outcomes(self) -> None:
+        going_on = self._outcomes.pending
         if not going_on:
             return
-        client = self._scripts.of("channel").client  # of no script: it asks, and holds nothing
+        client = self._scripts.get_or_create("channel").client  # of no script: it asks, and holds nothing
         try:
             status = client.status()
             for outcome in going_on:
-                outcome.look(status, client.events_since)
+                outcome.poll(status, client.events_since)
                 self._newest = outcome.reason if outcome.result == "failed" else self._newest
         except TransportError as fault:
             log.warning("what became of commands is not known: %s", fault)
@@ -111,48 +111,48 @@ class CommandExecutor:
     def _verb(self, script: Script, message: Message, outcome: Outcome) -> Mapping[str, Any]:
         """Do what a verb of the older channel comes to; returns the data of the answer."""
         if message.name not in VERBS:
-            raise NotOurs(
+            raise UnsupportedVerb(
                 f"command not allowed: {str(message.fields['cmd'])!r:.80}; known: {', '.join(VERBS)}"
             )
         client = script.client
-        with _nothing_given():
-            scene = Scene(message, client.status(), script.selection, lambda: _commanded(client))
-            made = deed(scene)
+        with _refused_if_unreachable():
+            scene = VerbContext(message, client.status(), script.selection, lambda: _commanded(client))
+            made = commands_for_verb(scene)
         told: Mapping[str, Any] = made.told
         for number, (kind, arguments) in enumerate(made.steps, start=1):
             last = number == len(made.steps)
-            told = self._give(script, kind, arguments, outcome if last else None) or told
+            told = self._send_command(script, kind, arguments, outcome if last else None) or told
         script.selection.choose(**made.chosen)
         outcome.explain(made.note)
         return told
 
-    def _own(self, script: Script, message: Message, outcome: Outcome) -> Mapping[str, Any]:
+    def _run_command(self, script: Script, message: Message, outcome: Outcome) -> Mapping[str, Any]:
         """Do a command of ours; returns the data of the answer."""
         kind, arguments = message.name, message.arguments
         if kind not in OWN:
-            raise NotOurs(f"unknown command {kind!r:.80}; known: {', '.join(OWN)}")
+            raise UnsupportedVerb(f"unknown command {kind!r:.80}; known: {', '.join(OWN)}")
         if kind == "aim":
-            return script.client.ask("aim", arguments).data
+            return script.client.query_with("aim", arguments).data
         if kind not in ("claim", "give_up"):
-            return self._give(script, kind, arguments, outcome)
+            return self._send_command(script, kind, arguments, outcome)
         if arguments:
-            raise NotOurs(f"{kind} takes no arguments; given: {', '.join(map(str, arguments)):.200}")
+            raise UnsupportedVerb(f"{kind} takes no arguments; given: {', '.join(map(str, arguments)):.200}")
         if kind == "claim":
             self._claim(script)
         else:
-            script.give_up()
+            script.release()
         return {}
 
-    def _give(
+    def _send_command(
         self, script: Script, kind: str, arguments: Mapping[str, Any], outcome: Outcome | None
     ) -> Mapping[str, Any]:
         """Give one command under the script's lease; raises Refused, or TransportError: outcome unknown."""
-        with _nothing_given():
+        with _refused_if_unreachable():
             self._claim(script)
             before = script.client.status()
-        ack = script.client.give(kind, arguments, outcome.id if outcome else "")
+        ack = script.client.send_command(kind, arguments, outcome.id if outcome else "")
         if outcome is not None:
-            outcome.give(kind, before if lasts(kind) else {})
+            outcome.accept(kind, before if is_long_running(kind) else {})
         return {key: value for key, value in ack.data.items() if key not in ("epoch", "holder")}
 
     def _claim(self, script: Script) -> None:
@@ -204,19 +204,22 @@ class CommandExecutor:
     def _events(self, script: Script, fields: Mapping[str, Any]) -> list[dict[str, Any]]:
         since = fields.get("since", 0)
         if isinstance(since, bool) or not isinstance(since, int) or not 0 <= since < 2**53:
-            raise NotOurs(f"since = {since!r:.80}: must be a whole number, the newest event you have")
+            raise UnsupportedVerb(f"since = {since!r:.80}: must be a whole number, the newest event you have")
         return script.client.events_since(since)
 
     def _result(self, script: Script, fields: Mapping[str, Any]) -> dict[str, Any]:
         given = fields.get("id")
-        self._look()
+        self._poll_outcomes()
         found = self._outcomes.get(given) if isinstance(given, str) else None
         if found is None:
-            raise NotOurs(f"id = {given!r:.80}: no command of that id is remembered")
-        return found.told
+            raise UnsupportedVerb(f"id = {given!r:.80}: no command of that id is remembered")
+        return found.to_dict
 
     def _commands(self, script: Script, fields: Mapping[str, Any]) -> dict[str, Any]:
-        return {"cmd": {f"web:{verb}": what.ours for verb, what in VERBS.items()}, "command": list(OWN)}
+        return {
+            "cmd": {f"web:{verb}": what.description for verb, what in VERBS.items()},
+            "command": list(OWN),
+        }
 
     def close(self) -> None:
         self._scripts.close()
@@ -227,7 +230,7 @@ def _commanded(client: StationClient) -> list[float]:
 
 
 @contextmanager
-def _nothing_given() -> Iterator[None]:
+def _refused_if_unreachable() -> Iterator[None]:
     """A station that does not answer before anything was given to it has refused: nothing is unknown."""
     try:
         yield

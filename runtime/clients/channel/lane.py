@@ -32,7 +32,7 @@ class Job:
     stops: int
 
 
-class Clerk(Protocol):
+class RequestHandler(Protocol):
     """Answers messages in a lane."""
 
     def answer(self, holder: str, message: Message) -> dict[str, Any]: ...
@@ -42,7 +42,7 @@ class Clerk(Protocol):
 Reply = Callable[[list[bytes], dict[str, Any]], None]
 
 
-class Lane:
+class RequestWorker:
     """Jobs for one clerk, who is made, used and closed in the lane's own thread.
 
     `keep` is done about ten times a second; without it a lane is one of stops, which are carried out whatever comes,
@@ -53,7 +53,7 @@ class Lane:
     def __init__(
         self,
         name: str,
-        clerk: Clerk,
+        clerk: RequestHandler,
         reply: Reply,
         stops: Callable[[], int],
         keep: Callable[[], None] | None = None,
@@ -67,7 +67,7 @@ class Lane:
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
 
-    def put(self, job: Job) -> bool:
+    def submit(self, job: Job) -> bool:
         """Take a job; False if there was no room for it."""
         connection = job.address[0]
         with self._lock:
@@ -92,11 +92,11 @@ class Lane:
             try:
                 job = self._jobs.get(timeout=_PERIOD_S)
             except Empty:
-                self._tend()
+                self._poll_handler()
                 continue
             self._forget(job.address[0])
             self._reply(job.address, self._answer(job))
-            self._tend()
+            self._poll_handler()
         self._clerk.close()
 
     def _forget(self, connection: bytes) -> None:
@@ -108,12 +108,12 @@ class Lane:
     def _answer(self, job: Job) -> dict[str, Any]:
         why = self._void(job)
         if why:
-            return answers.error(why) | job.message.echo | {"result": "refused"}
+            return answers.error_answer(why) | job.message.echo | {"result": "refused"}
         try:
             return self._clerk.answer(job.holder, job.message)
         except Exception as error:  # whatever a message meets, the channel goes on
             log.exception("%s cannot be answered", job.message.name)
-            return answers.error(f"handler error: {type(error).__name__}: {error}") | job.message.echo
+            return answers.error_answer(f"handler error: {type(error).__name__}: {error}") | job.message.echo
 
     def _void(self, job: Job) -> str:
         """Why a command is not carried out any more, "" where it is."""
@@ -124,7 +124,7 @@ class Lane:
             return "a stop came after it: not carried out"
         return f"it waited {waited:.1f} s behind others: not carried out" if waited > LATE_S else ""
 
-    def _tend(self) -> None:
+    def _poll_handler(self) -> None:
         if self._keep is None or time.monotonic() - self._kept < _PERIOD_S:
             return
         self._kept = time.monotonic()

@@ -48,7 +48,7 @@ class Message:
 def read(frames: list[bytes]) -> Message:
     """The message in the frames behind the address; raises Malformed, but for a press of the e-stop."""
     for frame in frames:
-        if (said := pressing.in_json(frame, "command", "cmd")) is not None:
+        if (said := pressing.parse_json_press(frame, "command", "cmd")) is not None:
             return _press(said)
     fields = _object(frames)
     client, identity = _client(fields), _identity(fields)
@@ -71,7 +71,7 @@ def _press(said: Mapping[str, Any]) -> Message:
     word = said.get(form)
     named = word if isinstance(word, str) else pressing.NAME
     reason = named.partition(f"{pressing.NAME}:")[2] or "over the control channel"
-    arguments = {"why": pressing.why_in(said, pressing.kept(reason))}
+    arguments = {"why": pressing.json_reason(said, pressing.sanitize_text(reason))}
     fields: dict[str, Any] = {form: named[:_LONGEST_NAME]}
     client, identity = _or_none(_client, said), _or_none(_identity, said)
     return Message(form, pressing.NAME, fields, None, arguments, client, identity)

@@ -10,7 +10,7 @@ from runtime.clients.channel.message import Message
 _CONNECTIONS = 1000  # that are remembered
 
 
-class Names:
+class HolderNames:
     """Whose a message is: a script that names itself, a connection, or all scripts together.
 
     `user` is who the channel's process commands for, as the deployment says. What scripts add to it is what they say
@@ -34,7 +34,7 @@ class Names:
         _forget(self._numbers)
         return f"{self.user}#{number}"
 
-    def lives(self, connection: bytes, message: Message, stops: bool) -> bool:
+    def is_alive(self, connection: bytes, message: Message, stops: bool) -> bool:
         """True if its holder is alive, as far as this message shows; `stops` where it ends something.
 
         Of scripts that are one holder some only look, and must not keep alive what another one began. So a question

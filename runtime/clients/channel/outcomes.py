@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from runtime.clients.terminal.settling import CALM_TICKS, Settled, busy
+from runtime.clients.terminal.settling import CALM_TICKS, Settled, is_busy
 
 KEPT = 1000
 # What the session is while each goes on; the rest goes on within the state it was given in.
@@ -22,7 +22,7 @@ _WITHIN = {
 Events = Callable[[int], list[dict[str, Any]]]
 
 
-def lasts(kind: str) -> bool:
+def is_long_running(kind: str) -> bool:
     """True if a command goes on after it was accepted."""
     return kind in _WHILE or kind in _WITHIN or kind == "approach"
 
@@ -45,10 +45,10 @@ class Outcome:
     calm_since: int | None = None
 
     @property
-    def told(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         return {"id": self.id, "said": self.said, "result": self.result, "reason": self.reason}
 
-    def become(self, result: str, reason: str) -> None:
+    def resolve(self, result: str, reason: str) -> None:
         """The command came to `result`, for that reason."""
         self.result, self.reason = result, reason
 
@@ -56,11 +56,11 @@ class Outcome:
         """What is to be said of it besides."""
         self.reason = reason
 
-    def give(self, kind: str, before: Mapping[str, Any]) -> None:
+    def accept(self, kind: str, before: Mapping[str, Any]) -> None:
         """The station took the command `kind`; `before` was its status where that goes on, {} where it is done."""
         self.kind, self.result, self.before = kind, "accepted" if before else "done", before
 
-    def look(self, status: dict[str, Any], events_since: Events) -> None:
+    def poll(self, status: dict[str, Any], events_since: Events) -> None:
         """See whether it is over."""
         if status["boot"] != self.before["boot"]:
             self._end("unknown", "the station was restarted")
@@ -76,14 +76,14 @@ class Outcome:
             self._end("failed", f"{status['state']}: {status['reason']}")
 
     def _settle(self, status: dict[str, Any], events_since: Events) -> None:
-        self._hear(status, events_since)
-        if status["state"] == self.before["state"] and not self._calm(status):
+        self._read_events(status, events_since)
+        if status["state"] == self.before["state"] and not self._is_settled(status):
             return
         wants = "motion_done" if self.kind == "approach" else _WITHIN[self.kind]
         failure = Settled(self.before["state"], status, self.events).failure(wants)
         self._end("failed" if failure else "done", failure)
 
-    def _calm(self, status: dict[str, Any]) -> bool:
+    def _is_settled(self, status: dict[str, Any]) -> bool:
         """True if it was seen to stand twice, so far apart that what there is to tell of it was told.
 
         What is seen in the first ticks says nothing: it may not have begun.
@@ -91,13 +91,13 @@ class Outcome:
         step = status["control"]["step"]
         if self.looked_since is None:
             self.looked_since = step
-        if busy(status) or step - self.looked_since < CALM_TICKS:
+        if is_busy(status) or step - self.looked_since < CALM_TICKS:
             self.calm_since = None
         elif self.calm_since is None:
             self.calm_since = step
         return self.calm_since is not None and step - self.calm_since >= CALM_TICKS
 
-    def _hear(self, status: dict[str, Any], events_since: Events) -> None:
+    def _read_events(self, status: dict[str, Any], events_since: Events) -> None:
         heard = self.events[-1]["number"] if self.events else self.before["newest_event"]
         if status["newest_event"] > heard:
             self.events.extend(events_since(heard))
@@ -113,7 +113,7 @@ class Outcomes:
         self._kept: dict[str, Outcome] = {}
         self._lock = threading.Lock()
 
-    def keep(self, outcome: Outcome) -> None:
+    def add(self, outcome: Outcome) -> None:
         """Remember it; what is known of an id is not replaced."""
         with self._lock:
             first = self._kept.get(outcome.id)
@@ -127,7 +127,7 @@ class Outcomes:
             return self._kept.get(identity)
 
     @property
-    def open(self) -> list[Outcome]:
+    def pending(self) -> list[Outcome]:
         """Those that go on."""
         with self._lock:
             return [outcome for outcome in self._kept.values() if outcome.result == "accepted"]

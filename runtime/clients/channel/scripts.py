@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from runtime.clients.channel.selection import Selection
+from runtime.clients.channel.selection import ScriptSelection
 from runtime.clients.client import Refused, StationClient
 from runtime.core.errors import TransportError
 
@@ -18,7 +18,7 @@ class Script:
     """One script: the client that commands for it, what it has chosen, whether it has the lease."""
 
     client: StationClient
-    selection: Selection = field(default_factory=Selection)
+    selection: ScriptSelection = field(default_factory=ScriptSelection)
     holds: bool = False
 
     def claim(self) -> None:
@@ -30,13 +30,13 @@ class Script:
             raise
         self.holds = True
 
-    def give_up(self) -> None:
+    def release(self) -> None:
         """Give the lease back, where it has it."""
         if self.holds:
             self.holds = False
-            self.client.give_up()
+            self.client.release()
 
-    def lose(self) -> None:
+    def mark_lease_lost(self) -> None:
         """Its lease is over."""
         self.holds = False
 
@@ -44,7 +44,7 @@ class Script:
         self.client.close()
 
 
-class Lives:
+class ScriptActivity:
     """When each script was last heard; told by one thread, asked by another."""
 
     def __init__(self, now: Callable[[], float]) -> None:
@@ -52,7 +52,7 @@ class Lives:
         self._heard: dict[str, float] = {}
         self._lock = threading.Lock()
 
-    def heard(self, holder: str) -> None:
+    def record(self, holder: str) -> None:
         """It has just spoken."""
         with self._lock:
             self._heard.pop(holder, None)
@@ -65,7 +65,7 @@ class Lives:
         with self._lock:
             return self._now() - self._heard.get(holder, -float("inf"))
 
-    def knows(self, holder: str) -> bool:
+    def is_known(self, holder: str) -> bool:
         """True if it is one of the channel's scripts."""
         with self._lock:
             return holder in self._heard
@@ -74,11 +74,13 @@ class Lives:
 class Scripts:
     """By the name of the holder; used by one thread, whose sockets their clients are."""
 
-    def __init__(self, open_client: Callable[[str], StationClient], lives: Lives, silence_s: float) -> None:
+    def __init__(
+        self, open_client: Callable[[str], StationClient], lives: ScriptActivity, silence_s: float
+    ) -> None:
         self._open, self._lives, self._silence = open_client, lives, silence_s
         self._known: dict[str, Script] = {}
 
-    def of(self, holder: str) -> Script:
+    def get_or_create(self, holder: str) -> Script:
         """The script, made where it is new."""
         script = self._known.pop(holder, None) or Script(self._open(holder))
         self._known[holder] = script
@@ -86,7 +88,7 @@ class Scripts:
             self._known.pop(name).close()
         return script
 
-    def keep(self) -> list[str]:
+    def poll(self) -> list[str]:
         """Renew the leases of those who speak, end those of the silent; returns a sentence for each that ended."""
         told = []
         for holder, script in self._known.items():
@@ -97,7 +99,7 @@ class Scripts:
                 if silence <= self._silence:
                     script.client.renew()
                     continue
-                script.client.give_up()
+                script.client.release()
                 told.append(f"{holder} has said nothing for {silence:.1f} s: its lease is over")
             except TransportError as fault:  # a station that is away has no lease either, in a while
                 if silence <= self._silence:
@@ -105,7 +107,7 @@ class Scripts:
                 told.append(f"{holder}: {fault}")
             except Refused as refusal:
                 told.append(f"{holder} has the lease no longer: {refusal}")
-            script.lose()
+            script.mark_lease_lost()
         return told
 
     def close(self) -> None:

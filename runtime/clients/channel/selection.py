@@ -7,7 +7,7 @@ from typing import Any
 
 
 @dataclass(slots=True)
-class Selection:
+class ScriptSelection:
     """The choices of one script; what is None or empty was not chosen, and the deployment's own holds."""
 
     task: str | None = None

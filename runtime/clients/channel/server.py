@@ -12,13 +12,13 @@ from typing import Any
 import zmq
 
 from runtime.clients.channel import answers, strict
-from runtime.clients.channel.brake import Brake, EStop, is_estop, is_stop
+from runtime.clients.channel.brake import EStopHandler, StopHandler, is_estop, is_stop
 from runtime.clients.channel.executor import CommandExecutor
-from runtime.clients.channel.lane import Job, Lane
+from runtime.clients.channel.lane import Job, RequestWorker
 from runtime.clients.channel.message import LARGEST, Malformed, Message, read
-from runtime.clients.channel.names import Names
+from runtime.clients.channel.names import HolderNames
 from runtime.clients.channel.outcomes import Outcomes
-from runtime.clients.channel.scripts import Lives
+from runtime.clients.channel.scripts import ScriptActivity
 from runtime.clients.client import StationClient
 from runtime.core.errors import TransportError
 
@@ -35,12 +35,12 @@ class ChannelServer:
         self,
         context: zmq.Context[Any],
         port: int,
-        names: Names,
+        names: HolderNames,
         silence_s: float,
         open_client: Callable[[str], StationClient],
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._names, self._lives, self._stops = names, Lives(now), 0
+        self._names, self._lives, self._stops = names, ScriptActivity(now), 0
         self._socket, self.endpoint = _listening(context, port)
         self._context, self._inbox = context, _REPLIES.format(uuid.uuid4())
         self._replies = context.socket(zmq.PULL)
@@ -49,12 +49,12 @@ class ChannelServer:
         self._local = threading.local()
         outcomes = Outcomes()
         executor = CommandExecutor(open_client, self._lives, outcomes, silence_s)
-        self._desk = self._lane("executor", executor, executor.keep)
-        self._brake = self._lane("brake", Brake(open_client, self._lives, outcomes))
-        self._estop = self._lane("estop", EStop(open_client, outcomes))
+        self._desk = self._lane("executor", executor, executor.poll)
+        self._brake = self._lane("brake", StopHandler(open_client, self._lives, outcomes))
+        self._estop = self._lane("estop", EStopHandler(open_client, outcomes))
 
-    def _lane(self, name: str, clerk: Any, keep: Callable[[], None] | None = None) -> Lane:
-        return Lane(f"channel-{name}", clerk, self._reply, lambda: self._stops, keep)
+    def _lane(self, name: str, clerk: Any, keep: Callable[[], None] | None = None) -> RequestWorker:
+        return RequestWorker(f"channel-{name}", clerk, self._reply, lambda: self._stops, keep)
 
     def _reply(self, address: list[bytes], answer: dict[str, Any]) -> None:
         """Hand an answer over, from a lane's thread by a socket of that thread."""
@@ -84,18 +84,18 @@ class ChannelServer:
         try:
             message = read(body)
         except Malformed as fault:
-            self._send([*address, strict.dumps(answers.error(str(fault)))])
+            self._send([*address, strict.dumps(answers.error_answer(str(fault)))])
             return
         holder = self._names.holder(address[0], message.client)
-        if self._names.lives(address[0], message, is_stop(message) or is_estop(message)):
-            self._lives.heard(holder)
+        if self._names.is_alive(address[0], message, is_stop(message) or is_estop(message)):
+            self._lives.record(holder)
         lane = self._lane_of(message)
-        if not lane.put(Job(address, holder, message, time.monotonic(), self._stops)):
+        if not lane.submit(Job(address, holder, message, time.monotonic(), self._stops)):
             under_way = "so many presses are under way already that this one adds nothing"
             why = under_way if is_estop(message) else "too many commands wait: not carried out"
-            self._send([*address, strict.dumps(answers.error(why) | message.echo)])
+            self._send([*address, strict.dumps(answers.error_answer(why) | message.echo)])
 
-    def _lane_of(self, message: Message) -> Lane:
+    def _lane_of(self, message: Message) -> RequestWorker:
         if not is_estop(message) and not is_stop(message):
             return self._desk
         self._stops += 1  # void is what waits

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from runtime.clients.channel.selection import Selection
+from runtime.clients.channel.selection import ScriptSelection
 
 _CLI_MODES = {"continuous": "real", "preview": "step"}
 _REPLAY = (
@@ -39,7 +39,7 @@ _ABSENT: dict[str, Any] = {
 }
 
 
-def status(snapshot: Mapping[str, Any], selection: Selection, newest: str) -> dict[str, Any]:
+def status(snapshot: Mapping[str, Any], selection: ScriptSelection, newest: str) -> dict[str, Any]:
     """Every key that the older channel has, with ours as `state`, `reason`, `allowed`, `lease` and `estop`.
 
     `newest` is the reason of the newest command that was refused or failed.
@@ -59,7 +59,7 @@ def _robot(snapshot: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _session(snapshot: Mapping[str, Any], selection: Selection, newest: str) -> dict[str, Any]:
+def _session(snapshot: Mapping[str, Any], selection: ScriptSelection, newest: str) -> dict[str, Any]:
     state, state_is, policy = snapshot["state"], snapshot["state_is"], snapshot["policy"]
     started = state_is["set_up"]
     rests = state_is["idle"] or state_is["ready"]
@@ -85,7 +85,7 @@ def _session(snapshot: Mapping[str, Any], selection: Selection, newest: str) -> 
     }
 
 
-def _run(snapshot: Mapping[str, Any], selection: Selection) -> dict[str, Any]:
+def _run(snapshot: Mapping[str, Any], selection: ScriptSelection) -> dict[str, Any]:
     policy, run, control = snapshot["policy"], snapshot["run"], snapshot["control"]
     episode, recording = snapshot["episode"], snapshot["recording"]
     collect = snapshot.get("collect") or {"armed": False, "episode": None}

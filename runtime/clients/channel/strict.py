@@ -12,17 +12,17 @@ import numpy as np
 
 def dumps(content: Mapping[str, Any]) -> bytes:
     """The map as one frame of JSON in ASCII."""
-    return json.dumps(plain(content), allow_nan=False).encode()
+    return json.dumps(to_builtin(content), allow_nan=False).encode()
 
 
-def plain(value: Any) -> Any:
+def to_builtin(value: Any) -> Any:
     """The value in JSON's own types: NaN and infinity are None, arrays lists, what is foreign its text."""
     if isinstance(value, Mapping):
-        return {str(key): plain(part) for key, part in value.items()}
+        return {str(key): to_builtin(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
+        return [to_builtin(part) for part in value]
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        return to_builtin(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)

@@ -9,18 +9,18 @@ from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
 from runtime.clients.channel.message import Message
-from runtime.clients.channel.selection import Selection
+from runtime.clients.channel.selection import ScriptSelection
 from runtime.core.errors import RuntimeFault
 
 Step = tuple[str, Mapping[str, Any]]
 
 
-class NotOurs(RuntimeFault):
+class UnsupportedVerb(RuntimeFault):
     """A verb, or an argument of one, that means nothing here; the sentence says what to give instead."""
 
 
 @dataclass(frozen=True, slots=True)
-class Deed:
+class CommandSequence:
     """Commands of ours in their order, none where nothing is asked of the station; the last one's result counts.
 
     `chosen` is remembered once they were accepted; `told` are further keys of the answer, `note` its reason.
@@ -33,12 +33,12 @@ class Deed:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class VerbContext:
     """Context of a verb: the message, the station's status, the script's choices, the commanded joints."""
 
     message: Message
     status: Mapping[str, Any]
-    selection: Selection
+    selection: ScriptSelection
     commanded: Callable[[], list[float]]
 
     @property
@@ -54,23 +54,23 @@ class Scene:
         return f"web:{self.message.name}"
 
     def refuse(self, why: str) -> NoReturn:
-        raise NotOurs(f"{self.verb}: {why}")
+        raise UnsupportedVerb(f"{self.verb}: {why}")
 
-    def nothing(self) -> None:
+    def no_argument(self) -> None:
         """Refuse an argument where none belongs."""
         if self.message.argument:
             self.refuse(f"takes no argument; given {self.message.argument!r:.80}")
 
-    def text(self, key: str = "") -> str:
+    def text_argument(self, key: str = "") -> str:
         """The argument, which has to be there; `key` of the message goes before it."""
         said = self.message.fields.get(key, self.message.argument) if key else self.message.argument
         if not isinstance(said, str) or not said.strip():
             self.refuse(f"needs {f'{key!r} in the message, or ' if key else ''}an argument after a colon")
         return said.strip()
 
-    def word(self, *allowed: str) -> str:
+    def choice_argument(self, *allowed: str) -> str:
         """The argument, one of `allowed`."""
-        said = self.text()
+        said = self.text_argument()
         if said not in allowed:
             self.refuse(f"{said!r:.80} is none of {', '.join(allowed)}")
         return said
@@ -78,7 +78,7 @@ class Scene:
     def table(self) -> dict[str, Any]:
         """The argument as a JSON object."""
         try:
-            found = json.loads(self.text())
+            found = json.loads(self.text_argument())
         except (ValueError, RecursionError) as error:
             self.refuse(f"its argument is not JSON: {error}")
         if not isinstance(found, dict):

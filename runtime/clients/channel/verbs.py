@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from runtime.clients.channel.verb_commands import Deed, Scene, Step
+from runtime.clients.channel.verb_commands import CommandSequence, Step, VerbContext
 
 STOPS = ("stop", "halt", "rollout_stop")  # verbs that overtake whatever waits
 _STOPPING_INTENTS = ("accept", "cancel")  # of operator_action
@@ -17,8 +17,8 @@ _TABS = "there are no tabs here: nothing is done"
 class Verb:
     """One verb: `does` makes its deed, `ours` is what it comes to, for people."""
 
-    does: Callable[[Scene], Deed]
-    ours: str
+    build: Callable[[VerbContext], CommandSequence]
+    description: str
 
 
 def stops(verb: str, argument: str | None) -> bool:
@@ -27,28 +27,28 @@ def stops(verb: str, argument: str | None) -> bool:
     return verb in STOPS or (verb == "operator_action" and intent in _STOPPING_INTENTS)
 
 
-def deed(scene: Scene) -> Deed:
+def commands_for_verb(scene: VerbContext) -> CommandSequence:
     """Commands of ours for a known verb; raises NotOurs with the reason and what to give instead."""
-    return VERBS[scene.message.name].does(scene)
+    return VERBS[scene.message.name].build(scene)
 
 
-def _plain(kind: str) -> Callable[[Scene], Deed]:
+def _plain(kind: str) -> Callable[[VerbContext], CommandSequence]:
     """A verb that is a command of ours without arguments."""
 
-    def does(scene: Scene) -> Deed:
-        scene.nothing()
-        return Deed(((kind, {}),))
+    def does(scene: VerbContext) -> CommandSequence:
+        scene.no_argument()
+        return CommandSequence(((kind, {}),))
 
     return does
 
 
-def _stopping(kind: str) -> Callable[[Scene], Deed]:
+def _stopping(kind: str) -> Callable[[VerbContext], CommandSequence]:
     """A stop is not refused for a word too many."""
-    return lambda scene: Deed(((kind, {}),))
+    return lambda scene: CommandSequence(((kind, {}),))
 
 
-def _never(why: str) -> Verb:
-    def does(scene: Scene) -> Deed:
+def _unsupported(why: str) -> Verb:
+    def does(scene: VerbContext) -> CommandSequence:
         scene.refuse(why)
 
     return Verb(does, f"refused: {why}")
@@ -57,173 +57,173 @@ def _never(why: str) -> Verb:
 # --- set-up and runs -----------------------------------------------------------------------------------------
 
 
-def _setup(scene: Scene) -> Deed:
-    scene.nothing()
-    return Deed((("setup", scene.selection.setup),))
+def _setup(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
+    return CommandSequence((("setup", scene.selection.setup),))
 
 
-def _connected(scene: Scene) -> Deed:
-    scene.nothing()
+def _connected(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
     if not scene.state_is["connected"]:
         scene.refuse(f"the station connects by itself, and is not connected: {scene.status['reason']}")
-    return Deed(note="the station connects by itself, and is connected")
+    return CommandSequence(note="the station connects by itself, and is connected")
 
 
-def _set_up(scene: Scene) -> Deed:
-    scene.nothing()
+def _set_up(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
     if not scene.state_is["set_up"]:
         scene.refuse(f"the station is {scene.state}, and this is a part of web:setup: give that, and wait")
-    return Deed(note="the set-up has done it")
+    return CommandSequence(note="the set-up has done it")
 
 
-def _run(scene: Scene) -> Deed:
-    scene.nothing()
-    return Deed((("run", scene.selection.run),))
+def _run(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
+    return CommandSequence((("run", scene.selection.run),))
 
 
-def _go_on(scene: Scene) -> Deed:
+def _go_on(scene: VerbContext) -> CommandSequence:
     return _plain("resume")(scene) if scene.state_is["held"] else _run(scene)
 
 
-def _saved(scene: Scene) -> Deed:
-    scene.nothing()
+def _saved(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
     if scene.state_is["run_open"]:
         scene.refuse("a run is open, and is recorded as it goes on: web:rollout_stop closes it")
     episode = scene.status["episode"]
     if not episode.get("path"):
         scene.refuse("nothing was recorded since the station started")
-    return Deed(told={"episode": episode}, note="it was saved as it went on, when it was stopped")
+    return CommandSequence(told={"episode": episode}, note="it was saved as it went on, when it was stopped")
 
 
-def _reset(scene: Scene) -> Deed:
+def _reset(scene: VerbContext) -> CommandSequence:
     """After a trial; a run that was halted is over then, one that goes on is not ended by it."""
     end: tuple[Step, ...] = (("stop", {}),) if scene.state_is["held"] else ()
-    return Deed((*end, ("home", {})))
+    return CommandSequence((*end, ("home", {})))
 
 
-def _bare_reset(scene: Scene) -> Deed:
-    scene.nothing()
+def _bare_reset(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
     return _reset(scene)
 
 
-def _tab(scene: Scene) -> Deed:
+def _tab(scene: VerbContext) -> CommandSequence:
     armed = scene.message.fields.get("armed", False)
     if not isinstance(armed, bool):
         scene.refuse(f"armed = {armed!r:.80}: must be true or false")
-    tab = scene.text()
-    return Deed(told={"tab": tab, "armed": armed and tab == "collect"}, note=_TABS)
+    tab = scene.text_argument()
+    return CommandSequence(told={"tab": tab, "armed": armed and tab == "collect"}, note=_TABS)
 
 
 # --- what is selected ----------------------------------------------------------------------------------------
 
 
-def _task(scene: Scene) -> Deed:
-    task = scene.text("task")
+def _task(scene: VerbContext) -> CommandSequence:
+    task = scene.text_argument("task")
     note = "in force now, and for the set-ups of this script"
-    return Deed((("tune", {"task": task}),), chosen={"task": task}, note=note)
+    return CommandSequence((("tune", {"task": task}),), chosen={"task": task}, note=note)
 
 
-def _collect_task(scene: Scene) -> Deed:
-    task = scene.text("task")
-    return Deed(chosen={"collect_task": task}, told={"selected_collect_task": task})
+def _collect_task(scene: VerbContext) -> CommandSequence:
+    task = scene.text_argument("task")
+    return CommandSequence(chosen={"collect_task": task}, told={"selected_collect_task": task})
 
 
-def _mode(scene: Scene) -> Deed:
-    mode = _MODES[scene.word(*_MODES)]
-    return Deed(chosen={"mode": mode}, note=f"the next run's mode is {mode}")
+def _mode(scene: VerbContext) -> CommandSequence:
+    mode = _MODES[scene.choice_argument(*_MODES)]
+    return CommandSequence(chosen={"mode": mode}, note=f"the next run's mode is {mode}")
 
 
-def _strategy(scene: Scene) -> Deed:
-    strategy = {"kind": scene.word(*scene.status["facts"]["strategies"])}
-    return Deed((("tune", {"strategy": strategy}),), chosen={"strategy": strategy})
+def _strategy(scene: VerbContext) -> CommandSequence:
+    strategy = {"kind": scene.choice_argument(*scene.status["facts"]["strategies"])}
+    return CommandSequence((("tune", {"strategy": strategy}),), chosen={"strategy": strategy})
 
 
-def _parameters(scene: Scene) -> Deed:
+def _parameters(scene: VerbContext) -> CommandSequence:
     parameters = scene.table()
-    return Deed((("tune", {"strategy": parameters}),), chosen={"strategy": parameters})
+    return CommandSequence((("tune", {"strategy": parameters}),), chosen={"strategy": parameters})
 
 
 # --- what a person does --------------------------------------------------------------------------------------
 
 
-def _target(scene: Scene) -> Deed:
-    said = [scene.number(part) for part in scene.text().split(",")]
+def _target(scene: VerbContext) -> CommandSequence:
+    said = [scene.number(part) for part in scene.text_argument().split(",")]
     target = scene.joints(said)
-    return Deed(chosen={"target": target}, note="web:manual_send goes there")
+    return CommandSequence(chosen={"target": target}, note="web:manual_send goes there")
 
 
-def _send(scene: Scene) -> Deed:
-    scene.nothing()
+def _send(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
     if scene.selection.target is None:
         scene.refuse("this script has given no target: web:manual_qpos first")
-    return Deed((("move", {"joints": scene.selection.target}),))
+    return CommandSequence((("move", {"joints": scene.selection.target}),))
 
 
-def _home(scene: Scene) -> Deed:
-    scene.nothing()
+def _home(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
     home = list(scene.status["facts"]["home"])
-    return Deed(chosen={"target": home}, note="nothing has moved: web:manual_send goes home")
+    return CommandSequence(chosen={"target": home}, note="nothing has moved: web:manual_send goes home")
 
 
-def _init_move(scene: Scene) -> Deed:
+def _init_move(scene: VerbContext) -> CommandSequence:
     said = scene.table()
     if set(said) != {"qpos"}:
         scene.refuse(f'its argument is {{"qpos": [..]}}; given the keys {sorted(said)!r:.80}')
-    return Deed((("move", {"joints": scene.joints(said["qpos"])}),))
+    return CommandSequence((("move", {"joints": scene.joints(said["qpos"])}),))
 
 
-def _init_gripper(scene: Scene) -> Deed:
-    action, _, side = scene.text().partition(":")
+def _init_gripper(scene: VerbContext) -> CommandSequence:
+    action, _, side = scene.text_argument().partition(":")
     if action not in ("open", "close"):
         scene.refuse(f"{action!r:.80} is none of open, close")
-    return Deed((("gripper", {"action": action, "arm": scene.arm(side)}),))
+    return CommandSequence((("gripper", {"action": action, "arm": scene.arm(side)}),))
 
 
-def _gripper(scene: Scene) -> Deed:
-    side, *rest = scene.text().split(":")
+def _gripper(scene: VerbContext) -> CommandSequence:
+    side, *rest = scene.text_argument().split(":")
     arm = scene.arm(side)
     if len(rest) == 1 and rest[0] not in ("open", "close"):
         return _gripper_at(scene, arm, scene.number(rest[0]))
     if len(rest) != 2 or rest[0] not in ("open", "close") or rest[1] not in ("0", "1"):
         scene.refuse("allowed: SIDE:open:1, SIDE:close:1, SIDE:open:0, SIDE:close:0, SIDE:NUMBER")
-    return Deed((("gripper", {"action": rest[0] if rest[1] == "1" else "unlock", "arm": arm}),))
+    return CommandSequence((("gripper", {"action": rest[0] if rest[1] == "1" else "unlock", "arm": arm}),))
 
 
-def _gripper_at(scene: Scene, arm: str, value: float) -> Deed:
+def _gripper_at(scene: VerbContext, arm: str, value: float) -> CommandSequence:
     """To a number of its own unit, with the other joints where they are commanded."""
     facts, joints = scene.status["facts"], scene.commanded()
     dims = dict(zip(scene.status["grippers"], facts["gripper_dims"], strict=True))
     joints[dims[arm]] = value
-    return Deed((("move", {"joints": joints}),))
+    return CommandSequence((("move", {"joints": joints}),))
 
 
-def _action(scene: Scene) -> Deed:
-    intent, _, _ = scene.text().partition(":")
+def _action(scene: VerbContext) -> CommandSequence:
+    intent, _, _ = scene.text_argument().partition(":")
     if intent not in _INTENTS:
         scene.refuse(f"{intent!r:.80} is none of {', '.join(_INTENTS)}")
     return _INTENTS[intent](scene)
 
 
-def _toggle(scene: Scene) -> Deed:
+def _toggle(scene: VerbContext) -> CommandSequence:
     if scene.state_is["going"]:
-        return Deed((("stop", {}),))
+        return CommandSequence((("stop", {}),))
     if not scene.state_is["ready"]:
         scene.refuse(f"the station is {scene.state}: say web:run, web:stop or web:setup, whichever is meant")
-    return Deed((("run", scene.selection.run),))
+    return CommandSequence((("run", scene.selection.run),))
 
 
-def _grip(action: str, side: str) -> Callable[[Scene], Deed]:
-    return lambda scene: Deed((("gripper", {"action": action, "arm": scene.arm(side)}),))
+def _grip(action: str, side: str) -> Callable[[VerbContext], CommandSequence]:
+    return lambda scene: CommandSequence((("gripper", {"action": action, "arm": scene.arm(side)}),))
 
 
-def _untaken(scene: Scene) -> Deed:
+def _untaken(scene: VerbContext) -> CommandSequence:
     scene.refuse("nobody takes over from a policy here: web:halt, or a run in the mode manual")
 
 
-_INTENTS: dict[str, Callable[[Scene], Deed]] = {
+_INTENTS: dict[str, Callable[[VerbContext], CommandSequence]] = {
     "rollout_toggle": _toggle,
     "rollout_reset": _reset,
-    "start": lambda scene: Deed((("run", scene.selection.run),)),
+    "start": lambda scene: CommandSequence((("run", scene.selection.run),)),
     "accept": _stopping("stop"),
     "cancel": _stopping("stop"),
     "intervention_toggle": _untaken,
@@ -236,38 +236,42 @@ _INTENTS: dict[str, Callable[[Scene], Deed]] = {
 }
 
 
-def _intervention(scene: Scene) -> Deed:
-    return Deed(note="it is never enabled") if scene.word("0", "1") == "0" else _untaken(scene)
+def _intervention(scene: VerbContext) -> CommandSequence:
+    return (
+        CommandSequence(note="it is never enabled")
+        if scene.choice_argument("0", "1") == "0"
+        else _untaken(scene)
+    )
 
 
 # --- recording -----------------------------------------------------------------------------------------------
 
 
-def _demonstrates(scene: Scene) -> bool:
+def _demonstrates(scene: VerbContext) -> bool:
     """True if the operator is to drive the robot, or does."""
     collect = scene.status.get("collect")
     return collect is not None and collect["set_up"]
 
 
-def _collect(scene: Scene) -> Deed:
-    scene.nothing()
+def _collect(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
     task = scene.selection.collect_task
     if _demonstrates(scene):
-        return Deed((("run", {"mode": "collect"} | ({} if task is None else {"task": task})),))
+        return CommandSequence((("run", {"mode": "collect"} | ({} if task is None else {"task": task})),))
     before = () if task is None else (("tune", {"task": task}),)
-    return Deed((*before, ("record_start", {})))
+    return CommandSequence((*before, ("record_start", {})))
 
 
-def _collect_stop(scene: Scene) -> Deed:
-    scene.nothing()
-    return Deed((("stop" if _demonstrates(scene) else "record_stop", {}),))
+def _collect_stop(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
+    return CommandSequence((("stop" if _demonstrates(scene) else "record_stop", {}),))
 
 
-def _collect_cancel(scene: Scene) -> Deed:
-    scene.nothing()
+def _collect_cancel(scene: VerbContext) -> CommandSequence:
+    scene.no_argument()
     if not _demonstrates(scene) or scene.status["collect"]["episode"] is None:
         scene.refuse(_KEPT)
-    return Deed((("discard", {}),))
+    return CommandSequence((("discard", {}),))
 
 
 _CHECKPOINT = (
@@ -288,7 +292,7 @@ VERBS: dict[str, Verb] = {
         _connected, "nothing: the station connects by itself; refused while it is disconnected"
     ),
     "connect": Verb(_connected, "nothing: the station connects by itself; refused while it is disconnected"),
-    "disconnect": _never(_STAYS),
+    "disconnect": _unsupported(_STAYS),
     "setup": Verb(_setup, "`setup` with the task and the strategy that were selected"),
     "warmup": Verb(_set_up, "nothing: a part of `setup`; refused before it"),
     "init_done": Verb(_set_up, "nothing: `setup` ends by itself; refused before it"),
@@ -314,7 +318,7 @@ VERBS: dict[str, Verb] = {
     "manual_qpos": Verb(_target, "a target for web:manual_send"),
     "manual_send": Verb(_send, "`move` to that target; in a run in the mode manual"),
     "manual_home": Verb(_home, "the home pose as the target for web:manual_send; moves nothing"),
-    "manual_dispatch": _never(_EXACTLY),
+    "manual_dispatch": _unsupported(_EXACTLY),
     "gripper": Verb(
         _gripper, "`gripper`: 1 opens or closes, 0 is `unlock`; a number is a `move` of it alone"
     ),
@@ -327,16 +331,16 @@ VERBS: dict[str, Verb] = {
     "collect_cancel": Verb(_collect_cancel, "`discard` of a demonstration that is open; else refused"),
     "select_collect_task": Verb(_collect_task, "the task of the next web:collect_start"),
     "tab_switch": Verb(_tab, f"nothing: {_TABS}"),
-    "switch_ckpt": _never(_CHECKPOINT),
-    "select_episode": _never(_REPLAY),
-    "load_replay_dataset": _never(_REPLAY),
-    "clear_replay": _never(_REPLAY),
-    "set_replay_fps": _never(_REPLAY),
-    "replay_seek": _never(_REPLAY),
+    "switch_ckpt": _unsupported(_CHECKPOINT),
+    "select_episode": _unsupported(_REPLAY),
+    "load_replay_dataset": _unsupported(_REPLAY),
+    "clear_replay": _unsupported(_REPLAY),
+    "set_replay_fps": _unsupported(_REPLAY),
+    "replay_seek": _unsupported(_REPLAY),
     "rollout_intervention_enabled": Verb(_intervention, "nothing for 0; 1 is refused: nobody takes over"),
     "rollout_intervention_abandon": Verb(_untaken, "refused: nobody takes over from a policy"),
-    "rl_select_task": _never(_LEARNING),
-    "rl_select_policy": _never(_LEARNING),
-    "rl_select_critic": _never(_LEARNING),
-    "rl_setup": _never(_LEARNING),
+    "rl_select_task": _unsupported(_LEARNING),
+    "rl_select_policy": _unsupported(_LEARNING),
+    "rl_select_critic": _unsupported(_LEARNING),
+    "rl_setup": _unsupported(_LEARNING),
 }

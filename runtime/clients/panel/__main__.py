@@ -17,7 +17,7 @@ from pathlib import Path
 
 import zmq
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 from runtime.clients.panel.pin import Attempts, PinFile
 from runtime.clients.panel.requests import Panel
 from runtime.clients.panel.server import PanelServer
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 _AGAIN_S = 1.0
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve until a signal or the end of standard input; exit code 2 where there is no panel, or no PIN to set."""
     given = _parser().parse_args(arguments)
@@ -45,12 +45,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             PinFile(station_dir).set(_asked())
             print(f"the panel of {given.station} has another PIN: who had given the former one gives it anew")
             return 0
-        logs.start("panel")
+        logs.configure_logging("panel")
         ended: list[int] = []
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, frame: ended.append(number))
         lifeline = Lifeline() if given.lifeline else None
-        serve(station_dir, lambda: bool(ended) or (lifeline is not None and lifeline.cut))
+        serve(station_dir, lambda: bool(ended) or (lifeline is not None and lifeline.is_cut))
     except RuntimeFault as fault:
         print(f"error: {fault}", file=sys.stderr)
         return 2
@@ -76,7 +76,7 @@ def serve(station_dir: Path, ended: Callable[[], bool]) -> None:
             )
         while not ended():
             server.turn()
-            if endpoints.lost("panel"):
+            if endpoints.is_missing("panel"):
                 endpoints.write("panel", {"panel": server.url})
         endpoints.withdraw("panel")
         server.server_close()

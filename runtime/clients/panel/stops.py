@@ -10,8 +10,8 @@ import zmq
 
 from runtime.core.errors import CodecError, TransportError
 from runtime.ipc.bus import Endpoints
-from runtime.ipc.estop_client import urgent
-from runtime.ipc.estop_requests import kept
+from runtime.ipc.estop_client import send_urgent
+from runtime.ipc.estop_requests import sanitize_text
 from runtime.ipc.identity import PANEL
 from runtime.ipc.messages import Ack, Command
 
@@ -35,7 +35,7 @@ class Stops:
     def press(self, source: str, uuid: str) -> Told:
         """Press the e-stop: at the guard, and where that does not answer at the coordinator, which has the flag too."""
         command = self._command(
-            uuid, "estop", source, {"why": kept(f"at the station's panel, from {source}")}
+            uuid, "estop", source, {"why": sanitize_text(f"at the station's panel, from {source}")}
         )
         try:
             ack = self._ask(command, ("guard", "estop"), _GUARD_S)
@@ -64,4 +64,4 @@ class Stops:
         return Command(uuid, kind, args, user=holder, holder=holder)
 
     def _ask(self, command: Command, where: tuple[str, str], seconds: float) -> Ack:
-        return urgent(self._context, self._endpoints, where, command, seconds)
+        return send_urgent(self._context, self._endpoints, where, command, seconds)

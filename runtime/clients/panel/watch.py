@@ -15,7 +15,7 @@ import zmq
 
 from runtime.core.errors import CodecError, TransportError
 from runtime.ipc.bus import Endpoints, Subscriber
-from runtime.ipc.session_state import with_meaning
+from runtime.ipc.session_state import complete_state_meaning
 from runtime.link.uplink import read_uplink
 
 log = logging.getLogger(__name__)
@@ -120,7 +120,7 @@ class Watch:
                     self._pictures[camera] = Picture(before.number + 1 if before else 1, bytes(jpeg))
                 said = state.hear(_TURN_S)
                 if "state" in said:
-                    self._state, self._heard = with_meaning(said["state"]), self._clock()
+                    self._state, self._heard = complete_state_meaning(said["state"]), self._clock()
         finally:
             state.turn_to("")
             cameras.turn_to("")

@@ -13,7 +13,7 @@ from runtime.core.errors import RuntimeFault
 _STILL = 5e-4  # a joint that changes by less is not worth a line [rad, or the gripper's unit]
 
 
-def wanted(client: StationClient, given: argparse.Namespace) -> dict[str, Any]:
+def aim_arguments(client: StationClient, given: argparse.Namespace) -> dict[str, Any]:
     """Arguments of `aim`, from the command line; RuntimeFault for a joint that the robot has not."""
     arm = getattr(given, "arm", None)
     if arm is not None:
@@ -48,7 +48,7 @@ def _changed(
     return list(joints.values())
 
 
-def lines(
+def aim_lines(
     aim: Mapping[str, Any], commanded: Sequence[float], names: Sequence[str], speed: float
 ) -> list[str]:
     """An answer to `aim` for a person: each joint that would move, how far, how long, and what is not as wished."""
@@ -59,11 +59,11 @@ def lines(
     ]
     told = told or ["  no joint would move"]
     told.append(f"  at most {aim['distance']:.3f} rad, in up to {aim['duration_s'] / speed:.1f} s")
-    short = shortcoming(aim)
+    short = aim_problem(aim)
     return [*told, f"  NOT AS ASKED: {short}"] if short else told
 
 
-def shortcoming(aim: Mapping[str, Any]) -> str:
+def aim_problem(aim: Mapping[str, Any]) -> str:
     """Why the aim is not what was asked for, "" where it is."""
     parts = []
     if aim["clipped"]:

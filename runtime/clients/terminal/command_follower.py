@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from runtime.clients.client import Refused, StationClient
-from runtime.clients.terminal.figures import away, line
+from runtime.clients.terminal.figures import distance_text, status_line
 from runtime.clients.terminal.keys import Keys, NoKeys, keys
 
 # Commands that go on after they were accepted, and what the session is while they do.
@@ -32,10 +32,12 @@ _LOOK_S = 0.05
 _SHOW_S = 0.5
 
 
-Tell = Callable[[str], None]
+EventCallback = Callable[[str], None]
 
 
-def attend(client: StationClient, kind: str, arguments: dict[str, Any], tell: Tell) -> dict[str, Any]:
+def follow_command(
+    client: StationClient, kind: str, arguments: dict[str, Any], tell: EventCallback
+) -> dict[str, Any]:
     """Give a lasting command and stay until it is over, telling how it goes; returns the status then."""
     pressed = threading.Event()
     # An exception out of nowhere can be lost in a destructor; a Ctrl-C that stops a robot must not be.
@@ -44,7 +46,7 @@ def attend(client: StationClient, kind: str, arguments: dict[str, Any], tell: Te
         client.command(kind, **arguments)
         status = client.status()
         with _keys_of(kind, status) as keyboard:
-            progress = _Steady(tell) if isinstance(keyboard, NoKeys) else _Keyed(tell, status["mode"])
+            progress = _PeriodicLine(tell) if isinstance(keyboard, NoKeys) else _KeyLine(tell, status["mode"])
             while status["state_is"][LASTING[kind]]:
                 if pressed.is_set():
                     raise KeyboardInterrupt
@@ -77,23 +79,23 @@ def _press(client: StationClient, key: str) -> None:
         print(f"refused: {refusal}", file=sys.stderr, flush=True)
 
 
-class _Steady:
+class _PeriodicLine:
     """A line of figures now and then."""
 
-    def __init__(self, tell: Tell) -> None:
+    def __init__(self, tell: EventCallback) -> None:
         self._tell = tell
         self._shown = -math.inf
 
     def show(self, status: dict[str, Any]) -> None:
         if time.monotonic() - self._shown > _SHOW_S:
             self._shown = time.monotonic()
-            self._tell(line(status))
+            self._tell(status_line(status))
 
 
-class _Keyed(_Steady):
+class _KeyLine(_PeriodicLine):
     """A line whenever something else goes on, with the keys where the run waits for one."""
 
-    def __init__(self, tell: Tell, mode: str) -> None:
+    def __init__(self, tell: EventCallback, mode: str) -> None:
         super().__init__(tell)
         self._keys = _KEYED[mode]
         self._last: tuple[Any, ...] = ()
@@ -103,7 +105,7 @@ class _Keyed(_Steady):
         if now == self._last:
             return
         self._last = now
-        self._tell(line(status))
+        self._tell(status_line(status))
         if status["phase"] in ("waiting", "proposed"):
-            what = away(status["proposal"], "the chunk that is shown")
+            what = distance_text(status["proposal"], "the chunk that is shown")
             self._tell(f"  {what + '  ' if what else ''}[{self._keys}]")

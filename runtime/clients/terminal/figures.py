@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 
-def line(status: Mapping[str, Any], me: str | None = None) -> str:
+def status_line(status: Mapping[str, Any], me: str | None = None) -> str:
     """One line for a person; with `me`, a lease that somebody else holds is named too."""
     parts = [_headline(status), *_run_figures(status), *_tick_figures(status)]
     holder = status["lease"]["holder"]
@@ -35,7 +35,7 @@ def _run_figures(status: Mapping[str, Any]) -> list[str]:
         parts.append(f"{status['recording']['rows']} rows")
     policy = status["policy"]
     if not math.isnan(policy["latency_p50_ms"]):
-        parts.append(f"policy {policy['latency_p50_ms']:.0f} ms, delay {figure(policy['delay_p50'])}")
+        parts.append(f"policy {policy['latency_p50_ms']:.0f} ms, delay {format_figure(policy['delay_p50'])}")
     if policy["lost"]:
         parts.append("policy lost")
     return parts
@@ -50,29 +50,29 @@ def _tick_figures(status: Mapping[str, Any]) -> list[str]:
     return parts
 
 
-def figure(value: float) -> str:
+def format_figure(value: float) -> str:
     """A whole number, or a dash for what has not been measured."""
     return "-" if math.isnan(value) else f"{value:.0f}"
 
 
-def report(status: Mapping[str, Any], me: str) -> list[str]:
+def status_report(status: Mapping[str, Any], me: str) -> list[str]:
     """State of the station, in lines."""
     rows = [
         ("lease", _lease(status["lease"], me)),
         ("robot", f"{status['robot']} over {status['transport']}"),
-        ("drives", drives(status["drives"])),
+        ("drives", drive_line(status["drives"])),
         ("grippers", _grippers(status["grippers"])),
         ("task", status["task"] or "none"),
         ("policy", _policy(status["policy"])),
-        ("strategy", ", ".join(tuning(status)) or status["strategy"]),
+        ("strategy", ", ".join(tuning_lines(status)) or status["strategy"]),
         ("mode", _mode(status)),
-        ("first", away(status["first_action"], "the policy's first action")),
-        ("chunk", away(status["proposal"], "the chunk that is shown")),
+        ("first", distance_text(status["first_action"], "the policy's first action")),
+        ("chunk", distance_text(status["proposal"], "the chunk that is shown")),
         ("recording", status["recording"]["uuid"] or "none"),
         *(("unclosed", f"{uuid}: {why}") for uuid, why in status["recording"].get("unclosed", {}).items()),
         ("allowed", ", ".join(status["allowed"])),
     ]
-    return [line(status), *(f"  {name:<9} {text}" for name, text in rows if text)]
+    return [status_line(status), *(f"  {name:<9} {text}" for name, text in rows if text)]
 
 
 def _lease(lease: Mapping[str, Any], me: str) -> str:
@@ -82,7 +82,7 @@ def _lease(lease: Mapping[str, Any], me: str) -> str:
     return f"{whose}, for {lease['expires_in']:.1f} s unless it is renewed"
 
 
-def drives(said: Mapping[str, Any]) -> str:
+def drive_line(said: Mapping[str, Any]) -> str:
     """The drives as the node says they are."""
     if not said:
         return "not reported by the node"
@@ -102,7 +102,9 @@ def _policy(policy: Mapping[str, Any]) -> str:
     if policy["answers"]:
         latency = f"p50 {policy['latency_p50_ms']:.0f} ms, p90 {policy['latency_p90_ms']:.0f} ms"
         parts.append(f"{policy['answers']} answers, {latency}")
-        parts.append(f"delay {figure(policy['delay_p50'])} ticks, at most {figure(policy['delay_max'])}")
+        parts.append(
+            f"delay {format_figure(policy['delay_p50'])} ticks, at most {format_figure(policy['delay_max'])}"
+        )
     if policy["lost"]:
         parts.append(f"LOST, asked again in {policy['retry_in_s']:.1f} s")
     if policy["rtc"].get("warning"):
@@ -115,7 +117,7 @@ def _mode(status: Mapping[str, Any]) -> str:
     return f"{status['mode']}{sees}" + (f", {status['phase']}" if status["phase"] else "")
 
 
-def away(found: Mapping[str, Any], what: str) -> str:
+def distance_text(found: Mapping[str, Any], what: str) -> str:
     """Distance of the robot from an action, in words; "" where there is none."""
     if not found:
         return ""
@@ -123,7 +125,7 @@ def away(found: Mapping[str, Any], what: str) -> str:
     return f"{what} is {found['distance']:.3f} rad away ({found['joint']}){far}"
 
 
-def tuning(status: Mapping[str, Any], everything: bool = False) -> list[str]:
+def tuning_lines(status: Mapping[str, Any], everything: bool = False) -> list[str]:
     """The strategy in force and its parameters; those that mean nothing to it only where asked for."""
     in_force = status["tuning"]
     uses = status["facts"]["strategies"].get(in_force["kind"], [])

@@ -35,7 +35,9 @@ class Settled:
         return ""
 
 
-def settle(client: StationClient, before: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Settled:
+def wait_until_settled(
+    client: StationClient, before: dict[str, Any], tell: Callable[[dict[str, Any]], None]
+) -> Settled:
     """Stay until nothing moves and nothing is asked any more, or the state of `before` has changed.
 
     Events since the status `before` are told as they come.
@@ -51,7 +53,7 @@ def settle(client: StationClient, before: dict[str, Any], tell: Callable[[dict[s
                 events.append(event)
                 tell(event)
         step = status["control"]["step"]
-        if busy(status):
+        if is_busy(status):
             calm_since = None
         elif calm_since is None:
             calm_since = step
@@ -62,6 +64,6 @@ def settle(client: StationClient, before: dict[str, Any], tell: Callable[[dict[s
         time.sleep(_LOOK_S)
 
 
-def busy(status: dict[str, Any]) -> bool:
+def is_busy(status: dict[str, Any]) -> bool:
     """True if something goes on; a gripper moves also where no run is open."""
     return status["phase"] in _BUSY or status["control"]["behaviour"] == "motion"

@@ -8,8 +8,8 @@ import time
 from typing import Any
 
 from runtime.clients.client import StationClient
-from runtime.clients.terminal.figures import line
-from runtime.ipc.session_state import with_meaning
+from runtime.clients.terminal.figures import status_line
+from runtime.ipc.session_state import complete_state_meaning
 
 _SHOW_S = 0.5
 _PATIENCE_S = 2.0
@@ -23,7 +23,7 @@ def watch(client: StationClient, as_json: bool) -> int:
     while True:
         heard = subscriber.receive(_PATIENCE_S)
         if "state" in heard:
-            status = with_meaning(heard["state"])
+            status = complete_state_meaning(heard["state"])
         else:
             status = client.status()  # raises a sentence where the station is gone
             subscriber.close()
@@ -36,7 +36,9 @@ def watch(client: StationClient, as_json: bool) -> int:
                 seen = event["number"]
         if time.monotonic() - shown > _SHOW_S:
             shown = time.monotonic()
-            print(json.dumps(status, default=str) if as_json else line(status, client.holder), flush=True)
+            print(
+                json.dumps(status, default=str) if as_json else status_line(status, client.holder), flush=True
+            )
 
 
 def tell(event: dict[str, Any], as_json: bool = False) -> None:

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from runtime.core.types import Float32, Float64
 from runtime.kinematics.kernels.compiling import kernel
-from runtime.kinematics.kernels.sines import sines_of
+from runtime.kinematics.kernels.sines import compute_sincos
 
 
-class Parts(NamedTuple):
+class LinkTable(NamedTuple):
     """Parts [P], parents first: where each is behind the one above it, for the value of its joint.
 
     `motions` [P, 4, 12] are weighted by 1, the cosine and sine of that value, and the value, and added: a rotation
@@ -29,7 +29,7 @@ class Parts(NamedTuple):
 
 
 @kernel
-def place_parts(parts: Parts, q: Float64, placed: Float32) -> None:
+def compute_link_poses(parts: LinkTable, q: Float64, placed: Float32) -> None:
     """Into placed [T, P, 16] the transforms scene <- part, column by column, for q [T, D]."""
     count = len(parts.drive)
     frames, turns, own = np.empty((count, 12)), np.empty((3, count)), np.empty(12)
@@ -38,7 +38,7 @@ def place_parts(parts: Parts, q: Float64, placed: Float32) -> None:
             drive = parts.drive[part]
             value = parts.offset[part] + (parts.factor[part] * q[row, drive] if drive >= 0 else 0.0)
             turns[0, part] = min(max(value, parts.low[part]), parts.high[part])
-        sines_of(turns)
+        compute_sincos(turns)
         for part in range(count):
             value, sine, cosine = turns[0, part], turns[1, part], turns[2, part]
             for k in range(12):

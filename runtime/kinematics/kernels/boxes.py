@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.kinematics.kernels.compiling import part
+from runtime.kinematics.kernels.compiling import device_function
 from runtime.kinematics.tables import Record
 
 _DEFINITE = 1e-13  # of its diagonal must be left of a row
 
 
-def box_type(size: int) -> np.dtype[np.void]:
+def box_qp_type(size: int) -> np.dtype[np.void]:
     """A quadratic in `size` numbers, the walls around 0, the step that is found, and what finding it overwrites."""
     vector, square = (size,), (size, size)
     return np.dtype(
@@ -28,8 +28,8 @@ def box_type(size: int) -> np.dtype[np.void]:
     )
 
 
-@part
-def step_in_box(box: Record, damping: float) -> bool:
+@device_function
+def solve_box_qp(box: Record, damping: float) -> bool:
     """Into box.step the d in [low, high], which holds 0, that minimises gradient . d + d . damped system . d / 2.
 
     Primal active set for a strictly convex problem (Nocedal and Wright, Numerical Optimization, 16.5): walk to the
@@ -56,12 +56,12 @@ def step_in_box(box: Record, damping: float) -> bool:
             step[first] = high[first] if move[first] > 0 else low[first]
             held[first] = 1
             _set_slope(box, damping)
-        elif not _let_go(box, damping):
+        elif not _release_bound(box, damping):
             break
     return True
 
 
-@part
+@device_function
 def _set_slope(box: Record, damping: float) -> None:
     n = len(box.step)
     for i in range(n):
@@ -71,8 +71,8 @@ def _set_slope(box: Record, damping: float) -> None:
         box.slope[i] = total
 
 
-@part
-def _let_go(box: Record, damping: float) -> bool:
+@device_function
+def _release_bound(box: Record, damping: float) -> bool:
     """Frees the held joint that the slope pulls hardest from its wall; whether there was one."""
     n = len(box.step)
     holding = 0
@@ -91,7 +91,7 @@ def _let_go(box: Record, damping: float) -> bool:
     return hardest >= 0
 
 
-@part
+@device_function
 def _solve(box: Record, damping: float) -> bool:
     """Into box.move what takes the slope to zero in all joints that are not held, by Cholesky's L D L^T.
 

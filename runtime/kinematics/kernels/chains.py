@@ -9,30 +9,30 @@ from __future__ import annotations
 import numpy as np
 
 from runtime.core.types import Float64
-from runtime.kinematics.kernels.compiling import kernel, part
+from runtime.kinematics.kernels.compiling import device_function, kernel
 from runtime.kinematics.kernels.rotations import quaternion_of
-from runtime.kinematics.kernels.sines import sines_of
+from runtime.kinematics.kernels.sines import compute_sincos
 from runtime.kinematics.tables import Record, Records
 
 
-def reach_type(moving: int) -> np.dtype[np.void]:
+def fk_buffer_type(moving: int) -> np.dtype[np.void]:
     """Values, sines and cosines of a chain's joints; the frames of its joints and, last, of its tip."""
     return np.dtype([("turns", np.float64, (3, moving)), ("frames", np.float64, (moving + 1, 12))])
 
 
-@part
-def reach_for(chain: Record, q: Float64, row: int, reach: Record) -> None:
+@device_function
+def compute_fk(chain: Record, q: Float64, row: int, reach: Record) -> None:
     """Fills `reach` for the chain and the numbers that drive it, q[row]."""
     turns, frames = reach.turns, reach.frames
     for i in range(len(chain.drive)):
         drive = chain.drive[i]
         turns[0, i] = chain.offset[i] + (chain.factor[i] * q[row, drive] if drive >= 0 else 0.0)
-    sines_of(turns)
+    compute_sincos(turns)
     for k in range(12):
         frames[0, k] = chain.fixed[0, k]
     for i in range(len(chain.drive)):
         if i > 0:
-            _put_behind(chain, i, frames)
+            _compose_frame(chain, i, frames)
         if chain.slides[i]:
             for k in range(3):
                 frames[i, 9 + k] += turns[0, i] * frames[i, 3 * k + 2]
@@ -42,11 +42,11 @@ def reach_for(chain: Record, q: Float64, row: int, reach: Record) -> None:
                 x, y = frames[i, 3 * k], frames[i, 3 * k + 1]
                 frames[i, 3 * k] = cosine * x + sine * y
                 frames[i, 3 * k + 1] = cosine * y - sine * x
-    _put_behind(chain, len(chain.drive), frames)
+    _compose_frame(chain, len(chain.drive), frames)
 
 
-@part
-def _put_behind(chain: Record, index: int, frames: Float64) -> None:
+@device_function
+def _compose_frame(chain: Record, index: int, frames: Float64) -> None:
     """frames[index], which the chain's `fixed` places behind the one before."""
     fixed = chain.fixed
     for i in range(3):
@@ -58,8 +58,10 @@ def _put_behind(chain: Record, index: int, frames: Float64) -> None:
         )
 
 
-@part
-def jacobian_of(chain: Record, reach: Record, position: float, rotation: float, jacobian: Float64) -> None:
+@device_function
+def compute_jacobian(
+    chain: Record, reach: Record, position: float, rotation: float, jacobian: Float64
+) -> None:
     """Into jacobian [6, n] d(position, rotation vector)/dq of the tip, each times its weight."""
     frames, last = reach.frames, len(chain.drive)
     for k in range(6):
@@ -90,13 +92,13 @@ def jacobian_of(chain: Record, reach: Record, position: float, rotation: float, 
 
 
 @kernel
-def poses_of(chains: Records, q: Float64, reaches: Records, poses: Float64) -> None:
+def compute_poses(chains: Records, q: Float64, reaches: Records, poses: Float64) -> None:
     """Into poses [T, A, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) the tips for q [T, D]; needs one reach."""
     reach = reaches[0]
     frames, last = reach.frames, len(reach.frames) - 1
     for row in range(len(q)):
         for index in range(len(chains)):
-            reach_for(chains[index], q, row, reach)
+            compute_fk(chains[index], q, row, reach)
             a, b, c = frames[last, 0], frames[last, 1], frames[last, 2]
             d, e, f = frames[last, 3], frames[last, 4], frames[last, 5]
             g, h, i = frames[last, 6], frames[last, 7], frames[last, 8]

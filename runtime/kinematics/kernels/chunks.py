@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from runtime.core.types import Float64, UInt8
-from runtime.kinematics.kernels.chains import reach_for, reach_type
-from runtime.kinematics.kernels.compiling import kernel, part
-from runtime.kinematics.kernels.frames import Costs, frame_type, near_singular, solve_frame
-from runtime.kinematics.kernels.postures import lean, look
+from runtime.kinematics.kernels.chains import compute_fk, fk_buffer_type
+from runtime.kinematics.kernels.compiling import device_function, kernel
+from runtime.kinematics.kernels.frames import Costs, frame_type, is_near_singular, solve_frame
+from runtime.kinematics.kernels.postures import add_nullspace_bias, update_jacobian
 from runtime.kinematics.kernels.rotations import matrix_of
 from runtime.kinematics.tables import POSED, Record, Records, chain_type
 
@@ -51,7 +51,7 @@ def arm_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
 
 def scratch_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
     """Type of the memory that solving a chunk overwrites."""
-    return np.dtype([("frame", frame_type(moving, size)), ("carried", reach_type(carrying))])
+    return np.dtype([("frame", frame_type(moving, size)), ("carried", fk_buffer_type(carrying))])
 
 
 class Tolerances(NamedTuple):
@@ -93,23 +93,23 @@ def solve_chunk(
     carried, frame = scratches[0].carried, scratches[0].frame
     for index in range(len(arms)):
         arm = arms[index]
-        reach_for(arm.carrier, seed, 0, carried)
-        _begin(arm, seed, frame)
+        compute_fk(arm.carrier, seed, 0, carried)
+        _set_first_seed(arm, seed, frame)
         free = dt > 0 and arm.joints > POSED
         if free:
-            look(arm.own, costs, frame)
+            update_jacobian(arm.own, costs, frame)
         bound, going = False, False
         for row in range(len(targets)):
             if row == anchor_row:
                 bound, going = True, False
                 for i in range(arm.joints):
                     frame.before[i] = anchor[arm.dims[i]]
-            _wall_in(arm, dt if bound else 0.0, frame)
+            _set_bounds(arm, dt if bound else 0.0, frame)
             _set_start(going, frame)
             if len(guide) > 0:
-                _steer(arm, guide, row, dt, frame)
+                _follow_guide(arm, guide, row, dt, frame)
             elif free:
-                lean(arm, costs, dt, going, frame)
+                add_nullspace_bias(arm, costs, dt, going, frame)
             _set_goal(targets, row, index, carried.frames, frame.goal)
             missed = solve_frame(arm.own, costs, frame)
             away, astray = _errors(costs, frame)
@@ -126,7 +126,7 @@ def solve_chunk(
     return FINE
 
 
-@part
+@device_function
 def _wrong(targets: Float64, seed: Float64, anchor: Float64) -> int:
     for dim in range(len(anchor)):
         if not math.isfinite(seed[0, dim]) or not math.isfinite(anchor[dim]):
@@ -143,8 +143,8 @@ def _wrong(targets: Float64, seed: Float64, anchor: Float64) -> int:
     return FINE
 
 
-@part
-def _begin(arm: Record, seed: Float64, frame: Record) -> None:
+@device_function
+def _set_first_seed(arm: Record, seed: Float64, frame: Record) -> None:
     """The joints that the first frame begins with: the seed, within limits."""
     for i in range(len(frame.q)):
         there = seed[0, arm.dims[i]] if i < arm.joints else 0.0
@@ -152,8 +152,8 @@ def _begin(arm: Record, seed: Float64, frame: Record) -> None:
         frame.before[i] = frame.q[i]
 
 
-@part
-def _wall_in(arm: Record, dt: float, frame: Record) -> None:
+@device_function
+def _set_bounds(arm: Record, dt: float, frame: Record) -> None:
     """The box of a frame: its limits, and, where dt is given, what velocities leave of them around `before`."""
     for i in range(len(frame.q)):
         frame.lower[i], frame.upper[i] = arm.lower[i], arm.upper[i]
@@ -164,7 +164,7 @@ def _wall_in(arm: Record, dt: float, frame: Record) -> None:
             frame.upper[i] = min(arm.upper[i], frame.before[i] + way)
 
 
-@part
+@device_function
 def _set_start(going: bool, frame: Record) -> None:
     """Set the start of a frame's search, and the joints it rests on.
 
@@ -179,8 +179,8 @@ def _set_start(going: bool, frame: Record) -> None:
         frame.tried[0, i] = min(max(begin + motion, frame.lower[i]), frame.upper[i])
 
 
-@part
-def _steer(arm: Record, guide: Float64, row: int, dt: float, frame: Record) -> None:
+@device_function
+def _follow_guide(arm: Record, guide: Float64, row: int, dt: float, frame: Record) -> None:
     """Has the frame begin at, and rest on, what is closest to the guide's row and not too far from the frame before."""
     for i in range(arm.joints):
         way = _GUIDED * arm.speed[i] * dt
@@ -189,7 +189,7 @@ def _steer(arm: Record, guide: Float64, row: int, dt: float, frame: Record) -> N
         frame.tried[0, i] = frame.centre[i]
 
 
-@part
+@device_function
 def _set_goal(targets: Float64, row: int, index: int, carried: Float64, goal: Float64) -> None:
     """Into `goal` [12] the target as it is seen from where the arm's own chain begins, the last of `carried`."""
     base = len(carried) - 1
@@ -206,7 +206,7 @@ def _set_goal(targets: Float64, row: int, index: int, carried: Float64, goal: Fl
         goal[9 + i] = a * x + b * y + c * z
 
 
-@part
+@device_function
 def _errors(costs: Costs, frame: Record) -> tuple[float, float]:
     """Errors of the joints found, in m and rad."""
     away, astray = 0.0, 0.0
@@ -216,11 +216,11 @@ def _errors(costs: Costs, frame: Record) -> tuple[float, float]:
     return math.sqrt(away) / costs.position, math.sqrt(astray) / costs.rotation
 
 
-@part
+@device_function
 def _flags(arm: Record, dt: float, costs: Costs, tolerances: Tolerances, frame: Record) -> int:
     """Flags of the joints found: limits that they touch, and freedom of the tip there."""
     flags = 0
-    if near_singular(arm.joints, tolerances.singular_below, costs, frame):
+    if is_near_singular(arm.joints, tolerances.singular_below, costs, frame):
         flags |= _NEAR_SINGULAR
     for i in range(arm.joints):
         if min(frame.q[i] - arm.lower[i], arm.upper[i] - frame.q[i]) <= _TOUCHING:

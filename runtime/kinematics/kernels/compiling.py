@@ -24,7 +24,7 @@ def kernel(loop: Loop) -> Loop:
     return cast(Loop, made)
 
 
-def part(function: Loop) -> Loop:
+def device_function(function: Loop) -> Loop:
     """Compiled function that is part of a kernel, compiled with it."""
     made = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy", forceinline=True)(function)
     return cast(Loop, made)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runtime.kinematics.kernels.boxes import box_type, step_in_box
-from runtime.kinematics.kernels.chains import jacobian_of, reach_for, reach_type
-from runtime.kinematics.kernels.compiling import part
-from runtime.kinematics.kernels.rotations import rotation_vector, turned_back
+from runtime.kinematics.kernels.boxes import box_qp_type, solve_box_qp
+from runtime.kinematics.kernels.chains import compute_fk, compute_jacobian, fk_buffer_type
+from runtime.kinematics.kernels.compiling import device_function
+from runtime.kinematics.kernels.rotations import relative_rotation, rotation_vector
 from runtime.kinematics.tables import Record
 
 _LARGEST_STEP = 0.5  # rad (m) of one iteration: linearisation is worth nothing farther out
@@ -38,8 +38,8 @@ def frame_type(moving: int, size: int) -> np.dtype[np.void]:
     vector = (size,)
     return np.dtype(
         [
-            ("reach", reach_type(moving)),
-            ("box", box_type(size)),
+            ("reach", fk_buffer_type(moving)),
+            ("box", box_qp_type(size)),
             ("goal", np.float64, (12,)),
             ("q", np.float64, vector),
             ("tried", np.float64, (1, size)),
@@ -60,7 +60,7 @@ def frame_type(moving: int, size: int) -> np.dtype[np.void]:
     )
 
 
-@part
+@device_function
 def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
     """Into frame.q the joints in [lower, upper] whose tip comes closest to `goal`, found from frame.tried on.
 
@@ -74,8 +74,8 @@ def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
     rest = costs.rest * costs.rest
     cost, missed, predicted, damping, growth = np.inf, np.inf, 0.0, 0.0, 2.0
     for iteration in range(costs.max_iterations + 1):
-        reach_for(chain, tried, 0, frame.reach)
-        off = _attempt(costs, frame)
+        compute_fk(chain, tried, 0, frame.reach)
+        off = _evaluate(costs, frame)
         strayed = 0.0
         for i in range(n):
             strayed += (tried[0, i] - frame.centre[i]) ** 2
@@ -87,7 +87,7 @@ def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
                 q[i] = tried[0, i]
             for k in range(6):
                 frame.error[k] = frame.attempt[k]
-            jacobian_of(chain, frame.reach, costs.position, costs.rotation, frame.jacobian)
+            compute_jacobian(chain, frame.reach, costs.position, costs.rotation, frame.jacobian)
             if stalled or (missed <= _CLOSE_ENOUGH and (iteration > 0 or strayed == 0.0)):
                 break
             if damping > 0:
@@ -98,10 +98,10 @@ def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
         else:
             damping = max(damping * growth, _FIRST_DAMPING)
             growth *= 2.0
-        while not step_in_box(box, damping) and damping < _GREATEST_DAMPING:
+        while not solve_box_qp(box, damping) and damping < _GREATEST_DAMPING:
             damping = max(damping * growth, _FIRST_DAMPING)
             growth *= 2.0
-        predicted = _promised(box)
+        predicted = _predicted_decrease(box)
         if predicted <= 1e-3 * _STALLED * cost:
             break
         for i in range(n):
@@ -109,15 +109,15 @@ def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
     return missed
 
 
-@part
-def _attempt(costs: Costs, frame: Record) -> float:
+@device_function
+def _evaluate(costs: Costs, frame: Record) -> float:
     """Into frame.attempt the weighted error of the tip; its square.
 
     The derivative of its rotation vector is taken as the geometric one, which leaves the gradient exact.
     """
     frames, goal = frame.reach.frames, frame.goal
     last = len(frames) - 1
-    turned = rotation_vector(turned_back(frames, last, goal))
+    turned = rotation_vector(relative_rotation(frames, last, goal))
     total = 0.0
     for k in range(3):
         away, astray = costs.position * (frames[last, 9 + k] - goal[9 + k]), costs.rotation * turned[k]
@@ -126,7 +126,7 @@ def _attempt(costs: Costs, frame: Record) -> float:
     return total
 
 
-@part
+@device_function
 def _set_quadratic(rest: float, frame: Record) -> None:
     """The system, the gradient of half the cost at q, and how far a step may go."""
     box, jacobian = frame.box, frame.jacobian
@@ -144,8 +144,8 @@ def _set_quadratic(rest: float, frame: Record) -> None:
         box.high[i] = min(frame.upper[i] - frame.q[i], _LARGEST_STEP)
 
 
-@part
-def _promised(box: Record) -> float:
+@device_function
+def _predicted_decrease(box: Record) -> float:
     """By how much the step would lower the cost if that were the undamped quadratic."""
     total = 0.0
     for i in range(len(box.step)):
@@ -156,14 +156,14 @@ def _promised(box: Record) -> float:
     return total
 
 
-@part
-def near_singular(joints: int, below: float, costs: Costs, frame: Record) -> bool:
+@device_function
+def is_near_singular(joints: int, below: float, costs: Costs, frame: Record) -> bool:
     """True if the smallest singular value of the unweighted Jacobian of so many joints lies below `below`.
 
     It does where J J^T - below^2 (J^T J with fewer than six joints) has a pivot that is not positive.
     """
     normal = frame.normal
-    set_normal(joints, costs, frame)
+    set_normal_matrix(joints, costs, frame)
     for i in range(6):
         normal[i, i] -= below * below
     for j in range(6):
@@ -177,8 +177,8 @@ def near_singular(joints: int, below: float, costs: Costs, frame: Record) -> boo
     return False
 
 
-@part
-def set_normal(joints: int, costs: Costs, frame: Record) -> None:
+@device_function
+def set_normal_matrix(joints: int, costs: Costs, frame: Record) -> None:
     """J J^T below its diagonal; J^T J, filled up with an identity, where there are fewer than six joints."""
     normal, jacobian = frame.normal, frame.jacobian
     metre, radian = 1 / (costs.position * costs.position), 1 / (costs.rotation * costs.rotation)

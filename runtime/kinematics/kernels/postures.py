@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.kinematics.kernels.chains import jacobian_of, reach_for
-from runtime.kinematics.kernels.compiling import part
-from runtime.kinematics.kernels.frames import Costs, set_normal
+from runtime.kinematics.kernels.chains import compute_fk, compute_jacobian
+from runtime.kinematics.kernels.compiling import device_function
+from runtime.kinematics.kernels.frames import Costs, set_normal_matrix
 from runtime.kinematics.tables import POSED, Record
 
 _FARTHEST = 0.6  # rad (m) from home beyond which the pull no longer grows, so that limits outweigh it
@@ -17,17 +17,17 @@ _SINGULAR = 0.002  # smallest singular value, about, at which the pull has half 
 _DEFINITE = 1e-9  # of a pivot must be left
 
 
-@part
-def look(chain: Record, costs: Costs, frame: Record) -> None:
+@device_function
+def update_jacobian(chain: Record, costs: Costs, frame: Record) -> None:
     """Into frame.jacobian that of frame.q, before a frame is solved."""
     for i in range(len(frame.q)):
         frame.tried[0, i] = frame.q[i]
-    reach_for(chain, frame.tried, 0, frame.reach)
-    jacobian_of(chain, frame.reach, costs.position, costs.rotation, frame.jacobian)
+    compute_fk(chain, frame.tried, 0, frame.reach)
+    compute_jacobian(chain, frame.reach, costs.position, costs.rotation, frame.jacobian)
 
 
-@part
-def lean(arm: Record, costs: Costs, dt: float, going: bool, frame: Record) -> None:
+@device_function
+def add_nullspace_bias(arm: Record, costs: Costs, dt: float, going: bool, frame: Record) -> None:
     """Adds to where a frame is searched from and to what it rests on a step in the null space of frame.jacobian.
 
     The step goes down a potential of distance from home and of nearness to limits (gradient projection, Liegeois
@@ -37,9 +37,9 @@ def lean(arm: Record, costs: Costs, dt: float, going: bool, frame: Record) -> No
     """
     free = frame.free
     for i in range(len(frame.q)):
-        free[0, i] = costs.home_rate * dt * _pull(arm, i, frame) if i < arm.joints else 0.0
+        free[0, i] = costs.home_rate * dt * _potential_gradient(arm, i, frame) if i < arm.joints else 0.0
         free[1, i] = frame.centre[i] - frame.begin[i] if going else 0.0
-    freedom = _project(arm.joints, costs, frame)
+    freedom = _project_nullspace(arm.joints, costs, frame)
     square, bend, fastest = 0.0, 0.0, 1.0
     for i in range(arm.joints):
         square += free[0, i] * free[0, i]
@@ -52,8 +52,8 @@ def lean(arm: Record, costs: Costs, dt: float, going: bool, frame: Record) -> No
         frame.tried[0, i] = min(max(frame.tried[0, i] + step, frame.lower[i]), frame.upper[i])
 
 
-@part
-def _pull(arm: Record, joint: int, frame: Record) -> float:
+@device_function
+def _potential_gradient(arm: Record, joint: int, frame: Record) -> float:
     """Down the potential, in rad (m): home, and off a limit that is nearer than it is kept at home.
 
     Into frame.stiffness how fast that changes with the joint.
@@ -74,15 +74,15 @@ def _pull(arm: Record, joint: int, frame: Record) -> float:
     return float(pull)
 
 
-@part
-def _project(joints: int, costs: Costs, frame: Record) -> float:
+@device_function
+def _project_nullspace(joints: int, costs: Costs, frame: Record) -> float:
     """Takes out of both rows of frame.free what moves the tip; how far that is from a singularity, 0 to 1.
 
     free - J^T (J J^T)^-1 J free, by L D L^T: of J J^T stays L D below the diagonal and D on it, above it comes L
     transposed.
     """
     normal, jacobian, free, moved = frame.normal, frame.jacobian, frame.free, frame.moved
-    set_normal(joints, costs, frame)
+    set_normal_matrix(joints, costs, frame)
     for j in range(POSED):
         weight = 1 / (costs.position if j < 3 else costs.rotation)
         for side in range(2):

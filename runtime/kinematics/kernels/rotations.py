@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from runtime.core.types import Float64
-from runtime.kinematics.kernels.compiling import part
+from runtime.kinematics.kernels.compiling import device_function
 
 _SMALL = 0.02  # sine below which four terms of the arc sine's series are exact to the last digit
 _TURNED = -0.5  # cosine below which a matrix no longer shows its axis as a difference
@@ -15,7 +15,7 @@ Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]  # row by row
 
 
-@part
+@device_function
 def matrix_of(w: float, x: float, y: float, z: float) -> Matrix:
     """The rotation that a quaternion of any length above zero stands for."""
     scale = 2.0 / (w * w + x * x + y * y + z * z)
@@ -32,7 +32,7 @@ def matrix_of(w: float, x: float, y: float, z: float) -> Matrix:
     )
 
 
-@part
+@device_function
 def quaternion_of(matrix: Matrix) -> Quaternion:
     """The unit quaternion with w >= 0, from the largest of its four squares (Shepperd 1978)."""
     a, b, c = matrix[0], matrix[4], matrix[8]
@@ -51,7 +51,7 @@ def quaternion_of(matrix: Matrix) -> Quaternion:
     return scale * row[0], scale * row[1], scale * row[2], scale * row[3]
 
 
-@part
+@device_function
 def rotation_vector(matrix: Matrix) -> Vector:
     """Axis times angle, the angle in [0, pi] rad."""
     x, y, z = 0.5 * (matrix[7] - matrix[5]), 0.5 * (matrix[2] - matrix[6]), 0.5 * (matrix[3] - matrix[1])
@@ -69,8 +69,8 @@ def rotation_vector(matrix: Matrix) -> Vector:
     return scale * x, scale * y, scale * z
 
 
-@part
-def turned_back(frames: Float64, row: int, wanted: Float64) -> Matrix:
+@device_function
+def relative_rotation(frames: Float64, row: int, wanted: Float64) -> Matrix:
     """The rotation of frames[row] [12] times the transpose of that of `wanted` [12]: from `wanted` to the frame."""
     a, b, c = frames[row, 0], frames[row, 1], frames[row, 2]
     d, e, f = frames[row, 3], frames[row, 4], frames[row, 5]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from runtime.core.types import Float64
-from runtime.kinematics.kernels.compiling import part
+from runtime.kinematics.kernels.compiling import device_function
 
 # A quarter turn in three parts, the first two of 33 bits, so that multiples of them are exact (Cody and Waite 1980).
 _QUARTERS = 2 / math.pi
@@ -21,8 +21,8 @@ _C1, _C2, _C3 = 4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015
 _C4, _C5, _C6 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.13596475577881948265e-11
 
 
-@part
-def sines_of(turns: Float64) -> None:
+@device_function
+def compute_sincos(turns: Float64) -> None:
     """Into rows 1 and 2 of `turns` [3, N] the sines and cosines of row 0 [rad]; within 2e-16 up to 1e5 rad."""
     for index in range(turns.shape[1]):
         angle = turns[0, index]

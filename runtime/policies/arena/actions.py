@@ -13,9 +13,9 @@ from runtime.core.pose_format import PoseFormat
 from runtime.core.settings import Settings
 from runtime.core.types import ActionChunk, Float32
 from runtime.policies.answers import Rate
-from runtime.policies.arena.wants import ActionSpace, Wants
-from runtime.policies.gripper_convention import Convention, Grip
-from runtime.policies.rows import action_rows
+from runtime.policies.arena.wants import ActionSpace, ServerRequirements
+from runtime.policies.gripper_convention import Convention, GripperConvention
+from runtime.policies.rows import parse_action_rows
 from runtime.spaces.pose_rows import PoseRows
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class VelocitySteps(Settings):
     """Of the end effector [rad]."""
 
 
-class MeantSettings(Settings):
+class ArenaActionSettings(Settings):
     """Answers of a server of the RoboArena family."""
 
     action_space: ActionSpace = "joint_position"
@@ -50,23 +50,23 @@ class MeantSettings(Settings):
     """Names of the parts of an answer that comes in parts, in the order of the row; without it the server's own."""
 
 
-class Meant:
+class ArenaActions:
     """Reads answers; ConfigurationError where a setting does not fit the robot."""
 
-    def __init__(self, settings: MeantSettings, convention: Convention, robot: Robot) -> None:
+    def __init__(self, settings: ArenaActionSettings, convention: Convention, robot: Robot) -> None:
         self._settings = settings
         self.cartesian = settings.action_space.startswith("cartesian")
         self.velocity = settings.action_space.endswith("velocity")
         self._steps = _steps(settings) if self.velocity else VelocitySteps()
         self._still = [dim for dim in range(robot.dim) if dim not in robot.gripper_dims]
         self._poses = PoseRows(settings.action_pose, robot, "policy.action_pose") if self.cartesian else None
-        self._grip = Grip(convention, robot, self._poses)
+        self._grip = GripperConvention(convention, robot, self._poses)
         self.width = robot.dim if self._poses is None else self._poses.width
         self._arms = len(robot.arms)
         self._each = 0 if self._poses is None else (self.width - len(self._poses.dims)) // self._arms
         self._parts: tuple[str, ...] = tuple(settings.action_keys or ())
 
-    def agree(self, wants: Wants) -> None:
+    def configure(self, wants: ServerRequirements) -> None:
         """Hold the server's words against the deployment's; ActionSpaceError with both sides."""
         settings = self._settings
         if wants.space != settings.action_space:
@@ -83,10 +83,10 @@ class Meant:
 
     def chunk(self, reply: Any, timing: Mapping[str, float]) -> ActionChunk:
         """From an answer's value: an array, a map with `actions`, or a map of named parts."""
-        rows = action_rows("actions", self._array(reply), self.width)
+        rows = parse_action_rows("actions", self._array(reply), self.width)
         if self.velocity:
             rows = self._steps_of_joints(rows) if self._poses is None else self._steps_of_poses(rows)
-        rows = self._grip.meant(rows)
+        rows = self._grip.to_robot(rows)
         return ActionChunk(
             actions=rows,
             space="eef" if self.cartesian else "joint",
@@ -108,7 +108,7 @@ class Meant:
                 f"the answer has no 'actions' but {found}; allowed: an array, a map with 'actions', or parts named "
                 f"in policy.action_keys ({', '.join(self._parts) or 'none'})"
             )
-        parts = [action_rows(name, reply[name]) for name in self._parts]
+        parts = [parse_action_rows(name, reply[name]) for name in self._parts]
         if len({len(part) for part in parts}) != 1:
             lengths = ", ".join(f"{name} {len(part)}" for name, part in zip(self._parts, parts, strict=True))
             raise ShapeError(f"the parts of the answer have different numbers of rows: {lengths}")
@@ -121,19 +121,19 @@ class Meant:
     def _steps_of_poses(self, rows: Float32) -> Float32:
         posed = self._each * self._arms
         arms = rows[:, :posed].reshape(len(rows), self._arms, self._each)
-        arms[..., :3] = _bounded(arms[..., :3]) * np.float32(self._steps.linear)
-        arms[..., 3:6] = _bounded(arms[..., 3:6]) * np.float32(self._steps.angular)
+        arms[..., :3] = _clip_norm(arms[..., :3]) * np.float32(self._steps.linear)
+        arms[..., 3:6] = _clip_norm(arms[..., 3:6]) * np.float32(self._steps.angular)
         return np.concatenate([arms.reshape(len(rows), -1), rows[:, posed:]], axis=1)
 
 
-def _bounded(vectors: Float32) -> Float32:
+def _clip_norm(vectors: Float32) -> Float32:
     """None longer than 1, its direction kept."""
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     bounded: Float32 = vectors / np.maximum(lengths, np.float32(1.0))
     return bounded
 
 
-def _steps(settings: MeantSettings) -> VelocitySteps:
+def _steps(settings: ArenaActionSettings) -> VelocitySteps:
     if settings.velocity_steps is None:
         raise ConfigurationError(
             f"policy.action_space = {settings.action_space!r} without policy.velocity_steps: velocities are shares "

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Literal
 
 from runtime.core.errors import ConfigurationError, ContradictionError
-from runtime.policies.arena.wants import Wants
+from runtime.policies.arena.wants import ServerRequirements
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -37,7 +37,7 @@ class Cameras:
             )
         self._numbering: Numbering = numbering
 
-    def of(self, wants: Wants) -> dict[str, str]:
+    def assign(self, wants: ServerRequirements) -> dict[str, str]:
         """Request key = observation key of what the server wants, in its order; the others are not sent.
 
         ContradictionError where it wants a view that no camera is declared for.
@@ -55,7 +55,7 @@ class Cameras:
         return found
 
 
-def _keys(wants: Wants, numbering: Numbering) -> list[tuple[Slot, str]]:
+def _keys(wants: ServerRequirements, numbering: Numbering) -> list[tuple[Slot, str]]:
     """Slots and request keys in the order of the field's messages."""
     slots: tuple[Slot, Slot] = ("first", "second")
     stereo: tuple[Slot, Slot] = ("first_stereo", "second_stereo")

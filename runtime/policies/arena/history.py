@@ -34,7 +34,7 @@ class History:
             while self._kept[0][0] < oldest:
                 self._kept.popleft()
 
-    def before(self, observation: Observation) -> list[Pictures]:
+    def frames_before(self, observation: Observation) -> list[Pictures]:
         """Pictures nearest to each of the steps before `observation`, in their order; never of after it.
 
         Where nothing as old was seen, the oldest; the observation is kept like any other.
@@ -46,7 +46,7 @@ class History:
         moments = (observation.arrived - step / self._rate for step in self._steps)
         return [min(seen, key=lambda one: abs(one[0] - moment))[1] for moment in moments]
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Nothing was seen yet."""
         with self._lock:
             self._kept.clear()

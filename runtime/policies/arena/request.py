@@ -15,9 +15,9 @@ from runtime.core.settings import Settings
 from runtime.core.types import EEF_WIDTH, Float32, Observation, UInt8
 from runtime.policies.arena.cameras import Cameras, Numbering, Slot
 from runtime.policies.arena.history import History
-from runtime.policies.arena.wants import Wants
-from runtime.policies.gripper_convention import Convention, Grip
-from runtime.policies.pictures import fitted
+from runtime.policies.arena.wants import ServerRequirements
+from runtime.policies.gripper_convention import Convention, GripperConvention
+from runtime.policies.pictures import resize_image
 from runtime.policies.request import Size
 from runtime.spaces.pose_rows import PoseRows
 
@@ -28,7 +28,7 @@ Steps = Annotated[int, Field(ge=0, le=64)]
 _FIELD_SIZE = (288, 512)  # to which the field's client brings every picture first
 
 
-class ShownSettings(Settings):
+class ArenaRequestSettings(Settings):
     """Inputs of a server of the RoboArena family."""
 
     cameras: dict[str, Slot] = Field(default_factory=dict)
@@ -60,7 +60,7 @@ class ShownSettings(Settings):
     """Poses as the robot measures them, where it does; or as its joints have them in any case."""
 
     @model_validator(mode="after")
-    def _one_history(self) -> ShownSettings:
+    def _one_history(self) -> ArenaRequestSettings:
         steps = self.frame_steps
         if steps is None:
             return self
@@ -76,13 +76,13 @@ class ShownSettings(Settings):
         return self
 
 
-class Shown:
+class ArenaRequest:
     """Builds requests; `agree` first with what the server wants. ConfigurationError where a setting does not fit."""
 
-    def __init__(self, settings: ShownSettings, robot: Robot) -> None:
+    def __init__(self, settings: ArenaRequestSettings, robot: Robot) -> None:
         self._settings = settings
         self._cameras = Cameras(settings.cameras, settings.numbering, robot)
-        self._grip = Grip(settings.gripper, robot)
+        self._grip = GripperConvention(settings.gripper, robot)
         self._grippers = list(robot.gripper_dims)
         self._joints = [dim for dim in range(robot.dim) if dim not in robot.gripper_dims]
         self._dim, self._arms = robot.dim, len(robot.arms)
@@ -100,7 +100,7 @@ class Shown:
         """Interval at which pictures are kept [s]; None if none are."""
         return None if self._history is None else 1.0 / self._settings.frame_rate
 
-    def glance(self, observation: Observation) -> None:
+    def observe(self, observation: Observation) -> None:
         """Keep its pictures, where a history is shown."""
         if self._history is not None:
             self._history.add(observation)
@@ -110,9 +110,9 @@ class Shown:
         """True if poses are shown."""
         return self._poses is not None
 
-    def agree(self, wants: Wants) -> None:
+    def configure(self, wants: ServerRequirements) -> None:
         """Which pictures are sent from now on, and in which size; ContradictionError where a view is missing."""
-        self._keys = self._cameras.of(wants)
+        self._keys = self._cameras.assign(wants)
         own = self._settings.image_size
         self._size = wants.resolution if own is None else (own[0], own[1])
         self.forget()  # another server's pictures may have been of another size
@@ -122,14 +122,14 @@ class Shown:
         self._seen.clear()
         self._begun = False
         if self._history is not None:
-            self._history.forget()
+            self._history.reset()
 
-    def of(self, observation: Observation) -> dict[str, Any]:
+    def build(self, observation: Observation) -> dict[str, Any]:
         """The request without session and endpoint; PolicyError where the observation lacks what belongs into it."""
         if observation.qpos.shape != (self._dim,):
             raise PolicyError(f"the state has shape {list(observation.qpos.shape)}; expected [{self._dim}]")
         qpos = observation.qpos.astype(np.float64)
-        grip = self._grip.shown(qpos[self._grippers]) if self._grippers else np.zeros(1)
+        grip = self._grip.to_policy(qpos[self._grippers]) if self._grippers else np.zeros(1)
         return {
             **self._pictures(observation),
             "observation/joint_position": qpos[self._joints].astype(np.float32),
@@ -140,7 +140,7 @@ class Shown:
 
     def _pictures(self, observation: Observation) -> dict[str, UInt8]:
         if self._history is not None and self._begun:
-            return self._of_moments(self._history.before(observation))
+            return self._of_moments(self._history.frames_before(observation))
         if self._history is not None:
             self._history.add(observation)
         first, self._begun = not self._seen, True
@@ -164,9 +164,9 @@ class Shown:
             given = ", ".join(pictures) or "none"
             raise PolicyError(f"the observation has no picture {camera!r}; it has {given}")
         if self._settings.resize == "droid":
-            picture = fitted(picture, *_FIELD_SIZE, "stretch", "lanczos")
-            return picture if self._size is None else fitted(picture, *self._size, "stretch", "lanczos")
-        return picture if self._size is None else fitted(picture, *self._size, self._settings.resize)
+            picture = resize_image(picture, *_FIELD_SIZE, "stretch", "lanczos")
+            return picture if self._size is None else resize_image(picture, *self._size, "stretch", "lanczos")
+        return picture if self._size is None else resize_image(picture, *self._size, self._settings.resize)
 
     def _pose(self, observation: Observation) -> Float32:
         if self._poses is None:

@@ -22,7 +22,7 @@ _PIXELS = range(1, 4097)
 
 
 @dataclass(frozen=True, slots=True)
-class Wants:
+class ServerRequirements:
     """The server's configuration; `resolution` is (height, width), None where it asks for no resizing.
 
     The last three are extras of vLLM-Omni: rows of an answer, numbers of a row, names of its parts.
@@ -39,7 +39,7 @@ class Wants:
     parts: tuple[str, ...] = ()
 
 
-def wanted(metadata: Mapping[str, Any]) -> Wants:
+def parse_requirements(metadata: Mapping[str, Any]) -> ServerRequirements:
     """From the metadata, with the defaults of the field's clients; PolicyError names what is wrong in them."""
     if not any(name in metadata for name in _FIELDS):
         found = ", ".join(map(str, metadata)) or "nothing"
@@ -48,7 +48,7 @@ def wanted(metadata: Mapping[str, Any]) -> Wants:
             'RoboArena family; correct policy.kind (a plain openpi server: "openpi") or policy.url'
         )
     parts = metadata.get("action_keys")
-    return Wants(
+    return ServerRequirements(
         resolution=_resolution(metadata.get("image_resolution", [224, 224])),
         wrist=_flag(metadata, "needs_wrist_camera", True),
         externals=_externals(metadata.get("n_external_cameras", 1)),

@@ -10,15 +10,15 @@ from urllib.parse import urlsplit
 
 from runtime.core.errors import (
     ConfigurationError,
+    PolicyDisconnected,
     PolicyError,
-    PolicyGone,
     PolicyTimeout,
     RefusedError,
-    ServerSaysError,
+    ServerReportedError,
     WrongProtocolError,
 )
-from runtime.policies.connection import Dial, reached
-from runtime.policies.link import headline
+from runtime.policies.connection import Dial, open_connection
+from runtime.policies.link import error_headline
 
 if TYPE_CHECKING:
     import grpc
@@ -56,7 +56,7 @@ class Channel:
         parts = urlsplit(self._url)
         host, port = self._dial() if self._dial else (parts.hostname or "", parts.port or 0)
         seconds = self._connect_deadline
-        reached(self._url, host, port, deadline, seconds, self._require_not_aborted).close()
+        open_connection(self._url, host, port, deadline, seconds, self._require_not_aborted).close()
         self._channel = _grpc().insecure_channel(
             f"[{host}]:{port}" if ":" in host else f"{host}:{port}",
             options=[
@@ -91,7 +91,7 @@ class Channel:
             self.drop()
             raise PolicyError(f"the connection to {self._url} was closed from our side") from error
         except _grpc().RpcError as error:
-            raise self._told(error, method, seconds) from error
+            raise self._to_policy_error(error, method, seconds) from error
         finally:
             self._call = None
         return answer
@@ -113,14 +113,14 @@ class Channel:
         if self._aborted:
             raise PolicyError(f"the connection to {self._url} was closed from our side")
 
-    def _told(self, error: Any, method: str, seconds: float) -> PolicyError:
+    def _to_policy_error(self, error: Any, method: str, seconds: float) -> PolicyError:
         """An error of gRPC as ours."""
         code, details = error.code(), str(error.details())
         codes, name = _grpc().StatusCode, method.rpartition("/")[2]
         if code is codes.UNKNOWN:  # the server's own code failed: it goes on serving
             said = details.removeprefix("Exception calling application: ")
-            return ServerSaysError(
-                f"the policy server at {self._url} reports an error in {name}: {headline(said)}"
+            return ServerReportedError(
+                f"the policy server at {self._url} reports an error in {name}: {error_headline(said)}"
             )
         self.drop()
         if self._aborted:
@@ -140,14 +140,14 @@ class Channel:
                 f"what listens at {self._url} does not speak gRPC ({details}): check host, port and policy.kind"
             )
         if code is codes.UNAVAILABLE:
-            return PolicyGone(
+            return PolicyDisconnected(
                 f"the policy server at {self._url} closed the connection ({details}): "
                 "see that it runs, and speaks gRPC: a server of another kind hangs up too; check policy.kind"
             )
         refusal = f"the policy server at {self._url} refuses {name}: {code.name}, {details}"
         if code in (codes.UNAUTHENTICATED, codes.PERMISSION_DENIED):
             return RefusedError(refusal)
-        return ServerSaysError(refusal)
+        return ServerReportedError(refusal)
 
 
 def _is_foreign(details: str) -> bool:

@@ -22,7 +22,7 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _LONGEST_VARINT = 10  # bytes
 
 
-def observations(data: bytes, chunk: int = CHUNK) -> Iterator[bytes]:
+def encode_observations(data: bytes, chunk: int = CHUNK) -> Iterator[bytes]:
     """Observation messages that carry `data`, the last marked END, and of several the first BEGIN."""
     starts = range(0, len(data), chunk)
     for start in starts:
@@ -31,12 +31,12 @@ def observations(data: bytes, chunk: int = CHUNK) -> Iterator[bytes]:
         yield bytes([1 << 3 | _VARINT, state]) + _field(2, data[start : start + chunk])
 
 
-def setup(data: bytes) -> bytes:
+def encode_setup(data: bytes) -> bytes:
     """A PolicySetup message."""
     return _field(1, data)
 
 
-def actions(message: bytes) -> bytes:
+def decode_actions(message: bytes) -> bytes:
     """The data of an Actions message, b"" of an empty one; CodecError for broken protobuf. Other fields are skipped."""
     place, data = 0, b""
     while place < len(message):

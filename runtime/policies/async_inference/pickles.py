@@ -53,14 +53,14 @@ class TimedAction:
     action: np.ndarray[Any, Any]
 
 
-def written(value: RemotePolicyConfig | TimedObservation, module: str) -> bytes:
+def dump(value: RemotePolicyConfig | TimedObservation, module: str) -> bytes:
     """`value` as the server's own class of the same name in `module` would be pickled."""
     file = io.BytesIO()
     _Writer(file, module).dump(value)
     return file.getvalue()
 
 
-def read_actions(data: bytes, limit: int) -> list[TimedAction]:
+def load_actions(data: bytes, limit: int) -> list[TimedAction]:
     """The actions in their order on the wire; CodecError names what is wrong or refused."""
     if len(data) > limit:
         raise CodecError(f"actions of {len(data)} bytes exceed the limit of {limit}")

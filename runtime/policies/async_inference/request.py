@@ -11,17 +11,17 @@ from pydantic import Field
 
 from runtime.core.errors import ConfigurationError, ContradictionError, ShapeError, WrongProtocolError
 from runtime.core.types import Float32, Observation
-from runtime.policies.action_layout import MeaningSettings
+from runtime.policies.action_layout import ActionLayoutSettings
 from runtime.policies.async_inference.pickles import (
     MODULES,
     RemotePolicyConfig,
     TimedAction,
     TimedObservation,
-    written,
+    dump,
 )
-from runtime.policies.gripper_convention import Convention, Grip
-from runtime.policies.request import Dims, poses_of
-from runtime.policies.rows import action_rows
+from runtime.policies.gripper_convention import Convention, GripperConvention
+from runtime.policies.request import Dims, pose_rows_for
+from runtime.policies.rows import parse_action_rows
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -30,7 +30,7 @@ _RATE_TOLERANCE = 0.02  # of the rate: timestamps are wall clock in double preci
 _NATIVE = (480, 640)  # what a picture is declared as where its size is not; the server resizes whatever comes
 
 
-class RequestSettings(MeaningSettings):
+class RequestSettings(ActionLayoutSettings):
     """Model that the server is to load, and its names of what it is shown."""
 
     policy_type: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
@@ -71,14 +71,16 @@ class AsyncRequest:
             raise ConfigurationError(
                 f"policy.actions = {self._actions}; allowed: each of 0 to {self._row_width - 1} once"
             )
-        posed = poses_of(settings.action_space, settings.action_pose, robot, "action_pose")
-        self._grip = Grip(settings.gripper, robot, posed)
-        poses = poses_of(settings.observation_space, settings.observation_pose, robot, "observation_pose")
+        posed = pose_rows_for(settings.action_space, settings.action_pose, robot, "action_pose")
+        self._grip = GripperConvention(settings.gripper, robot, posed)
+        poses = pose_rows_for(
+            settings.observation_space, settings.observation_pose, robot, "observation_pose"
+        )
         ours = robot.joint_names if poses is None else poses.names
         self._names = _names(settings.state_names, [f"{ours[place]}.pos" for place in self._places])
         self._layout = settings.layout(robot, {camera: camera for camera in settings.images.values()})
 
-    def instructions(self) -> bytes:
+    def setup_message(self) -> bytes:
         """The pickle of what to load and of what each observation will have."""
         settings = self._settings
         height, width = settings.image_size or _NATIVE
@@ -99,17 +101,17 @@ class AsyncRequest:
             settings.device,
             dict(settings.rename),
         )
-        return written(config, self._module)
+        return dump(config, self._module)
 
-    def of(self, observation: Observation, timestep: int) -> bytes:
+    def build(self, observation: Observation, timestep: int) -> bytes:
         """The pickle of an observation that has to be answered; PolicyError where something is missing in it."""
-        shown = self._layout.of(self._grip.observed(observation))
+        shown = self._layout.build(self._grip.convert_observation(observation))
         values: dict[str, Any] = {
             name: float(shown["state"][place]) for name, place in zip(self._names, self._places, strict=True)
         }
         values |= {name: shown["images"][camera] for name, camera in self._settings.images.items()}
         values["task"] = observation.prompt
-        return written(TimedObservation(time.time(), timestep, values, must_go=True), self._module)
+        return dump(TimedObservation(time.time(), timestep, values, must_go=True), self._module)
 
     def rows(self, given: Sequence[TimedAction], timestep: int) -> Float32:
         """Rows [H, W] in the robot's order of the actions that answer the observation `timestep`.
@@ -126,19 +128,19 @@ class AsyncRequest:
                 f"the answer has actions for the steps {_short(steps)}; expected {timestep} and those after it, as it "
                 "answers the observation of that step: another client uses the same server?"
             )
-        self._agree([one.timestamp for one in actions])
+        self._check_rate([one.timestamp for one in actions])
         for one in actions:
             if one.action.ndim != 1 or one.action.shape != actions[0].action.shape:
                 raise ShapeError(
                     f"the action for step {one.timestep} has shape {list(one.action.shape)}, the first "
                     f"{list(actions[0].action.shape)}; expected [{self._row_width}] each"
                 )
-        rows = action_rows("the answer", np.stack([one.action for one in actions]), self._row_width)
+        rows = parse_action_rows("the answer", np.stack([one.action for one in actions]), self._row_width)
         made = np.empty_like(rows)
         made[:, self._actions] = rows
-        return self._grip.meant(made)
+        return self._grip.to_robot(made)
 
-    def _agree(self, times: Sequence[float]) -> None:
+    def _check_rate(self, times: Sequence[float]) -> None:
         """The server says when each row is for, by the rate that it was started with."""
         if len(times) < 2:
             return

@@ -10,8 +10,14 @@ from urllib.parse import urlsplit
 
 import zmq
 
-from runtime.core.errors import PolicyError, PolicyGone, PolicyLostError, PolicyTimeout, WrongProtocolError
-from runtime.policies.connection import Dial, Place, reached
+from runtime.core.errors import (
+    PolicyDisconnected,
+    PolicyError,
+    PolicyLostError,
+    PolicyTimeout,
+    WrongProtocolError,
+)
+from runtime.policies.connection import Dial, Place, open_connection
 
 _SPELL_MS = 20  # how soon a wait notices that it was aborted; an answer is noticed at once
 _SIGNATURE = b"\xff\0\0\0\0\0\0\0\1\x7f"  # how every ZMTP peer begins
@@ -53,7 +59,7 @@ class ReqLink:
         deadline = time.monotonic() + self._connect_deadline
         self._require_not_aborted()
         place = self._place()
-        self._knock(place, deadline)
+        self._probe(place, deadline)
         made: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REQ)
         for option, value in (
             (zmq.LINGER, 0),
@@ -67,7 +73,7 @@ class ReqLink:
             made.connect(
                 f"tcp://[{place[0]}]:{place[1]}" if ":" in place[0] else f"tcp://{place[0]}:{place[1]}"
             )
-            self._shake_hands(deadline)
+            self._handshake(deadline)
         return max(0.0, deadline - time.monotonic())
 
     def exchange(self, request: bytes, seconds: float, what: str = "an answer") -> bytes:
@@ -80,17 +86,17 @@ class ReqLink:
             try:
                 wire.send(request, zmq.NOBLOCK)
             except zmq.Again as error:  # there is nobody any more to send it to
-                raise PolicyGone(
+                raise PolicyDisconnected(
                     f"the policy server at {self._url} closed the connection since the last request: see that it runs"
                 ) from error
-            while (frames := _received(wire)) is None:
+            while (frames := _receive_reply(wire)) is None:
                 self._require_not_aborted()
                 if time.monotonic() >= deadline:
                     raise PolicyTimeout(
                         f"{self._url} did not send {what} within {seconds:g} s; the connection is dropped"
                     )
-                if self._heard() & zmq.EVENT_DISCONNECTED and not wire.poll(0):
-                    raise PolicyGone(
+                if self._poll_events() & zmq.EVENT_DISCONNECTED and not wire.poll(0):
+                    raise PolicyDisconnected(
                         f"the policy server at {self._url} closed the connection before {what}: see that it runs, and "
                         f"that it sends no more than {self._limit} bytes"
                     )
@@ -122,11 +128,11 @@ class ReqLink:
         parts = urlsplit(self._url)
         return self._dial() if self._dial else (parts.hostname or "", parts.port or 0)
 
-    def _knock(self, place: Place, deadline: float) -> None:
+    def _probe(self, place: Place, deadline: float) -> None:
         """See who listens, before ZMQ, which would try again for ever and say nothing."""
         try:
             seconds = self._connect_deadline
-            with reached(self._url, *place, deadline, seconds, self._require_not_aborted) as wire:
+            with open_connection(self._url, *place, deadline, seconds, self._require_not_aborted) as wire:
                 wire.settimeout(_SPELL_MS / 1e3)
                 wire.sendall(_KNOCK)
                 self._require_zmq(self._greeting(wire, deadline))
@@ -163,10 +169,10 @@ class ReqLink:
                 "check host, port and policy.kind"
             )
 
-    def _shake_hands(self, deadline: float) -> None:
+    def _handshake(self, deadline: float) -> None:
         while True:
             self._require_not_aborted()
-            heard = self._heard(_SPELL_MS)
+            heard = self._poll_events(_SPELL_MS)
             if heard & zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 return
             if heard:  # it failed, or the peer hung up in the middle, as it does where sockets do not match
@@ -180,7 +186,7 @@ class ReqLink:
                     "stuck"
                 )
 
-    def _heard(self, milliseconds: int = 0) -> int:
+    def _poll_events(self, milliseconds: int = 0) -> int:
         """Events of the connection since the last call, as one set of ZMQ's events."""
         from zmq.utils.monitor import recv_monitor_message  # it brings asyncio along
 
@@ -199,7 +205,7 @@ class ReqLink:
             raise
 
 
-def _received(wire: zmq.Socket[bytes]) -> list[bytes] | None:
+def _receive_reply(wire: zmq.Socket[bytes]) -> list[bytes] | None:
     """The frames of an answer, None where none comes within a spell: what answers another request is thrown away."""
     try:
         return wire.recv_multipart(zmq.NOBLOCK) if wire.poll(_SPELL_MS) else None

@@ -21,7 +21,7 @@ _PLAIN = ("state_keys", "action_keys")  # of a server without configurations
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class ActionFormat:
     """Format of an action in N1.6 and newer."""
 
     representation: str  # "ABSOLUTE", "DELTA", "RELATIVE", which it answers as absolute
@@ -38,7 +38,7 @@ class Modality:
 
     keys: tuple[str, ...] | None = ()
     steps: tuple[int, ...] = (0,)
-    written: Mapping[str, Written] = field(default_factory=dict)
+    written: Mapping[str, ActionFormat] = field(default_factory=dict)
     widths: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -55,11 +55,11 @@ class Modalities:
     state: Modality
     action: Modality
     language: Modality
-    early: bool = False
+    is_n15: bool = False
     reads_mnp: bool | None = None
     contract: Mapping[str, Any] | None = None
 
-    def plain(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """For a recording's manifest."""
         if self.contract is not None:
             return dict(self.contract)
@@ -67,7 +67,7 @@ class Modalities:
         return {name: {"keys": list(one.keys or ()), "steps": list(one.steps)} for name, one in each.items()}
 
 
-def modalities(reply: object) -> Modalities:
+def parse_modalities(reply: object) -> Modalities:
     """The answer to get_modality_config; PolicyError where it is none. A modality that is not in it has no keys.
 
     StarVLA's servers of this protocol have flat lists of keys instead.
@@ -150,12 +150,12 @@ def _modality(given: Mapping[str, Any], name: Name) -> Modality:
     return Modality(bare, tuple(steps), _written(bare, fields.get("action_configs")))
 
 
-def _written(keys: tuple[str, ...], configs: object) -> dict[str, Written]:
+def _written(keys: tuple[str, ...], configs: object) -> dict[str, ActionFormat]:
     """By key; nothing where there is not one for each, which some servers get wrong without harm."""
     if not isinstance(configs, list) or len(configs) != len(keys):
         return {}
     return {
-        key: Written(_word(config.get("rep")), _word(config.get("format")))
+        key: ActionFormat(_word(config.get("rep")), _word(config.get("format")))
         for key, config in zip(keys, configs, strict=True)
         if isinstance(config, Mapping)
     }
@@ -166,7 +166,7 @@ def _word(given: object) -> str:
     return str(given).upper().replace("+", "_")
 
 
-def listed(names: Iterable[str]) -> str:
+def join_names(names: Iterable[str]) -> str:
     """Names for a sentence."""
     return ", ".join(names) or "none"
 

@@ -19,11 +19,11 @@ from runtime.core.errors import (
     WrongProtocolError,
 )
 from runtime.core.types import Float32, Observation, UInt8
-from runtime.policies.action_layout import MeaningSettings
-from runtime.policies.gripper_convention import Convention, Grip
-from runtime.policies.groot.modality import Modalities, Modality, Written, listed
-from runtime.policies.request import Dims, poses_of
-from runtime.policies.rows import action_rows
+from runtime.policies.action_layout import ActionLayoutSettings
+from runtime.policies.gripper_convention import Convention, GripperConvention
+from runtime.policies.groot.modality import ActionFormat, Modalities, Modality, join_names
+from runtime.policies.request import Dims, pose_rows_for
+from runtime.policies.rows import parse_action_rows
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -34,7 +34,7 @@ _LANGUAGE = "annotation.human.task_description"  # what servers that name no key
 _MOST_STEPS = 64  # of a modality; more pictures than that in one request are a mistake
 
 
-class RequestSettings(MeaningSettings):
+class RequestSettings(ActionLayoutSettings):
     """Which keys of the model hold what, and in what form the server wants them."""
 
     dialect: Literal["nested", "sim_wrapper", "n1.5"] = "nested"
@@ -58,7 +58,7 @@ class RequestSettings(MeaningSettings):
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class ModelInput:
     """Content of one observation."""
 
     step: int
@@ -74,8 +74,8 @@ class Gr00tRequest:
         width, self._row_width = settings.widths(robot)
         _check_parts(settings.state, width)
         _check_cover(settings.actions, self._row_width)
-        poses = poses_of(settings.action_space, settings.action_pose, robot, "action_pose")
-        self._grip = Grip(settings.gripper, robot, poses)
+        poses = pose_rows_for(settings.action_space, settings.action_pose, robot, "action_pose")
+        self._grip = GripperConvention(settings.gripper, robot, poses)
         cameras = {camera: camera for camera in settings.video.values()}
         self._layout = settings.layout(robot, cameras)
         self._pace = control_rate / (
@@ -83,13 +83,13 @@ class Gr00tRequest:
         )  # control steps per step of the model
         self._wanted: Modalities | None = None
         self._language = ""
-        self._moments: deque[Moment] = deque()
+        self._moments: deque[ModelInput] = deque()
 
-    def agree(self, wanted: Modalities) -> None:
+    def configure(self, wanted: Modalities) -> None:
         """Hold what the server wants against the deployment; ContradictionError names both sides."""
         settings = self._settings
-        if wanted.early != (settings.dialect == "n1.5"):
-            version = "of version N1.5" if wanted.early else "newer than N1.5"
+        if wanted.is_n15 != (settings.dialect == "n1.5"):
+            version = "of version N1.5" if wanted.is_n15 else "newer than N1.5"
             raise ContradictionError(
                 f"the server is {version}, policy.dialect = {settings.dialect!r}; correct the one that is wrong"
             )
@@ -117,17 +117,17 @@ class Gr00tRequest:
         steps = None if self._wanted is None else self._wanted.action.steps
         return len(steps) if steps is not None and len(steps) > 1 else None
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """An episode ended: what was seen in it is not shown any more."""
         self._moments.clear()
 
-    def moment(self, observation: Observation) -> Moment:
+    def model_input(self, observation: Observation) -> ModelInput:
         """Content of the observation; PolicyError where something is missing."""
-        shown = self._layout.of(self._grip.observed(observation))
+        shown = self._layout.build(self._grip.convert_observation(observation))
         pictures = {key: shown["images"][camera] for key, camera in self._settings.video.items()}
-        return Moment(observation.step, pictures, shown["state"])
+        return ModelInput(observation.step, pictures, shown["state"])
 
-    def of(self, moment: Moment, prompt: str) -> dict[str, Any]:
+    def build(self, moment: ModelInput, prompt: str) -> dict[str, Any]:
         """The data of get_action for the newest moment, which is remembered as far as later ones need it."""
         wanted = self._wanted
         assert wanted is not None, "agree comes first"
@@ -158,7 +158,7 @@ class Gr00tRequest:
         made = np.empty((next(iter(heights.values())), self._row_width), np.float32)
         for key, part in parts.items():
             made[:, self._settings.actions[key]] = part
-        return self._grip.meant(made)
+        return self._grip.to_robot(made)
 
     def _answer(self, reply: object) -> Mapping[str, Any]:
         early = self._settings.dialect == "n1.5"
@@ -173,18 +173,18 @@ class Gr00tRequest:
     def _part(self, answer: Mapping[str, Any], key: str, dims: Sequence[int]) -> Float32:
         name = key if key in answer else f"action.{key}"
         if name not in answer:
-            raise ShapeError(f"the answer has no action {key!r}; it has {listed(map(str, answer))}")
+            raise ShapeError(f"the answer has no action {key!r}; it has {join_names(map(str, answer))}")
         given = answer[name]
         if isinstance(given, Mapping):
             raise WrongProtocolError(
-                f"action {key!r} is a map of {listed(map(str, given))}; expected an array in NPY or MNP: "
+                f"action {key!r} is a map of {join_names(map(str, given))}; expected an array in NPY or MNP: "
                 "the server writes arrays in another dialect"
             )
         if isinstance(given, np.ndarray) and given.ndim == 1 and len(dims) == 1:
             given = given[:, None]  # N1.5 leaves the last axis of single numbers away
-        return action_rows(f"action {key!r}", given, len(dims))
+        return parse_action_rows(f"action {key!r}", given, len(dims))
 
-    def _remember(self, moment: Moment) -> None:
+    def _remember(self, moment: ModelInput) -> None:
         while self._moments and self._moments[-1].step >= moment.step:
             self._moments.pop()  # asked again, or control began anew
         self._moments.append(moment)
@@ -199,7 +199,7 @@ class Gr00tRequest:
         while len(self._moments) > 1 and self._moments[1].step <= earliest:
             self._moments.popleft()
 
-    def _at(self, steps: Sequence[int]) -> list[Moment]:
+    def _at(self, steps: Sequence[int]) -> list[ModelInput]:
         now = self._moments[-1].step
         return [
             min(reversed(self._moments), key=lambda one, at=now + step * self._pace: abs(one.step - at))  # type: ignore[misc]
@@ -238,7 +238,7 @@ def _same_keys(name: str, wanted: Modality, given: Iterable[str]) -> None:
     if wanted.keys is not None and set(here) != set(wanted.keys):
         kind = ActionSpaceError if name == "actions" else ContradictionError
         raise kind(
-            f"the server's model has the {name} keys {listed(wanted.keys)}; policy.{name} has {listed(here)}; "
+            f"the server's model has the {name} keys {join_names(wanted.keys)}; policy.{name} has {join_names(here)}; "
             "correct policy." + name
         )
 
@@ -255,13 +255,13 @@ def _language_key(wanted: Modality, given: str | None) -> str:
     keys = (_LANGUAGE,) if wanted.keys is None and given is None else wanted.keys or ()
     if given is not None and keys and given not in keys:
         raise ContradictionError(
-            f"the server's model has the language keys {listed(keys)}; policy.language_key = {given!r}"
+            f"the server's model has the language keys {join_names(keys)}; policy.language_key = {given!r}"
         )
     if given is not None:
         return given
     if len(keys) != 1:
         raise ContradictionError(
-            f"the server's model has the language keys {listed(keys)}; set policy.language_key to one of them"
+            f"the server's model has the language keys {join_names(keys)}; set policy.language_key to one of them"
         )
     return keys[0]
 
@@ -269,17 +269,17 @@ def _language_key(wanted: Modality, given: str | None) -> str:
 def _check_steps(name: str, wanted: Modality, history: str) -> None:
     if len(wanted.steps) > _MOST_STEPS or max(wanted.steps) > 0:
         raise PolicyError(
-            f"the server's model wants {name} at the steps {listed(map(str, wanted.steps[:8]))}; "
+            f"the server's model wants {name} at the steps {join_names(map(str, wanted.steps[:8]))}; "
             f"allowed: at most {_MOST_STEPS}, none of them in the future"
         )
     if history == "none" and any(wanted.steps):
         raise ContradictionError(
-            f"the server's model sees {name} at the steps {listed(map(str, wanted.steps))} before the newest, "
+            f"the server's model sees {name} at the steps {join_names(map(str, wanted.steps))} before the newest, "
             'policy.history = "none"; allowed: "repeat" or "nearest"'
         )
 
 
-def _check_written(key: str, written: Written | None, settings: RequestSettings) -> None:
+def _check_written(key: str, written: ActionFormat | None, settings: RequestSettings) -> None:
     """Rows of poses, or of changes, must not be taken for joints, or for targets."""
     if written is None:
         return

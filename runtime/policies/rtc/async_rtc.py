@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from runtime.core.errors import ServerSaysError, WrongProtocolError
+from runtime.core.errors import ServerReportedError, WrongProtocolError
 from runtime.core.types import Conditioning
-from runtime.policies.link import headline
+from runtime.policies.link import error_headline
 from runtime.policies.rtc.base import Dialect, Message
 
 NAME = "openpi-async-rtc"
@@ -30,7 +30,7 @@ class AsyncRtc(Dialect):
         self._number = -1
         self._horizon: int | None = None
 
-    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+    def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
         """Value of `rtc_supported`; PolicyError if protocol, version, codec or the word itself is wrong."""
         said = metadata.get("async_rtc")
         if not isinstance(said, Mapping):
@@ -52,7 +52,7 @@ class AsyncRtc(Dialect):
         self._horizon = horizon if type(horizon) is int else None
         return supported
 
-    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+    def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
         """The envelope for the next request."""
         self._number += 1
         return {
@@ -64,11 +64,13 @@ class AsyncRtc(Dialect):
             "rtc": None if conditioning is None else self._rtc(conditioning),
         }
 
-    def result(self, reply: Message) -> Message:
+    def unwrap(self, reply: Message) -> Message:
         """Content of the envelope; PolicyError for the server's error, another version or request number."""
         _check_version(reply, "the answer")
         if reply.get("error"):
-            raise ServerSaysError(f"the policy server reports an error: {headline(str(reply['error']))}")
+            raise ServerReportedError(
+                f"the policy server reports an error: {error_headline(str(reply['error']))}"
+            )
         number = reply.get("request_id")
         if number != self._number:
             raise WrongProtocolError(
@@ -82,7 +84,7 @@ class AsyncRtc(Dialect):
         return result
 
     def _rtc(self, conditioning: Conditioning) -> Message:
-        left = conditioning.left_over
+        left = conditioning.remaining_rows
         delay = min(conditioning.predicted_delay, len(left))
         highest = len(conditioning.previous) if self._horizon is None else self._horizon
         return {

@@ -22,30 +22,30 @@ class Dialect(ABC):
     continues_model_rows = True
 
     @abstractmethod
-    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+    def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
         """True if the server continues a chunk that it is given; None where its metadata do not say.
 
         Raises PolicyError where it speaks another dialect.
         """
 
     @abstractmethod
-    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+    def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
         """The message to send for an observation."""
 
     @abstractmethod
-    def result(self, reply: Message) -> Message:
+    def unwrap(self, reply: Message) -> Message:
         """The part of a reply that holds the actions; PolicyError for an error, or a reply to something else."""
 
 
-class Plain(Dialect):
+class NoRtc(Dialect):
     """No RTC: servers drop keys that they do not know, so conditioning would be sent and do nothing."""
 
-    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+    def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
         """Never."""
         refuse_envelopes(metadata, "none")
         return False
 
-    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+    def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
         """The observation itself; PolicyError for conditioning."""
         if conditioning is not None:
             raise PolicyError(
@@ -53,12 +53,12 @@ class Plain(Dialect):
             )
         return observation
 
-    def result(self, reply: Message) -> Message:
+    def unwrap(self, reply: Message) -> Message:
         """The reply itself."""
         return reply
 
 
-def dialect_told(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
+def declared_dialect(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
     """The map under the metadata key `rtc`, that of our bundled server; None where the server does not say.
 
     ContradictionError for a server that takes versioned envelopes alone, or whose key is something else.

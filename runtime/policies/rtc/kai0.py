@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from runtime.core.types import Conditioning, Float32
-from runtime.policies.rtc.base import Dialect, Message, dialect_told
+from runtime.policies.rtc.base import Dialect, Message, declared_dialect
 from runtime.policies.rtc.openpi_rtc import Rows
-from runtime.policies.rtc.prev_action import padded
+from runtime.policies.rtc.prev_action import pad_rows
 
 NAME = "kai0"
 _COLUMNS = 32  # of the model: rows are padded with zeros to it, or cropped
@@ -30,12 +30,12 @@ class Kai0(Dialect):
         self._rows = rows
         self._weight = max_guidance_weight
 
-    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+    def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
         """True if the metadata key `rtc` names this dialect; None without it."""
-        said = dialect_told(metadata, NAME)
+        said = declared_dialect(metadata, NAME)
         return None if said is None else bool(said["dialect"] == NAME)
 
-    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+    def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
         """The observation with the keys."""
         chunk, delay, horizon = self._continued(conditioning)
         return {
@@ -48,7 +48,7 @@ class Kai0(Dialect):
             "max_guidance_weight": self._weight,
         }
 
-    def result(self, reply: Message) -> Message:
+    def unwrap(self, reply: Message) -> Message:
         """The reply itself."""
         return reply
 
@@ -59,12 +59,12 @@ class Kai0(Dialect):
         delay, end = conditioning.predicted_delay, conditioning.execution_horizon
         rows = conditioning.previous
         if self._rows == "aligned":
-            left = conditioning.left_over
-            rows, end = padded(left, len(rows)), max(delay, min(end, len(left)))
-        return {"prev_action_chunk": _wide(rows).tolist()}, delay, max(1, end)
+            left = conditioning.remaining_rows
+            rows, end = pad_rows(left, len(rows)), max(delay, min(end, len(left)))
+        return {"prev_action_chunk": _nested_lists(rows).tolist()}, delay, max(1, end)
 
 
-def _wide(rows: Float32) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _nested_lists(rows: Float32) -> np.ndarray[Any, np.dtype[np.float64]]:
     made = np.zeros((len(rows), _COLUMNS))
     kept = min(_COLUMNS, rows.shape[1])
     made[:, :kept] = rows[:, :kept]

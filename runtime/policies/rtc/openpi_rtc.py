@@ -16,7 +16,7 @@ import numpy as np
 from runtime.core.errors import ConfigurationError, ContradictionError
 from runtime.core.settings import Settings
 from runtime.core.types import Conditioning, Float32
-from runtime.policies.rtc.base import Dialect, Message, dialect_told
+from runtime.policies.rtc.base import Dialect, Message, declared_dialect
 
 NAME = "openpi_rtc"
 Rows = Literal["aligned", "whole"]
@@ -51,9 +51,9 @@ class OpenpiRtc(Dialect):
         self._keys = keys
         self._rows = rows
 
-    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+    def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
         """True if `rtc` names this dialect, None without the key; ContradictionError for other row counts."""
-        said = dialect_told(metadata, NAME)
+        said = declared_dialect(metadata, NAME)
         if said is None:
             return None
         shift = said.get("shift")
@@ -64,7 +64,7 @@ class OpenpiRtc(Dialect):
             )
         return bool(said["dialect"] == NAME)
 
-    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+    def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
         """The envelope."""
         keys = self._keys
         message: Message = {keys.observation: observation}
@@ -72,12 +72,12 @@ class OpenpiRtc(Dialect):
             message["prev_action"] = self._placed(conditioning)
         message[keys.flag] = conditioning is not None
         if conditioning is not None and keys.shift:
-            message[keys.shift] = conditioning.consumed
+            message[keys.shift] = conditioning.consumed_rows
         if conditioning is not None and keys.delay:
             message[keys.delay] = conditioning.predicted_delay
         return message
 
-    def result(self, reply: Message) -> Message:
+    def unwrap(self, reply: Message) -> Message:
         """The reply itself."""
         return reply
 
@@ -85,10 +85,10 @@ class OpenpiRtc(Dialect):
         previous = conditioning.previous
         if self._rows == "whole" or self._keys.shift or self._keys.server_shift is None:
             return np.ascontiguousarray(previous, np.float32)
-        return moved(previous, conditioning.consumed - self._keys.server_shift)
+        return shift_rows(previous, conditioning.consumed_rows - self._keys.server_shift)
 
 
-def moved(rows: Float32, by: int) -> Float32:
+def shift_rows(rows: Float32, by: int) -> Float32:
     """Row n is row n + `by` [T, W]; what is before the first or after the last row repeats that."""
     places = np.clip(np.arange(len(rows)) + by, 0, len(rows) - 1)
     return np.ascontiguousarray(rows[places], np.float32)

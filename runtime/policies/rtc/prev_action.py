@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from runtime.core.types import Conditioning, Float32
-from runtime.policies.rtc.base import Dialect, Message, dialect_told
+from runtime.policies.rtc.base import Dialect, Message, declared_dialect
 
 NAME = "prev_action"
 
@@ -20,26 +20,26 @@ class PrevAction(Dialect):
     that does not know them drops them without a word, and most say nothing of themselves.
     """
 
-    def supported(self, metadata: Mapping[str, Any]) -> bool | None:
+    def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
         """True if the metadata key `rtc` (that of our bundled server) names this dialect; None without it."""
-        said = dialect_told(metadata, NAME)
+        said = declared_dialect(metadata, NAME)
         return None if said is None else bool(said["dialect"] == NAME)
 
-    def request(self, observation: Message, conditioning: Conditioning | None) -> Message:
+    def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
         """The observation with both keys, or as it is."""
         if conditioning is None:
             return observation
         return observation | {
-            "prev_action": padded(conditioning.left_over, len(conditioning.previous)),
-            "rtc_params": {"s": conditioning.consumed},
+            "prev_action": pad_rows(conditioning.remaining_rows, len(conditioning.previous)),
+            "rtc_params": {"s": conditioning.consumed_rows},
         }
 
-    def result(self, reply: Message) -> Message:
+    def unwrap(self, reply: Message) -> Message:
         """The reply itself."""
         return reply
 
 
-def padded(rows: Float32, count: int) -> Float32:
+def pad_rows(rows: Float32, count: int) -> Float32:
     """`rows` and then the last of them until there are `count`."""
     missing = count - len(rows)
     return np.ascontiguousarray(np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)]), np.float32)

@@ -11,7 +11,7 @@ from typing import Any
 
 from runtime.core.backoff import BackOff
 from runtime.policies.tunnel.process import Ssh
-from runtime.policies.tunnel.sentences import is_taken, unopened, why
+from runtime.policies.tunnel.sentences import explain_exit, explain_session_refused, port_was_taken
 
 log = logging.getLogger(__name__)
 _POLL_S = 0.05
@@ -39,7 +39,7 @@ class Status:
     closed: bool = False
 
 
-class Keeper:
+class TunnelKeeper:
     """One tunnel from `begin` to `close`; `start` starts one ssh with a near end of its own, or raises OSError."""
 
     def __init__(
@@ -58,7 +58,7 @@ class Keeper:
         self._stop = threading.Event()
         self.status = Status(False, now())
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """Keep it in a thread of its own: ssh ends with the thread that started it."""
         threading.Thread(target=self._keep, name="tunnel", daemon=True).start()
 
@@ -67,48 +67,50 @@ class Keeper:
         self._tell(closed=True, why="it was closed from our side")
         self._stop.set()
 
-    def lasts(self, status: Status) -> float:
+    def duration(self, status: Status) -> float:
         """Duration of the status so far [s]."""
         return self._now() - status.since
 
-    def holds(self, port: int) -> bool:
+    def owns_port(self, port: int) -> bool:
         """True if the near end at `port` is its own at this moment; one that was its own may be another's."""
         ssh = self._ssh
-        return ssh is not None and ssh.port == port and ssh.listens()
+        return ssh is not None and ssh.port == port and ssh.is_listening()
 
-    def wait(self, reached: Callable[[Status], bool], seconds: float) -> Status:
+    def wait_for(self, reached: Callable[[Status], bool], seconds: float) -> Status:
         """The status as soon as it is one, or after `seconds`."""
         with self._changed:
             self._changed.wait_for(lambda: reached(self.status), seconds)
             return self.status
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Whatever is due."""
         now, ssh = self._now(), self._ssh
         if ssh is None:
-            if not self._back_off.waiting(now):
+            if not self._back_off.remaining_delay(now):
                 self._launch(now)
             return
-        code = ssh.look()
+        code = ssh.poll()
         self._count(ssh)
         if code is not None:
             silent = not self.status.up and not ssh.said and ssh.refusal
-            self._over(ssh, unopened(ssh.refusal) if silent else why(ssh.said, code))
+            self._discard(
+                ssh, explain_session_refused(ssh.refusal) if silent else explain_exit(ssh.said, code)
+            )
         elif self.status.up:
             return
-        elif ssh.listens():
+        elif ssh.is_listening():
             self._taken = 0
             self._tell(up=True, since=now, port=ssh.port)
             log.info("the tunnel to %s is up, at port %d", self._name, ssh.port)
         elif now - self._begun > self._deadline:
             last = f" ({ssh.said[-1]})" if ssh.said else ""
-            self._over(ssh, f"it was not up within {self._deadline:g} s{last}")
+            self._discard(ssh, f"it was not up within {self._deadline:g} s{last}")
 
-    def end(self) -> None:
+    def stop(self) -> None:
         """End its ssh, if there is one."""
         ssh, self._ssh = self._ssh, None
         if ssh is not None:
-            ssh.end()
+            ssh.terminate()
 
     def _launch(self, now: float) -> None:
         try:
@@ -123,10 +125,10 @@ class Keeper:
             new, self._refused = ssh.refusals - self._refused, ssh.refusals
             self._tell(refusals=self.status.refusals + new, refusal=ssh.refusal)
 
-    def _over(self, ssh: Ssh, reason: str) -> None:
+    def _discard(self, ssh: Ssh, reason: str) -> None:
         """This ssh is of no use any more."""
-        taken = not self.status.up and is_taken(ssh.said)
-        self.end()
+        taken = not self.status.up and port_was_taken(ssh.said)
+        self.stop()
         if taken and self._taken < _PORTS:
             self._taken += 1  # another port is free for certain
             return
@@ -135,12 +137,12 @@ class Keeper:
     def _failed(self, reason: str) -> None:
         now, before = self._now(), self.status
         if before.up and now - before.since >= _STEADY_S:
-            self._back_off.forget()
-        self._back_off.failed(now)
+            self._back_off.reset()
+        self._back_off.record_failure(now)
         self._taken = 0
         since = now if before.up else before.since
         self._tell(up=False, since=since, port=0, why=reason, failures=before.failures + 1)
-        again = self._back_off.waiting(now)
+        again = self._back_off.remaining_delay(now)
         log.warning("the tunnel to %s is down: %s; trying again in %.1f s", self._name, reason, again)
 
     def _tell(self, **changes: Any) -> None:
@@ -151,11 +153,11 @@ class Keeper:
     def _keep(self) -> None:
         try:
             while not self._stop.is_set():
-                self.look()
+                self.poll()
                 self._stop.wait(_POLL_S)
         except Exception as error:  # of our own code: whoever waits has to be told
             log.exception("the tunnel to %s is not kept any more", self._name)
             self._tell(why=f"it is not kept any more ({type(error).__name__}: {error})")
         finally:
-            self.end()
+            self.stop()
             self._tell(up=False, since=self._now(), port=0, closed=True)

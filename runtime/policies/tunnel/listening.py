@@ -14,7 +14,7 @@ _LISTEN = "0A"
 _LOOPBACK = int.from_bytes(socket.inet_aton("127.0.0.1"), sys.byteorder)
 
 
-def listens(pid: int, port: int) -> bool:
+def is_listening(pid: int, port: int) -> bool:
     """True if the process `pid`, and no other, takes connections on 127.0.0.1:`port`."""
     sockets = _sockets(pid)
     return any(f"socket:[{inode}]" in sockets for inode in _listeners(pid, port)) if sockets else False

@@ -20,9 +20,9 @@ from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.connection import Place
 from runtime.policies.tunnel.command import command, far_end, require_files
-from runtime.policies.tunnel.keeper import Keeper, Status
+from runtime.policies.tunnel.keeper import Status, TunnelKeeper
 from runtime.policies.tunnel.process import Ssh, free_port
-from runtime.policies.tunnel.sentences import unreached
+from runtime.policies.tunnel.sentences import explain_forward_refused
 from runtime.policies.tunnel.settings import TunnelSettings
 
 _SLACK_S = 3.0  # of the keeper's own deadline, which says more
@@ -57,44 +57,44 @@ class TunnelledPolicy(Policy):
         self._far = far
         self._ssh = ssh
         self._turning = threading.Lock()  # between two keepers: held for a moment
-        self._keeper: Keeper | None = None
-        self.observation_eef, self.sees_poses = policy.observation_eef, policy.sees_poses
-        self.glances_s = policy.glances_s
-        policy.dial = self._near_end
+        self._keeper: TunnelKeeper | None = None
+        self.observation_eef, self.uses_poses = policy.observation_eef, policy.uses_poses
+        self.observe_period_s = policy.observe_period_s
+        policy.address_override = self._local_address
 
     def connect(self) -> PolicyInfo:
         """Make the tunnel, then reach the server; a tunnel that there was is replaced."""
         require_files(self._settings)
         keeper = self._new_keeper()
-        status = keeper.wait(
+        status = keeper.wait_for(
             lambda now: now.up or now.closed or now.failures > 0, self._settings.connect_deadline + _SLACK_S
         )
         if not status.up:
             keeper.close()  # else it would go on knocking while nobody waits for it
             raise self._ended(status) if status.closed else TunnelError(self._absence(status))
-        with self._telling():
+        with self._explain_errors():
             return self._policy.connect()
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         """As the policy; PolicyLostError with the tunnel's own reason where it is down, until it is up again."""
         if self._keeper is None:
             raise self._never()
-        with self._telling():
+        with self._explain_errors():
             return self._policy.infer(observation, conditioning)
 
-    def glance(self, observation: Observation) -> None:
+    def observe(self, observation: Observation) -> None:
         """As the policy."""
-        self._policy.glance(observation)
+        self._policy.observe(observation)
 
     def reset(self) -> None:
         """As the policy."""
-        with self._telling():
+        with self._explain_errors():
             self._policy.reset()
 
-    def rest(self) -> None:
+    def end_episode(self) -> None:
         """As the policy."""
-        with self._telling():
-            self._policy.rest()
+        with self._explain_errors():
+            self._policy.end_episode()
 
     def close(self) -> None:
         """As the policy; the tunnel ends."""
@@ -103,34 +103,34 @@ class TunnelledPolicy(Policy):
                 self._keeper.close()
             self._policy.close()
 
-    def _new_keeper(self) -> Keeper:
+    def _new_keeper(self) -> TunnelKeeper:
         with self._turning:
             if self._keeper is not None:
                 self._keeper.close()
-            self._keeper = Keeper(self._settings.where, self._start, self._settings.connect_deadline)
-            self._keeper.begin()
+            self._keeper = TunnelKeeper(self._settings.where, self._start, self._settings.connect_deadline)
+            self._keeper.start()
             return self._keeper
 
     def _start(self) -> Ssh:
         port = free_port()
         return Ssh(command(self._ssh, self._settings, port, self._far), port, self._settings.session)
 
-    def _near_end(self) -> Place:
+    def _local_address(self) -> Place:
         """Near end that the policy connects to, looked up each time: a port once ours may be another's."""
         keeper = self._keeper
         if keeper is None:
             raise self._never()
         status = keeper.status
-        if status.up and not keeper.holds(status.port):
-            status = keeper.wait(lambda now: not now.up, _HEARD_S)
+        if status.up and not keeper.owns_port(status.port):
+            status = keeper.wait_for(lambda now: not now.up, _HEARD_S)
         if status.closed:
             raise self._ended(status)
-        if not status.up or not keeper.holds(status.port):
+        if not status.up or not keeper.owns_port(status.port):
             raise TunnelError(self._down(keeper, status))
         return "127.0.0.1", status.port
 
     @contextlib.contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _explain_errors(self) -> Iterator[None]:
         """Say of an error that has to do with the tunnel that it does."""
         keeper = self._keeper
         before = keeper.status if keeper else None
@@ -142,7 +142,7 @@ class TunnelledPolicy(Policy):
             lost = isinstance(error, PolicyLostError) or isinstance(error.__cause__, OSError)
             if keeper is None or before is None or not lost:
                 raise
-            status = keeper.wait(lambda now: not now.up or _happened(before, now), _HEARD_S)
+            status = keeper.wait_for(lambda now: not now.up or _changed(before, now), _HEARD_S)
             if status.closed:
                 raise
             if not status.up:
@@ -164,18 +164,16 @@ class TunnelledPolicy(Policy):
     def _absence(self, status: Status) -> str:
         return f"there is no tunnel to {self._settings.where}: {status.why}"
 
-    def _down(self, keeper: Keeper, status: Status) -> str:
-        return (
-            f"the tunnel to {self._settings.where} is down since {keeper.lasts(status):.0f} s: {status.why}"
-        )
+    def _down(self, keeper: TunnelKeeper, status: Status) -> str:
+        return f"the tunnel to {self._settings.where} is down since {keeper.duration(status):.0f} s: {status.why}"
 
     def _unreached(self, status: Status) -> str:
         host, port = self._far
         return (
             f"the tunnel to {self._settings.where} is up, but {host} port {port} was not reached from there "
-            f"({status.refusal}): {unreached(status.refusal)}"
+            f"({status.refusal}): {explain_forward_refused(status.refusal)}"
         )
 
 
-def _happened(before: Status, now: Status) -> bool:
+def _changed(before: Status, now: Status) -> bool:
     return now.failures > before.failures or now.refusals > before.refusals

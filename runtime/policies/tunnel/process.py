@@ -13,8 +13,8 @@ from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 
-from runtime.core.environment import for_ssh
-from runtime.policies.tunnel.listening import listens
+from runtime.core.environment import ssh_environment
+from runtime.policies.tunnel.listening import is_listening
 
 _BOUND = Path(__file__).with_name("bound.py")
 _PATIENCE_S = 2.0  # after it was told to end
@@ -47,7 +47,7 @@ class Ssh:
             stdin=subprocess.PIPE if echoes else subprocess.DEVNULL,  # its end is that of a session, too
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            env=for_ssh(),
+            env=ssh_environment(),
             start_new_session=True,  # without a terminal: nobody can be asked
         )
         self._pipes = [pipe for pipe in (self._process.stdout, self._process.stderr) if pipe is not None]
@@ -63,20 +63,20 @@ class Ssh:
     def pid(self) -> int:
         return self._process.pid
 
-    def look(self) -> int | None:
+    def poll(self) -> int | None:
         """Take in what it said; its exit code, None while it lives."""
         code = self._process.poll()  # first, so that all it said is there to be read when it has ended
         for pipe in self._rests:
             self._read(pipe)
             if code is not None and self._rests[pipe]:
-                self._take(pipe, b"\n")
+                self._handle_line(pipe, b"\n")
         return code
 
-    def listens(self) -> bool:
+    def is_listening(self) -> bool:
         """True if its near end takes connections, and its far end answers."""
-        return self._echoed and listens(self.pid, self.port)
+        return self._echoed and is_listening(self.pid, self.port)
 
-    def end(self) -> None:
+    def terminate(self) -> None:
         """End it and what it started, wait for that; nobody else's."""
         if self._process.poll() is None:  # not reaped: the number of its session is still its own
             with contextlib.suppress(ProcessLookupError):
@@ -99,9 +99,9 @@ class Ssh:
                 return
             if not piece:
                 return
-            self._take(pipe, piece)
+            self._handle_line(pipe, piece)
 
-    def _take(self, pipe: int, piece: bytes) -> None:
+    def _handle_line(self, pipe: int, piece: bytes) -> None:
         *lines, rest = (self._rests[pipe] + piece).split(b"\n")
         self._rests[pipe] = rest[-_WIDTH:]
         for line in lines:

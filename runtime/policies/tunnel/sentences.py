@@ -31,12 +31,12 @@ _ADVICE = (
 )
 
 
-def is_taken(said: Sequence[str]) -> bool:
+def port_was_taken(said: Sequence[str]) -> bool:
     """True if another process was quicker to take the near end's port."""
     return any(_TAKEN.search(line) for line in said)
 
 
-def why(said: Sequence[str], code: int) -> str:
+def explain_exit(said: Sequence[str], code: int) -> str:
     """The last of what ssh said, with what came before it where that alone says little, and an advice."""
     told = "; ".join(list(said)[-2:]) or f"ssh ended with {code} and said nothing"
     if code not in (_OWN_FAULT, *_SIGNALS):
@@ -44,7 +44,7 @@ def why(said: Sequence[str], code: int) -> str:
     return next((f"{told}: {advice}" for pattern, advice in _ADVICE if re.search(pattern, told)), told)
 
 
-def unopened(refusal: str) -> str:
+def explain_session_refused(refusal: str) -> str:
     """Why an ssh ended that was never up and said nothing but that the far end did not open its session."""
     return (
         f"no session was opened there ({refusal}): for an account or a server without any set "
@@ -52,7 +52,7 @@ def unopened(refusal: str) -> str:
     )
 
 
-def unreached(refusal: str) -> str:
+def explain_forward_refused(refusal: str) -> str:
     """Advice for a connection that the far end did not make."""
     if "prohibited" in refusal:
         return "let the SSH server there forward to it (AllowTcpForwarding, PermitOpen)"

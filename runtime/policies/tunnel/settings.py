@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from runtime.core.machine_names import Names
+from runtime.core.machine_names import HostReference
 from runtime.core.settings import Settings
 
 # Nothing here begins with "-", which ssh would take for an option, or means something to a shell, which ssh itself
@@ -70,7 +70,7 @@ def _configuration(path: str) -> str:
     return path if path == "none" else _path(path)
 
 
-File = Annotated[str, AfterValidator(_path), Names.FILE]
+File = Annotated[str, AfterValidator(_path), HostReference.FILE]
 
 
 class TunnelSettings(Settings):
@@ -91,9 +91,9 @@ class TunnelSettings(Settings):
     host_keys: Literal["strict", "accept-new"] = "strict"
     """"strict": the host's key has to be known; "accept-new": one that is seen for the first time is believed and
     kept. A key that has changed is refused in any case."""
-    known_hosts_file: Annotated[str, AfterValidator(_path), Names.WRITTEN] | None = None
+    known_hosts_file: Annotated[str, AfterValidator(_path), HostReference.WRITTEN] | None = None
     """Path of the known keys, where it is not ssh's own."""
-    ssh_config: Annotated[str, AfterValidator(_configuration), Names.FILE] | None = None
+    ssh_config: Annotated[str, AfterValidator(_configuration), HostReference.FILE] | None = None
     """Path of ssh's configuration in the place of ~/.ssh/config; "none" reads none."""
     session: bool = True
     """Whether the command `cat` is run there, which ends with the tunnel. Without a session OpenSSH's server collects

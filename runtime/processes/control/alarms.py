@@ -12,7 +12,7 @@ from runtime.ipc.observation_reader import LatestObservation
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.control.actuator import RobotActuator, TickSettings
 from runtime.processes.control.led import Led
-from runtime.processes.control.plausibility import Plausibility
+from runtime.processes.control.plausibility import JointPlausibility
 
 _SIBLING_SILENT = Pattern("control.sibling_silent", "no sign of life from {process} {since}")
 _HELD_ELSEWHERE = Pattern(
@@ -30,20 +30,20 @@ _RESTLESS, _STILL_S = 0.1, 0.3  # [rad/s], [s] of readings that rest, or slip sl
 _VERDICTS = 3  # ways that readings said nothing of, after which a joint is not led again
 
 
-def silent_sibling(shared: SharedState, now: float, allowed: Callable[[str], float]) -> str:
+def stale_heartbeat(shared: SharedState, now: float, allowed: Callable[[str], float]) -> str:
     """The process whose heartbeat is older than it is `allowed` to be [s], in a sentence; "" where none is."""
     for process in ("coordinator", "guard"):
         if not shared.alive(process, now, allowed(process)):
-            return _SIBLING_SILENT(process=process, since=shared.silence(process, now))
+            return _SIBLING_SILENT(process=process, since=shared.describe_silence(process, now))
     return ""
 
 
-class Displacement:
+class DisplacementMonitor:
     """Notices a robot that is far from where it is told to hold, and leads what is held to where it is.
 
     It was moved by hand, switched off, or its node was restarted: to send the old target would make it move by
     itself, and so would what moved it before it was not seen for a time. One sample says nothing: it is there when
-    several agree (`Plausibility.apart`).
+    several agree (`JointPlausibility.is_displaced`).
 
     An encoder that is off looks like that, but its joint follows the command, and its readings keep their distance. So
     no command follows a joint that leapt before the two have agreed for _AGREES_S, nor one a second time that has kept
@@ -54,10 +54,10 @@ class Displacement:
     on.
     """
 
-    def __init__(self, settings: TickSettings, plausibility: Plausibility) -> None:
+    def __init__(self, settings: TickSettings, plausibility: JointPlausibility) -> None:
         self._settings = settings
         self._plausibility = plausibility
-        self._angles = settings.limits.places
+        self._angles = settings.limits.position_mask
         dim = len(settings.limits.names)
         self._followed = np.zeros(dim, bool)  # their command was led to where they were read
         self._unsaid = np.zeros(dim, np.int64)  # how often readings said nothing on that way
@@ -78,7 +78,7 @@ class Displacement:
         self.begins = False  # whether it has been since this tick
         self._doubt = ""  # which joints are not followed since this tick, and why
 
-    def take_doubt(self) -> str:
+    def pop_untrusted_reason(self) -> str:
         """The joints that are not followed since it was asked last, and why; "" for none."""
         doubt, self._doubt = self._doubt, ""
         return doubt
@@ -96,7 +96,7 @@ class Displacement:
         self._compare(robot, measured, now)
         if measured is None:
             return None
-        returned = self._plausibility.returned()
+        returned = self._plausibility.pop_outage()
         if not (held or (returned and robot.engaged)) or self._settings.safety.report_only:
             self.goal = None
             return None
@@ -119,14 +119,14 @@ class Displacement:
         )
         if stopped:
             allowed[still] = min(allowed[0], safety.sagged + _BESIDE)
-        away = self.goal is None and self._away(robot, measured, allowed)
+        away = self.goal is None and self._exceeds(robot, measured, allowed)
         self._meeting = self._meeting and (away or self.goal is not None)
         if away:
-            where = self._plausibility.middle(measured)
-            self.follow(robot, where)
-            if self._away(robot, where, allowed):
+            where = self._plausibility.median_joints(measured)
+            self.update_target(robot, where)
+            if self._exceeds(robot, where, allowed):
                 limits = self._settings.limits
-                goal = np.clip(self.trusted(robot, where), limits.lower, limits.upper)
+                goal = np.clip(self.substitute_untrusted(robot, where), limits.lower, limits.upper)
                 # What hangs by its error alone stays: it would sink by it each time that another joint is led.
                 least = np.where(still, safety.sagged, allowed) if stopped else safety.sagged
                 self.goal = np.where(np.abs(where - robot.commanded) > least, goal, robot.commanded)
@@ -139,13 +139,13 @@ class Displacement:
         """Distance of the farthest joint from its command [rad]."""
         return float(np.abs(measured - robot.commanded).max(where=self._angles, initial=0.0))
 
-    def trusted(self, robot: RobotActuator, measured: Float64) -> Float64:
+    def substitute_untrusted(self, robot: RobotActuator, measured: Float64) -> Float64:
         """`measured` [D], and where it is told to be for a joint whose readings are not followed."""
         return np.where(self._distrusted, robot.commanded, measured)
 
-    def follow(self, robot: RobotActuator, measured: Float64) -> None:
+    def update_target(self, robot: RobotActuator, measured: Float64) -> None:
         """The command is about to be led to `measured` [D]: `doubt` names the joints for which it was before."""
-        where = self.trusted(robot, measured)
+        where = self.substitute_untrusted(robot, measured)
         away = self._angles & (np.abs(where - robot.commanded) > self._settings.safety.sagged)
         off = away & self._followed
         self._off |= off
@@ -161,7 +161,7 @@ class Displacement:
 
     def reason(self, robot: RobotActuator, measured: Float64 | None) -> str:
         """Why no motion may begin from what is held, "" where one may; `measured` [D], None where not known."""
-        if measured is None or not robot.engaged or not self._settings.guarded:
+        if measured is None or not robot.engaged or not self._settings.checks_measurements:
             return ""
         led = self._distrusted | (self._meeting or self.goal is not None)
         away = np.abs(measured - robot.commanded)
@@ -183,17 +183,17 @@ class Displacement:
             whole, 1.0, self._settings.safety.motion_velocity_scale
         )
 
-    def meet(self) -> None:
+    def converge_to_measured(self) -> None:
         """Lead what is held to where joints are read, also those that leapt: the operator wants it there."""
-        self.forget()
+        self.trust_all_joints()
         self._meeting = True
 
-    def leave_off(self) -> None:
+    def stop_converging(self) -> None:
         """Lead on no further for a set-up that is over: where the encoder is off, that would move the robot."""
         if self._meeting:
             self._meeting, self.goal = False, None
 
-    def forget(self) -> None:
+    def trust_all_joints(self) -> None:
         """Follow all joints again."""
         for joints in (self._followed, self._off, self._plausibility.leapt):
             joints[:] = False
@@ -229,10 +229,10 @@ class Displacement:
     def _distrusted(self) -> np.ndarray:
         return np.asarray(self._off | self._plausibility.leapt)
 
-    def _away(self, robot: RobotActuator, measured: Float64, allowed: Float64) -> bool:
-        apart = np.abs(self.trusted(robot, measured) - robot.commanded)
+    def _exceeds(self, robot: RobotActuator, measured: Float64, allowed: Float64) -> bool:
+        apart = np.abs(self.substitute_untrusted(robot, measured) - robot.commanded)
         far = bool((self._angles & (apart > allowed)).any())
-        return far and self._plausibility.apart(robot.commanded, allowed, self._distrusted)
+        return far and self._plausibility.is_displaced(robot.commanded, allowed, self._distrusted)
 
     def _still(self, now: float) -> np.ndarray:
         """The joints whose readings rest, bool [D]."""
@@ -242,7 +242,7 @@ class Displacement:
     def _compare(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
         """Follow those joints again that agree with their command."""
         if not robot.engaged:
-            self.forget()
+            self.trust_all_joints()
             self.goal = None
         apart = (
             True if measured is None else np.abs(measured - robot.commanded) > self._settings.safety.sagged

@@ -23,7 +23,7 @@ class Target(NamedTuple):
     action: Float64
     source: ControlSource
     path: Path | None
-    makers: Contributions = ()
+    contributions: Contributions = ()
     velocity: Float64 | None = None  # at the end of the tick, where it is not that on the way there
 
 
@@ -41,7 +41,7 @@ class Behaviour(ABC):
         """
 
 
-class Silent(Behaviour):
+class Disengaged(Behaviour):
     """Sends nothing: before the first set-up the robot is not ours."""
 
     name = "silent"
@@ -50,7 +50,7 @@ class Silent(Behaviour):
         return None
 
 
-class Yielded(Behaviour):
+class NodeDriven(Behaviour):
     """Sends nothing because the node drives the robot by its own leader; whatever stops us takes that back."""
 
     name = "yield"
@@ -70,7 +70,7 @@ class Hold(Behaviour):
         self._time = 0.0
 
     @property
-    def standing(self) -> bool:
+    def at_rest(self) -> bool:
         """True if it has come to a stand."""
         return self._time >= self._brake.duration
 
@@ -79,7 +79,7 @@ class Hold(Behaviour):
         return Target(self._brake.at(self._time), "hold", None, velocity=self._brake.velocity(self._time))
 
 
-class Move(Behaviour):
+class MoveTo(Behaviour):
     """Comes to a stand, then runs a trajectory of ours; its time goes on only with what was sent.
 
     `speed` is the part of the speed of such motions that it was planned with.
@@ -102,7 +102,7 @@ class Move(Behaviour):
             return Target(self._brake.at(self._next), "motion", None, velocity=velocity)
         return Target(self._motion.at(self._next - self._brake.duration), "motion", "motion")
 
-    def sent(self) -> None:
+    def advance(self) -> None:
         """The newest target was sent, and not refused."""
         self._time = self._next
 
@@ -111,7 +111,7 @@ class Move(Behaviour):
         return self._time >= self._brake.duration + self._motion.duration
 
 
-class EStopped(Behaviour):
+class EStopHold(Behaviour):
     """Sends where the robot comes to rest, or the last command where that is not known.
 
     Joints that stood within their steady error keep their command. The others go along with the measurement for
@@ -135,26 +135,26 @@ class EStopped(Behaviour):
         self._time = 0.0
 
     @property
-    def seen(self) -> bool:
+    def was_measured(self) -> bool:
         """True if the robot was seen since the e-stop was pressed."""
         return self._first is not None
 
-    def see(self, position: Float64) -> None:
+    def update_measured(self, position: Float64) -> None:
         """Take the measured position of a robot that comes to rest, no farther than it could go."""
         self._first = position if self._first is None else self._first
         farthest = self.rest + self._SLACK
         self.position = np.clip(position, self._first - farthest, self._first + farthest)
 
-    def stay(self, position: Float64) -> None:
+    def hold_at(self, position: Float64) -> None:
         """Hold the robot at `position` from now on."""
         self._first = self.position = position
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Nothing is sent until it is measured anew."""
         self.position = None
 
     @property
-    def follows(self) -> bool:
+    def is_settling(self) -> bool:
         """True while the arm may still be coming to rest."""
         return self._time <= self._FOLLOWS_S
 

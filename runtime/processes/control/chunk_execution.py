@@ -19,7 +19,7 @@ from runtime.motion.timeline import DimensionKinds, Timeline, difference
 from runtime.processes.control.actuator import TickSettings
 from runtime.processes.control.behaviours import Behaviour, Target
 from runtime.recording.base import ControlSource
-from runtime.strategies.base import Arrival, Merge, Merged, join
+from runtime.strategies.base import ArrivedChunk, Merge, MergeResult, join
 
 log = logging.getLogger(__name__)
 _CHUNK_UNUSABLE = Pattern("control.chunk_unusable", "control cannot use it: {kind}: {error}")
@@ -50,7 +50,7 @@ class Strategy:
     merge: Merge
 
 
-def strategy(section: Mapping[str, Any], dims: DimensionKinds) -> Strategy:
+def build_strategy(section: Mapping[str, Any], dims: DimensionKinds) -> Strategy:
     """The strategy of a deployment's section `strategy`; ConfigurationError where it is none."""
     known = variants("runtime.strategies")
     kind = section.get("kind")
@@ -73,7 +73,7 @@ class JoinResult(NamedTuple):
     """
 
     merged: ChunkMerged
-    far: str = ""
+    distance_note: str = ""
     too_far: bool = False
 
 
@@ -103,7 +103,7 @@ class ExecuteChunks(Behaviour):
         planned = self.timeline.at(step)
         if planned is None:
             return None
-        return Target(planned.action, self._source, "policy", planned.makers)
+        return Target(planned.action, self._source, "policy", planned.contributions)
 
     def ran_on(self, step: int, commanded: Float64) -> bool:
         """Whether what is planned for `step` has gone on while the robot, told to be at `commanded` [D], stood."""
@@ -111,7 +111,7 @@ class ExecuteChunks(Behaviour):
         if planned is None:
             return False
         apart = np.abs(difference(planned.action, commanded, self._settings.dims.wrapping))
-        return bool(apart.max(where=self._settings.limits.places, initial=0.0) > _JOINED_AT_ONCE)
+        return bool(apart.max(where=self._settings.limits.position_mask, initial=0.0) > _JOINED_AT_ONCE)
 
     def begin_anew(self) -> None:
         """Forget what is planned: the next chunk is a first one, and the robot waits for it."""
@@ -123,7 +123,7 @@ class ExecuteChunks(Behaviour):
     def tune(self, chosen: Strategy, step: int) -> None:
         """Merge by another strategy from now on; what is planned from `step` on stays."""
         self._switched = self._switched or chosen.kind != self._strategy.kind
-        if self._starved_since is None and self.waits and not self.timeline.remaining(step):
+        if self._starved_since is None and self.is_waiting and not self.timeline.remaining(step):
             self._expecting = True  # what the old strategy waited for is no gap of the new one
         self._strategy, self._useless = chosen, False
 
@@ -137,35 +137,39 @@ class ExecuteChunks(Behaviour):
             joined = self._join(chunk, step, commanded)
         except Exception as error:  # about one chunk: it must not end what keeps the robot held
             log.exception("chunk %d cannot be used", chunk.chunk_id)
-            joined = JoinResult(dropped(chunk, step, _CHUNK_UNUSABLE(kind=type(error).__name__, error=error)))
+            joined = JoinResult(
+                dropped_chunk(chunk, step, _CHUNK_UNUSABLE(kind=type(error).__name__, error=error))
+            )
         self._expecting = False
-        self._useless = bool(joined.merged.dropped) and chunk.waited
+        self._useless = bool(joined.merged.dropped) and chunk.requested_while_stopped
         return joined
 
     def _join(self, chunk: PostedChunk, step: int, commanded: Float64) -> JoinResult:
         rows, dim = chunk.rows, len(commanded)
         if rows.ndim != 2 or rows.shape[1] != dim or not len(rows):
             shape = _CHUNK_SHAPE(shape=list(rows.shape), width=dim)
-            return JoinResult(dropped(chunk, step, shape))
-        arrival = Arrival(chunk.chunk_id, chunk.observation_step, rows.astype(np.float64), chunk.waited)
+            return JoinResult(dropped_chunk(chunk, step, shape))
+        arrival = ArrivedChunk(
+            chunk.chunk_id, chunk.observation_step, rows.astype(np.float64), chunk.requested_while_stopped
+        )
         safety = self._settings.safety
         # A policy that means to begin elsewhere is told by its first row; a late one has gone on by the first used.
-        begin = arrival.rows[0] if chunk.meant is None else chunk.meant.astype(np.float64)
+        begin = arrival.rows[0] if chunk.intended_start is None else chunk.intended_start.astype(np.float64)
         if begin.shape != (dim,):
-            return JoinResult(dropped(chunk, step, _CHUNK_BEGIN(given=list(begin.shape), expected=dim)))
-        meant, where = self._away(begin, commanded)
+            return JoinResult(dropped_chunk(chunk, step, _CHUNK_BEGIN(given=list(begin.shape), expected=dim)))
+        meant, where = self._first_action_distance(begin, commanded)
         if meant > safety.jump:
             reason = _TOO_FAR(where=where, allowed=safety.jump)
-            return JoinResult(dropped(chunk, step, reason), reason, too_far=True)
-        away, where = self._away_where_used(arrival, step, commanded)
+            return JoinResult(dropped_chunk(chunk, step, reason), reason, too_far=True)
+        away, where = self._first_used_distance(arrival, step, commanded)
         far, late = _BLENDED_IN(where=where) if away > safety.first_action_far else "", away > safety.jump
         if late:  # the robot stood where the policy means to begin: no row of it is stale
-            arrival, far = replace(arrival, waited=True), _BEGUN_LATE(where=where)
-            away, where = self._away_where_used(arrival, step, commanded)
+            arrival, far = replace(arrival, requested_while_stopped=True), _BEGUN_LATE(where=where)
+            away, where = self._first_used_distance(arrival, step, commanded)
         if away > safety.jump:
             reason = _TOO_FAR(where=where, allowed=safety.jump)
-            return JoinResult(dropped(chunk, step, reason), reason, too_far=True)
-        held = commanded if away > _JOINED_AT_ONCE or self.starved else None
+            return JoinResult(dropped_chunk(chunk, step, reason), reason, too_far=True)
+        held = commanded if away > _JOINED_AT_ONCE or self.is_starved else None
         switched = self._switched
         merged = join(
             self._strategy.merge,
@@ -179,26 +183,26 @@ class ExecuteChunks(Behaviour):
         )
         merged = replace(merged, mistimed=merged.delay) if late else merged
         self._switched = switched and bool(merged.dropped)
-        return JoinResult(self._told(chunk, merged), far)
+        return JoinResult(self._to_message(chunk, merged), far)
 
-    def _away_where_used(self, arrival: Arrival, step: int, commanded: Float64) -> tuple[float, str]:
+    def _first_used_distance(self, arrival: ArrivedChunk, step: int, commanded: Float64) -> tuple[float, str]:
         """The same of the first row that is not stale."""
         if not self._expecting:
             return 0.0, ""
         placed = self._strategy.merge.place(self.timeline, arrival, step)
-        return self._away(placed.rows[0], commanded) if len(placed.rows) else (0.0, "")
+        return self._first_action_distance(placed.rows[0], commanded) if len(placed.rows) else (0.0, "")
 
-    def _away(self, row: Float64, commanded: Float64) -> tuple[float, str]:
+    def _first_action_distance(self, row: Float64, commanded: Float64) -> tuple[float, str]:
         """Distance of a run's first action from the robot [rad], and that in words; 0 for later ones."""
         settings = self._settings
         if not self._expecting or settings.safety.report_only:
             return 0.0, ""
         apart = difference(row, commanded, settings.dims.wrapping)
-        away = np.where(settings.limits.places, np.abs(apart), 0.0)
+        away = np.where(settings.limits.position_mask, np.abs(apart), 0.0)
         worst, name = float(away.max()), settings.limits.names[int(away.argmax())]
         return worst, _FIRST_ACTION_FAR(joint=name, distance=worst)
 
-    def _told(self, chunk: PostedChunk, merged: Merged) -> ChunkMerged:
+    def _to_message(self, chunk: PostedChunk, merged: MergeResult) -> ChunkMerged:
         return ChunkMerged(
             chunk_id=merged.chunk_id,
             run=chunk.run,
@@ -209,7 +213,7 @@ class ExecuteChunks(Behaviour):
             dropped=merged.dropped,
             strategy=self._strategy.kind,
             overlap=merged.overlap,
-            shares=merged.shares,
+            contributions=merged.contributions,
         )
 
     def bear(self, until: float) -> None:
@@ -220,31 +224,31 @@ class ExecuteChunks(Behaviour):
     # --- nothing planned -----------------------------------------------------------------------------------
 
     @property
-    def waits(self) -> bool:
+    def is_waiting(self) -> bool:
         """True if an empty timeline is as it should be: the operator, or the strategy, asks when it is."""
         if self._useless:
             return False
-        return self._expecting or self._one_by_one or self._strategy.merge.waits
+        return self._expecting or self._one_by_one or self._strategy.merge.requests_while_stopped
 
     @property
-    def starved(self) -> bool:
+    def is_starved(self) -> bool:
         return self._starved_since is not None
 
-    def starve(self, now: float) -> float | None:
+    def update_starvation(self, now: float) -> float | None:
         """Nothing is planned for this tick: how long that has been so, 0 when it begins, None while it waits."""
-        if self.waits:
+        if self.is_waiting:
             return None
         if self._starved_since is None:
             self._starved_since = now
         return now - self._starved_since
 
-    def fed(self, now: float) -> float | None:
+    def end_starvation(self, now: float) -> float | None:
         """An action was sent: how long there was none before it, None where there was no gap."""
         since, self._starved_since = self._starved_since, None
         return None if since is None else now - since
 
 
-def dropped(chunk: PostedChunk, step: int, why: str) -> ChunkMerged:
+def dropped_chunk(chunk: PostedChunk, step: int, why: str) -> ChunkMerged:
     """Report of a chunk that control has no use for."""
     nowhere = np.full(len(np.atleast_1d(chunk.rows)), -1, np.int64)
     return ChunkMerged(chunk.chunk_id, chunk.run, step, step - chunk.observation_step, nowhere, 0, why)

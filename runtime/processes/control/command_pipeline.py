@@ -13,13 +13,13 @@ from runtime.core.types import Float64
 from runtime.ipc.observation_reader import LatestObservation
 from runtime.motion.timeline import difference
 from runtime.motion.trajectories import Trajectory
-from runtime.processes.control.actuator import Actuator, Sent, TickSettings
-from runtime.processes.control.behaviours import Behaviour, Hold, Move, Silent, Target, Yielded
+from runtime.processes.control.actuator import Actuator, TickResult, TickSettings
+from runtime.processes.control.behaviours import Behaviour, Disengaged, Hold, MoveTo, NodeDriven, Target
 from runtime.processes.control.chunk_execution import ExecuteChunks
 from runtime.processes.control.gripper_locks import GripperLocks
 from runtime.processes.control.telemetry import Telemetry
 from runtime.safety.filter import RobotState, SafetyFilter
-from runtime.spaces.binary_grippers import Dwell, open_or_closed
+from runtime.spaces.binary_grippers import Dwell, snap_grippers
 
 _ACTIONS_AGAIN = Pattern("control.actions_again", "actions again after {seconds:.2f} s")
 _IN_A_ROW = Pattern("control.refused_in_a_row", "{count} actions refused in a row, the last one: {why}")
@@ -97,7 +97,7 @@ class CommandPipeline:
         self._unseen_since = 0.0  # when the last joints before them were measured [s]
         self._gap: _Gap | None = None
         self._gaps: deque[float] = deque(maxlen=_GAPS)  # when the newest of them began, in this run
-        self.behaviour: Behaviour = Silent()
+        self.behaviour: Behaviour = Disengaged()
         if actuator.engaged:
             self.hold_here()
 
@@ -109,43 +109,43 @@ class CommandPipeline:
         return self.behaviour if isinstance(self.behaviour, ExecuteChunks) else None
 
     @property
-    def stands(self) -> bool:
+    def is_stationary(self) -> bool:
         """True if the robot is to stay where it is: it holds, or its run has come to a stand."""
-        waits = self.run is not None and self._standing is not None and self._standing.standing
+        waits = self.run is not None and self._standing is not None and self._standing.at_rest
         return waits or isinstance(self.behaviour, Hold)
 
-    def silence(self) -> None:
+    def disengage(self) -> None:
         """Send nothing any more: the robot is not ours."""
         self._standing = None
         self.actuator.disengage()
-        self.behaviour = Silent()
+        self.behaviour = Disengaged()
 
-    def give_way(self) -> None:
+    def yield_to_node(self) -> None:
         """Leave the robot to its node."""
-        self.silence()
-        self.behaviour = Yielded()
+        self.disengage()
+        self.behaviour = NodeDriven()
 
     def hold(self) -> None:
         """Come to a stand and stay there; who is not engaged stays silent, the node stops what it drives."""
-        if isinstance(self.behaviour, Yielded):
-            self.silence()
+        if isinstance(self.behaviour, NodeDriven):
+            self.disengage()
         elif self.actuator.engaged and not isinstance(self.behaviour, Hold):
-            self.behaviour = self._standing or self._holding()
+            self.behaviour = self._standing or self._new_hold()
 
     def hold_here(self) -> None:
         """Hold anew, from the last command on."""
         self._standing = None
-        self.behaviour = self._holding()
+        self.behaviour = self._new_hold()
 
     def release(self) -> None:
         """The e-stop is over: hold, or be silent where the robot was never ours."""
-        self.behaviour = self._holding() if self.actuator.engaged else Silent()
+        self.behaviour = self._new_hold() if self.actuator.engaged else Disengaged()
 
     def hold_because(self, kind: str, reason: str) -> None:
         """Hold for a reason of control's own, and say so."""
         if self.behaviour.moving:
             self.hold()
-            self._report.say(kind, reason)
+            self._report.emit(kind, reason)
 
     def move(self, goal: Float64, speed: float) -> None:
         """Come to a stand, then go to `goal` at `speed`, a part of the speed of motions of ours.
@@ -154,20 +154,20 @@ class CommandPipeline:
         open or closed at its end, and switch at its beginning.
         """
         self._begin()
-        self._go(open_or_closed(self._settings.switches, goal, self.actuator.commanded), speed)
+        self._start_motion(snap_grippers(self._settings.switches, goal, self.actuator.commanded), speed)
 
-    def follow(self, run: ExecuteChunks) -> None:
+    def execute_run(self, run: ExecuteChunks) -> None:
         """Execute `run` from the next tick on."""
         self._begin()
         self.behaviour = run
 
-    def relock(self) -> None:
+    def on_locks_changed(self) -> None:
         """Locks have changed: a stop must not go on to where an unlocked gripper was before, it begins anew."""
         self._standing = None
         if isinstance(self.behaviour, Hold):
             self.hold_here()
-        elif isinstance(self.behaviour, Move):
-            self._go(self.behaviour.goal, self.behaviour.speed)
+        elif isinstance(self.behaviour, MoveTo):
+            self._start_motion(self.behaviour.goal, self.behaviour.speed)
 
     def _begin(self) -> None:
         self._standing, self._aim = None, None
@@ -175,32 +175,32 @@ class CommandPipeline:
         self._gaps.clear()
         self._verdicts.clear()
 
-    def _go(self, goal: Float64, speed: float) -> None:
+    def _start_motion(self, goal: Float64, speed: float) -> None:
         limits, safety = self._settings.limits, self._settings.safety
-        brake = self.actuator.brake()
+        brake = self.actuator.braking_motion()
         start = brake.at(brake.duration)
-        goal = limits.standing(np.where(np.isnan(goal), start, goal))  # a copy
+        goal = limits.with_zero_speeds(np.where(np.isnan(goal), start, goal))  # a copy
         if turning := list(self._settings.dims.wrapping):  # endless joints go the shorter way
             goal[turning] = (start + difference(goal, start, turning))[turning]
         top = limits.velocity * safety.motion_velocity_scale * speed
         begin = np.where(limits.binary, goal, start)
-        path = Trajectory(begin, goal, top, safety.motion_acceleration * limits.reach)
-        self.behaviour = Move(brake, path, goal, speed)
+        path = Trajectory(begin, goal, top, safety.motion_acceleration * limits.radian_scale)
+        self.behaviour = MoveTo(brake, path, goal, speed)
 
-    def _holding(self) -> Hold:
-        return Hold(self.actuator.brake())
+    def _new_hold(self) -> Hold:
+        return Hold(self.actuator.braking_motion())
 
     # --- one tick ------------------------------------------------------------------------------------------
 
-    def drive(self, step: int, planned: float, seen: LatestObservation) -> Sent:
+    def tick(self, step: int, planned: float, seen: LatestObservation) -> TickResult:
         """Tell the robot what the behaviour wants, as far as locks and safety let it pass."""
         before = self.actuator.commanded
         sent = self._drive(step, planned, seen)
         if sent.executed is not None:
-            self._dwell.sent(before, sent.executed, planned)
+            self._dwell.record_command(before, sent.executed, planned)
         return sent
 
-    def _drive(self, step: int, planned: float, seen: LatestObservation) -> Sent:
+    def _drive(self, step: int, planned: float, seen: LatestObservation) -> TickResult:
         run = self.run
         if run is not None and self._gap is not None:
             return self._wait_for_joints(run, self._gap, step, planned, seen)
@@ -210,28 +210,30 @@ class CommandPipeline:
         if target is None:
             return self._nothing_planned(step, planned, seen)
         if target.path is None:
-            sent = self._hold_to(step, planned, target, seen)
+            sent = self._send_hold(step, planned, target, seen)
             self._standing = None  # what is sent now is another stop: the old one must not go on later
         else:
             sent = self._judge(step, planned, target, seen)
-        if isinstance(self.behaviour, Move):
+        if isinstance(self.behaviour, MoveTo):
             self._finish(self.behaviour, sent)
         return sent
 
-    def _judge(self, step: int, planned: float, target: Target, seen: LatestObservation) -> Sent:
-        action, notes = self._permitted(target.action, planned)
+    def _judge(self, step: int, planned: float, target: Target, seen: LatestObservation) -> TickResult:
+        action, notes = self._apply_locks(target.action, planned)
         state = self.actuator.state(seen, planned, self._aim)
         verdict = self._safety.judge(action, state, target.path or "policy")
         if verdict.action is None:
             return self._refuse(step, planned, target, (*notes, *verdict.notes), seen)
         self.refused, self._unseen, self._standing, self._aim = 0, 0, None, action
         self._verdicts.append(False)
-        if self.run is not None and (gap := self.run.fed(planned)) is not None:
-            self._report.say("recovered", _ACTIONS_AGAIN(seconds=gap))
+        if self.run is not None and (gap := self.run.end_starvation(planned)) is not None:
+            self._report.emit("recovered", _ACTIONS_AGAIN(seconds=gap))
         sent = self.actuator.send(step, planned, target, verdict.action, (*notes, *verdict.notes))
-        return sent._replace(limited=verdict.most, change=verdict.change, near=verdict.near)
+        return sent._replace(
+            limited=verdict.largest_change_note, change=verdict.change, near=verdict.near_collision
+        )
 
-    def _hold_to(self, step: int, planned: float, target: Target, seen: LatestObservation) -> Sent:
+    def _send_hold(self, step: int, planned: float, target: Target, seen: LatestObservation) -> TickResult:
         """Send a braking or held target as it is; a gripper that is locked elsewhere goes there within its limits."""
         self._aim = None
         action = target.action
@@ -239,7 +241,7 @@ class CommandPipeline:
         if target.source == "estop":
             action = self._approach(action, seen, planned)
         else:
-            locked, notes = self._permitted(action, planned)
+            locked, notes = self._apply_locks(action, planned)
             if notes:
                 action = np.where(self._locks.on, self._to_lock(locked, seen, planned), action)
         return self.actuator.send(step, planned, target, action, notes)
@@ -247,24 +249,24 @@ class CommandPipeline:
     def _to_lock(self, locked: Float64, seen: LatestObservation, planned: float) -> Float64:
         """Towards where grippers are locked [D], as fast as motions of ours; to a stand while the robot is not seen."""
         state = self.actuator.state(seen, planned, locked)
-        if self._safety.blind(state):
-            locked, state = state.previous, replace(state, aim=None)
+        if self._safety.unknown_state_reason(state):
+            locked, state = state.previous, replace(state, previous_target=None)
         return self._safety.reachable(locked, state, "motion")
 
     def _approach(self, where: Float64, seen: LatestObservation, planned: float) -> Float64:
         """Towards where the e-stop holds the robot, as fast as it moves; a base stands at once."""
-        if not self._settings.guarded:
+        if not self._settings.checks_measurements:
             return where
         state = self.actuator.state(seen, planned, where)
         reachable = self._safety.reachable(where, state).copy()
         reachable[list(self._settings.limits.speeds)] = where[list(self._settings.limits.speeds)]
         return reachable
 
-    def _permitted(self, action: Float64, planned: float) -> tuple[Float64, tuple[str, ...]]:
+    def _apply_locks(self, action: Float64, planned: float) -> tuple[Float64, tuple[str, ...]]:
         """`action` [D] as far as locks, and what a gripper that switches can be, let it be; and notes on that."""
         commanded = self.actuator.commanded
         action, locked = self._locks.apply(action)
-        action = open_or_closed(self._settings.switches, action, commanded)
+        action = snap_grippers(self._settings.switches, action, commanded)
         action, kept = self._dwell.apply(action, commanded, planned)
         return action, (*locked, *kept)
 
@@ -275,7 +277,7 @@ class CommandPipeline:
         target: Target | None,
         notes: tuple[str, ...],
         seen: LatestObservation,
-    ) -> Sent:
+    ) -> TickResult:
         run, unseen = self.run, self._safety.unseen(self.actuator.state(seen, planned, None))
         if self._unseen and not self._known():  # back, and not yet believed
             unseen = notes[-1]
@@ -283,9 +285,9 @@ class CommandPipeline:
         self._unseen_since = self._unseen_since if self._unseen else seen.joints_captured
         self._unseen = self._unseen + 1 if unseen and run is not None else 0
         self._verdicts.append(True)
-        self._brace()
+        self._braking_hold()
         if planned - self._refused_at > _QUIET_S:
-            self._report.say("refused", notes[-1])
+            self._report.emit("refused", notes[-1])
         self._refused_at = planned
         refused = sum(self._verdicts)
         if refused < self._settings.safety.refusals_to_hold:
@@ -295,16 +297,16 @@ class CommandPipeline:
             self._gaps.append(planned)
             run.begin_anew()
             seconds = self._settings.safety.joint_gap_s
-            self._report.say("joints_missing", _JOINTS_MISSING(why=unseen, seconds=seconds))
+            self._report.emit("joints_missing", _JOINTS_MISSING(why=unseen, seconds=seconds))
         else:
             told = {"count": refused, "why": notes[-1]}
             in_row, of = refused == self.refused, len(self._verdicts)
             self.hold_because("refusals", _IN_A_ROW(**told) if in_row else _OF_THE_LAST(**told, of=of))
-        return self._stand(step, planned, seen)._replace(target=target, notes=notes, refused=True)
+        return self._send_braking(step, planned, seen)._replace(target=target, notes=notes, refused=True)
 
     def _wait_for_joints(
         self, run: ExecuteChunks, gap: _Gap, step: int, planned: float, seen: LatestObservation
-    ) -> Sent:
+    ) -> TickResult:
         """Stand until the joints are seen and believed again; then go on with the next chunk, or hold."""
         state, why = self.actuator.state(seen, planned, None), ""
         allowed, unseen = self._settings.safety.joint_gap_s, self._safety.unseen(state)
@@ -314,21 +316,25 @@ class CommandPipeline:
         if missing > allowed:
             why = _IN_A_ROW(count=self.refused, why=unseen or _BACK_LATE(seconds=missing, allowed=allowed))
         elif planned - gap.since > allowed + _BELIEVED_S:  # or control itself did not look for so long
-            why = _NOT_BELIEVED(seconds=missing, why=state.doubt or _DISAGREE)
-        elif not unseen and not state.doubt and self._believed():
+            why = _NOT_BELIEVED(seconds=missing, why=state.implausible_reason or _DISAGREE)
+        elif not unseen and not state.implausible_reason and self._believed():
             why = self._elsewhere(state, missing)
             if not why:
                 self._go_on(run, missing)
         if why:
             self.hold_because("refusals", why)
-        return self._stand(step, planned, seen)._replace(refused=True)
+        return self._send_braking(step, planned, seen)._replace(refused=True)
 
     def _look_whether_seen(
         self, run: ExecuteChunks, step: int, planned: float, seen: LatestObservation
     ) -> None:
         """Joints are back before the run waited for them: what was planned meanwhile is not caught up either."""
         state = self.actuator.state(seen, planned, None)
-        if not self._safety.unseen(state) and not state.doubt and run.ran_on(step, state.previous):
+        if (
+            not self._safety.unseen(state)
+            and not state.implausible_reason
+            and run.ran_on(step, state.previous)
+        ):
             self._go_on(run, planned - self._unseen_since)
 
     def _may_wait(self, planned: float) -> bool:
@@ -339,7 +345,7 @@ class CommandPipeline:
     def _elsewhere(self, state: RobotState, missing: float) -> str:
         """Which joint is not where it was told to stand, "" where all are."""
         limits, allowed = self._settings.limits, self._settings.safety.steady_error
-        apart = np.where(limits.places, np.abs(state.measured - state.previous), 0.0)
+        apart = np.where(limits.position_mask, np.abs(state.measured - state.previous), 0.0)
         apart[np.isnan(apart)] = np.inf  # nobody knows
         worst = int(apart.argmax())
         if apart[worst] <= allowed:
@@ -351,44 +357,44 @@ class CommandPipeline:
         run.begin_anew()  # what came meanwhile was meant for joints of before
         self.refused, self._unseen, self._gap = 0, 0, None
         self._verdicts.clear()
-        self._report.say("joints_back", _JOINTS_BACK(seconds=missing))
+        self._report.emit("joints_back", _JOINTS_BACK(seconds=missing))
 
-    def _nothing_planned(self, step: int, planned: float, seen: LatestObservation) -> Sent:
+    def _nothing_planned(self, step: int, planned: float, seen: LatestObservation) -> TickResult:
         run = self.run
         if run is None:
-            return Sent(planned)
+            return TickResult(planned)
         unseen = self._safety.unseen(self.actuator.state(seen, planned, None))
-        if unseen and not run.waits:  # nobody can answer without joints
+        if unseen and not run.is_waiting:  # nobody can answer without joints
             return self._refuse(step, planned, None, (unseen,), seen)
-        self._brace()
-        starved = run.starve(planned)
+        self._braking_hold()
+        starved = run.update_starvation(planned)
         if starved == 0.0:
-            self._report.say("starved", _NO_ACTION)
+            self._report.emit("starved", _NO_ACTION)
         borne = self._settings.starvation == "slow" and planned < run.borne_until
         if starved is not None and starved >= self._settings.starvation_patience and not borne:
             self.hold_because("starvation", _STARVED(seconds=starved) if starved else _STARVED_AT_ONCE)
-        return self._stand(step, planned, seen)
+        return self._send_braking(step, planned, seen)
 
-    def _stand(self, step: int, planned: float, seen: LatestObservation) -> Sent:
+    def _send_braking(self, step: int, planned: float, seen: LatestObservation) -> TickResult:
         """Send the next point of a stop instead of what could not be sent."""
-        target = self._brace().target(step, self.actuator.elapsed(planned))
-        return self._hold_to(step, planned, target, seen)._replace(target=None)
+        target = self._braking_hold().target(step, self.actuator.elapsed(planned))
+        return self._send_hold(step, planned, target, seen)._replace(target=None)
 
-    def _brace(self) -> Hold:
+    def _braking_hold(self) -> Hold:
         """The stop that is under way in place of what could not be sent; `hold` goes on with it."""
         if self._standing is None:
-            self._standing = self._holding()
+            self._standing = self._new_hold()
         return self._standing
 
-    def _finish(self, move: Move, sent: Sent) -> None:
+    def _finish(self, move: MoveTo, sent: TickResult) -> None:
         """A motion is done when its end has been sent: not refused, and not limited on the way there."""
         if sent.executed is None:
             return
         if sent.refused:
-            self._go(move.goal, move.speed)  # from where it stands, when it may go on
+            self._start_motion(move.goal, move.speed)  # from where it stands, when it may go on
             return
-        move.sent()
+        move.advance()
         left = np.where(self._locks.on, 0.0, np.abs(sent.executed - move.goal))
         if move.finished and left.max() <= _ARRIVED:
             self.hold_here()
-            self._report.say("motion_done", _ARRIVED_THERE)
+            self._report.emit("motion_done", _ARRIVED_THERE)

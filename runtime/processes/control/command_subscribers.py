@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 from runtime.core.errors import RuntimeFault
 from runtime.core.sentences import Pattern, fixed, series
-from runtime.ipc.messages import HEARD, UNHEARD
+from runtime.ipc.messages import ALL_SUBSCRIBED, NO_SUBSCRIBER
 from runtime.ipc.shared_state import SharedState
 from runtime.transports.base import Sink
 
@@ -21,20 +21,20 @@ class SubscriberCheck:
     """Asks the sink now and then who does not take commands; the event has all of them under `unheard`."""
 
     def __init__(self, shared: SharedState, sink: Sink, say: Say) -> None:
-        self._page, self._sink, self._say = shared, sink, say
+        self._shared_state, self._sink, self._say = shared, sink, say
         self._next = float("-inf")
         self._told: dict[str, str] = {}
 
-    def look(self, now: float) -> None:
+    def poll(self, now: float) -> None:
         """One tick; a coordinator that was started anew is told again."""
-        if self._page.last_beat("coordinator") == 0.0:
+        if self._shared_state.last_beat("coordinator") == 0.0:
             self._told, self._next = {}, now
             return
         if now < self._next:
             return
         self._next = now + _EVERY_S
         try:
-            unheard = self._sink.unheard()
+            unheard = self._sink.missing_subscribers()
         except RuntimeFault as error:  # commands go out all the same
             unheard = {"": str(error)}
         if unheard == self._told:
@@ -42,6 +42,6 @@ class SubscriberCheck:
         self._told = unheard
         if unheard:
             said = [why or _UNHEARD(place=place) for place, why in sorted(unheard.items())]
-            self._say(UNHEARD, series(said), {"unheard": unheard})
+            self._say(NO_SUBSCRIBER, series(said), {"unheard": unheard})
         else:
-            self._say(HEARD, _HEARD, {"unheard": {}})
+            self._say(ALL_SUBSCRIBED, _HEARD, {"unheard": {}})

@@ -7,7 +7,7 @@ import numpy as np
 from runtime.core.sentences import Pattern, fixed, series
 from runtime.core.types import Float64
 from runtime.safety.filter import Limits
-from runtime.spaces.binary_grippers import Switch, open_or_closed
+from runtime.spaces.binary_grippers import BinaryGripper, snap_grippers
 
 _LOCKS_OF_OTHER_SHAPE = Pattern(
     "control.locks_of_other_shape",
@@ -23,7 +23,7 @@ _SAME = 1e-9
 class GripperLocks:
     """Replaces locked dimensions of an action, after the plan and before safety."""
 
-    def __init__(self, limits: Limits, switches: tuple[Switch, ...] = ()) -> None:
+    def __init__(self, limits: Limits, switches: tuple[BinaryGripper, ...] = ()) -> None:
         self._limits = limits
         self._switches = switches
         self._notes: dict[int, str] = {}
@@ -44,7 +44,7 @@ class GripperLocks:
         if len(wrong):
             return _NO_GRIPPER(joint=limits.names[wrong[0]])
         within = np.clip(values.astype(np.float64), limits.lower, limits.upper)
-        self.values = open_or_closed(self._switches, within, commanded)
+        self.values = snap_grippers(self._switches, within, commanded)
         self.on = ~np.isnan(self.values)
         self._notes = {
             int(i): _LOCKED_AT(joint=limits.names[i], value=round(float(self.values[i]), 4))

@@ -25,11 +25,11 @@ class NodeHandover:
         self._word, self._left, self._last = "", 0, float("-inf")
 
     @property
-    def telling(self) -> bool:
+    def is_repeating(self) -> bool:
         """True if its word is to be said again."""
         return self._left > 0
 
-    def look(self, yielded: bool, now: float) -> None:
+    def update(self, yielded: bool, now: float) -> None:
         """One tick at `now` [s]: the robot is the node's, or is not."""
         if yielded is not self._yielded:
             self._yielded = yielded

@@ -76,7 +76,7 @@ class _Chain:
     def newest(self) -> _Sample:
         return self.samples[-1]
 
-    def lately(self, needed: float) -> list[_Sample]:
+    def recent(self, needed: float) -> list[_Sample]:
         """The newest samples that span `needed` seconds, [] while there are too few."""
         enough: list[_Sample] = []
         for sample in reversed(self.samples):
@@ -93,7 +93,7 @@ class _Chain:
         self.samples.append(newest)
 
 
-class Plausibility:
+class JointPlausibility:
     """Judges each new sample of the joints by those before it.
 
     A sample is believed where no joint is beyond its limits or has moved faster than it can since the last believed
@@ -107,7 +107,7 @@ class Plausibility:
     def __init__(self, limits: Limits, dims: DimensionKinds) -> None:
         self._limits = limits
         self._wrapping = dims.wrapping
-        self._places = limits.places
+        self._places = limits.position_mask
         self._chain: _Chain | None = None  # what is believed
         self._other: _Chain | None = None  # what contradicts it
         self._before: Float64 | None = None  # what was believed before the joints were missing
@@ -119,14 +119,14 @@ class Plausibility:
         self._judged: float | None = None
         self._unseen = 0.0  # how long there has been no sample; a stall of our own counts little [s]
         self._doubt = ""
-        self._digits = _Digits(len(limits.names))
-        self._frozen = _Frozen(limits)
+        self._digits = _LastDigitActivity(len(limits.names))
+        self._frozen = _FrozenJointDetector(limits)
         self.leapt = np.zeros(
             len(limits.names), bool
         )  # were believed elsewhere, and no way was seen to there
         self.dead = ""  # the joints that have read exactly 0 since they came back from somewhere else
 
-    def trust(self) -> None:
+    def reset_zeros(self) -> None:
         """The robot is taken over anew: a joint that reads 0 stands there."""
         self.dead = ""
 
@@ -143,32 +143,32 @@ class Plausibility:
             self._captured, self._joints = seen.joints_captured, seen.joints
             self._doubt = self._take(_Sample(seen.joints, seen.joints_captured, now), commanded)
             self._unseen = 0.0 if fresh else self._unseen
-        return replace(seen, doubt=self._doubt) if self._doubt else seen
+        return replace(seen, implausible_reason=self._doubt) if self._doubt else seen
 
     @property
-    def known(self) -> bool:
+    def has_known_sample(self) -> bool:
         """True if any sample was believed since joints were last missing."""
         return self._chain is not None
 
     @property
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         """True if samples have agreed for as long as they have to, up to the newest."""
-        return self._chain is not None and not self._doubt and bool(self._chain.lately(self._needed))
+        return self._chain is not None and not self._doubt and bool(self._chain.recent(self._needed))
 
-    def apart(self, held: Float64, allowed: Float64 | float, but: np.ndarray | bool = False) -> bool:
+    def is_displaced(self, held: Float64, allowed: Float64 | float, but: np.ndarray | bool = False) -> bool:
         """True if all samples that have to agree are farther than `allowed` [rad] or [D] from `held` [D].
 
         The joints `but`, bool [D], do not count.
         """
-        lately = self._chain.lately(self._needed) if self._chain and not self._doubt else []
+        lately = self._chain.recent(self._needed) if self._chain and not self._doubt else []
         return bool(lately) and all(self._away(sample.joints, held, allowed, but) for sample in lately)
 
-    def returned(self) -> float:
+    def pop_outage(self) -> float:
         """For how long the joints were missing before those that are believed now came [s]; 0 the second time."""
         missing, self._missing = (0.0 if self._chain is None else self._missing), 0.0
         return missing
 
-    def middle(self, joints: Float64) -> Float64:
+    def median_joints(self, joints: Float64) -> Float64:
         """The middle of the newest three believed samples, number by number: a spike among them does not count.
 
         Angles that wrap are counted in the turn of `joints` [D]. After a gap it is `joints` until there are three:
@@ -183,7 +183,7 @@ class Plausibility:
 
     def speed(self) -> Float64:
         """Median velocity [D] between the newest believed samples that have to agree: a step among them is none."""
-        lately = [] if self._chain is None else self._chain.lately(CONSISTENT_S)
+        lately = [] if self._chain is None else self._chain.recent(CONSISTENT_S)
         steps = [
             difference(after.joints, before.joints, self._wrapping)
             / max(after.captured - before.captured, _EPSILON)
@@ -199,7 +199,7 @@ class Plausibility:
         if beyond := self._beyond(sample.joints):
             self._other = None
             return beyond
-        if self._chain is not None and self._goes_on(self._chain, sample):
+        if self._chain is not None and self._continues(self._chain, sample):
             self._digits.add(difference(sample.joints, self._chain.newest.joints, self._wrapping))
             if self._other is not None:  # what was believed before does not agree with this one for that long
                 self._chain.samples.clear()
@@ -209,16 +209,18 @@ class Plausibility:
             return stuck or self._frozen(sample.joints, sample.captured, commanded)
         return self._contradiction(sample)
 
-    def _goes_on(self, chain: _Chain, sample: _Sample) -> bool:
+    def _continues(self, chain: _Chain, sample: _Sample) -> bool:
         """True if the sample follows what is believed, rather than what contradicts it."""
-        if self._faster(chain.newest, sample).any() or self._dies(chain, sample):
+        if self._faster(chain.newest, sample).any() or self._drop_to_zero(chain, sample):
             return False
-        if self._swaps(chain, sample):
+        if self._has_swapped(chain, sample):
             return False
         other = self._other
-        return other is None or self._way(chain.newest, sample) <= self._way(other.newest, sample)
+        return other is None or self._min_travel_time(chain.newest, sample) <= self._min_travel_time(
+            other.newest, sample
+        )
 
-    def _way(self, before: _Sample, after: _Sample) -> float:
+    def _min_travel_time(self, before: _Sample, after: _Sample) -> float:
         """Least time from one sample to the other, of the joint that needs longest [s]."""
         moved = np.abs(difference(after.joints, before.joints, self._wrapping)) / self._limits.velocity
         return float(moved.max(where=self._places, initial=0.0))
@@ -226,13 +228,13 @@ class Plausibility:
     def _contradiction(self, sample: _Sample) -> str:
         other = self._other
         if other is not None and not self._faster(other.newest, sample).any():
-            self._digits.turn(difference(sample.joints, other.newest.joints, self._wrapping))
+            self._digits.add_step(difference(sample.joints, other.newest.joints, self._wrapping))
             other.samples.append(sample)
         else:
             if other is not None or self._chain is not None:
                 self._contradict(sample.seen)
-            self._other = other = _Chain(sample, self._never(sample))
-        if not other.never and not (stuck := self._stuck(other)) and other.lately(self._needed):
+            self._other = other = _Chain(sample, self._permanent_reason(sample))
+        if not other.never and not (stuck := self._stuck(other)) and other.recent(self._needed):
             self.dead = "" if self._before is None else self._zeros(self._before, other.samples[0].joints)
             if (
                 self._chain is not None
@@ -252,7 +254,7 @@ class Plausibility:
 
     def _beyond(self, joints: Float64) -> str:
         limits = self._limits
-        beyond = np.where(self._places, limits.outside(joints), 0.0)
+        beyond = np.where(self._places, limits.excess(joints), 0.0)
         worst = int(beyond.argmax())
         if beyond[worst] <= _BEYOND:
             return ""
@@ -284,18 +286,18 @@ class Plausibility:
             speed=self._limits.velocity[worst],
         )
 
-    def _never(self, sample: _Sample) -> str:
+    def _permanent_reason(self, sample: _Sample) -> str:
         """Why samples from this one on are never believed: a question, for numbers alone do not answer it."""
         if self._chain is None:
             return ""
         before = self._chain.newest
-        if exchanged := self._exchanged(before, sample):
+        if exchanged := self._swapped_joints(before, sample):
             return _EXCHANGED(joints=exchanged)
-        if dead := self._dies(self._chain, sample):
+        if dead := self._drop_to_zero(self._chain, sample):
             return _ENCODER_DEAD(what=dead)
         return ""
 
-    def _exchanged(self, before: _Sample, after: _Sample) -> str:
+    def _swapped_joints(self, before: _Sample, after: _Sample) -> str:
         """The joints whose values are those of each other, as far as they can have moved meanwhile."""
         away = np.abs(difference(after.joints, before.joints, self._wrapping))
         other = np.flatnonzero(self._places & (away > _SAME))
@@ -307,7 +309,7 @@ class Plausibility:
             return ""
         return " and ".join(self._limits.names[i] for i in other)
 
-    def _swaps(self, chain: _Chain, sample: _Sample) -> bool:
+    def _has_swapped(self, chain: _Chain, sample: _Sample) -> bool:
         """True if joints have leapt, no farther than they can but harder, to exactly each other's values."""
         newest, before = chain.newest, chain.samples[-2 if len(chain.samples) > 1 else -1]
         passed = max(sample.captured - newest.captured, _EPSILON)
@@ -331,7 +333,7 @@ class Plausibility:
         joints = np.array([sample.joints for sample in chain.samples])
         moved = np.abs(difference(joints[-1], self._chain.newest.joints, self._wrapping)) > _SAME
         still = np.ptp(joints, axis=0) == 0.0
-        never = self._digits.lively
+        never = self._digits.active
         if (self._places & ~still).any():  # not all have come to rest
             never = never | self._digits.changing
         return self._stays(self._places & never & moved & still, joints[-1])
@@ -343,7 +345,7 @@ class Plausibility:
         first = int(which.argmax())
         return _STUCK(joint=self._limits.names[first], value=joints[first])
 
-    def _dies(self, chain: _Chain, sample: _Sample) -> str:
+    def _drop_to_zero(self, chain: _Chain, sample: _Sample) -> str:
         """The joints that jump to exactly 0, and neither come by it on their way nor go back to it."""
         newest = chain.newest
         if not (zeros := self._zeros(newest.joints, sample.joints)) or len(chain.samples) < _CONSISTENT:
@@ -368,7 +370,7 @@ class Plausibility:
         return bool((self._places & np.logical_not(but) & (apart > allowed)).any())
 
 
-class Unquestioned(Plausibility):
+class TrustingPlausibility(JointPlausibility):
     """Believes each sample: what moves no robot jumps where its recording begins anew."""
 
     def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
@@ -377,14 +379,14 @@ class Unquestioned(Plausibility):
         return seen
 
     @property
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         return self._chain is not None
 
-    def apart(self, held: Float64, allowed: Float64 | float, but: np.ndarray | bool = False) -> bool:
+    def is_displaced(self, held: Float64, allowed: Float64 | float, but: np.ndarray | bool = False) -> bool:
         return self._chain is not None and self._away(self._chain.newest.joints, held, allowed, but)
 
 
-class _Digits:
+class _LastDigitActivity:
     """Which joints are never still, in their last digits: they went there and back, and did not come to rest since."""
 
     def __init__(self, dim: int) -> None:
@@ -394,21 +396,21 @@ class _Digits:
         self._leapt = np.zeros(dim, bool)
         self._changed = np.zeros(dim, np.int64)
 
-    def turn(self, step: Float64) -> None:
+    def add_step(self, step: Float64) -> None:
         """The difference of two samples [D], believed or not."""
         self._turns += (step * self._step < 0.0) & (np.abs(step) < _DIGITS)
         self._step = np.where(step != 0.0, step, self._step)
 
     def add(self, step: Float64) -> None:
         """That of two which are believed [D]."""
-        self._leapt = np.where(step != 0.0, self.lively & (np.abs(step) > _LEAP), self._leapt)
-        self.turn(step)
+        self._leapt = np.where(step != 0.0, self.active & (np.abs(step) > _LEAP), self._leapt)
+        self.add_step(step)
         self._still = np.where(step == 0.0, self._still + 1, 0)
         self._changed = np.where(step == 0.0, 0, self._changed + 1)
         self._turns[self._still >= _STILL] = 0
 
     @property
-    def lively(self) -> np.ndarray:
+    def active(self) -> np.ndarray:
         """Bool [D]."""
         return np.asarray(self._turns >= _TURNS)
 
@@ -423,7 +425,7 @@ class _Digits:
         return np.asarray(self._leapt & (self._still >= _CONSISTENT - 1))
 
 
-class _Frozen:
+class _FrozenJointDetector:
     """Notices a joint whose number stays the same, under fresh stamps, while its command moves."""
 
     def __init__(self, limits: Limits) -> None:
@@ -446,7 +448,7 @@ class _Frozen:
         np.copyto(high, np.where(fresh, commanded, np.maximum(high, commanded)))
         self._moved[high - low <= _FROZEN_RAD] = captured
         late = (captured - self._since >= _FROZEN_S) & (captured - self._moved >= _LATENCY_S)
-        frozen = self._limits.places & late
+        frozen = self._limits.position_mask & late
         if not frozen.any():
             return ""
         worst = int(np.where(frozen, high - low, 0.0).argmax())

@@ -16,14 +16,14 @@ from runtime.core.plugins import variants
 from runtime.core.quantiles import quantiles
 from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.shared_state import SharedState
-from runtime.processes.child import join
+from runtime.processes.child import join_station
 from runtime.processes.control.chunk_execution import Strategy
 from runtime.processes.control.telemetry import StatusRecord
 from runtime.processes.control.tick import Tick, TickSettings
 from runtime.safety.collision import Collisions
 from runtime.safety.filter import SafetyFilter
 from runtime.safety.workspace import Workspace
-from runtime.spaces.binary_grippers import switches
+from runtime.spaces.binary_grippers import binary_grippers_of
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Sink
 
@@ -78,7 +78,7 @@ def make_tick(spec: StationSpec, shared: SharedState, sink: Sink, now: Callable[
             starvation=deployment.faults.starvation,
             starvation_hold=deployment.control.starvation_hold_s,
             moves_robot=spec.capabilities.moves_robot,
-            switches=switches(spec.robot),
+            switches=binary_grippers_of(spec.robot),
             publication=make_publisher(spec),
         ),
         now,
@@ -117,7 +117,7 @@ class Loop:
 
     def __init__(self, tick: Tick, shared: SharedState, clock: Clock, rate: float, scheduling: str) -> None:
         self._tick = tick
-        self._page = shared
+        self._shared_state = shared
         self._clock = clock
         self._period = 1.0 / rate
         self._lateness = Lateness(tick.status, scheduling)
@@ -126,7 +126,7 @@ class Loop:
         self._n = 0
         self._collect_at = 0.0
 
-    def once(self) -> None:
+    def tick_once(self) -> None:
         """Wait for the next deadline and do its tick."""
         deadline = self._start + self._n * self._period
         self._clock.sleep_until(deadline)
@@ -135,7 +135,7 @@ class Loop:
         self._n += missed
         self._step += missed
         planned = deadline + missed * self._period
-        self._page.beat("control", now)
+        self._shared_state.beat("control", now)
         self._tick(self._step, planned, now)
         self._lateness.add(now - deadline, missed)
         self._n += 1
@@ -148,7 +148,7 @@ class Loop:
 
 def main() -> None:
     """Tick until the supervisor is gone, then hold for a while, then end."""
-    member = join("control", pictures=False, unread=_UNREAD)
+    member = join_station("control", pictures=False, unread=_UNREAD)
     spec, shared = member.spec, member.shared
     clock = MonotonicClock()
     for _ in shared.rings["orders"].drain():
@@ -157,30 +157,32 @@ def main() -> None:
     _connect(sink, clock, member.lifeline)
     tick = make_tick(spec, shared, sink, clock.now)
     settings = spec.deployment.control
-    scheduling = realtime.enter(settings.realtime_priority) if settings.realtime == "auto" else "ordinary"
+    scheduling = (
+        realtime.enter_realtime(settings.realtime_priority) if settings.realtime == "auto" else "ordinary"
+    )
     log.info("ticking at %g Hz, scheduling %s", spec.rate, scheduling)
     loop = Loop(tick, shared, clock, spec.rate, scheduling)
-    while not member.lifeline.cut:
-        loop.once()
+    while not member.lifeline.is_cut:
+        loop.tick_once()
     log.info(
         "the supervisor has ended: holding what is commanded for %g s, then ending", settings.orphan_hold_s
     )
-    outlive(loop, tick, shared, clock, settings.orphan_hold_s)
+    hold_then_end(loop, tick, shared, clock, settings.orphan_hold_s)
     sink.close()
     shared.beat("control", 0.0)  # processes that outlive control need not find out by its silence
 
 
-def outlive(loop: Loop, tick: Tick, shared: SharedState, clock: Clock, seconds: float) -> None:
+def hold_then_end(loop: Loop, tick: Tick, shared: SharedState, clock: Clock, seconds: float) -> None:
     """Take the robot back from its node, and hold what is commanded for so long; where nothing is, nothing is held."""
-    tick.orphan()
+    tick.hold_orphaned()
     until = clock.now() + seconds
-    loop.once()
-    while tick.telling or (clock.now() < until and shared.control.read()["engaged"]):
-        loop.once()
+    loop.tick_once()
+    while tick.is_handing_over or (clock.now() < until and shared.control.read()["engaged"]):
+        loop.tick_once()
 
 
 def _connect(sink: Sink, clock: Clock, lifeline: Lifeline) -> None:
-    while not lifeline.cut:
+    while not lifeline.is_cut:
         try:
             sink.connect()
         except RuntimeFault as error:

@@ -66,11 +66,13 @@ class SteadyError:
     def keeps(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
         """The joints of which a stop leaves the command as it is, bool [D]: they stand within a steady error of it, or
         it has rested for so long that nobody knows what moved their readings away. They may be those of an encoder
-        that has slipped: such a command is led (`Displacement`).
+        that has slipped: such a command is led (`DisplacementMonitor`).
         """
         if self._inherited:
             error = self._error(robot, measured)
-            standing = self._settings.limits.places & (np.abs(error) <= self._settings.safety.steady_error)
+            standing = self._settings.limits.position_mask & (
+                np.abs(error) <= self._settings.safety.steady_error
+            )
         else:
             self._note(robot, measured, now)
             standing, error = self._standing(now)
@@ -78,7 +80,9 @@ class SteadyError:
             lately = [sample.commanded for sample in self._samples if now - sample.time <= _REST_S]
             new = np.isnan(self.last) & (np.ptp(lately, axis=0) <= _STILL) & ~self._presses
             now_off = self._error(robot, measured)
-            new &= self._settings.limits.places & (np.abs(now_off) <= self._settings.safety.steady_error)
+            new &= self._settings.limits.position_mask & (
+                np.abs(now_off) <= self._settings.safety.steady_error
+            )
             error, standing = np.where(standing, error, now_off), standing | new
         self.last = np.where(standing, error, self.last)
         return np.asarray(standing | self._moved_at_rest(robot, measured, now))
@@ -88,7 +92,7 @@ class SteadyError:
         rested = now - self._samples[0].time >= _WINDOW_S - _EVERY_S if self._samples else False
         far = np.abs(self._error(robot, measured)) > self._settings.safety.sagged
         rests = np.ptp([sample.commanded for sample in self._samples], axis=0) <= _STILL if rested else False
-        return self._settings.limits.places & far & rests & ~self._presses
+        return self._settings.limits.position_mask & far & rests & ~self._presses
 
     @property
     def known(self) -> Float64:
@@ -121,4 +125,4 @@ class SteadyError:
         rests = (np.ptp(commands, axis=0) <= _STILL) & (np.ptp(commands - errors, axis=0) <= _QUIET)
         steady = (np.abs(error) <= self._settings.safety.steady_error) & (np.abs(error) - least <= _GROWN)
         seen = now - self._samples[0].time >= _REST_S - _EVERY_S
-        return np.asarray(self._settings.limits.places & rests & steady & seen & ~self._presses), error
+        return np.asarray(self._settings.limits.position_mask & rests & steady & seen & ~self._presses), error

@@ -13,10 +13,10 @@ from runtime.core.sentences import Pattern
 from runtime.core.types import Float32, Float64
 from runtime.ipc.messages import ChunkMerged, Event, Message, TickDone, encode
 from runtime.ipc.observation_reader import LatestObservation
-from runtime.ipc.shared_state import DOUBT_BYTES, SharedState
+from runtime.ipc.shared_state import JOINT_PROBLEM_BYTES, SharedState
 from runtime.motion.timeline import HELD, Contributions
-from runtime.processes.control.actuator import Actuator, Sent
-from runtime.processes.control.behaviours import Behaviour, EStopped
+from runtime.processes.control.actuator import Actuator, TickResult
+from runtime.processes.control.behaviours import Behaviour, EStopHold
 from runtime.recording.base import ControlSource
 from runtime.safety.collision import Collision
 
@@ -33,8 +33,8 @@ class TickState:
     """State of control at the end of a tick."""
 
     robot: Actuator
-    believed: bool  # where the robot is is known
-    doubt: str  # why what is measured cannot be true, or is not where the robot is held
+    trusted_joints: bool  # where the robot is is known
+    implausible_reason: str  # why what is measured cannot be true, or is not where the robot is held
     behaviour: Behaviour  # the robot's
     simulating: bool  # the simulated robot follows a run
     simulated: Float64 | None  # [D] the simulated robot's command
@@ -45,7 +45,7 @@ class TickState:
     locked: Float64  # [D]
 
 
-class Limiting:
+class LimitingMonitor:
     """Tells when safety begins to change what is sent, and how much it did once that is over; never once per tick."""
 
     def __init__(self, say: Callable[[str, str], None]) -> None:
@@ -53,7 +53,7 @@ class Limiting:
         self._last = float("-inf")
         self._count, self._worst, self._most = 0, 0.0, ""
 
-    def note(self, sent: Sent, now: float) -> None:
+    def update(self, sent: TickResult, now: float) -> None:
         """One tick."""
         if sent.change > _TOLD:
             if not self._count:
@@ -71,7 +71,7 @@ class Limiting:
         self._count, self._worst, self._most = 0, 0.0, ""
 
 
-class Nearing:
+class ProximityMonitor:
     """Tells when actions begin to bring links near each other, and how near once that is over; never once per tick."""
 
     def __init__(self, say: Callable[[str, str], None]) -> None:
@@ -80,7 +80,7 @@ class Nearing:
         self._count = 0
         self._nearest: Collision | None = None
 
-    def note(self, sent: Sent, now: float) -> None:
+    def update(self, sent: TickResult, now: float) -> None:
         """One tick."""
         near = sent.near
         if near is not None:
@@ -103,7 +103,7 @@ class Telemetry:
     """Gathers what a tick has to say, hands it over at its end; a full ring is counted, never waited for."""
 
     def __init__(self, shared: SharedState) -> None:
-        self._page = shared
+        self._shared_state = shared
         self._outbox: list[ChunkMerged | Event] = []
         self._records_lost = 0
         self._step, self.planned = -1, 0.0
@@ -112,34 +112,34 @@ class Telemetry:
         self._smoothed: Float32 | None = None  # of this tick: what was wanted before safety
         self.status: StatusRecord = np.zeros((), shared.layout.control_dtype())  # written whole by every tick
         self.status[()] = shared.control.read()  # counters go on from a predecessor's
-        self.limiting = Limiting(self.say)
-        self.nearing = Nearing(self.say)
+        self.limiting = LimitingMonitor(self.emit)
+        self.nearing = ProximityMonitor(self.emit)
         self.order = 0  # number of the newest order obeyed
         self.run = 0
 
-    def begin(self, step: int, planned: float, woke: float | None = None) -> None:
+    def begin_tick(self, step: int, planned: float, woke: float | None = None) -> None:
         """The tick that everything is about from here on; planned for `planned`, begun at `woke`."""
         self._step, self.planned, self._woke = step, planned, woke
 
-    def say(self, kind: str, text: str, data: Mapping[str, object] = MappingProxyType({})) -> None:
+    def emit(self, kind: str, text: str, data: Mapping[str, object] = MappingProxyType({})) -> None:
         """An event, told at the end of the tick, with the order that control was carrying out."""
         self._outbox.append(Event(kind, text, self.planned, self._step, {"order": self.order, **data}))
 
-    def merged(self, merged: ChunkMerged) -> None:
+    def add_merge(self, merged: ChunkMerged) -> None:
         """Tell where a chunk fell, at the end of the tick."""
         self._outbox.append(merged)
 
-    def record(self, seen: LatestObservation, sent: Sent, simulated: bool) -> None:
+    def add_tick(self, seen: LatestObservation, sent: TickResult, simulated: bool) -> None:
         """The tick, for the episode if there is one; `simulated`: it was the simulated robot that was told."""
-        self.limiting.note(sent, self.planned)
+        self.limiting.update(sent, self.planned)
         self._note_corrected(sent)
-        self.nearing.note(sent, self.planned)
+        self.nearing.update(sent, self.planned)
         target, executed = sent.target, sent.executed
         wanted = target is not None and target.path is not None
         self._smoothed = target.action.astype(np.float32) if target and wanted else None
-        makers = target.makers if target else ()
-        self._tell_makers(makers, sent)
-        if self._page.unrecorded:
+        makers = target.contributions if target else ()
+        self._emit_contributions(makers, sent)
+        if self._shared_state.unrecorded:
             return
         done = TickDone(
             step=self._step,
@@ -171,26 +171,29 @@ class Telemetry:
         status["run"], status["behaviour"] = self.run, name.encode()
         status["remaining"], status["refused_in_row"] = standing.remaining, standing.refused
         status["engaged"], status["moving"] = robot.engaged, standing.behaviour.moving
-        status["estop_obeyed"] = isinstance(standing.behaviour, EStopped)
+        status["estop_obeyed"] = isinstance(standing.behaviour, EStopHold)
         status["commanded"], status["velocity"] = robot.commanded, robot.velocity
         status["smoothed"] = np.nan if self._smoothed is None else self._smoothed
         status["simulated"] = np.nan if standing.simulated is None else standing.simulated
         status["waiting"], status["starved"] = standing.waiting, standing.starved
         status["locked"] = standing.locked
-        status["believed"], status["doubt"] = standing.believed, standing.doubt.encode()[:DOUBT_BYTES]
+        status["believed"], status["doubt"] = (
+            standing.trusted_joints,
+            standing.implausible_reason.encode()[:JOINT_PROBLEM_BYTES],
+        )
         status["records_lost"] = self._records_lost
-        self._page.control.write(status)
+        self._shared_state.control.write(status)
         for message in self._outbox:
             self._push("control_events", message)
             self._push("ticks", message)
         self._outbox.clear()
 
-    def _note_corrected(self, sent: Sent) -> None:
+    def _note_corrected(self, sent: TickResult) -> None:
         if sent.corrected and self.planned - self._corrected > _QUIET_S:
-            self.say("corrected", sent.corrected)
+            self.emit("corrected", sent.corrected)
         self._corrected = self.planned if sent.corrected else self._corrected
 
-    def _tell_makers(self, makers: Contributions, sent: Sent) -> None:
+    def _emit_contributions(self, makers: Contributions, sent: TickResult) -> None:
         if sent.target is not None and sent.target.source == "teleop":
             makers = ()  # what a leader said: each message is merged like a chunk, and is none to whoever looks
         status = self.status
@@ -199,11 +202,11 @@ class Telemetry:
         status["limited"] = bool(sent.limited) or sent.refused
 
     def _push(self, ring: str, message: Message) -> None:
-        if not self._page.rings[ring].push(encode(message)):
+        if not self._shared_state.rings[ring].push(encode(message)):
             self._records_lost += 1
 
 
-def _source(sent: Sent, simulated: bool) -> ControlSource:
+def _source(sent: TickResult, simulated: bool) -> ControlSource:
     if sent.executed is None:
         return "none"
     if sent.target is None or sent.refused:

@@ -22,15 +22,21 @@ from runtime.ipc.messages import (
 )
 from runtime.ipc.observation_reader import ObservationReader
 from runtime.ipc.shared_state import EStop, SharedState
-from runtime.processes.control.actuator import Actuator, RobotActuator, Sent, SimulatedActuator, TickSettings
-from runtime.processes.control.alarms import Displacement, silent_sibling
-from runtime.processes.control.behaviours import EStopped, Yielded
-from runtime.processes.control.chunk_execution import ExecuteChunks, Strategy, dropped, strategy
+from runtime.processes.control.actuator import (
+    Actuator,
+    RobotActuator,
+    SimulatedActuator,
+    TickResult,
+    TickSettings,
+)
+from runtime.processes.control.alarms import DisplacementMonitor, stale_heartbeat
+from runtime.processes.control.behaviours import EStopHold, NodeDriven
+from runtime.processes.control.chunk_execution import ExecuteChunks, Strategy, build_strategy, dropped_chunk
 from runtime.processes.control.command_pipeline import CommandPipeline
 from runtime.processes.control.command_subscribers import SubscriberCheck
 from runtime.processes.control.gripper_locks import GripperLocks
 from runtime.processes.control.node_handover import NodeHandover
-from runtime.processes.control.plausibility import Plausibility, Unquestioned
+from runtime.processes.control.plausibility import JointPlausibility, TrustingPlausibility
 from runtime.processes.control.steady_error import SteadyError
 from runtime.processes.control.telemetry import StatusRecord, Telemetry, TickState
 from runtime.safety.filter import SafetyFilter
@@ -86,7 +92,7 @@ class Tick:
         settings: TickSettings,
         clock: Callable[[], float],
     ) -> None:
-        self._page = shared
+        self._shared_state = shared
         self._safety = safety
         self._strategy = chosen
         self._settings = settings
@@ -94,16 +100,16 @@ class Tick:
         self._eyes = ObservationReader(shared)
         self._report = Telemetry(shared)
         self._locks = GripperLocks(settings.limits, settings.switches)
-        judges = Plausibility if settings.guarded else Unquestioned
+        judges = JointPlausibility if settings.checks_measurements else TrustingPlausibility
         self._plausibility = judges(settings.limits, settings.dims)
-        self._displacement = Displacement(settings, self._plausibility)
+        self._displacement = DisplacementMonitor(settings, self._plausibility)
         self._actuator = RobotActuator(shared, sink, settings, clock)
         self._steady = SteadyError(settings, self._actuator.engaged)
-        self._hearing = SubscriberCheck(shared, sink, self._report.say)
+        self._hearing = SubscriberCheck(shared, sink, self._report.emit)
         # A restarted control goes on holding where its predecessor stood; a new one keeps silent.
-        self._robot = self._lane(self._actuator)
-        left = self._report.status["behaviour"].item() == Yielded.name.encode()
-        self._yielding = NodeHandover(self._actuator.tell, self._report.say, left)
+        self._robot = self._make_pipeline(self._actuator)
+        left = self._report.status["behaviour"].item() == NodeDriven.name.encode()
+        self._yielding = NodeHandover(self._actuator.send_node_request, self._report.emit, left)
         self._simulated: CommandPipeline | None = None
         self._simulated_run = 0
         self._left_run = -1  # the run during which the robot was left alone
@@ -112,31 +118,31 @@ class Tick:
 
     def __call__(self, step: int, planned: float, woke: float | None = None) -> None:
         """Do the tick `step`, planned for `planned` on our clock; the loop woke for it at `woke`."""
-        self._report.begin(step, planned, woke)
-        self._seen = self._plausibility.judge(self._eyes.look(), planned, self._moved)
-        for payload in self._page.rings["orders"].drain():
+        self._report.begin_tick(step, planned, woke)
+        self._seen = self._plausibility.judge(self._eyes.read_latest(), planned, self._moving_command)
+        for payload in self._shared_state.rings["orders"].drain():
             self._read(payload, step, planned)
         self._look_at_error(planned)
         self._check_estop(planned)
-        self._check_family(planned)
-        self._check_doubt(planned)
+        self._check_heartbeats(planned)
+        self._check_plausibility(planned)
         self._check_displaced(planned)
-        sent = self._drive(step, planned)
-        self._yielding.look(isinstance(self._robot.behaviour, Yielded), planned)
-        self._hearing.look(planned)
-        self._report.record(self._seen, sent, self._simulated is not None)
+        sent = self._tick_pipelines(step, planned)
+        self._yielding.update(isinstance(self._robot.behaviour, NodeDriven), planned)
+        self._hearing.poll(planned)
+        self._report.add_tick(self._seen, sent, self._simulated is not None)
         self._report.publish(self._seen, self._standing(step, sent))
-        for lane in self._lanes:
-            lane.actuator.ticked(planned)
+        for lane in self._pipelines:
+            lane.actuator.end_tick(planned)
 
-    def orphan(self) -> None:
+    def hold_orphaned(self) -> None:
         """The supervisor is gone: whatever moves is held."""
         self._orphaned = True
 
     @property
-    def telling(self) -> bool:
+    def is_handing_over(self) -> bool:
         """True while the node is still being told that the robot is its own, or is not any more."""
-        return self._yielding.telling
+        return self._yielding.is_repeating
 
     @property
     def status(self) -> StatusRecord:
@@ -146,43 +152,44 @@ class Tick:
     # --- lanes ---------------------------------------------------------------------------------------------
 
     @property
-    def _lanes(self) -> tuple[CommandPipeline, ...]:
+    def _pipelines(self) -> tuple[CommandPipeline, ...]:
         return (self._robot,) if self._simulated is None else (self._robot, self._simulated)
 
     @property
-    def _led(self) -> CommandPipeline:
+    def _active_pipeline(self) -> CommandPipeline:
         """The lane that chunks are for."""
         return self._robot if self._simulated is None else self._simulated
 
-    def _lane(self, actuator: Actuator) -> CommandPipeline:
+    def _make_pipeline(self, actuator: Actuator) -> CommandPipeline:
         def believed() -> bool:
-            return self._plausibility.settled
+            return self._plausibility.is_settled
 
         def known() -> bool:
-            return self._plausibility.known
+            return self._plausibility.has_known_sample
 
         judged = (self._safety, self._locks, self._settings, self._report)
         return CommandPipeline(actuator, *judged, believed, known)
 
-    def _drive(self, step: int, planned: float) -> Sent:
+    def _tick_pipelines(self, step: int, planned: float) -> TickResult:
         """Move every lane on by a tick; what became of it on the one that is led, for the record."""
-        sent = Sent(planned)
-        if self._page.estop is not EStop.UNKNOWN:
-            sent = self._robot.drive(step, planned, self._seen)
+        sent = TickResult(planned)
+        if self._shared_state.estop is not EStop.UNKNOWN:
+            sent = self._robot.tick(step, planned, self._seen)
             if self._simulated is not None:
-                shown = self._simulated.drive(step, planned, self._seen)
+                shown = self._simulated.tick(step, planned, self._seen)
                 sent = shown._replace(notes=(*sent.notes, *shown.notes), corrected=sent.corrected)
         return sent
 
-    def _standing(self, step: int, sent: Sent) -> TickState:
-        led, run = self._led, self._led.run
-        waits = run is None or run.waits
+    def _standing(self, step: int, sent: TickResult) -> TickState:
+        led, run = self._active_pipeline, self._active_pipeline.run
+        waits = run is None or run.is_waiting
         empty = run is not None and sent.target is None
         simulated = None if self._simulated is None else self._simulated.actuator.commanded
         measured = self._measured(self._report.planned)
         return TickState(
-            believed=measured is not None and self._plausibility.settled,
-            doubt=self._seen.doubt or self._displacement.reason(self._actuator, measured),
+            trusted_joints=measured is not None and self._plausibility.is_settled,
+            implausible_reason=self._seen.implausible_reason
+            or self._displacement.reason(self._actuator, measured),
             robot=self._actuator,
             behaviour=self._robot.behaviour,
             simulating=self._simulated is not None and run is not None,
@@ -200,90 +207,90 @@ class Tick:
         try:
             message = decode(payload)
         except CodecError as error:  # one message that is none must not end what keeps the robot held
-            self._report.say("unreadable", str(error))
+            self._report.emit("unreadable", str(error))
         else:
-            self._obey(message, step, now)
+            self._dispatch(message, step, now)
 
-    def _obey(self, message: Message, step: int, now: float) -> None:
+    def _dispatch(self, message: Message, step: int, now: float) -> None:
         if isinstance(message, PostedChunk):
             self._merge(message, step)
         elif isinstance(message, NodeRequest):
-            self._answer("word_refused", self._actuator.tell(message.word, message.data))
+            self._answer("word_refused", self._actuator.send_node_request(message.word, message.data))
         elif isinstance(message, Tune):
             self._tune(message.strategy, step)
         elif isinstance(message, PolicyAway):
-            if self._led.run is not None and self._led.run.number == message.run:
-                self._led.run.bear(message.until)
+            if self._active_pipeline.run is not None and self._active_pipeline.run.number == message.run:
+                self._active_pipeline.run.bear(message.until)
         elif isinstance(message, LockGrippers):
             self._lock(message.values)
         elif isinstance(message, Order):
             self._report.order, self._report.run = message.number, message.run
-            if not isinstance(self._robot.behaviour, EStopped):
+            if not isinstance(self._robot.behaviour, EStopHold):
                 self._follow_order(message, now)
 
     def _answer(self, kind: str, refusal: str) -> None:
         if refusal:
-            self._report.say(kind, refusal)
+            self._report.emit(kind, refusal)
 
     def _merge(self, chunk: PostedChunk, step: int) -> None:
-        lane, run = self._led, self._led.run
+        lane, run = self._active_pipeline, self._active_pipeline.run
         if run is None or chunk.run != run.number:
-            self._report.merged(dropped(chunk, step, _OTHER_RUN))
+            self._report.add_merge(dropped_chunk(chunk, step, _OTHER_RUN))
             return
         joined = run.join(chunk, step, lane.actuator.commanded)
-        self._report.merged(joined.merged)
+        self._report.add_merge(joined.merged)
         if joined.too_far:
-            lane.hold_because("too_far", joined.far)
+            lane.hold_because("too_far", joined.distance_note)
         else:
-            self._answer("far_start", joined.far)
+            self._answer("far_start", joined.distance_note)
 
     def _tune(self, section: Mapping[str, Any], step: int) -> None:
         try:
-            chosen = strategy(section, self._settings.dims)
+            chosen = build_strategy(section, self._settings.dims)
         except ConfigurationError as error:
-            self._report.say("tune_refused", str(error))
+            self._report.emit("tune_refused", str(error))
             return
-        before, self._strategy, run = self._strategy.kind, chosen, self._led.run
+        before, self._strategy, run = self._strategy.kind, chosen, self._active_pipeline.run
         if run is not None:
             run.tune(chosen, step)
         if chosen.kind != before:
-            self._report.say("tuned", _MERGED_BY(strategy=chosen.kind))
+            self._report.emit("tuned", _MERGED_BY(strategy=chosen.kind))
 
     def _lock(self, values: Float64) -> None:
-        before, refusal = str(self._locks), self._locks.set(values, self._led.actuator.commanded)
+        before, refusal = str(self._locks), self._locks.set(values, self._active_pipeline.actuator.commanded)
         if refusal:
-            self._report.say("lock_refused", refusal)
+            self._report.emit("lock_refused", refusal)
             return
-        for lane in self._lanes:
-            lane.relock()
+        for lane in self._pipelines:
+            lane.on_locks_changed()
         if str(self._locks) != before:
-            self._report.say("locked", str(self._locks))
+            self._report.emit("locked", str(self._locks))
 
     def _follow_order(self, order: Order, now: float) -> None:
         self._report.limiting.close()
         self._report.nearing.close()
-        self._displacement.leave_off()
+        self._displacement.stop_converging()
         rehearses = order.kind == "hold" or (order.kind == "follow" and order.mode == "sim")
         if order.run != self._simulated_run or not rehearses:
             self._simulated = None
         if order.kind == "silent":
-            self._robot.silence()
+            self._robot.disengage()
         elif order.kind == "yield":
-            self._robot.give_way()
+            self._robot.yield_to_node()
         elif order.kind == "hold":
-            for lane in self._lanes:
+            for lane in self._pipelines:
                 lane.hold()
         elif order.kind == "meet":
             self._robot.hold()
-            self._displacement.meet()
+            self._displacement.converge_to_measured()
         elif order.kind == "motion":
             self._begin_motion(order, now)
         elif order.mode == "sim":
             self._begin_simulation(order, now)
         elif order.run == self._left_run and not self._actuator.engaged:
-            self._report.say("unmeasured", _LEFT_ALONE)
+            self._report.emit("unmeasured", _LEFT_ALONE)
         elif self._engage(now):
-            self._robot.follow(self._run(order))
+            self._robot.execute_run(self._run(order))
 
     def _run(self, order: Order) -> ExecuteChunks:
         return ExecuteChunks(order.run, order.mode, self._strategy, self._settings)
@@ -292,13 +299,13 @@ class Tick:
         goal = order.goal
         if goal is None or goal.shape != self._locks.values.shape or np.isinf(goal).any():
             self._robot.hold()
-            self._report.say("refusals", _NO_MOTION(goal=goal, expected=len(self._locks.on)))
+            self._report.emit("refusals", _NO_MOTION(goal=goal, expected=len(self._locks.on)))
         elif not 0.0 < order.speed <= 1.0:
             self._robot.hold()
-            self._report.say("refusals", _MOTION_SPEED(speed=order.speed))
+            self._report.emit("refusals", _MOTION_SPEED(speed=order.speed))
         elif self._engage(now):
             if not order.run:  # a set-up: where joints are believed to be is looked at anew
-                self._displacement.forget()
+                self._displacement.trust_all_joints()
             self._robot.move(goal.astype(np.float64), order.speed)
 
     def _begin_simulation(self, order: Order, now: float) -> None:
@@ -307,12 +314,12 @@ class Tick:
         if self._simulated is None:
             measured = self._measured(now)
             if measured is None:
-                why = self._seen.doubt or _NO_FRESH_JOINTS
-                self._report.say("unmeasured", _SIMULATION_UNPLACED(why=why))
+                why = self._seen.implausible_reason or _NO_FRESH_JOINTS
+                self._report.emit("unmeasured", _SIMULATION_UNPLACED(why=why))
                 return
             start = SimulatedActuator(measured, self._settings, self._clock)
-            self._simulated, self._simulated_run = self._lane(start), order.run
-        self._simulated.follow(self._run(order))
+            self._simulated, self._simulated_run = self._make_pipeline(start), order.run
+        self._simulated.execute_run(self._run(order))
 
     # --- alarms --------------------------------------------------------------------------------------------
 
@@ -324,140 +331,152 @@ class Tick:
         """Take the robot over where it is measured; False, and said so, where nobody knows where it is."""
         if not self._actuator.engaged:
             measured = self._measured(now)
-            if measured is None or not self._plausibility.settled:
-                why = self._seen.doubt or (_NO_FRESH_JOINTS if measured is None else _CONTRADICTION)
-                self._report.say("unmeasured", _ROBOT_UNSEEN(why=why))
+            if measured is None or not self._plausibility.is_settled:
+                why = self._seen.implausible_reason or (
+                    _NO_FRESH_JOINTS if measured is None else _CONTRADICTION
+                )
+                self._report.emit("unmeasured", _ROBOT_UNSEEN(why=why))
                 return False
-            self._plausibility.trust()
+            self._plausibility.reset_zeros()
             self._actuator.engage(measured)
-        self._actuator.open_or_close()
+        self._actuator.snap_grippers()
         return True
 
     def _look_at_error(self, now: float) -> None:
-        stopped = self._robot.behaviour if isinstance(self._robot.behaviour, EStopped) else None
-        if (stopped is not None and stopped.follows) or self._displacement.goal is not None:
+        stopped = self._robot.behaviour if isinstance(self._robot.behaviour, EStopHold) else None
+        if (stopped is not None and stopped.is_settling) or self._displacement.goal is not None:
             self._steady.leave_out()
         else:
             self._steady.look(self._actuator, self._measured(now), now)
 
     def _check_estop(self, now: float) -> None:
-        latched = self._page.estop is EStop.LATCHED
-        stopped = self._robot.behaviour if isinstance(self._robot.behaviour, EStopped) else None
+        latched = self._shared_state.estop is EStop.LATCHED
+        stopped = self._robot.behaviour if isinstance(self._robot.behaviour, EStopHold) else None
         if latched and stopped is None:
             # Before it was ever engaged nothing is known to send, until the robot has been measured.
-            commanded = self._settings.limits.standing(self._actuator.commanded.copy())
+            commanded = self._settings.limits.with_zero_speeds(self._actuator.commanded.copy())
             position = commanded if self._actuator.engaged else None
-            stopped = EStopped(position, self._actuator.rest, self._seen.joints_captured)
-            self._actuator.rest_here()
-            self._displacement.leave_off()
+            stopped = EStopHold(position, self._actuator.stopping_distance, self._seen.joints_captured)
+            self._actuator.zero_velocity()
+            self._displacement.stop_converging()
             # Or a gripper that is on its way to its lock would go on after the release.
             self._lock(np.full(len(self._locks.on), np.nan))
             self._robot.behaviour, self._simulated = stopped, None
-            self._report.say("estopped", _ESTOP)
+            self._report.emit("estopped", _ESTOP)
         elif not latched and stopped is not None:
             self._robot.release()
-            self._report.say("released", _RELEASED)
+            self._report.emit("released", _RELEASED)
             return
         measured = None if stopped is None else self._measured(now)
         if stopped is not None and measured is not None and self._shows_it_now(stopped, now):
             self._stop_at(measured, stopped, now)
 
-    def _shows_it_now(self, stopped: EStopped, now: float) -> bool:
+    def _shows_it_now(self, stopped: EStopHold, now: float) -> bool:
         """False while the joints are those of before a gap in which the e-stop was pressed: the arm has gone on since,
         and would be driven back to there.
         """
         seen = self._seen.joints_captured
-        return stopped.seen or not self._actuator.engaged or seen > stopped.captured or now - seen <= _NOW_S
+        return (
+            stopped.was_measured
+            or not self._actuator.engaged
+            or seen > stopped.captured
+            or now - seen <= _NOW_S
+        )
 
-    def _stop_at(self, measured: Float64, stopped: EStopped, now: float) -> None:
+    def _stop_at(self, measured: Float64, stopped: EStopHold, now: float) -> None:
         """Send where the robot is: at once as far as it takes to come to rest, farther as fast as it moves."""
         actuator, limits = self._actuator, self._settings.limits
-        if not actuator.engaged and (self._plausibility.dead or not self._plausibility.settled):
+        if not actuator.engaged and (self._plausibility.dead or not self._plausibility.is_settled):
             return
         if not actuator.engaged:
             actuator.engage(measured)
-            stopped.stay(actuator.commanded.copy())
-            stopped.kept = limits.places.copy()
-        elif stopped.follows:
-            measured = self._plausibility.middle(measured)
+            stopped.hold_at(actuator.commanded.copy())
+            stopped.kept = limits.position_mask.copy()
+        elif stopped.is_settling:
+            measured = self._plausibility.median_joints(measured)
             if stopped.kept is None:
                 stopped.kept = self._steady.keeps(actuator, measured, now)
             measured = np.where(stopped.kept, actuator.commanded, measured + self._steady.known)
-            if not stopped.seen:
-                self._displacement.follow(actuator, measured)
-            measured = self._displacement.trusted(actuator, measured)
-            if not stopped.seen:
-                actuator.step_to(measured, _WHAT_ESTOP, stopped.rest)
+            if not stopped.was_measured:
+                self._displacement.update_target(actuator, measured)
+            measured = self._displacement.substitute_untrusted(actuator, measured)
+            if not stopped.was_measured:
+                actuator.rebase_command(measured, _WHAT_ESTOP, stopped.rest)
             # An object in the gripper keeps it open: its command stays, or it would let go.
-            stopped.see(limits.standing(np.where(limits.grippers, actuator.commanded, measured)))
+            stopped.update_measured(
+                limits.with_zero_speeds(np.where(limits.grippers, actuator.commanded, measured))
+            )
 
-    def _check_family(self, now: float) -> None:
+    def _check_heartbeats(self, now: float) -> None:
         kind, reason = "orphaned", str(_SUPERVISOR_GONE if self._orphaned else "")
         if not reason:
-            kind, reason = "family", silent_sibling(self._page, now, self._settings.heartbeat_timeout)
+            kind, reason = (
+                "family",
+                stale_heartbeat(self._shared_state, now, self._settings.heartbeat_timeout),
+            )
         if reason:
-            self._displacement.leave_off()
-        for lane in self._lanes if reason else ():
+            self._displacement.stop_converging()
+        for lane in self._pipelines if reason else ():
             lane.hold_because(kind, reason)
 
     @property
-    def _moved(self) -> Float64 | None:
+    def _moving_command(self) -> Float64 | None:
         """The command of a robot that we move, None where nothing should change."""
         return self._actuator.commanded if self._robot.behaviour.moving and self._actuator.engaged else None
 
-    def _check_doubt(self, now: float) -> None:
+    def _check_plausibility(self, now: float) -> None:
         """Hold, and name the joint, while what is measured cannot be true."""
-        doubt = self._seen.doubt
+        doubt = self._seen.implausible_reason
         if (
-            not doubt or not self._plausibility.known
+            not doubt or not self._plausibility.has_known_sample
         ):  # where the joints were missing there is no contradiction
             return
         if self._robot.behaviour.moving:
             self._robot.hold_because("implausible", doubt)
         elif now - self._doubted > _QUIET_S:
-            self._report.say("implausible", doubt)
+            self._report.emit("implausible", doubt)
         self._doubted = now
 
     def _check_displaced(self, now: float) -> None:
         """Hold where the robot is, and not where it was told to hold, once these are far apart."""
         behaviour = self._robot.behaviour
-        stopped = isinstance(behaviour, EStopped)
-        held = (self._robot.stands or stopped) and self._actuator.engaged
+        stopped = isinstance(behaviour, EStopHold)
+        held = (self._robot.is_stationary or stopped) and self._actuator.engaged
         where = self._displacement(self._actuator, self._seen, now, held, stopped)
-        self._name_followed_twice()
+        self._report_untrusted_joints()
         if where is None:
             return
         if self._plausibility.dead:
-            self._leave(_AFTER_MISSING_JOINTS(what=self._plausibility.dead))
+            self._disengage(_AFTER_MISSING_JOINTS(what=self._plausibility.dead))
             return
         goal = where if self._displacement.goal is None else self._displacement.goal
         away = self._displacement.distance(self._actuator, goal)
         farthest = self._displacement.speed * self._actuator.elapsed(now)
-        self._actuator.step_to(where, _WHAT_HELD, farthest)
-        if isinstance(behaviour, EStopped):
-            behaviour.stay(self._actuator.commanded.copy())
+        self._actuator.rebase_command(where, _WHAT_HELD, farthest)
+        if isinstance(behaviour, EStopHold):
+            behaviour.hold_at(self._actuator.commanded.copy())
             return
         if self._displacement.begins:
-            self._tell_displaced(_MOVED_AWAY(distance=away))
+            self._report_displaced(_MOVED_AWAY(distance=away))
         self._robot.hold_here()
 
-    def _name_followed_twice(self) -> None:
+    def _report_untrusted_joints(self) -> None:
         """Say, once, which joints are not followed any more; what moves is held."""
-        doubt = self._displacement.take_doubt()
+        doubt = self._displacement.pop_untrusted_reason()
         if doubt and self._robot.behaviour.moving:
             self._robot.hold_because("implausible", doubt)
         elif doubt:
-            self._report.say("implausible", doubt)
+            self._report.emit("implausible", doubt)
 
-    def _leave(self, why: str) -> None:
+    def _disengage(self, why: str) -> None:
         """Send nothing: a node that was started anew at 0 is pulled by an old target, a dead encoder by a new one."""
         self._left_run = self._report.run
-        self._tell_displaced(why)
-        if isinstance(self._robot.behaviour, EStopped):
-            self._robot.behaviour.let_go()
+        self._report_displaced(why)
+        if isinstance(self._robot.behaviour, EStopHold):
+            self._robot.behaviour.release()
             self._actuator.disengage()
         else:
-            self._robot.silence()
+            self._robot.disengage()
 
-    def _tell_displaced(self, text: str) -> None:
-        self._report.say("moved_away" if self._robot.behaviour.moving else "displaced", text)
+    def _report_displaced(self, text: str) -> None:
+        self._report.emit("moved_away" if self._robot.behaviour.moving else "displaced", text)

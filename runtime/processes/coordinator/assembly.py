@@ -11,7 +11,7 @@ from runtime.ipc.messages import Event, ReceptionReport
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
 from runtime.kinematics.forward import ChainForward
-from runtime.kinematics.loading import Loading
+from runtime.kinematics.loading import LazyKinematics
 from runtime.processes.coordinator.builders import (
     MakePolicy,
     kinematics_compiled,
@@ -23,21 +23,21 @@ from runtime.processes.coordinator.coordinator import Coordinator
 from runtime.processes.coordinator.demonstrations import Demonstrations
 from runtime.processes.coordinator.health_monitor import HealthMonitor
 from runtime.processes.coordinator.inference.chunk_mixture import Mixture
-from runtime.processes.coordinator.inference.inference import Inference, Patience
-from runtime.processes.coordinator.inference.policy_observation import PolicyObservation, SightSettings
+from runtime.processes.coordinator.inference.inference import FaultTimeouts, Inference
+from runtime.processes.coordinator.inference.policy_observation import PolicyObservation, StalenessLimits
 from runtime.processes.coordinator.inference.requests import MissBound, PolicyRequests
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
 from runtime.processes.coordinator.inference.worker import Runner
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.manual.targets import Targets
-from runtime.processes.coordinator.operations import Parts, SessionActions
-from runtime.processes.coordinator.preflight_desk import PreflightDesk
+from runtime.processes.coordinator.operations import SessionActions, SessionComponents
+from runtime.processes.coordinator.preflight_desk import PreflightService
 from runtime.processes.coordinator.runs import Runs
 from runtime.processes.coordinator.session.machine import SessionMachine
 from runtime.processes.coordinator.session.tuning import strategy_of
 from runtime.processes.coordinator.setup.sequence import SetUp
-from runtime.processes.coordinator.snapshot import control_figures, facts
+from runtime.processes.coordinator.snapshot import control_figures, station_facts
 from runtime.processes.coordinator.timing_report import TimingReport
 from runtime.safety.settings import SafetySettings
 from runtime.spaces.conversion import ActionSpaces
@@ -57,7 +57,7 @@ def assemble(
 
     # What parts ask of the coordinator, or tell it, once it is there.
     def say(event: Event) -> None:
-        coordinator.say(event)
+        coordinator.emit(event)
 
     def state() -> SessionState:
         return coordinator.session.state
@@ -67,10 +67,10 @@ def assemble(
 
     boot, people = str(uuid.uuid4()), people or clock
     lease, orders = Lease(spec.deployment.lease.ttl_s), ControlQueue(shared)
-    kinematics = Loading(
+    kinematics = LazyKinematics(
         ChainForward(spec.robot),
         partial(make_kinematics, spec),
-        runner.aside,
+        runner.run_in_background,
         partial(kinematics_compiled, spec),
     )
     spaces = ActionSpaces(spec.robot, kinematics, spec.rate)
@@ -90,16 +90,16 @@ def assemble(
     )
     manual = ManualControl(spec, shared, orders, runs, Targets(spec, spaces, kinematics))
     collecting = Demonstrations(spec, shared, clock, inference, setup, lambda: runs.open, say)
-    parts = Parts(shared, clock, orders, inference, setup, runs, manual, collecting)
-    operations = SessionActions(spec, parts, state, health.absent, say, make_policy)
+    parts = SessionComponents(shared, clock, orders, inference, setup, runs, manual, collecting)
+    operations = SessionActions(spec, parts, state, health.silent_sibling, say, make_policy)
     settings = spec.deployment.control
     coordinator = Coordinator(
         boot=boot,
         shared=shared,
         clock=clock,
-        people=people,
-        own=spec.resolved,
-        facts=facts(spec),
+        client_clock=people,
+        deployment_spec=spec.resolved,
+        facts=station_facts(spec),
         events=EventLog(),
         lease=lease,
         orders=orders,
@@ -112,7 +112,7 @@ def assemble(
         health=health,
         timing=TimingReport(shared, spec.rate, settings.realtime_priority, settings.realtime == "auto"),
         operations=operations,
-        preflights=PreflightDesk(lambda: operations.spec, spec, state, say, clock),
+        preflights=PreflightService(lambda: operations.spec, spec, state, say, clock),
         session=SessionMachine(operations, lease, boot, people.now),
     )
     return coordinator
@@ -129,12 +129,12 @@ def _inference(
     clock: Clock,
     runner: Runner,
     orders: ControlQueue,
-    kinematics: Loading,
+    kinematics: LazyKinematics,
     make_policy: MakePolicy,
 ) -> Inference:
     """What asks the policy, with action spaces of its own: they are used in the thread of the call."""
     settings = spec.deployment
-    ages = SightSettings(spec.rate, settings.safety.joint_age_s, settings.safety.picture_age_s)
+    ages = StalenessLimits(spec.rate, settings.safety.joint_age_s, settings.safety.picture_age_s)
     requests = PolicyRequests(
         make_policy(spec, clock),
         settings.task,
@@ -144,6 +144,6 @@ def _inference(
         clock,
         _bound(settings.safety),
     )
-    patience = Patience(settings.control.starvation_hold_s, settings.faults.patience_s)
+    patience = FaultTimeouts(settings.control.starvation_hold_s, settings.faults.patience_s)
     prefix = RtcPrefix(spec.rate, Mixture(spec.dims, spec.robot))
     return Inference(requests, strategy_of(spec), shared, orders, clock, patience, prefix)

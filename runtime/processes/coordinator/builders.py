@@ -43,7 +43,7 @@ def make_policy(
     `build` stands in for that of the policy's kind, `leader` for the deployment's.
     """
     if spec.collecting:
-        return _teleoperation(spec, clock, leader)
+        return _leader_policy(spec, clock, leader)
     settings = spec.deployment.policy
     try:
         build = build or variants("runtime.policies")[settings.kind].build
@@ -57,16 +57,16 @@ def make_policy(
         ) from error
 
 
-def _teleoperation(spec: StationSpec, clock: Clock, leader: Callable[[StationSpec, Clock], Leader]) -> Policy:
+def _leader_policy(spec: StationSpec, clock: Clock, leader: Callable[[StationSpec, Clock], Leader]) -> Policy:
     """The policy that is asked while the operator drives the robot."""
-    from runtime.teleoperators.relay import NodeLed, Relay
+    from runtime.teleoperators.relay import LeaderPolicy, NodeDrivenPolicy
 
     wanted = spec.deployment.collection
     if wanted is None:
         raise ConfigurationError("this deployment has no [collection]: it says nothing of who leads")
     if wanted.source == "node":
-        return NodeLed()
-    return Relay(
+        return NodeDrivenPolicy()
+    return LeaderPolicy(
         leader(spec, clock),
         spec.robot,
         wanted.mode,

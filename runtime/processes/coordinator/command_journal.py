@@ -81,7 +81,7 @@ def _row(command: Command, ack: Ack) -> dict[str, Any]:
     return {
         "uuid": command.uuid,
         "kind": command.kind,
-        "args": _told(command.args),
+        "args": _json_arguments(command.args),
         "user": command.user,
         "role": command.role,
         "holder": command.holder,
@@ -91,7 +91,7 @@ def _row(command: Command, ack: Ack) -> dict[str, Any]:
     }
 
 
-def _told(arguments: Mapping[str, Any]) -> object:
+def _json_arguments(arguments: Mapping[str, Any]) -> object:
     """The arguments as JSON can say them; those of no JSON were refused, and must not end who refused them."""
     try:
         json.dumps(arguments, default=str)

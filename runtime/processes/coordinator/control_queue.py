@@ -1,4 +1,4 @@
-"""Main's side of the ring to control: numbered orders and chunks."""
+"""The coordinator's side of the ring to control: numbered orders and chunks."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class ControlQueue:
     """Writes orders and chunks; only the thread that owns the coordinator's loop may call it."""
 
     def __init__(self, shared: SharedState) -> None:
-        self._page = shared
+        self._shared_state = shared
         self._number = int(shared.control.read()["order"])
         self._chunk = 0
 
-    def give(
+    def send_order(
         self,
         kind: OrderKind,
         *,
@@ -58,16 +58,16 @@ class ControlQueue:
             )  # the coordinator goes on: it notices that control hangs
         return self._number
 
-    def obeyed(self, number: int) -> bool:
+    def is_obeyed(self, number: int) -> bool:
         """True if control has come to order `number`."""
-        return int(self._page.control.read()["order"]) >= number
+        return int(self._shared_state.control.read()["order"]) >= number
 
     def next_chunk(self) -> int:
         """A new chunk number."""
         self._chunk += 1
         return self._chunk
 
-    def post(self, chunk: PostedChunk) -> None:
+    def send_chunk(self, chunk: PostedChunk) -> None:
         """Hand a chunk over, unmerged."""
         self._push(chunk)
 
@@ -79,14 +79,14 @@ class ControlQueue:
         """Have control stand, and not hold, where nothing is planned before `until` on the monotonic clock [s]."""
         self._push(PolicyAway(run, until))
 
-    def lock(self, values: Float64) -> None:
+    def lock_grippers(self, values: Float64) -> None:
         """Lock grippers at these values [D]; NaN for what is not locked."""
         self._push(LockGrippers(values))
 
-    def ask_node(self, word: str, data: Mapping[str, Any]) -> None:
+    def send_node_request(self, word: str, data: Mapping[str, Any]) -> None:
         """Have control pass a control word on to the node."""
         self._push(NodeRequest(word, data))
 
     def _push(self, message: Message) -> None:
-        if not self._page.rings["orders"].push(encode(message)):
+        if not self._shared_state.rings["orders"].push(encode(message)):
             raise RuntimeFault(_CONTROL_DOES_NOT_READ)

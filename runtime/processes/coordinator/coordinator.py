@@ -12,8 +12,8 @@ from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError, RuntimeFault
 from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.bus import EventLog
-from runtime.ipc.estop_requests import why_of
-from runtime.ipc.identity import named
+from runtime.ipc.estop_requests import reason_of
+from runtime.ipc.identity import display_name
 from runtime.ipc.messages import (
     Ack,
     Command,
@@ -29,13 +29,13 @@ from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.operations import SessionActions
-from runtime.processes.coordinator.preflight_desk import PreflightDesk
+from runtime.processes.coordinator.preflight_desk import PreflightService
 from runtime.processes.coordinator.queries import QUERIES, Queries
 from runtime.processes.coordinator.runs import Runs
 from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
 from runtime.processes.coordinator.session.transitions import SessionEvent
 from runtime.processes.coordinator.setup.sequence import SetUp
-from runtime.processes.coordinator.snapshot import snapshot
+from runtime.processes.coordinator.snapshot import build_snapshot
 from runtime.processes.coordinator.timing_report import TimingReport
 from runtime.spaces.conversion import ActionSpaces
 from runtime.station import permissions as rights
@@ -61,8 +61,8 @@ class Coordinator:
     boot: str
     shared: SharedState
     clock: Clock
-    people: Clock  # of leases, and of how long commands are valid: lockstep has another
-    own: Resolved  # as the station was started with
+    client_clock: Clock  # of leases, and of how long commands are valid: lockstep has another
+    deployment_spec: Resolved  # as the station was started with
     facts: Mapping[str, Any]  # what a snapshot says of a station that does not change
     events: EventLog
     lease: Lease
@@ -76,7 +76,7 @@ class Coordinator:
     health: HealthMonitor
     timing: TimingReport
     operations: SessionActions
-    preflights: PreflightDesk
+    preflights: PreflightService
     session: SessionMachine
 
     def __post_init__(self) -> None:
@@ -100,65 +100,65 @@ class Coordinator:
             self.session.state.meaning.at_work
             or self.setup.active
             or self.runs.open is not None
-            or self.runs.alone
-            or self.inference.asked
-            or self.lease.current(self.people.now()) is not None
+            or self.runs.is_recording_standalone
+            or self.inference.is_pending
+            or self.lease.current(self.client_clock.now()) is not None
         )
 
-    def pump(self) -> None:
+    def poll(self) -> None:
         """Hear the family, notice what happened, advance set-up and inference."""
         self.shared.beat("coordinator", self.clock.now())
-        self.inbox.read()
-        for noticed in self.health.notice(self.session.state, self.runs.open):
-            self.observe(*noticed)
-        if missed := self.collecting.look(self.session.state):
-            self.observe(*missed)
-        for event in (*self.health.look_at_recorder(self.session.state), *self.timing.look(self.clock.now())):
-            self.say(event)
-        self.runs.pump()
+        self.inbox.poll()
+        for noticed in self.health.poll(self.session.state, self.runs.open):
+            self.handle_event(*noticed)
+        if missed := self.collecting.poll(self.session.state):
+            self.handle_event(*missed)
+        for event in (*self.health.look_at_recorder(self.session.state), *self.timing.poll(self.clock.now())):
+            self.emit(event)
+        self.runs.poll()
         self._advance_setup()
         self._advance_inference()
-        self.preflights.look()
+        self.preflights.poll()
 
     def snapshot(self) -> dict[str, Any]:
         """The station's state at this moment."""
-        return snapshot(self)
+        return build_snapshot(self)
 
-    def finish(self, reason: str) -> None:
+    def end_source_run(self, reason: str) -> None:
         """The run is over, says who simulates what it is about."""
-        self.observe(SessionEvent.RUN_ENDED, reason)
+        self.handle_event(SessionEvent.RUN_ENDED, reason)
 
-    def say(self, event: Event) -> None:
+    def emit(self, event: Event) -> None:
         """An event of the coordinator's own: to the log, to clients, into the episode."""
-        self.log(event)
-        self.runs.note(event)
+        self.record_event(event)
+        self.runs.record_event(event)
 
-    def log(self, event: Event) -> None:
+    def record_event(self, event: Event) -> None:
         """An event of another process, which it writes into the episode itself."""
         self.events.append(event)
         log.info("%s: %s", event.kind, event.text)
 
-    def observe(self, happening: SessionEvent, reason: str, process: str = "") -> None:
+    def handle_event(self, happening: SessionEvent, reason: str, process: str = "") -> None:
         """Tell the session; `process` is the one that was restarted."""
         if happening is SessionEvent.FAMILY_DIED:
-            self.say(Event("family_died", reason, self.clock.now()))
-            self.inbox.forget_unheard()
-            self.runs.lost(process, reason)
+            self.emit(Event("family_died", reason, self.clock.now()))
+            self.inbox.reset_subscribers()
+            self.runs.on_process_restarted(process, reason)
         if happening is SessionEvent.ESTOPPED:
-            self.runs.interrupt_alone(reason)
+            self.runs.interrupt_standalone_recording(reason)
         if happening in (SessionEvent.FAMILY_DIED, SessionEvent.ESTOPPED):
             self._unlock()
-        self.collecting.noticed(happening, reason)
+        self.collecting.on_session_event(happening, reason)
         before, run = self.session.state, self.runs.open
-        if self.session.observe(happening, reason):
+        if self.session.handle_event(happening, reason):
             text = _CHANGED(before=before, after=self.session.state, reason=reason)
-            state, told = str(self.session.state), self.session.told()
+            state, told = str(self.session.state), self.session.state_meaning()
             data = {"state": state, "state_is": told, **self._unbegun(run)}
-            self.say(Event("state", text, self.clock.now(), data=data))
+            self.emit(Event("state", text, self.clock.now(), data=data))
 
     def _unbegun(self, run: Run | None) -> dict[str, Any]:
         """Data for the event of a `run` that is over and never began; {} for any other."""
-        return {} if run is None or run is self.runs.open else run.unbegun
+        return {} if run is None or run is self.runs.open else run.never_began_data
 
     def _unlock(self) -> None:
         """A control that was restarted, or obeys the e-stop, knows of no locks, another may: none, in any case."""
@@ -174,28 +174,28 @@ class Coordinator:
             return
         stage = self.setup.stage
         try:
-            done = self.setup.pump()
+            done = self.setup.poll()
         except RuntimeFault as error:
             self.setup.fail()
-            self.orders.give("hold")
-            self.observe(SessionEvent.SETUP_FAILED, str(error))
+            self.orders.send_order("hold")
+            self.handle_event(SessionEvent.SETUP_FAILED, str(error))
             return
         if self.setup.stage is not stage:
-            self.say(Event("setup", self.setup.stage.sentence, self.clock.now()))
+            self.emit(Event("setup", self.setup.stage.sentence, self.clock.now()))
         if done:
-            self.observe(SessionEvent.SETUP_DONE, self.setup.outcome)
+            self.handle_event(SessionEvent.SETUP_DONE, self.setup.outcome)
 
     def _advance_inference(self) -> None:
         try:
-            answer = self.inference.pump()
+            answer = self.inference.poll()
         except RuntimeFault as error:
             answer = None
             self._answer_fault(error)
         if answer is not None:
-            self.runs.note(answer)
-        for note in self.inference.notes:
-            self.say(note)
-        self.inference.notes.clear()
+            self.runs.record_event(answer)
+        for note in self.inference.pending_notes:
+            self.emit(note)
+        self.inference.pending_notes.clear()
 
     def _answer_fault(self, error: RuntimeFault) -> None:
         """Do what the deployment says of a policy that fails: hold, try again for a while, or end the run."""
@@ -203,55 +203,55 @@ class Coordinator:
         answer = faults.policy_lost if lost else faults.policy_error
         if self.spec.collecting:  # a leader is not asked again by itself: who holds it arms anew
             answer = "hold"
-        if answer == "slow" and self.inference.retries(error):
+        if answer == "slow" and self.inference.should_retry(error):
             return
-        self.say(Event("policy_lost" if lost else "policy_failed", str(error), self.clock.now()))
-        self.observe(SessionEvent.RUN_FAILED if answer == "stop" else SessionEvent.HELD, str(error))
+        self.emit(Event("policy_lost" if lost else "policy_failed", str(error), self.clock.now()))
+        self.handle_event(SessionEvent.RUN_FAILED if answer == "stop" else SessionEvent.HELD, str(error))
 
     # --- commands ------------------------------------------------------------------------------------------
 
     def handle(self, command: Command) -> Ack:
         """The answer to a command or a query of a client."""
         if command.kind == "estop":
-            return self._press(command)
+            return self._press_estop(command)
         if command.kind == "status":
             return Ack(
                 command.uuid, "done", boot=self.boot, sequence=self.session.sequence, data=self.snapshot()
             )
-        if refusal := self._beyond_rights(command):
+        if refusal := self._permission_problem(command):
             return Ack(command.uuid, "refused", refusal, boot=self.boot, sequence=self.session.sequence)
         if command.kind in QUERIES:
             return self.queries.answer(command)
         before, sequence, run = self.session.state, self.session.sequence, self.runs.open
         ack = self.session.handle(command)
         if ack.status == "accepted" and command.kind in ("setup", "run"):
-            self.preflights.cancel(_WANTED(command=command.kind, who=named(command)))
+            self.preflights.cancel(_WANTED(command=command.kind, who=display_name(command)))
         # A lease that is kept is a stream; only its changes and refusals are worth a line.
         kept = command.kind in LEASE_COMMANDS and ack.status == "accepted" and ack.sequence == sequence
         if not kept:
-            self.collecting.touch()
-            who = {"command": command.kind, "who": named(command), "status": ack.status}
+            self.collecting.record_activity()
+            who = {"command": command.kind, "who": display_name(command), "status": ack.status}
             what = _ANSWERED_WITH(**who, reason=ack.reason) if ack.reason else _ANSWERED(**who)
             told = {"uuid": command.uuid, "from": str(before), "to": str(self.session.state)}
             told |= {"user": command.user, "role": command.role, "holder": command.holder}
-            self.say(Event("command", what, self.clock.now(), data=told | self._unbegun(run)))
+            self.emit(Event("command", what, self.clock.now(), data=told | self._unbegun(run)))
         return ack
 
-    def _press(self, command: Command) -> Ack:
+    def _press_estop(self, command: Command) -> Ack:
         """Raise the flag, whatever goes on and whoever it is; the guard latches it, now or when it is there again."""
         self.shared.rings["presses"].push(encode(command))
         self.shared.set_estop(EStop.LATCHED)
         told = {"uuid": command.uuid, "user": command.user, "role": command.role, "holder": command.holder}
-        text = _PRESSED(who=named(command), why=why_of(command))
-        self.say(Event("command", text, self.clock.now(), data=told))
+        text = _PRESSED(who=display_name(command), why=reason_of(command))
+        self.emit(Event("command", text, self.clock.now(), data=told))
         return Ack(command.uuid, "accepted", _ESTOP_FLAG_RAISED, boot=self.boot, kind=command.kind)
 
-    def _beyond_rights(self, command: Command) -> str:
+    def _permission_problem(self, command: Command) -> str:
         """Why who gives it may not bring what it brings; "" where it may, or was answered before."""
         if self.session.answered(command) is not None:
             return ""
         try:
-            rights.require(command, self.own)
+            rights.require(command, self.deployment_spec)
         except RuntimeFault as fault:
             return str(fault)
         return ""

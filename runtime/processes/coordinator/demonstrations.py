@@ -1,4 +1,4 @@
-"""Main's side of collecting demonstrations: the arm switch, what leads, what was collected, how people judged it."""
+"""The coordinator's side of collecting demonstrations: arm switch, leading side, demonstrations and their labels."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from runtime.ipc.shared_state import SharedState
 from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.session.transitions import SessionEvent
 from runtime.processes.coordinator.setup.sequence import SetUp
-from runtime.recording.labels import Label, append, newest
+from runtime.recording.labels import Label, append_label, latest_label
 from runtime.recording.schema import Schema
 from runtime.station.run import Run
 from runtime.station.spec import StationSpec
-from runtime.teleoperators.relay import Relay
+from runtime.teleoperators.relay import LeaderPolicy
 
 _NOT_YET = fixed("collect.not_armed_yet", "nobody has armed it since it was set up")
 _NOT_SET_UP = fixed("collect.not_set_up", "the station is not set up to collect")
@@ -101,7 +101,7 @@ class Demonstrations:
         self._plan = spec
         self._settings = spec.deployment.collection
         self._data = spec.deployment.data
-        self._page, self._clock = shared, clock
+        self._shared_state, self._clock = shared, clock
         self._inference, self._setup = inference, setup
         self._opened = opened  # the run that is open
         self._say = say
@@ -124,9 +124,9 @@ class Demonstrations:
         return self._settings is not None
 
     @property
-    def _relay(self) -> Relay | None:
+    def _relay(self) -> LeaderPolicy | None:
         policy = self._inference.policy
-        return policy if isinstance(policy, Relay) else None
+        return policy if isinstance(policy, LeaderPolicy) else None
 
     @property
     def _node_leads(self) -> bool:
@@ -144,10 +144,10 @@ class Demonstrations:
         return self._asked[-1] if self._asked else ""
 
     @property
-    def unled(self) -> str:
+    def leader_problem(self) -> str:
         """Why the leader cannot be followed just now; "" where it can, or nobody can know before it is asked to."""
         relay = self._relay
-        return "" if relay is None else relay.silence()
+        return "" if relay is None else relay.leader_problem()
 
     def begin_setup(self, collects: bool) -> None:
         """A set-up begins, to collect or with a policy."""
@@ -166,60 +166,60 @@ class Demonstrations:
             self.armed, self.why_not = False, why
             self._event("collect_disarmed", _DISARMED(why=why))
 
-    def touch(self) -> None:
+    def record_activity(self) -> None:
         """A person has done something."""
         self._touched = self._clock.now()
 
-    def noticed(self, happening: SessionEvent, reason: str) -> None:
+    def on_session_event(self, happening: SessionEvent, reason: str) -> None:
         """Disarm at an event of the session after which no demonstration may begin."""
         if happening in DISARMING:
             self.disarm(reason)
 
-    def look(self, state: SessionState) -> tuple[SessionEvent, str] | None:
+    def poll(self, state: SessionState) -> tuple[SessionEvent, str] | None:
         """Once per pump: what is to be told to the session; an arm that nobody uses falls by itself."""
         now, run = self._clock.now(), self.run
-        self._hear_node()
+        self._poll_node()
         if self.set_up and state is SessionState.READY:
-            self._aim()
+            self._update_first_goal()
         if run is not None:
-            self.touch()
-            return self._missed(run, state)
+            self.record_activity()
+            return self._node_silence(run, state)
         if self.armed and now - self._touched > IDLE_S:
             self.disarm(_NOBODY_DID_ANYTHING(minutes=IDLE_S / 60))
-        if self.armed and (why := self.unled):
+        if self.armed and (why := self.leader_problem):
             self.disarm(why)
             self._event("leader_lost", why)
         return None
 
-    def _aim(self) -> None:
+    def _update_first_goal(self) -> None:
         """Renew where the first action would have the robot, as the leader moves on."""
         relay = self._relay
         if relay is not None:
-            qpos = np.array(self._page.observation.read()["qpos"], np.float64)
-            status = self._page.control.read()
+            qpos = np.array(self._shared_state.observation.read()["qpos"], np.float64)
+            status = self._shared_state.control.read()
             commanded = np.array(status["commanded"], np.float64) if status["engaged"] else None
-            self._setup.expect(relay.aim(qpos, commanded))
+            self._setup.set_first_action(relay.first_goal(qpos, commanded))
 
     # --- what the node reports ---------------------------------------------------------------------------------
 
-    def _hear_node(self) -> None:
+    def _poll_node(self) -> None:
         if not self._node_leads:
             return
-        record = self._page.observation.read()
+        record = self._shared_state.observation.read()
         at = float(record["joints_captured"])
         if record["has"][3] and at != self._reported_at:  # reported_action
             self._reported_at = at
             self._reported = [*self._reported[-39:], at]
 
-    def _missed(self, run: Run, state: SessionState) -> tuple[SessionEvent, str] | None:
+    def _node_silence(self, run: Run, state: SessionState) -> tuple[SessionEvent, str] | None:
         """A node that was told to drive, and reports no action."""
-        if not self._node_leads or run.begun is None or state is not SessionState.RUNNING:
+        if not self._node_leads or run.begun_at is None or state is not SessionState.RUNNING:
             return None
-        since = max(self._reported_at or -math.inf, run.followed)
+        since = max(self._reported_at or -math.inf, run.followed_at)
         silent = self._clock.now() - since
         if silent <= NODE_SILENT_S:
             return None
-        never = self._reported_at is None or self._reported_at < run.begun
+        never = self._reported_at is None or self._reported_at < run.begun_at
         why = _NODE_NEVER_REPORTED(seconds=NODE_SILENT_S) if never else _NODE_SILENT(seconds=silent)
         self._event("node_silent", why)
         return (SessionEvent.RUN_FAILED if never else SessionEvent.HELD), why
@@ -233,27 +233,27 @@ class Demonstrations:
         return {
             "kind": "demonstration",
             "session": asked.session.model_dump() if asked.session else {},
-            "collection": self._settings.described(self._plan.cameras),
+            "collection": self._settings.manifest_entry(self._plan.cameras),
             "policy": {"kind": "teleop", "name": info.name if info else ""},
             **({} if asked.task is None else {"task": asked.task}),
         }
 
-    def begun(self, episode: str, asked: RunRequest) -> None:
+    def on_episode_started(self, episode: str, asked: RunRequest) -> None:
         """An episode is asked for."""
         self.task = asked.task or ""
         if episode:
             self._asked.append(episode)
 
-    def unopened(self) -> None:
+    def on_open_failed(self) -> None:
         """The recording of the open run could not be opened: there is no such episode to speak of."""
         if self.run is not None and self.run.uuid in self._asked:
             self._asked.remove(self.run.uuid)
 
-    def closed(self, message: EpisodeClosed) -> None:
+    def on_episode_closed(self, message: EpisodeClosed) -> None:
         """An episode is on disk."""
         if self._settings is None or message.uuid not in self._asked or message.waits:
             return
-        label = newest(self._data, message.uuid)
+        label = latest_label(self._data, message.uuid)
         self.last = {
             "uuid": message.uuid,
             "rows": message.rows,
@@ -267,18 +267,18 @@ class Demonstrations:
 
     def label(self, asked: LabelRequest, by: str) -> Mapping[str, Any]:
         """Write down how an episode went."""
-        episode, before = self._named(asked.episode)
+        episode, before = self._find_episode(asked.episode)
         return self._write(
             episode, replace(before, time=time.time(), by=by, result=asked.result, note=asked.note)
         )
 
     def discard(self, asked: DiscardRequest, by: str) -> Mapping[str, Any]:
         """Mark an episode as one that is never published; its files stay."""
-        episode, before = self._named(asked.episode)
+        episode, before = self._find_episode(asked.episode)
         return self._write(episode, replace(before, time=time.time(), by=by, discarded=True))
 
     def _write(self, episode: str, label: Label) -> Mapping[str, Any]:
-        append(self._data, episode, label)
+        append_label(self._data, episode, label)
         if self.last is not None and self.last["uuid"] == episode:
             self.last |= {"result": label.result, "discarded": label.discarded}
         data = {
@@ -292,7 +292,7 @@ class Demonstrations:
         self._say(Event("labelled", _LABELLED(episode=episode, how=how), self._clock.now(), data=data))
         return data
 
-    def _named(self, given: str | None) -> tuple[str, Label]:
+    def _find_episode(self, given: str | None) -> tuple[str, Label]:
         """The episode that is spoken of, and what was last said of it; RuntimeFault where it is none of ours."""
         run = self.run
         if given is None:
@@ -307,11 +307,11 @@ class Demonstrations:
                 raise RuntimeFault(_EPISODE_OPEN(episode=given))
             if given not in self._asked:
                 self._require_demonstration(given)
-        before = newest(self._data, episode)
+        before = latest_label(self._data, episode)
         return episode, before or Label(0.0, "")
 
     def _require_demonstration(self, episode: str) -> None:
-        newest(self._data, episode)  # refuses what is no uuid, before it becomes a path
+        latest_label(self._data, episode)  # refuses what is no uuid, before it becomes a path
         path = self._plan.deployment.episodes_dir / episode / "manifest.json"
         try:
             kind = json.loads(path.read_text("utf-8")).get("kind")
@@ -327,7 +327,7 @@ class Demonstrations:
         if self._settings is None:
             return None
         settings, run, cameras = self._settings, self.run, self._plan.cameras
-        described = settings.described(cameras)
+        described = settings.manifest_entry(cameras)
         return {
             "source": settings.source,
             "mode": settings.mode,
@@ -348,16 +348,16 @@ class Demonstrations:
     def _fingerprint(self) -> dict[str, Any] | None:
         """The next episode's fingerprint, in its manifest's words; None before every picture was seen."""
         assert self._settings is not None
-        record, robot = self._page.observation.read(), self._plan.robot
-        described = self._settings.described(self._plan.cameras)
+        record, robot = self._shared_state.observation.read(), self._plan.robot
+        described = self._settings.manifest_entry(self._plan.cameras)
         cameras = {}
         for key in described["cameras"]:
-            number = int(record["picture_number"][self._page.layout.cameras.index(key)])
-            size = self._page.pictures[key].shape(number) if number else None
+            number = int(record["picture_number"][self._shared_state.layout.cameras.index(key)])
+            size = self._shared_state.pictures[key].shape(number) if number else None
             if size is None:
                 return self._seen
             cameras[key] = {"width": size[1], "height": size[0]}
-        schema = Schema.of({"collection": described})
+        schema = Schema.from_manifest({"collection": described})
         self._seen = {
             "robot": robot.name,
             "groups": [group.name for group in robot.groups],
@@ -376,10 +376,10 @@ class Demonstrations:
         if self._node_leads:
             return self._node(now)
         kind = "" if self._settings.leader is None else self._settings.leader.kind
-        newest_pose = None if relay is None else relay.leader.newest
+        newest_pose = None if relay is None else relay.leader.latest_pose
         if relay is None or newest_pose is None:
             return {"kind": kind, "rate": 0.0, "age_s": None, "state": "absent"}
-        state = "silent" if relay.silence() else "alive"
+        state = "silent" if relay.leader_problem() else "alive"
         return {
             "kind": kind,
             "rate": relay.leader.rate,
@@ -393,7 +393,7 @@ class Demonstrations:
         alive = age is not None and age <= NODE_SILENT_S
         times = self._reported
         rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9) if alive and len(times) > 1 else 0.0
-        asked = run is not None and run.begun is not None
+        asked = run is not None and run.begun_at is not None
         state = "alive" if alive else "silent" if asked else "unknown"
         return {"kind": "node", "rate": rate, "age_s": age, "state": state}
 

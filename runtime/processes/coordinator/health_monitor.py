@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runtime.cameras.complaints import complaints
+from runtime.cameras.complaints import describe_camera_problems
 from runtime.core.clock import Clock
 from runtime.core.sentences import Pattern, fixed, series
 from runtime.ipc.estop_latch import Latch
@@ -54,7 +54,7 @@ _RECEPTION_SILENT = fixed("health.reception_silent", "our process reception does
 _TIME_OVER = Pattern("health.time_over", "the run's {seconds:g} s are over")
 _SOURCE_ENDED = fixed("health.source_ended", "the recording that is the source has ended")
 
-SIBLINGS = ("control", "reception", "media", "guard")
+SIBLING_PROCESSES = ("control", "reception", "media", "guard")
 _TO_RECORD = ("minutes", "ticks", "observations")  # rings that media reads
 _MOST_WAITING = 0.5  # of a ring: what comes after it is full is lost
 _LINK_LOST_S = 2.0
@@ -63,7 +63,7 @@ _EARLY_S = 1e-6  # moments are sums of floats
 _LATCH_S = 0.2  # how long the e-stop's flag may be ahead of its latch on the disk
 
 
-class Noticed(NamedTuple):
+class HealthEvent(NamedTuple):
     """Something for the session, and the sentence that goes with it."""
 
     happening: SessionEvent
@@ -86,47 +86,50 @@ class HealthMonitor:
     ) -> None:
         """`stoppable` says whether somebody beside the robot can stop it: its panel is served."""
         self._plan = spec
-        self._page = shared
+        self._shared_state = shared
         self._lease = lease
         self._clock = clock
         self._people = people  # the clock of leases
         self._reception = reception  # what it last reported
         self._stoppable = stoppable
         self._latch = Latch(spec.deployment.station_dir)
-        self._generations = {name: shared.generation(name) for name in SIBLINGS}
+        self._generations = {name: shared.generation(name) for name in SIBLING_PROCESSES}
         self._lease_held = False
         self._unattended = False  # a run goes on though its holder is lost
         self._recording_late = False
         self.estop = ""  # who pressed and why, while it is latched
         self._pressed: float | None = None  # when the flag was seen without its latch
 
-    def notice(self, state: SessionState, run: Run | None) -> Iterator[Noticed]:
+    def poll(self, state: SessionState, run: Run | None) -> Iterator[HealthEvent]:
         """News for the session, which is in `state` before the first of it."""
-        yield from self._family(state)
+        yield from self._check_heartbeats(state)
         yield from self._estop(state)
         yield from self._leases(run if state is SessionState.RUNNING else None)
         yield from self._link()
-        if run is not None and run.begun is not None and state is SessionState.RUNNING:
+        if run is not None and run.begun_at is not None and state is SessionState.RUNNING:
             yield from self._end_of(run)
 
-    def absent(self) -> str:
+    def silent_sibling(self) -> str:
         """A sibling that does not answer, "" where all do: what it is sent would be lost."""
-        return next((name for name in SIBLINGS if not self._alive(name)), "")
+        return next((name for name in SIBLING_PROCESSES if not self._alive(name)), "")
 
     def _alive(self, name: str) -> bool:
         within = self._plan.deployment.heartbeat_timeout_s(name)
-        return self._page.alive(name, self._clock.now(), within)
+        return self._shared_state.alive(name, self._clock.now(), within)
 
     @property
     def _waiting_to_record(self) -> float:
         """Part of the room for what waits to be recorded that is taken, of the fullest ring."""
-        return max(self._page.rings[ring].fill for ring in _TO_RECORD)
+        return max(self._shared_state.rings[ring].fill for ring in _TO_RECORD)
 
     def look_at_recorder(self, state: SessionState) -> Iterator[Event]:
         """Events of a recorder that is silent in a run, and of one that goes on."""
         now, late = self._clock.now(), not self._alive("media")
         if late and not self._recording_late and state is SessionState.RUNNING:
-            since, percent = self._page.silence("media", now), 100.0 * self._waiting_to_record
+            since, percent = (
+                self._shared_state.describe_silence("media", now),
+                100.0 * self._waiting_to_record,
+            )
             yield Event("recording_late", _RECORDING_LATE(since=since, percent=percent), now)
             self._recording_late = True
         elif self._recording_late and not late:
@@ -135,42 +138,47 @@ class HealthMonitor:
 
     def missing_cameras(self) -> list[str]:
         """Cameras that have not sent a picture yet."""
-        numbers = self._page.observation.read()["picture_number"]
+        numbers = self._shared_state.observation.read()["picture_number"]
         return [
-            camera for camera, number in zip(self._page.layout.cameras, numbers, strict=False) if not number
+            camera
+            for camera, number in zip(self._shared_state.layout.cameras, numbers, strict=False)
+            if not number
         ]
 
-    def _family(self, state: SessionState) -> Iterator[Noticed]:
-        for name in SIBLINGS:
-            generation = self._page.generation(name)
+    def _check_heartbeats(self, state: SessionState) -> Iterator[HealthEvent]:
+        for name in SIBLING_PROCESSES:
+            generation = self._shared_state.generation(name)
             if generation != self._generations[name]:
                 self._generations[name] = generation
                 reason = _RESTARTED(process=name)
-                yield Noticed(SessionEvent.FAMILY_DIED, reason, name)
+                yield HealthEvent(SessionEvent.FAMILY_DIED, reason, name)
         if state is not SessionState.RUNNING:  # a set-up looks for itself
             return
         now = self._clock.now()
         # Media moves nothing, and what it has not read yet is kept for it, unless it has ended.
-        ended = not self._page.last_beat("media")
-        silent = [name for name in SIBLINGS if not self._alive(name) and (name != "media" or ended)]
+        ended = not self._shared_state.last_beat("media")
+        silent = [name for name in SIBLING_PROCESSES if not self._alive(name) and (name != "media" or ended)]
         if silent:
-            yield Noticed(
-                SessionEvent.HELD, _SILENT(process=silent[0], since=self._page.silence(silent[0], now))
+            yield HealthEvent(
+                SessionEvent.HELD,
+                _SILENT(process=silent[0], since=self._shared_state.describe_silence(silent[0], now)),
             )
         elif not self._alive("media") and self._waiting_to_record > _MOST_WAITING:
-            yield Noticed(SessionEvent.HELD, _RECORDING_WAITS(since=self._page.silence("media", now)))
+            yield HealthEvent(
+                SessionEvent.HELD, _RECORDING_WAITS(since=self._shared_state.describe_silence("media", now))
+            )
 
-    def _estop(self, state: SessionState) -> Iterator[Noticed]:
-        latched = self._page.estop is EStop.LATCHED
+    def _estop(self, state: SessionState) -> Iterator[HealthEvent]:
+        latched = self._shared_state.estop is EStop.LATCHED
         if latched and state is not SessionState.FAULTED:
             pressed = self._latch.read()
             if not (pressed and pressed.wall) and self._just_pressed():  # absent, or half written
                 return
             self.estop = _PRESSED_BY(who=pressed.by, why=pressed.why) if pressed else _PRESSED
-            yield Noticed(SessionEvent.ESTOPPED, _ESTOPPED(pressed=self.estop))
+            yield HealthEvent(SessionEvent.ESTOPPED, _ESTOPPED(pressed=self.estop))
         elif not latched and state is SessionState.FAULTED:
             self.estop, self._pressed = "", None
-            yield Noticed(SessionEvent.RELEASED, _RELEASED)
+            yield HealthEvent(SessionEvent.RELEASED, _RELEASED)
 
     def _just_pressed(self) -> bool:
         """Control obeys the flag already; who pressed and why is on the disk a moment later."""
@@ -178,20 +186,20 @@ class HealthMonitor:
         self._pressed = now if self._pressed is None else self._pressed
         return now - self._pressed < _LATCH_S
 
-    def _leases(self, going: Run | None) -> Iterator[Noticed]:
+    def _leases(self, going: Run | None) -> Iterator[HealthEvent]:
         held = self._lease.current(self._people.now()) is not None
         if self._lease_held and not held:
             limit = self._goes_on_to(going)
             self._unattended = limit is not None
             if limit is None:
-                yield Noticed(SessionEvent.LEASE_ENDED, _LEASE_ENDED)
+                yield HealthEvent(SessionEvent.LEASE_ENDED, _LEASE_ENDED)
             else:
-                yield Noticed(SessionEvent.HOLDER_LOST, _GOES_ON(seconds=limit))
+                yield HealthEvent(SessionEvent.HOLDER_LOST, _GOES_ON(seconds=limit))
         elif held or going is None:
             self._unattended = False
         elif self._unattended and not self._stoppable():
             self._unattended = False
-            yield Noticed(SessionEvent.LEASE_ENDED, _PANEL_GONE)
+            yield HealthEvent(SessionEvent.LEASE_ENDED, _PANEL_GONE)
         self._lease_held = held
 
     def _goes_on_to(self, going: Run | None) -> float | None:
@@ -201,35 +209,35 @@ class HealthMonitor:
         """
         if self._plan.deployment.lease.lost == "hold" or not self._lease.lost(self._people.now()):
             return None
-        scored = going is not None and going.trial and going.begun is not None
+        scored = going is not None and going.trial and going.begun_at is not None
         return going.duration_s if going is not None and scored and self._stoppable() else None
 
-    def _link(self) -> Iterator[Noticed]:
-        record = self._page.observation.read()
+    def _link(self) -> Iterator[HealthEvent]:
+        record = self._shared_state.observation.read()
         if not record["sequence"]:
             return
         age = self._clock.now() - float(record["arrived"])
         missing = self.missing_cameras()
         if age < _CONNECTED_S and not missing:
-            yield Noticed(SessionEvent.CONNECTED, _CONNECTED)
+            yield HealthEvent(SessionEvent.CONNECTED, _CONNECTED)
         elif age < _CONNECTED_S:
             silent = _NO_PICTURE(cameras=", ".join(missing))
-            why = series([silent, *complaints(self._reception().cameras, missing)])
-            yield Noticed(SessionEvent.INCOMPLETE, why)
+            why = series([silent, *describe_camera_problems(self._reception().cameras, missing)])
+            yield HealthEvent(SessionEvent.INCOMPLETE, why)
         elif age > _LINK_LOST_S and not record["last"]:
-            yield Noticed(SessionEvent.LINK_LOST, _LINK_LOST(seconds=age, who=self._who_is_silent()))
+            yield HealthEvent(SessionEvent.LINK_LOST, _LINK_LOST(seconds=age, who=self._who_is_silent()))
 
     def _who_is_silent(self) -> str:
         now, within = self._clock.now(), self._plan.deployment.control.heartbeat_timeout_s
-        if self._page.alive("reception", now, within):
+        if self._shared_state.alive("reception", now, within):
             return _ASK_FOR_NODE
         return _RECEPTION_SILENT
 
-    def _end_of(self, run: Run) -> Iterator[Noticed]:
+    def _end_of(self, run: Run) -> Iterator[HealthEvent]:
         limit = run.duration_s
         if limit is not None and run.elapsed(self._clock.now()) >= limit - _EARLY_S:
-            yield Noticed(SessionEvent.RUN_ENDED, _TIME_OVER(seconds=limit))
+            yield HealthEvent(SessionEvent.RUN_ENDED, _TIME_OVER(seconds=limit))
             return
-        record: np.void = self._page.observation.read()
-        if record["last"] and int(self._page.control.read()["sequence"]) == int(record["sequence"]):
-            yield Noticed(SessionEvent.RUN_ENDED, _SOURCE_ENDED)
+        record: np.void = self._shared_state.observation.read()
+        if record["last"] and int(self._shared_state.control.read()["sequence"]) == int(record["sequence"]):
+            yield HealthEvent(SessionEvent.RUN_ENDED, _SOURCE_ENDED)

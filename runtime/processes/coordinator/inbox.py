@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from runtime.core.sentences import Pattern
 from runtime.ipc.messages import (
-    HEARD,
-    UNHEARD,
+    ALL_SUBSCRIBED,
+    NO_SUBSCRIBER,
     ChunkMerged,
     EpisodeClosed,
     EpisodeOpened,
@@ -45,14 +45,14 @@ class Inbox:
             message
         ) in self._waiting():  # of before there was a coordinator, or since one died: told to that one
             if isinstance(message, Event):
-                self._keep(message)
+                self._store_event(message)
 
-    def read(self) -> None:
+    def poll(self) -> None:
         """Hear all that waits."""
         for message in self._waiting():
-            self._hear(message)
+            self._dispatch(message)
 
-    def forget_unheard(self) -> None:
+    def reset_subscribers(self) -> None:
         """Control is started anew: it says again who does not hear it."""
         self.unheard = {}
 
@@ -61,60 +61,60 @@ class Inbox:
             for payload in self._to.shared.rings[ring].drain():
                 yield decode(payload)
 
-    def _hear(self, message: Message) -> None:
+    def _dispatch(self, message: Message) -> None:
         to = self._to
         if isinstance(message, Event):
-            self._hear_event(message)
+            self._on_event(message)
         elif isinstance(message, ChunkMerged):
-            to.inference.merged(message)
+            to.inference.on_merged(message)
             if message.dropped:
                 text = _CHUNK_DROPPED(chunk=message.chunk_id, why=message.dropped)
-                to.say(Event("chunk_dropped", text, to.clock.now(), message.arrival_step))
+                to.emit(Event("chunk_dropped", text, to.clock.now(), message.arrival_step))
         elif isinstance(message, EpisodeOpened):
             self._episode_opened(message)
         elif isinstance(message, EpisodeClosed):
-            to.say(to.runs.closed(message))
-            to.collecting.closed(message)
+            to.emit(to.runs.on_episode_closed(message))
+            to.collecting.on_episode_closed(message)
         elif isinstance(message, MediaReport):
             self.media_report = message
         elif isinstance(message, ReceptionReport):
             self.reception_report = message
-            to.runs.saw(message.truth, to.session.state is SessionState.RUNNING)
+            to.runs.update_truth(message.truth, to.session.state is SessionState.RUNNING)
 
-    def _hear_event(self, event: Event) -> None:
+    def _on_event(self, event: Event) -> None:
         to, settings = self._to, self._to.spec.deployment
-        self._keep(event)
-        to.setup.heard(event)
+        self._store_event(event)
+        to.setup.on_event(event)
         if event.kind == "motion_done":
-            to.runs.arrived()
+            to.runs.on_motion_done()
         if event.kind == "joints_back":
             to.inference.forget_plan()
         if event.kind == "starved":
             to.inference.metrics.count_starved()
         if event.kind == "starvation":
-            trouble = to.inference.trouble
+            trouble = to.inference.problem
             stops = settings.faults.starvation == "stop"
             why = _STARVED_BECAUSE(why=event.text, trouble=trouble) if trouble else event.text
-            to.observe(SessionEvent.RUN_FAILED if stops else SessionEvent.HELD, why)
+            to.handle_event(SessionEvent.RUN_FAILED if stops else SessionEvent.HELD, why)
         elif event.kind in _HOLDS or (
             event.kind == "recording_failed" and settings.recording.on_failure == "hold"
         ):
-            to.observe(SessionEvent.HELD, event.text)
+            to.handle_event(SessionEvent.HELD, event.text)
         elif event.kind == "displaced":
-            to.observe(SessionEvent.DISPLACED, event.text)
+            to.handle_event(SessionEvent.DISPLACED, event.text)
 
-    def _keep(self, event: Event) -> None:
-        self._to.log(event)
-        if event.kind in (UNHEARD, HEARD):
+    def _store_event(self, event: Event) -> None:
+        self._to.record_event(event)
+        if event.kind in (NO_SUBSCRIBER, ALL_SUBSCRIBED):
             self.unheard = dict(event.data["unheard"])
 
     def _episode_opened(self, opened: EpisodeOpened) -> None:
         to = self._to
         if opened.error:
-            to.say(Event("recording_failed", opened.error, to.clock.now()))
+            to.emit(Event("recording_failed", opened.error, to.clock.now()))
         elif opened.uuid:
-            to.say(Event("episode_opened", _RECORDING(episode=opened.uuid), to.clock.now()))
-        failure = to.runs.opened(opened, to.session.state is SessionState.RUNNING)
+            to.emit(Event("episode_opened", _RECORDING(episode=opened.uuid), to.clock.now()))
+        failure = to.runs.on_episode_opened(opened, to.session.state is SessionState.RUNNING)
         if failure:
-            to.collecting.unopened()
-            to.observe(SessionEvent.RUN_FAILED, failure)
+            to.collecting.on_open_failed()
+            to.handle_event(SessionEvent.RUN_FAILED, failure)

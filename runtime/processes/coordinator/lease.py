@@ -19,7 +19,7 @@ HIGHEST_EPOCH = 2**52  # of a claim; beyond 2**53 a browser counts no more
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class LeaseState:
     """A lease as it stands: who, in which epoch, until when on our monotonic clock; `by`: as whom he is known.
 
     `hidden`: his page has said since it was last renewed that nobody looks at it.
@@ -37,10 +37,10 @@ class Lease:
 
     def __init__(self, ttl: float) -> None:
         self._ttl = ttl
-        self._held: Held | None = None
+        self._held: LeaseState | None = None
         self._epoch = 0  # of the newest lease there ever was
 
-    def current(self, now: float) -> Held | None:
+    def current(self, now: float) -> LeaseState | None:
         """The lease that is valid at `now`."""
         return self._held if self._held and now < self._held.until else None
 
@@ -59,7 +59,7 @@ class Lease:
     def epoch(self) -> int:
         return self._epoch
 
-    def never_below(self, epoch: int) -> None:
+    def raise_epoch_floor(self, epoch: int) -> None:
         """Epochs up to `epoch` were in use before a restart: they are over."""
         self._epoch = max(self._epoch, epoch)
 
@@ -83,7 +83,7 @@ class Lease:
         if epoch <= self._epoch:
             return _EPOCH_OVER(epoch=epoch, newest=self._epoch)
         self._epoch = epoch
-        self._held = Held(holder, epoch, now + self._ttl, by)
+        self._held = LeaseState(holder, epoch, now + self._ttl, by)
         return ""
 
     def renew(self, holder: str, epoch: int, now: float, by: str = "") -> str:
@@ -98,7 +98,7 @@ class Lease:
         if not self.check(holder, epoch, now) and self._held:
             self._held = replace(self._held, hidden=True)
 
-    def give_up(self, holder: str, epoch: int, now: float, by: str = "") -> str:
+    def release(self, holder: str, epoch: int, now: float, by: str = "") -> str:
         """End the lease before its time."""
         refusal = self.check(holder, epoch, now)
         if not refusal:

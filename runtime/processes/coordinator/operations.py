@@ -27,8 +27,8 @@ from runtime.processes.coordinator.demonstrations import Demonstrations
 from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.runs import Runs
-from runtime.processes.coordinator.session.transitions import DISCARDED, GuardFacts, Told
-from runtime.processes.coordinator.session.tuning import strategy_of, tuned
+from runtime.processes.coordinator.session.transitions import DISCARDED, GuardFacts, TransitionResult
+from runtime.processes.coordinator.session.tuning import apply_tuning, strategy_of
 from runtime.processes.coordinator.setup.sequence import SetUp
 from runtime.station.spec import StationSpec
 
@@ -100,7 +100,7 @@ _FAMILY_STARTING = Pattern(
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
+class SessionComponents:
     """Parts that operations are carried out with."""
 
     shared: SharedState
@@ -123,7 +123,7 @@ class SessionActions:
     def __init__(
         self,
         spec: StationSpec,
-        parts: Parts,
+        parts: SessionComponents,
         state: Callable[[], SessionState],
         absent: Callable[[], str],
         say: Callable[[Event], None],
@@ -145,14 +145,14 @@ class SessionActions:
         self.by: str = ""  # the client whose command is being carried out
         self.command: str = ""  # that command's uuid
 
-    def attribute(self, by: str, command: str) -> None:
+    def set_requester(self, by: str, command: str) -> None:
         """What is carried out next was asked for by `by`, in the command with that uuid."""
         self.by, self.command = by, command
 
     # --- set-up and runs -------------------------------------------------------------------------------------
 
-    def begin_setup(self, asked: SetUpRequest) -> Told:
-        spec, reset = self._changed(asked), self.setup.bench.of(asked.bench)
+    def begin_setup(self, asked: SetUpRequest) -> TransitionResult:
+        spec, reset = self._changed_spec(asked), self.setup.bench.from_request(asked.bench)
         policy = self.inference.policy
         other = spec.deployment.policy != self.spec.deployment.policy
         if spec.collecting != self.spec.collecting or (other and not spec.collecting):
@@ -162,20 +162,20 @@ class SessionActions:
         # Nothing is refused from here on.
         checkpoint = asked.checkpoint.model_dump() if asked.checkpoint else {}
         self.spec = spec
-        self.runs.describe(spec=spec, checkpoint=checkpoint, bench=reset or {})
-        self.inference.exchange(policy, spec.deployment.task)
+        self.runs.update_provenance(spec=spec, checkpoint=checkpoint, bench=reset or {})
+        self.inference.set_policy(policy, spec.deployment.task)
         self.inference.tune(strategy_of(spec), spec.deployment.task)
         self._tuned = False
         self.collecting.begin_setup(spec.collecting)
         self.setup.begin(reset, asked.least)
         return {"bench": reset["id"]} if reset else {}
 
-    def _changed(self, asked: SetUpRequest) -> StationSpec:
+    def _changed_spec(self, asked: SetUpRequest) -> StationSpec:
         """The plan of a set-up; raises RuntimeFault where it is none, or an open recording would not be about it."""
         collects = self._collects(asked)
         changes = asked.changes | ({"strategy": {"kind": "naive"}} if collects else {})
-        resolved = loader.changed(self._own.resolved, changes, "setup")
-        if self.runs.alone and resolved.digest != self.spec.resolved.digest:
+        resolved = loader.apply_changes(self._own.resolved, changes, "setup")
+        if self.runs.is_recording_standalone and resolved.digest != self.spec.resolved.digest:
             raise RuntimeFault(_RECORDING_OPEN_OF_OTHER_MANIFEST)
         return replace(self._own, resolved=resolved, collecting=collects)
 
@@ -195,10 +195,10 @@ class SessionActions:
 
     def cancel_setup(self, reason: str) -> None:
         self.setup.cancel()
-        self._orders.give("hold", reason=reason)
-        self.manual.stand()
+        self._orders.send_order("hold", reason=reason)
+        self.manual.stop_grippers()
 
-    def begin_run(self, asked: RunRequest) -> Told:
+    def begin_run(self, asked: RunRequest) -> TransitionResult:
         self._require_family()
         if asked.trial is not None:
             self._require_comparable(asked)
@@ -214,7 +214,7 @@ class SessionActions:
             return {"episode": self.runs.begin(self.setup.info, asked, command=self.command)}
         self.manual.require_robot(_WHAT_RUN_COLLECT)
         episode = self.runs.begin(self.setup.info, asked, collecting.manifest(asked), self.command)
-        collecting.begun(episode, asked)
+        collecting.on_episode_started(episode, asked)
         return {"episode": episode}
 
     def _mode(self, asked: RunRequest) -> Mode:
@@ -250,31 +250,31 @@ class SessionActions:
         return GuardFacts(
             mode=run.mode if run else None,
             trial=run is not None and run.trial,
-            proposed=self.inference.proposal is not None,
-            asked=self.inference.asked,
+            has_proposal=self.inference.proposal is not None,
+            is_requesting=self.inference.is_pending,
             executing=int(control["remaining"]) > 0,
             first_action=self.setup.first_action is not None and self.spec.capabilities.moves_robot,
-            opening=run is not None and run.begun is None,
-            approaching=run is not None and run.approaching,
+            opening=run is not None and run.begun_at is None,
+            approaching=run is not None and run.is_approaching,
             collection=self.collecting.declared,
             collecting=self.spec.collecting,
             armed=self.collecting.armed,
-            unled=self.collecting.unled,
-            doubt=self.shared.doubt if self.spec.capabilities.moves_robot else "",
+            leader_problem=self.collecting.leader_problem,
+            doubt=self.shared.joint_problem if self.spec.capabilities.moves_robot else "",
         )
 
-    def tune(self, asked: TuneRequest) -> Told:
+    def tune(self, asked: TuneRequest) -> TransitionResult:
         """Another strategy, other parameters, another instruction from now on."""
         if self.spec.collecting and asked.strategy is not None:
             raise RuntimeFault(_TUNE_STRATEGY_WHILE_COLLECTING)
-        spec = tuned(self.spec, asked, self.setup.info)
+        spec = apply_tuning(self.spec, asked, self.setup.info)
         settings = spec.deployment
         strategy = settings.strategy.model_dump()
         self._orders.tune(strategy)
         if settings.task != self.spec.deployment.task:
-            self.setup.expect(None)  # it answered another instruction
+            self.setup.set_first_action(None)  # it answered another instruction
         self.spec, self._tuned = spec, True
-        self.runs.describe(spec=spec)
+        self.runs.update_provenance(spec=spec)
         self.inference.tune(strategy_of(spec), settings.task)
         data = {"strategy": strategy, "task": settings.task, "hash": spec.resolved.digest}
         text = _TUNED_TO(strategy=settings.strategy.kind, task=settings.task)
@@ -284,22 +284,22 @@ class SessionActions:
     def cancel(self) -> None:
         """Forget the chunk that is shown, leave the rest of the one that is executed, end a motion; hold."""
         self.runs.cancel()
-        self.manual.stand()
+        self.manual.stop_grippers()
 
-    def grip(self, asked: GripperRequest) -> Told:
+    def move_gripper(self, asked: GripperRequest) -> TransitionResult:
         run = self.runs.open
         if run is not None and run.mode == "sim" and asked.action in ("open", "close"):
             raise RuntimeFault(_GRIPPER_IN_SIM(action=asked.action))
         free = run is None or run.mode == "manual" or self._state() is SessionState.HOLDING
-        return self.manual.grip(asked, free)
+        return self.manual.move_gripper(asked, free)
 
     def approach(self) -> None:
         """Go to the policy's first action on a limited path: the one of the set-up, or the one that is shown."""
         made, first = self.inference.proposal, self.setup.first_action
         if self._state() is not SessionState.READY and made is not None:
-            self.runs.approach(self.manual.checked("approach", made.answered.made.meant))
+            self.runs.approach(self.manual.check_motion("approach", made.answered.commands.intended_start))
         elif first is not None:
-            self.setup.begin_approach(self.manual.checked("approach", first))
+            self.setup.begin_approach(self.manual.check_motion("approach", first))
 
     # --- demonstrations -----------------------------------------------------------------------------
 
@@ -308,7 +308,7 @@ class SessionActions:
         self._require_family()
         self.collecting.arm()
 
-    def discard(self, asked: DiscardRequest) -> Told:
+    def discard(self, asked: DiscardRequest) -> TransitionResult:
         """Mark an episode as discarded; the open one ends, as by `end_run`, where none is named."""
         told = self.collecting.discard(asked, self.by)
         if asked.episode is None and self.collecting.run is not None:
@@ -320,7 +320,7 @@ class SessionActions:
     def hold(self, reason: str) -> None:
         """Decelerate, hold, stop asking the policy; a run stays open."""
         self.runs.hold(reason)
-        self.manual.stand()
+        self.manual.stop_grippers()
 
     def resume_run(self) -> None:
         self._require_family()
@@ -329,15 +329,15 @@ class SessionActions:
     def end_run(self, status: str, reason: str) -> None:
         """Decelerate, hold, close the run and its episode; nothing to do where no run is open."""
         self.runs.end(status, reason)
-        self.manual.stand()
+        self.manual.stop_grippers()
 
     def go_home(self) -> None:
         self.manual.require_robot("home")
         self.setup.begin_homing()
 
-    def start_recording(self) -> Told:
+    def start_recording(self) -> TransitionResult:
         self._require_family()
-        return {"episode": self.runs.record_alone(self.setup.info)}
+        return {"episode": self.runs.start_standalone_recording(self.setup.info)}
 
     def _require_family(self) -> None:
         """Refuse while a process is still starting: what it is sent would be lost."""

@@ -38,17 +38,17 @@ class PathCheck:
 
     def check(self, what: str, start: Float64, goal: Float64) -> None:
         """RuntimeFault for `what` where the way from `start` to `goal` [D] leaves a box it is in, or links collide."""
-        way = self._way(start, goal)
-        if arm := self._workspace.left_on(way):
+        way = self._path(start, goal)
+        if arm := self._workspace.arm_leaving_on(way):
             raise RuntimeFault(_LEAVES_WORKSPACE(what=what, arm=arm))
-        found = self._collisions.on_way(way)
+        found = self._collisions.first_on_path(way)
         if found is not None:
             collision, at = found
             raise RuntimeFault(_COLLIDES(what=what, collision=collision, percent=100 * at / (len(way) - 1)))
 
-    def _way(self, start: Float64, goal: Float64) -> Float64:
+    def _path(self, start: Float64, goal: Float64) -> Float64:
         """Postures [T, D] from `start` to `goal`, near enough to each other."""
         apart = difference(goal, start, self._wrapping)
-        farthest = np.abs(apart).max(where=self._limits.places, initial=0.0)
+        farthest = np.abs(apart).max(where=self._limits.position_mask, initial=0.0)
         count = max(2, math.ceil(farthest / _STEP) + 1)
         return np.asarray(start + np.linspace(0.0, 1.0, count)[:, None] * apart)

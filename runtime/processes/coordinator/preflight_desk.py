@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from runtime.config.loader import changed, server_of
+from runtime.config.loader import apply_changes, server_address
 from runtime.core.clock import Clock
 from runtime.core.errors import RuntimeFault
 from runtime.core.plugins import variants
 from runtime.core.sentences import Pattern
 from runtime.ipc.command_arguments import PolicyServerRequest, PreflightReportRequest, PreflightRequest, read
-from runtime.ipc.identity import named
+from runtime.ipc.identity import display_name
 from runtime.ipc.messages import Ack, Command, Event
 from runtime.ipc.session_state import SessionState
 from runtime.station.preflight_child import Preflights
@@ -36,8 +36,8 @@ _SERVER_IN_USE = Pattern(
 PREFLIGHT_QUERIES = ("preflight", "preflight_report", "policy_server")
 
 
-class PreflightDesk:
-    """Main's: `in_force` is the plan as it was last set up, `own` the deployment's, which is what is asked about."""
+class PreflightService:
+    """Preflights of the coordinator: `in_force` is the plan last set up, `own` the deployment's, which is checked."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class PreflightDesk:
     def handle(self, command: Command, boot: str) -> Ack:
         """The answer to one of PREFLIGHT_QUERIES."""
         answer = {
-            "preflight": self._begin,
+            "preflight": self._start,
             "preflight_report": self._report,
             "policy_server": self._server,
         }[command.kind]
@@ -64,12 +64,12 @@ class PreflightDesk:
         except RuntimeFault as fault:
             return Ack(command.uuid, "refused", str(fault), boot=boot)
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Say what has ended; cheap."""
-        ended = self._preflights.look()
+        ended = self._preflights.poll()
         if ended is not None:
-            verdict = ended.told.get("verdict") or ended.failure
-            self._note(_ENDED(about=ended.about, verdict=verdict), {"id": ended.id})
+            verdict = ended.finished.get("verdict") or ended.failure
+            self._emit(_ENDED(about=ended.about, verdict=verdict), {"id": ended.id})
 
     def cancel(self, why: str) -> None:
         """The policy's server is wanted for something that counts."""
@@ -79,11 +79,11 @@ class PreflightDesk:
         """End what is under way."""
         self._preflights.close()
 
-    def _begin(self, command: Command) -> dict[str, Any]:
+    def _start(self, command: Command) -> dict[str, Any]:
         asked = read("preflight", PreflightRequest, command.args)
         self._require_free(asked)
         longest = self._preflights.start(asked, self._own.resolved)
-        self._note(_BEGUN(about=asked.about, who=named(command)), {"id": asked.id})
+        self._emit(_BEGUN(about=asked.about, who=display_name(command)), {"id": asked.id})
         return {"id": asked.id, "longest_s": longest}
 
     def _require_free(self, asked: PreflightRequest) -> None:
@@ -98,9 +98,9 @@ class PreflightDesk:
             )
         if not state.meaning.ready:
             return
-        settings = changed(self._own.resolved, asked.changes, "preflight").deployment
+        settings = apply_changes(self._own.resolved, asked.changes, "preflight").deployment
         exclusive = getattr(variants("runtime.policies")[settings.policy.kind], "EXCLUSIVE", False)
-        if exclusive and server_of(settings) == server_of(self._in_force().deployment):
+        if exclusive and server_address(settings) == server_address(self._in_force().deployment):
             raise RuntimeFault(_SERVER_IN_USE(kind=settings.policy.kind))
 
     def _report(self, command: Command) -> dict[str, Any]:
@@ -111,8 +111,12 @@ class PreflightDesk:
         asked = read("policy_server", PolicyServerRequest, command.args)
         settings = self._in_force().deployment
         if asked.policy is not None:
-            settings = changed(self._own.resolved, {"policy": asked.policy}, "policy_server").deployment
-        return {"server": server_of(settings), "state": str(self._state()), "state_is": self._state().told()}
+            settings = apply_changes(self._own.resolved, {"policy": asked.policy}, "policy_server").deployment
+        return {
+            "server": server_address(settings),
+            "state": str(self._state()),
+            "state_is": self._state().meaning_dict(),
+        }
 
-    def _note(self, text: str, data: dict[str, Any]) -> None:
+    def _emit(self, text: str, data: dict[str, Any]) -> None:
         self._say(Event("preflight", text, self._clock.now(), data=data))

@@ -13,16 +13,24 @@ from runtime.core import file_limits as descriptors
 from runtime.core import malloc as heap
 from runtime.core.clock import MonotonicClock
 from runtime.core.sentences import Pattern
-from runtime.ipc.bus import STREAM_HIGH_WATER, TOO_MANY, Call, CommandServer, Endpoints, Key, Publisher
-from runtime.ipc.fair_queue import Asked, Turns
-from runtime.ipc.identity import forged, identified, lacking
+from runtime.ipc.bus import (
+    STREAM_HIGH_WATER,
+    TOO_MANY,
+    CommandServer,
+    Endpoints,
+    IncomingMessage,
+    Key,
+    Publisher,
+)
+from runtime.ipc.fair_queue import FairQueue, QueuedCommand
+from runtime.ipc.identity import authenticate, missing_role, unverified_reason
 from runtime.ipc.membership import rest_s
 from runtime.ipc.messages import Ack, Command, Event
-from runtime.processes.child import join
+from runtime.processes.child import join_station
 from runtime.processes.coordinator.assembly import assemble
 from runtime.processes.coordinator.command_journal import CommandJournal
 from runtime.processes.coordinator.coordinator import Coordinator
-from runtime.processes.coordinator.inference.inference import ShownChunk
+from runtime.processes.coordinator.inference.inference import DisplayedChunk
 from runtime.processes.coordinator.inference.worker import ThreadRunner
 from runtime.processes.coordinator.session.transitions import STOPPING
 
@@ -43,7 +51,7 @@ _SLOWER = 2.0  # the period of snapshots of a station at rest, where every event
 _WORK_S = 0.004  # between two looks at what goes on
 
 
-Answered = tuple[Command, Ack, Call]
+Answered = tuple[Command, Ack, IncomingMessage]
 
 
 class CommandService:
@@ -54,13 +62,13 @@ class CommandService:
         settings = coordinator.spec.deployment
         folder = settings.station_dir
         self._server = CommandServer(context, folder, "commands")
-        self._turns = Turns(self._server, STOPPING, _SHARE)
+        self._turns = FairQueue(self._server, STOPPING, _SHARE)
         self._key = Key(folder)
         self._streams = Publisher(context, folder, "state", STREAM_HIGH_WATER)
         self._journal = CommandJournal(folder)
-        coordinator.session.remember(self._journal.answers)
+        coordinator.session.restore_answers(self._journal.answers)
         self._endpoints = Endpoints(folder)
-        self._tell_where()
+        self._write_endpoints()
         self._bell = coordinator.shared.bells.get("coordinator")
         self._poller = zmq.Poller()
         for woken_by in (self._server.socket, self._streams.socket, self._bell and self._bell.descriptor):
@@ -69,11 +77,11 @@ class CommandService:
         self._due: dict[str, float] = {}
         self._read: list[str] = []  # streams of _PERIODS that somebody reads
         self._told = 0
-        self._shown: ShownChunk | None = None
+        self._shown: DisplayedChunk | None = None
         self._unjournalled = ""
-        self._waiting: list[Asked] = []  # for what is still being loaded
+        self._waiting: list[QueuedCommand] = []  # for what is still being loaded
 
-    def _tell_where(self) -> None:
+    def _write_endpoints(self) -> None:
         where = {
             "commands": self._server.endpoint,
             "state": self._streams.endpoint,
@@ -86,34 +94,38 @@ class CommandService:
 
         Who begins to read a stream, and a message of the family, end the wait too.
         """
-        if not self._turns.waiting:
+        if not self._turns.has_waiting:
             self._poller.poll(math.ceil(timeout * 1000))
         if self._bell is not None:
             self._bell.hush()
-        stops, others = self._turns.take()
+        stops, others = self._turns.take_turn()
         stopped = self._stop([(call, self._identified(call, command)) for call, command in stops])
         loading, self._waiting = self._waiting, []
-        answered = self._carry_out(
+        answered = self._execute(
             [*loading, *((call, self._identified(call, command)) for call, command in others)]
         )
         journalled = [
             (command, ack) for command, ack, _ in (*stopped, *answered) if command.kind not in _NOT_JOURNALLED
         ]
         if journalled:
-            self._tell_once(self._journal.append_all(journalled))
+            self._report_disk_failure(self._journal.append_all(journalled))
         for _, ack, call in answered:
             self._server.answer(call, ack)
-        self._tell_of_flood()
+        self._report_flood()
         self._publish()
         if any(
-            [self._server.moved(), self._streams.moved(), self._endpoints.lost("coordinator")]
+            [
+                self._server.rebind_if_unreachable(),
+                self._streams.rebind_if_unreachable(),
+                self._endpoints.is_missing("coordinator"),
+            ]
         ):  # all are looked after
-            self._tell_where()
+            self._write_endpoints()
 
-    def _identified(self, call: Call, command: Command) -> Command:
-        return identified(command, call.payload, call.signature, call.uid, self._key)
+    def _identified(self, call: IncomingMessage, command: Command) -> Command:
+        return authenticate(command, call.payload, call.signature, call.uid, self._key)
 
-    def _stop(self, stops: list[Asked]) -> list[Answered]:
+    def _stop(self, stops: list[QueuedCommand]) -> list[Answered]:
         """Answer stops without waiting for the disk; those alike in this turn get the same answer."""
         first: dict[tuple[str, str, str, int], Ack] = {}
         fresh: list[Answered] = []
@@ -127,26 +139,26 @@ class CommandService:
             self._server.answer(call, replace(ack, uuid=command.uuid))
         return fresh
 
-    def _carry_out(self, asked: list[Asked]) -> list[Answered]:
+    def _execute(self, asked: list[QueuedCommand]) -> list[Answered]:
         """Answers that are new, to be given when they are on disk."""
         fresh: list[Answered] = []
         for call, command in asked:
             if (first := self._coordinator.session.answered(command)) is not None:
                 self._server.answer(call, first)
-            elif refusal := forged(command) or lacking(command):
+            elif refusal := unverified_reason(command) or missing_role(command):
                 self._refuse(call, command, refusal)
-            elif self._coordinator.queries.waits(command):
-                self._keep(call, command)
+            elif self._coordinator.queries.is_loading(command):
+                self._defer(call, command)
             else:
                 fresh.append((command, self._coordinator.handle(command), call))
         return fresh
 
-    def _refuse(self, call: Call, command: Command, reason: str) -> None:
+    def _refuse(self, call: IncomingMessage, command: Command, reason: str) -> None:
         text = _REFUSED(kind=command.kind, who=command.user, reason=reason)
-        self._say_seldom("not_allowed", text)
+        self._emit_rate_limited("not_allowed", text)
         self._server.answer(call, Ack(command.uuid, "refused", reason, kind=command.kind))
 
-    def _keep(self, call: Call, command: Command) -> None:
+    def _defer(self, call: IncomingMessage, command: Command) -> None:
         """Answer it when what it needs is loaded; nobody waits for that here."""
         if len(self._waiting) < _MOST_WAITING:
             self._waiting.append((call, command))
@@ -154,30 +166,30 @@ class CommandService:
             reason = _TOO_MANY_WAIT(kind=command.kind, most=_MOST_WAITING)
             self._server.answer(call, Ack(command.uuid, "refused", reason))
 
-    def _tell_of_flood(self) -> None:
+    def _report_flood(self) -> None:
         if (call := self._turns.refused) is not None:
-            self._say_seldom("flood", _TOO_MANY_REQUESTS(pid=call.pid, why=TOO_MANY))
+            self._emit_rate_limited("flood", _TOO_MANY_REQUESTS(pid=call.pid, why=TOO_MANY))
 
-    def _say_seldom(self, kind: str, text: str) -> None:
+    def _emit_rate_limited(self, kind: str, text: str) -> None:
         """An event, unless there was one of its kind just now: a flood is not to fill the record."""
-        if (now := self._coordinator.people.now()) >= self._due.get(kind, 0.0):
+        if (now := self._coordinator.client_clock.now()) >= self._due.get(kind, 0.0):
             self._due[kind] = now + _FLOOD_S
-            self._coordinator.say(Event(kind, text, self._coordinator.clock.now()))
+            self._coordinator.emit(Event(kind, text, self._coordinator.clock.now()))
 
-    def _tell_once(self, failure: str) -> None:
+    def _report_disk_failure(self, failure: str) -> None:
         """A disk that is full stays so for a while: one event when it begins."""
         if failure and not self._unjournalled:
             text = _NOT_ON_DISK(why=failure)
-            self._coordinator.say(Event("not_journalled", text, self._coordinator.clock.now()))
+            self._coordinator.emit(Event("not_journalled", text, self._coordinator.clock.now()))
         self._unjournalled = failure
 
     def until_due(self) -> float:
         """Seconds until a stream that somebody reads is due; inf where nobody reads any."""
         due = min((self._due.get(stream, 0.0) for stream in self._read), default=math.inf)
-        return max(0.0, due - self._coordinator.people.now())
+        return max(0.0, due - self._coordinator.client_clock.now())
 
     def _publish(self) -> None:
-        coordinator, now = self._coordinator, self._coordinator.people.now()
+        coordinator, now = self._coordinator, self._coordinator.client_clock.now()
         if begun := self._streams.hear():  # is shown at once what there is
             self._due = {name: due for name, due in self._due.items() if not name.startswith(tuple(begun))}
         self._read = [stream for stream in _PERIODS if self._streams.wanted(stream)]
@@ -206,7 +218,7 @@ class CommandService:
             self._due["chunk"] = now + 1.0
             self._streams.publish("chunk", {"chunk": 0} if shown is None else self._chunk(shown))
 
-    def _chunk(self, shown: ShownChunk) -> dict[str, Any]:
+    def _chunk(self, shown: DisplayedChunk) -> dict[str, Any]:
         """Rows float32 [H, D], poses float32 [H, 8 * arms], the step each row is for (-1: none)."""
         return {
             "chunk": shown.number,
@@ -230,7 +242,7 @@ class CommandService:
         """
         status, seen = self._coordinator.shared.control.read(), self._coordinator.shared.observation.read()
         step = int(status["step"])
-        raw, ticked = self._coordinator.inference.raw(step), bool(status["behaviour"])
+        raw, ticked = self._coordinator.inference.raw_action(step), bool(status["behaviour"])
         nothing = np.full(len(seen["qpos"]), np.nan, np.float32)
         return {
             "step": step,
@@ -260,14 +272,14 @@ class CommandService:
 
 def main() -> None:
     """The process coordinator: decide and serve until the supervisor is gone."""
-    heap.keep()
-    descriptors.allow_all()
-    member = join("coordinator")
+    heap.keep_freed_memory()
+    descriptors.raise_file_limit()
+    member = join_station("coordinator")
     deciding = assemble(member.spec, member.shared, MonotonicClock(), ThreadRunner())
     service = CommandService(deciding, zmq.Context.instance())
     rest = rest_s(member.spec.deployment.control.heartbeat_timeout_s)
-    while not member.lifeline.cut:
-        deciding.pump()
+    while not member.lifeline.is_cut:
+        deciding.poll()
         service.serve(min(rest, service.until_due()) if deciding.rests else _WORK_S)
     deciding.close()
     service.close()

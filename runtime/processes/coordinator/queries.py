@@ -7,7 +7,7 @@ from runtime.core.sentences import Pattern
 from runtime.ipc.bus import EventLog
 from runtime.ipc.messages import Ack, Command
 from runtime.processes.coordinator.manual.manual_control import ManualControl
-from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
+from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightService
 
 _EVENTS_SINCE_NUMBER = Pattern(
     "queries.events_since_number",
@@ -20,7 +20,9 @@ QUERIES = ("events_since", "aim", *PREFLIGHT_QUERIES)
 class Queries:
     """Answers to QUERIES; any client that may ask at all may ask them."""
 
-    def __init__(self, boot: str, events: EventLog, manual: ManualControl, preflights: PreflightDesk) -> None:
+    def __init__(
+        self, boot: str, events: EventLog, manual: ManualControl, preflights: PreflightService
+    ) -> None:
         self._boot, self._events, self._manual, self._preflights = boot, events, manual, preflights
 
     def answer(self, command: Command) -> Ack:
@@ -31,9 +33,9 @@ class Queries:
             return self._aim(command)
         return self._preflights.handle(command, self._boot)
 
-    def waits(self, command: Command) -> bool:
+    def is_loading(self, command: Command) -> bool:
         """True if its answer needs what is still being loaded, so that it is to be asked again in a moment."""
-        return command.kind == "aim" and self._manual.waits(command.args)
+        return command.kind == "aim" and self._manual.is_loading(command.args)
 
     def _events_since(self, command: Command) -> Ack:
         number = command.args.get("number", 0)

@@ -1,4 +1,4 @@
-"""Main's side of runs and recordings: what is opened, held, resumed, closed, and what media is told of it."""
+"""The coordinator's side of runs and recordings: opens, holds, resumes and closes them, and notifies media."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Runs:
         prepared: Callable[[], bool],
     ) -> None:
         self._plan = spec
-        self._page = shared
+        self._shared_state = shared
         self._clock = clock
         self._inference = inference
         self._orders = orders
@@ -88,13 +88,13 @@ class Runs:
         self.last_episode: dict[str, Any] = {}
 
     @property
-    def _evidence(self) -> bool:
+    def _requires_recording(self) -> bool:
         """True if a run that is not recorded must not go on."""
         return self._plan.deployment.recording.on_failure == "hold"
 
     def _must_record(self, trial: bool, mode: str) -> bool:
         """True if a run must not begin without its recording: a trial or demonstration is nothing without."""
-        return self._evidence or trial or mode == "collect"
+        return self._requires_recording or trial or mode == "collect"
 
     def _require_room(self) -> None:
         """RecordingError where the disk of the episodes has too little room for another one."""
@@ -111,7 +111,7 @@ class Runs:
             "episode": self.last_episode,
         }
 
-    def describe(self, **changes: Any) -> None:
+    def update_provenance(self, **changes: Any) -> None:
         """Another plan, checkpoint or layout of the bench, for the manifests of what follows: fields of Provenance."""
         self._provenance = replace(self._provenance, **changes)
 
@@ -146,7 +146,7 @@ class Runs:
             manifest |= more
         identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
         self._tell(BeginEpisode(self._count, manifest, self._generation))
-        self._inference.show_simulated(mode == "sim" and sim_state == "simulated")
+        self._inference.use_simulated(mode == "sim" and sim_state == "simulated")
         self.open = Run(
             self._count,
             identity,
@@ -159,12 +159,12 @@ class Runs:
         )
         return identity if manifest else ""
 
-    def opened(self, message: EpisodeOpened, running: bool) -> str:
+    def on_episode_opened(self, message: EpisodeOpened, running: bool) -> str:
         """Media is ready, or could not be: returns why the run cannot go on, "" where it can."""
         if message.error and message.run == 0:
             self._alone = ""
         run = self.open
-        if run is None or message.run != run.number or run.begun is not None:
+        if run is None or message.run != run.number or run.begun_at is not None:
             return ""
         if message.error and self._must_record(run.trial, run.mode):
             run.fail_to_open()
@@ -174,7 +174,7 @@ class Runs:
             self._tell(BeginEpisode(run.number, None, self._generation))  # the source plays all the same
             return ""
         run.open()
-        doubt = self._page.doubt if running and self._plan.capabilities.moves_robot else ""
+        doubt = self._shared_state.joint_problem if running and self._plan.capabilities.moves_robot else ""
         if running and not doubt:
             self._start(run)
         return doubt  # which came after the run was accepted
@@ -182,23 +182,23 @@ class Runs:
     def hold(self, reason: str) -> None:
         """Decelerate, hold, stop asking; an open run's clock pauses."""
         self._inference.pause()
-        self._orders.give("hold", run=self._begun, reason=reason)
+        self._orders.send_order("hold", run=self._begun, reason=reason)
         if self.open:
             self.open.hold(self._clock.now())
 
     @property
     def _begun(self) -> int:
         """The number of the open run, whose rows control's ticks are; 0 where none is open, or it has not begun."""
-        return 0 if self.open is None or self.open.begun is None else self.open.number
+        return 0 if self.open is None or self.open.begun_at is None else self.open.number
 
     def resume(self) -> None:
         """Go on with the open run; raises RuntimeFault where there is none, or its recording has failed."""
         run = self.open
         if run is None:
             raise RuntimeFault(_NONE_OPEN)
-        if run.unrecorded and self._evidence:
+        if run.unrecorded and self._requires_recording:
             raise RuntimeFault(_RECORDING_ENDED(why=run.unrecorded))
-        if run.begun is not None:
+        if run.begun_at is not None:
             run.resume(self._clock.now())
             self._follow(run, fresh=False)
         elif run.opened:  # it was halted before it began
@@ -207,29 +207,31 @@ class Runs:
     def end(self, status: str, reason: str) -> None:
         """Decelerate, hold, close the open run."""
         self._inference.pause()
-        self._inference.show_simulated(False)
-        self._orders.give("hold", reason=reason)
+        self._inference.use_simulated(False)
+        self._orders.send_order("hold", reason=reason)
         run, self.open = self.open, None
         if run is not None:
-            if run.begun is not None and run.mode not in ("manual", "collect"):
-                self._inference.requests.rest()
+            if run.begun_at is not None and run.mode not in ("manual", "collect"):
+                self._inference.requests.end_episode()
             seconds = run.elapsed(self._clock.now())
             self.last = {"number": run.number, "uuid": run.uuid, "status": status, "reason": reason}
             policy = self._inference.metrics.figures()
             details = {"run_seconds": seconds, "control": run.figures(self._figures()), "policy": policy}
             details |= {"reached": run.reached} if run.reached else {}
-            self.note(EndEpisode(status, reason, details))  # a stop is not refused because media hangs
+            self.record_event(
+                EndEpisode(status, reason, details)
+            )  # a stop is not refused because media hangs
 
-    def saw(self, truth: Mapping[str, Any], running: bool) -> None:
+    def update_truth(self, truth: Mapping[str, Any], running: bool) -> None:
         """Note when a simulated bench first says of a milestone that it is reached, in a run that is not held."""
         run, milestones = self.open, truth.get("milestones")
-        if not running or run is None or run.begun is None or not isinstance(milestones, Mapping):
+        if not running or run is None or run.begun_at is None or not isinstance(milestones, Mapping):
             return
         for name, reached in milestones.items():
             if reached:
                 run.reached.setdefault(str(name), round(run.elapsed(self._clock.now()), 2))
 
-    def pump(self) -> None:
+    def poll(self) -> None:
         """Begin a run as soon as what it waited for is there."""
         if self.open is not None and self.open.waiting:
             self._start(self.open)
@@ -245,20 +247,20 @@ class Runs:
     def _follow(self, run: Run, fresh: bool) -> None:
         run.arrive()
         if run.mode == "manual":
-            self._orders.give("hold", run=run.number)
-        elif run.mode == "collect" and not self._inference.policy.answers:
-            self._orders.give("yield", run=run.number, mode=run.mode)
+            self._orders.send_order("hold", run=run.number)
+        elif run.mode == "collect" and not self._inference.policy.is_queried:
+            self._orders.send_order("yield", run=run.number, mode=run.mode)
         else:
-            self._orders.give("follow", run=run.number, mode=run.mode)
+            self._orders.send_order("follow", run=run.number, mode=run.mode)
             self._inference.begin(run.number, fresh, run.mode)
             if run.mode == "collect":  # a leader has moved on while the robot was held: it is engaged anew
-                self._inference.requests.forget()
+                self._inference.requests.reset_episode()
 
     # --- by a person, within a run ---------------------------------------------------------------------------
 
     def move(self, goal: Float64, speed: float) -> None:
         """Go to `goal` on a limited path, within the open run where there is one."""
-        self._orders.give("motion", run=self._begun, goal=goal, speed=speed)
+        self._orders.send_order("motion", run=self._begun, goal=goal, speed=speed)
 
     def cancel(self) -> None:
         """Leave what is planned or under way, and stand; the run goes on."""
@@ -272,26 +274,26 @@ class Runs:
             self.open.approach()
             self.move(goal, 1.0)
 
-    def arrived(self) -> None:
+    def on_motion_done(self) -> None:
         """Control has come to the end of a motion: an open run that asked for it stands and waits again."""
-        if self.open is not None and self.open.approaching:
+        if self.open is not None and self.open.is_approaching:
             self._stand(self.open)
 
     def _stand(self, run: Run) -> None:
         run.arrive()
         if run.mode == "manual":
-            self._orders.give("hold", run=run.number)
+            self._orders.send_order("hold", run=run.number)
         else:
-            self._orders.give("follow", run=run.number, mode=run.mode)
+            self._orders.send_order("follow", run=run.number, mode=run.mode)
 
     # --- recordings ----------------------------------------------------------------------------------------
 
     @property
-    def alone(self) -> bool:
+    def is_recording_standalone(self) -> bool:
         """True if a recording without a run is open."""
         return bool(self._alone)
 
-    def record_alone(self, info: PolicyInfo | None) -> str:
+    def start_standalone_recording(self, info: PolicyInfo | None) -> str:
         """Open an episode of whatever control does; returns its uuid."""
         if self._alone:
             raise RuntimeFault(_RECORDING_OPEN)
@@ -301,7 +303,7 @@ class Runs:
         self._alone = str(manifest["uuid"])
         return self._alone
 
-    def stop_alone(self) -> None:
+    def stop_standalone_recording(self) -> None:
         """Close it."""
         if not self._alone:
             raise RuntimeFault(_NO_RECORDING_ALONE)
@@ -311,20 +313,20 @@ class Runs:
     def _end_alone(self, status: str, reason: str) -> EndEpisode:
         return EndEpisode(status, reason, {"control": self._figures()})
 
-    def interrupt_alone(self, reason: str) -> None:
+    def interrupt_standalone_recording(self, reason: str) -> None:
         """Close a recording without a run, where one is open; media may hang."""
         if self._alone:
-            self.note(self._end_alone("interrupted", reason))
+            self.record_event(self._end_alone("interrupted", reason))
             self._alone = ""
 
-    def lost(self, process: str, reason: str) -> None:
+    def on_process_restarted(self, process: str, reason: str) -> None:
         """That process was restarted: of a recording without a run media held the files and control the ticks."""
         if process == "media":
             self._alone = ""  # repair closes it
         elif process == "control":
-            self.interrupt_alone(reason)
+            self.interrupt_standalone_recording(reason)
 
-    def closed(self, message: EpisodeClosed) -> Event:
+    def on_episode_closed(self, message: EpisodeClosed) -> Event:
         """An episode is on disk, or waits for room there; the event that says so."""
         if self.open is not None and self.open.uuid == message.uuid:
             self.open.stop_recording(message.error or message.reason)
@@ -343,7 +345,7 @@ class Runs:
         text = _EPISODE_WAITS(**told) if message.waits else _EPISODE_CLOSED(**told, how=message.status)
         return Event("episode_closed", text, self._clock.now(), data=self.last_episode)
 
-    def note(self, message: Message) -> None:
+    def record_event(self, message: Message) -> None:
         """Something for the record; where media does not read, the record misses it and the log says so."""
         try:
             self._tell(message)
@@ -351,5 +353,5 @@ class Runs:
             log.error("%s is missing from the record: %s", type(message).__name__, error)
 
     def _tell(self, message: Message) -> None:
-        if not self._page.rings["minutes"].push(encode(message)):
+        if not self._shared_state.rings["minutes"].push(encode(message)):
             raise RuntimeFault(_MEDIA_DOES_NOT_READ)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from runtime.processes.coordinator.coordinator import Coordinator
 
 
-def snapshot(of: Coordinator) -> dict[str, Any]:
+def build_snapshot(of: Coordinator) -> dict[str, Any]:
     """The station's state; times in seconds on the runtime's clock, ages in seconds.
 
     "clock" is the one that commands are valid by; in lockstep it goes on while the runtime's stands. "sentences" has
@@ -30,7 +30,7 @@ def snapshot(of: Coordinator) -> dict[str, Any]:
 
 def _snapshot(of: Coordinator) -> dict[str, Any]:
     spec, settings = of.spec, of.spec.deployment
-    now, people = of.clock.now(), of.people.now()
+    now, people = of.clock.now(), of.client_clock.now()
     media, reception = of.inbox.media_report, of.inbox.reception_report
     return {
         "boot": of.boot,
@@ -73,7 +73,7 @@ def _snapshot(of: Coordinator) -> dict[str, Any]:
     }
 
 
-def facts(spec: StationSpec) -> dict[str, Any]:
+def station_facts(spec: StationSpec) -> dict[str, Any]:
     """Constants of a running station: names, sizes, limits [rad or the gripper's unit], rates [Hz]."""
     robot, bus = spec.robot, spec.deployment.bus
     return {
@@ -107,16 +107,16 @@ def facts(spec: StationSpec) -> dict[str, Any]:
 def _phase(of: Coordinator) -> str:
     """Phase of a run that goes on, in one word; "" where none does, or it has not begun."""
     run, control = of.runs.open, of.shared.control.read()
-    if run is None or run.begun is None or of.session.state is not SessionState.RUNNING:
+    if run is None or run.begun_at is None or of.session.state is not SessionState.RUNNING:
         return ""
     moving = bytes(control["behaviour"]) == b"motion"
     states = (
-        ("approaching", run.approaching),
+        ("approaching", run.is_approaching),
         ("moving", moving),
         ("proposed", of.inference.proposal is not None),
         ("executing", int(control["remaining"]) > 0),
         ("starved", bool(control["starved"])),
-        ("asking", of.inference.asked),
+        ("asking", of.inference.is_pending),
     )
     return next((word for word, holds in states if holds), "waiting")
 
@@ -124,7 +124,11 @@ def _phase(of: Coordinator) -> str:
 def _proposal(of: Coordinator, now: float) -> dict[str, Any]:
     """The chunk that is shown and waits to be committed."""
     made = of.inference.proposal
-    return {} if made is None else {**made.status(now), **of.setup.distance_of(made.answered.made.meant)}
+    return (
+        {}
+        if made is None
+        else {**made.status(now), **of.setup.distance_of(made.answered.commands.intended_start)}
+    )
 
 
 def control_figures(shared: SharedState, rate: float) -> dict[str, Any]:

@@ -19,7 +19,7 @@ class TimingReport:
     """Looks at control's own figures once a second; `asked`: control asks for the real-time class."""
 
     def __init__(self, shared: SharedState, rate: float, priority: int, asked: bool) -> None:
-        self._page = shared
+        self._shared_state = shared
         self._rate = rate
         self._priority = priority
         self._asked = asked
@@ -27,12 +27,12 @@ class TimingReport:
         self._class = ""  # that was told of
         self._late = False
 
-    def look(self, now: float) -> list[Event]:
+    def poll(self, now: float) -> list[Event]:
         """New events about control's timing; none before control has ticked for a while."""
         if now < self._next:
             return []
         self._next = now + _LOOK_S
-        status = self._page.control.read()
+        status = self._shared_state.control.read()
         scheduling = bytes(status["scheduling"]).decode()
         if not scheduling or int(status["ticks"]) < _MEASURED_S * self._rate:
             return []

@@ -17,11 +17,11 @@ from runtime.core import logs, realtime
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.sentences import Pattern
 from runtime.ipc.bells import bells
-from runtime.ipc.bus import Call, CommandServer, Endpoints, Key
+from runtime.ipc.bus import CommandServer, Endpoints, IncomingMessage, Key
 from runtime.ipc.estop_latch import Latch
-from runtime.ipc.estop_requests import in_packed, why_of
-from runtime.ipc.fair_queue import LONGEST_STOP, Asked, Turns
-from runtime.ipc.identity import identified, named
+from runtime.ipc.estop_requests import parse_packed_press, reason_of
+from runtime.ipc.fair_queue import LONGEST_STOP, FairQueue, QueuedCommand
+from runtime.ipc.identity import authenticate, display_name
 from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.membership import Membership
 from runtime.ipc.messages import Ack, Command
@@ -48,7 +48,7 @@ class Guard:
     def __init__(
         self, shared: SharedState, latch: Latch, clock: Clock, period: float, station: str = ""
     ) -> None:
-        self._page = shared
+        self._shared_state = shared
         self._latch = latch
         self._clock = clock
         self._said = {"station": station}  # so that nobody takes another station's answer for his own
@@ -64,8 +64,10 @@ class Guard:
 
     def raise_flag(self) -> None:
         """Stop the robot: before anybody is asked who he is."""
-        self._page.set_estop(EStop.LATCHED)
-        self._releases = self._page.releases  # a release asked for before this press is not for this press
+        self._shared_state.set_estop(EStop.LATCHED)
+        self._releases = (
+            self._shared_state.releases
+        )  # a release asked for before this press is not for this press
 
     def press(self, by: str, why: str) -> str:
         """Raise the flag, then latch on disk; returns "" or why the latch will not outlive a restart.
@@ -84,54 +86,54 @@ class Guard:
         self._latched = (by, why)
         return ""
 
-    def watch(self) -> None:
+    def poll(self) -> None:
         """Release where the coordinator has asked for it, latch what came to it meanwhile, then log what there is.
 
         The coordinator has raised the flag for such a press itself: a release in between has lowered it again.
         """
-        if self._page.releases != self._releases:
+        if self._shared_state.releases != self._releases:
             self._release()
-        for payload in self._page.rings["presses"].drain():
-            if (command := in_packed(payload)) is not None:
-                self.press(named(command), why_of(command))
+        for payload in self._shared_state.rings["presses"].drain():
+            if (command := parse_packed_press(payload)) is not None:
+                self.press(display_name(command), reason_of(command))
         for level, line in self._unsaid:
             log.log(level, "%s", line)
         self._unsaid.clear()
 
     def _release(self) -> None:
         """The coordinator has checked the lease; where the disk refuses, the e-stop stays."""
-        self._releases = self._page.releases
+        self._releases = self._shared_state.releases
         try:
             self._latch.clear()
         except OSError as error:
             self._unsaid.append((logging.ERROR, f"the e-stop stays: its latch cannot be removed: {error}"))
             return
         self._latched = None
-        self._page.set_estop(EStop.CLEAR)
+        self._shared_state.set_estop(EStop.CLEAR)
         self._unsaid.append((logging.WARNING, "e-stop released"))
 
-    def obeyed(self, version: int) -> bool:
+    def wait_until_obeyed(self, version: int) -> bool:
         """True if control has said since `version` of its status that it obeys.
 
         Waits at most max(50 ms, 2 ticks). An older word is worth nothing: control may have died after it.
         """
         until = self._clock.now() + self._patience
-        while not self._says_so(version):
+        while not self._control_confirms(version):
             if self._clock.now() >= until:
                 return False
             self._clock.sleep_until(self._clock.now() + 0.002)
         return True
 
-    def _says_so(self, version: int) -> bool:
-        status = self._page.control
+    def _control_confirms(self, version: int) -> bool:
+        status = self._shared_state.control
         return status.version > version and bool(status.read()["estop_obeyed"])
 
     def answer(self, command: Command) -> Ack:
         """Any user may press; "failed" means that control did not answer in time: use the hardware stop."""
         if command.kind == "estop":
-            version = self._page.control.version
-            doubt = self.press(named(command), why_of(command))
-            if self.obeyed(version):
+            version = self._shared_state.control.version
+            doubt = self.press(display_name(command), reason_of(command))
+            if self.wait_until_obeyed(version):
                 return Ack(command.uuid, "done", _OBEYED(doubt=doubt), data=self._said)
             late = _NOT_OBEYED(ms=self._patience * 1000, doubt=doubt)
             return Ack(command.uuid, "failed", late, data=self._said)
@@ -142,7 +144,7 @@ class Guard:
         return Ack(command.uuid, "refused", _UNKNOWN(kind=command.kind))
 
 
-class Desk:
+class EStopServer:
     """The guard's socket: every press that has come is answered in the turn in which it comes, however many there are.
 
     They raise one flag and are one latch, that of the first of them: the answer to it is that to all. A repeated uuid
@@ -156,9 +158,9 @@ class Desk:
     def __init__(
         self, guard: Guard, shared: SharedState, context: zmq.Context[Any], station_dir: Path
     ) -> None:
-        self._guard, self._page, self._key = guard, shared, Key(station_dir)
+        self._guard, self._shared_state, self._key = guard, shared, Key(station_dir)
         self._server = CommandServer(context, station_dir, "estop")
-        self._turns = Turns(self._server, (), _SHARE, LONGEST_STOP)
+        self._turns = FairQueue(self._server, (), _SHARE, LONGEST_STOP)
         self._bell = shared.bells.get("guard")
         self._poller = zmq.Poller()
         self._poller.register(self._server.socket, zmq.POLLIN)
@@ -166,19 +168,19 @@ class Desk:
             self._poller.register(self._bell.descriptor, zmq.POLLIN)
         self._endpoints = Endpoints(station_dir)
         self._answered: dict[str, Ack] = {}
-        self._tell_where()
+        self._write_endpoints()
 
-    def _tell_where(self) -> None:
+    def _write_endpoints(self) -> None:
         self._endpoints.write("guard", {"estop": self._server.endpoint})
 
     def serve(self, timeout: float) -> None:
         """Wait up to `timeout` seconds for a message, or for what the guard watches; answer what there is."""
-        if not self._turns.waiting:
+        if not self._turns.has_waiting:
             self._poller.poll(int(timeout * 1000))
         if self._bell is not None:
             self._bell.hush()
-        presses, others = self._turns.take()
-        anew = self._page.estop is not EStop.LATCHED
+        presses, others = self._turns.take_turn()
+        anew = self._shared_state.estop is not EStop.LATCHED
         if anew:
             self._answered.clear()
         if presses:
@@ -186,10 +188,10 @@ class Desk:
             self._answer(presses, "anew" if anew else "already")
         for call, command in others:
             self._server.answer(call, self._guard.answer(command))
-        if self._server.moved() or self._endpoints.lost("guard"):
-            self._tell_where()
+        if self._server.rebind_if_unreachable() or self._endpoints.is_missing("guard"):
+            self._write_endpoints()
 
-    def _answer(self, presses: list[Asked], latched: str) -> None:
+    def _answer(self, presses: list[QueuedCommand], latched: str) -> None:
         fresh, at = None, time.time()
         for call, command in presses:
             answer = self._answered.get(command.uuid)
@@ -201,8 +203,8 @@ class Desk:
             if answer.status == "done":
                 self._remember(answer)
 
-    def _identified(self, call: Call, command: Command) -> Command:
-        return identified(command, call.payload, call.signature, call.uid, self._key)
+    def _identified(self, call: IncomingMessage, command: Command) -> Command:
+        return authenticate(command, call.payload, call.signature, call.uid, self._key)
 
     def _remember(self, ack: Ack) -> None:
         self._answered.setdefault(ack.uuid, replace(ack, data={**ack.data, "latched": "before"}))
@@ -231,11 +233,11 @@ def _arguments() -> argparse.Namespace:
 
 def main() -> None:
     """Guard until the supervisor is gone and control has stopped ticking."""
-    descriptors.allow_all()
+    descriptors.raise_file_limit()
     given = _arguments()
-    logs.start("guard")
+    logs.configure_logging("guard")
     # before there are other threads, which are to have the same
-    scheduling = realtime.enter_below(given.priority) if given.priority else "ordinary"
+    scheduling = realtime.enter_realtime_below(given.priority) if given.priority else "ordinary"
     log.info("guarding, scheduling %s", scheduling)
     sizes = json.loads(given.layout)
     layout = SharedStateLayout(**{**sizes, "cameras": tuple(sizes["cameras"])})
@@ -244,10 +246,10 @@ def main() -> None:
     member = Membership(shared, given.boot, Lifeline())
     clock = MonotonicClock()
     guard = Guard(member.shared, Latch(given.folder), clock, given.period, given.station)
-    desk = Desk(guard, member.shared, zmq.Context.instance(), given.folder)
-    while member.needed(clock.now()):
+    desk = EStopServer(guard, member.shared, zmq.Context.instance(), given.folder)
+    while member.is_needed(clock.now()):
         member.shared.beat("guard", clock.now())
-        guard.watch()
+        guard.poll()
         desk.serve(given.rest)
     desk.close()
 

@@ -49,11 +49,11 @@ class LockstepRun:
 
 
 @dataclass(frozen=True, slots=True)
-class Around:
+class LockstepEnvironment:
     """Surroundings of a lockstep station; by default it is alone."""
 
     runner: Runner | None = None
-    people: Clock | None = None  # the clock of leases and commands
+    client_clock: Clock | None = None  # the clock of leases and commands
     waits: Clock | None = None  # what the guard waits by
     preview: Callable[[Observation], None] = lambda observation: None
     closer: Callable[[Close], Future[ClosedEpisode]] = at_once
@@ -79,13 +79,13 @@ class Lockstep:
         self,
         spec: StationSpec,
         clock: VirtualClock | None = None,
-        around: Around | None = None,
+        around: LockstepEnvironment | None = None,
         peers: Peers | None = None,
     ) -> None:
         self.spec = spec
         self.clock = clock = clock or VirtualClock()
         self.shared = SharedState(spec.layout, mmap.mmap(-1, SharedState.size(spec.layout)))
-        settings, around, peers = spec.deployment, around or Around(), peers or Peers()
+        settings, around, peers = spec.deployment, around or LockstepEnvironment(), peers or Peers()
         waits = around.waits or clock
         self.guard = Guard(self.shared, Latch(settings.station_dir), waits, 1.0 / spec.rate, settings.station)
         self._source = peers.source(spec, clock)
@@ -94,7 +94,7 @@ class Lockstep:
         self.media = Media(self.shared, recorder, clock, around.preview, around.closer, around.on_disk)
         self.reception = Reception(self.shared, self._source, clock, LOCKSTEP)
         self._runner = around.runner or LockstepRunner(settings.lockstep.delay_ticks)
-        self.coordinator = assemble(spec, self.shared, clock, self._runner, around.people, peers.policy)
+        self.coordinator = assemble(spec, self.shared, clock, self._runner, around.client_clock, peers.policy)
         self._tick = make_tick(spec, self.shared, self._sink, self.clock.now)
         self.step = 0
 
@@ -108,18 +108,18 @@ class Lockstep:
         now = self.clock.now()
         for process in ("control", "guard", "reception", "media"):
             self.shared.beat(process, now)
-        self.guard.watch()
-        self.reception.pump(0.0)
-        self.media.digest()
-        if self.reception.hear():  # a run begins with its source, in this tick
-            self.media.digest()
-        self.coordinator.pump()
+        self.guard.poll()
+        self.reception.poll(0.0)
+        self.media.poll()
+        if self.reception.poll_commands():  # a run begins with its source, in this tick
+            self.media.poll()
+        self.coordinator.poll()
         self._tick(self.step, now)
         self._runner.tick()
         self.step += 1
-        self._pass()
+        self._advance_clock()
 
-    def _pass(self) -> None:
+    def _advance_clock(self) -> None:
         """Let time come to the next tick: from the start and not by adding up, so that tick k is at k / rate."""
         self.clock.sleep_until(self.step / self.spec.rate)
 
@@ -160,7 +160,7 @@ class Lockstep:
 
     def close(self) -> None:
         """Close the episode, the policy, source and sink."""
-        self.media.digest()
+        self.media.poll()
         self.media.end("interrupted", "lockstep ended")
         self.coordinator.close()
         self._source.close()

@@ -27,13 +27,13 @@ from runtime.processes.control.process import Lateness
 from runtime.processes.coordinator.inference.requests import PolicyResponse
 from runtime.processes.coordinator.inference.worker import DeclaredRunner
 from runtime.processes.coordinator.process import CommandService
-from runtime.processes.guard.process import Desk
-from runtime.processes.lockstep.lockstep import Around, Lockstep, Peers
+from runtime.processes.guard.process import EStopServer
+from runtime.processes.lockstep.lockstep import Lockstep, LockstepEnvironment, Peers
 from runtime.processes.media.crash_repair import start_repair
 from runtime.processes.media.episode_closing import in_background
-from runtime.processes.media.export_jobs import Exports
+from runtime.processes.media.export_jobs import ExportQueue
 from runtime.processes.media.previews import Previews
-from runtime.station.lock import hold
+from runtime.station.lock import acquire_station_lock
 from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ Over = Callable[[bool], str]
 """Asked before each tick with whether a run goes on: why it is over, "" while it is not."""
 
 
-def declared(rate: float) -> Callable[[Any], tuple[Any, int]]:
+def declared_delay(rate: float) -> Callable[[Any], tuple[Any, int]]:
     """Hand-over of a policy's answer, and how many ticks late it is: as late as it says that it took.
 
     A result that is no answer, that of connecting, is there with the next tick.
@@ -65,7 +65,7 @@ def declared(rate: float) -> Callable[[Any], tuple[Any, int]]:
     return told
 
 
-class _Waiting(Clock):
+class _TickingClock(Clock):
     """The station's clock for its guard, which waits for control: to wait is to tick."""
 
     def __init__(self, clock: Clock, tick: Callable[[], None]) -> None:
@@ -100,26 +100,26 @@ class ServedLockstep(Lockstep):
             raise SetupError("control_channel.enabled = true in lockstep, which has none; allowed: false")
         self._people = people or MonotonicClock()
         self._over = over
-        descriptors.allow_all()
-        self._lock = hold(settings)
-        Endpoints(settings.station_dir).begin()
+        descriptors.raise_file_limit()
+        self._lock = acquire_station_lock(settings)
+        Endpoints(settings.station_dir).prepare()
         Key(settings.station_dir).secret()
-        self._exports = Exports(settings.data, settings.recording.export)
-        start_repair(settings.episodes_dir, settings.station, self._exports.start)
+        self._exports = ExportQueue(settings.data, settings.recording.export)
+        start_repair(settings.episodes_dir, settings.station, self._exports.submit)
         self._previews = Previews(spec)
-        self._asking = DeclaredRunner(declared(spec.rate))
-        around = Around(
+        self._asking = DeclaredRunner(declared_delay(spec.rate))
+        around = LockstepEnvironment(
             runner=self._asking,
-            people=self._people,
-            waits=_Waiting(clock, self._tick_ahead),
+            client_clock=self._people,
+            waits=_TickingClock(clock, self._tick_ahead),
             preview=self._previews,
             closer=in_background,
-            on_disk=self._exports.start,
+            on_disk=self._exports.submit,
         )
         super().__init__(spec, clock, around, peers)
         self._figures = Lateness(self._tick.status, LOCKSTEP)
         context: zmq.Context[Any] = zmq.Context.instance()
-        self._estops = Desk(self.guard, self.shared, context, settings.station_dir)
+        self._estops = EStopServer(self.guard, self.shared, context, settings.station_dir)
         self._service = CommandService(self.coordinator, context)
         self._told_at = -1  # the step that the coordinator was last told of how it goes, time standing still
         self._again_at = self._next_at = 0.0  # on the people's clock
@@ -128,29 +128,29 @@ class ServedLockstep(Lockstep):
         """Tick where time passes, answer commands, publish, until `ended`."""
         self.connect()
         while not ended():
-            self.turn()
+            self.poll()
 
-    def turn(self) -> None:
+    def poll(self) -> None:
         """One tick if time passes, then every command there is."""
         wait = _POLL_S
-        if not self._stands():
+        if not self._is_paused():
             now = self._people.now()
-            if self._fast():
+            if self._is_unpaced():
                 wait = 0.0
                 self.tick()
             elif now >= self._next_at:
                 self._next_at = now + 1.0 / self.spec.rate
                 self.tick()
         else:
-            self._stand()
+            self._poll_paused()
         self._service.serve(wait)
         self._estops.serve(0.0)
 
     def tick(self) -> None:
         """One control period; a run that is over ends within it."""
-        super()._pass()
+        super()._advance_clock()
         if why := self._over(self.coordinator.session.state is SessionState.RUNNING):
-            self.coordinator.finish(why)
+            self.coordinator.end_source_run(why)
         super().tick()
         self._figures.add(0.0, 0)
         if self.step % _FIGURES_EVERY == 0:
@@ -161,19 +161,21 @@ class ServedLockstep(Lockstep):
         self._next_at = max(self._next_at, self._people.now()) + 1.0 / self.spec.rate
         self.tick()
 
-    def _pass(self) -> None:
+    def _advance_clock(self) -> None:
         """Time comes to a tick when that begins: the policy is asked between two, and it is now until it answers."""
 
-    def _stands(self) -> bool:
+    def _is_paused(self) -> bool:
         """True if time stands still: nothing needs it, or the policy or a closing episode is waited for."""
-        if self._asking.begin() or self.media.closing:
+        if self._asking.start_waiting() or self.media.closing:
             return True
         if self._paced or self.coordinator.session.state not in (SessionState.IDLE, SessionState.READY):
             return False
         moving = bytes(self.shared.control.read()["behaviour"]) == b"motion"
-        return not (moving or self.coordinator.runs.alone or self.shared.rings["orders"].waiting)
+        return not (
+            moving or self.coordinator.runs.is_recording_standalone or self.shared.rings["orders"].waiting
+        )
 
-    def _fast(self) -> bool:
+    def _is_unpaced(self) -> bool:
         """True if ticks need no pace: no operator is waited for, to see them as they happen."""
         if self._paced:
             return False
@@ -182,30 +184,30 @@ class ServedLockstep(Lockstep):
             return run is None or run.mode not in _ON_DEMAND
         return state is SessionState.SETTING_UP
 
-    def _stand(self) -> None:
+    def _poll_paused(self) -> None:
         """Hear and tell, while it is still now; what begins, begins with a tick."""
-        self.guard.watch()
+        self.guard.poll()
         closing, rests = (
             self.media.closing,
             self.coordinator.session.state in (SessionState.IDLE, SessionState.READY),
         )
         if closing:
-            self.media.collect()
+            self.media.report_closed()
         elif rests:
-            self.media.digest()
+            self.media.poll()
         # Once in each rest, and after the episode is closed: whoever commands next, however soon, finds it said.
         if not self.media.closing and (closing or (rests and self._told_at != self.step)):
             self._told_at = self.step
             self.media.report()
             self.reception.report()
-        self.coordinator.pump()
+        self.coordinator.poll()
         if (now := self._people.now()) >= self._again_at:
             self._again_at = now + _AGAIN_S
-            self._previews.again()
+            self._previews.republish()
 
     def close(self) -> None:
         """Close the episode, what is asked, all sockets; then the station is free for another process."""
-        self.media.digest()
+        self.media.poll()
         self.media.end("interrupted", "the station's supervisor ended")
         self.media.finish(_LAST_S)
         self._exports.finish(_EXPORT_S)

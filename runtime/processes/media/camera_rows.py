@@ -36,18 +36,18 @@ class _Camera:
     unsaid_from: int = 0  # the row of the first of these
     spoken: float = -math.inf  # when that was
 
-    def turn(self, silent: bool, row: int) -> None:
+    def set_silent(self, silent: bool, row: int) -> None:
         """It falls silent at row `row`, or is back."""
         self.silent, self.row = silent, row
         if silent:
             self.unsaid_from = self.unsaid_from if self.unsaid else row
             self.unsaid += 1
 
-    def due(self, now: float) -> bool:
+    def is_due(self, now: float) -> bool:
         """Something is to be said of it."""
         return (self.said and not self.silent) or (self.unsaid > 0 and now - self.spoken >= QUIET_S)
 
-    def say(self, name: str, now: float, age: float | None) -> Event:
+    def to_event(self, name: str, now: float, age: float | None) -> Event:
         """How it is; `age` [s] is that of its last picture."""
         data: dict[str, object] = {"camera": name, "row": self.row}
         if self.silent:
@@ -74,19 +74,19 @@ class DropoutLog:
     def __init__(self, cameras: Iterable[str]) -> None:
         self._cameras = {name: _Camera() for name in sorted(cameras)}
 
-    def look(self, now: float, row: int, silent: Mapping[str, float]) -> list[Event]:
+    def update(self, now: float, row: int, silent: Mapping[str, float]) -> list[Event]:
         """Events at row `row`, made at `now` [s]; `silent` has the age [s] of each picture too old."""
         events = []
         for name, camera in self._cameras.items():
             if (name in silent) != camera.silent:
-                camera.turn(name in silent, row)
-            if camera.due(now):
-                events.append(camera.say(name, now, silent.get(name)))
+                camera.set_silent(name in silent, row)
+            if camera.is_due(now):
+                events.append(camera.to_event(name, now, silent.get(name)))
         return events
 
-    def rest(self, now: float) -> list[Event]:
+    def flush(self, now: float) -> list[Event]:
         """Events that were counted and not said yet, at the end of the episode."""
-        return [camera.say(name, now, None) for name, camera in self._cameras.items() if camera.unsaid]
+        return [camera.to_event(name, now, None) for name, camera in self._cameras.items() if camera.unsaid]
 
 
 class CameraRows:
@@ -132,14 +132,14 @@ class CameraRows:
         self.lost = frozenset(lost)
         return pictures
 
-    def look(self, now: float, row: int) -> list[Event]:
+    def check_ages(self, now: float, row: int) -> list[Event]:
         """Judge the age of what row `row` shows at `now` [s]; cameras that fall silent or are back are events."""
         self._began = now if self._began is None else self._began
         ages = {camera: now - self._captured.get(camera, self._began) for camera in self._cameras}
         old = {camera: age for camera, age in ages.items() if age > self._settings.max_picture_age_s}
         self.stale = frozenset(old)
-        return self._silences.look(now, row, old)
+        return self._silences.update(now, row, old)
 
-    def rest(self, now: float) -> list[Event]:
+    def flush(self, now: float) -> list[Event]:
         """Events about the cameras that are left to be said when the episode ends."""
-        return self._silences.rest(now)
+        return self._silences.flush(now)

@@ -11,7 +11,7 @@ from runtime.recording.base import Journal, RawChunk
 _KEPT = 256  # of either half, until the other comes
 
 
-class RecordedChunks:
+class ChunkLog:
     """Writes each chunk of one episode once both halves are known, in whichever order they come; RecordingError."""
 
     def __init__(self, journal: Journal) -> None:
@@ -19,7 +19,7 @@ class RecordedChunks:
         self._answers: dict[int, PolicyAnswer] = {}
         self._merged: dict[int, ChunkMerged] = {}
 
-    def answered(self, answer: PolicyAnswer) -> None:
+    def add_answer(self, answer: PolicyAnswer) -> None:
         """A chunk as the policy gave it."""
         merged = self._merged.pop(answer.chunk_id, None)
         if merged is not None:
@@ -29,7 +29,7 @@ class RecordedChunks:
         if len(self._answers) > _KEPT:  # the oldest never came to control
             self._write(self._answers.pop(next(iter(self._answers))), None)
 
-    def merged(self, merged: ChunkMerged) -> None:
+    def add_merge(self, merged: ChunkMerged) -> None:
         """Place that control gave a chunk."""
         answer = self._answers.pop(merged.chunk_id, None)
         if answer is not None:
@@ -37,7 +37,7 @@ class RecordedChunks:
         elif len(self._merged) < _KEPT:
             self._merged[merged.chunk_id] = merged
 
-    def rest(self) -> None:
+    def flush(self) -> None:
         """Write the chunks that never came to control."""
         for answer in list(self._answers.values()):
             self._write(answer, None)

@@ -17,17 +17,17 @@ log = logging.getLogger(__name__)
 
 def start_repair(root: Path, station: str, repaired: Callable[[Path], None]) -> None:
     """On a thread: what is to be received and recorded now does not wait for what was left."""
-    given = (leftovers(root), station, repaired)
-    threading.Thread(target=repair_leftovers, args=given, name="repair", daemon=True).start()
+    given = (find_open_episodes(root), station, repaired)
+    threading.Thread(target=repair_open_episodes, args=given, name="repair", daemon=True).start()
 
 
-def leftovers(root: Path) -> list[Path]:
+def find_open_episodes(root: Path) -> list[Path]:
     """The folders of episodes without an outcome, to be found before the first new one begins."""
     folders = [manifest.parent for manifest in root.glob("*/manifest.json")]
     return [folder for folder in folders if not os.path.exists(folder / "outcome.json")]
 
 
-def repair_leftovers(
+def repair_open_episodes(
     folders: list[Path], station: str, repaired: Callable[[Path], None] = lambda folder: None
 ) -> None:
     """Close what the last start of `station` left open: nobody else writes its episodes.

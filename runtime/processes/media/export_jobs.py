@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 _LOOK_S = 0.02
 
 
-class Exports:
+class ExportQueue:
     """Exports into one data folder, one episode after the other; its process ends with ours, however that ends.
 
     Where exports are not `wanted` it does nothing.
@@ -26,7 +26,7 @@ class Exports:
         self._waiting: queue.Queue[Path] = queue.Queue()
         self._thread: threading.Thread | None = None
 
-    def start(self, folder: Path) -> None:
+    def submit(self, folder: Path) -> None:
         """Export the closed episode in `folder` in its turn; returns at once, what goes wrong is logged."""
         if not self._wanted:
             return

@@ -31,9 +31,9 @@ class Previews:
         self._newest: Observation | None = None
         cv2.setNumThreads(1)  # the other cores belong to the rest of the family
         self._endpoints = Endpoints(folder)
-        self._tell_where()
+        self._write_endpoints()
 
-    def _tell_where(self) -> None:
+    def _write_endpoints(self) -> None:
         self._endpoints.write("media", {"cameras": self._publisher.endpoint})
 
     @property
@@ -44,8 +44,8 @@ class Previews:
 
     def wanted(self) -> bool:
         """True if somebody looks; to be asked five times a second: looks whether they can connect."""
-        if self._publisher.moved():
-            self._tell_where()
+        if self._publisher.rebind_if_unreachable():
+            self._write_endpoints()
         for topic in self._publisher.hear():  # who begins to look sees what there is
             self._due = {
                 name: due for name, due in self._due.items() if not f"camera/{name}".startswith(topic)
@@ -73,7 +73,7 @@ class Previews:
                 f"camera/{camera}", simplejpeg.encode_jpeg(self._small(picture), quality=80)
             )
 
-    def again(self) -> None:
+    def republish(self) -> None:
         """Show the newest of each camera once more: time stands still, and who begins to look now sees them too."""
         self._due.clear()
         self._shown.clear()

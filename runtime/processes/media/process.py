@@ -38,14 +38,14 @@ from runtime.ipc.observation_messages import as_observation
 from runtime.ipc.shared_memory import TornReadError
 from runtime.ipc.shared_state import RecorderStage, SharedState
 from runtime.kinematics.forward import ChainForward
-from runtime.processes.child import join
+from runtime.processes.child import join_station
 from runtime.processes.media.background import LowPriorityWorker
 from runtime.processes.media.crash_repair import start_repair
 from runtime.processes.media.episode_closing import Close, at_once, in_background
-from runtime.processes.media.export_jobs import Exports
+from runtime.processes.media.export_jobs import ExportQueue
 from runtime.processes.media.previews import Previews
 from runtime.processes.media.recorder import ClosedEpisode, DatasetGrid, Recorder
-from runtime.processes.media.unclosed_episodes import Unclosed
+from runtime.processes.media.unclosed_episodes import UnclosedEpisodes
 from runtime.recording.episode import EpisodeJournal
 from runtime.spaces.end_effectors import EndEffectors
 from runtime.station.spec import StationSpec
@@ -91,13 +91,13 @@ class Media:
         closer: Callable[[Close], Future[ClosedEpisode]] = at_once,
         on_disk: Callable[[Path], None] = lambda folder: None,
     ) -> None:
-        self._page = shared
+        self._shared_state = shared
         self._recorder = recorder
         self._clock = clock
         self._preview = preview
         self._closer = closer
         self._on_disk = on_disk  # hears of every episode that was closed
-        self._unclosed = Unclosed(closer, clock.now)
+        self._unclosed = UnclosedEpisodes(closer, clock.now)
         self._closing: Future[ClosedEpisode] | None = None
         self._closing_uuid = ""
         self._waiting: BeginEpisode | None = None  # for the episode before it to be closed
@@ -127,27 +127,31 @@ class Media:
         going_on = self.recording, self.closing, self._waiting is not None, self._opened is not None
         return not any(going_on)
 
-    def digest(self) -> None:
+    def poll(self) -> None:
         """Write down what reception, control and the coordinator have posted."""
-        died = self._page.generation("coordinator") != self._generation  # all that it said is in the rings
+        died = (
+            self._shared_state.generation("coordinator") != self._generation
+        )  # all that it said is in the rings
         if died and self._waiting is not None and self._waiting.generation == self._generation:
             self._waiting = None
-        self.collect()
-        with self._page.recorder_stage(RecorderStage.WRITING if self.recording else RecorderStage.WAITING):
+        self.report_closed()
+        with self._shared_state.recorder_stage(
+            RecorderStage.WRITING if self.recording else RecorderStage.WAITING
+        ):
             self._drain("observations")
             self._drain("minutes")
             self._drain("ticks")
         if died:
-            self._leave_the_dead()
-        for event in self._recorder.news():
+            self._end_orphaned_episode()
+        for event in self._recorder.pop_events():
             log.warning("%s", event.text)
-            self._tell(event)
+            self._send(event)
         if self._clock.now() >= self._next_report:
             self.report()
 
-    def _leave_the_dead(self) -> None:
+    def _end_orphaned_episode(self) -> None:
         """End what a coordinator asked for that has died: the next one knows nothing of it. What it said is heard."""
-        generation = self._page.generation("coordinator")
+        generation = self._shared_state.generation("coordinator")
         if generation != self._generation:
             self._drain("ticks")
             self._generation = generation
@@ -158,8 +162,8 @@ class Media:
     def _drain(self, ring: str) -> None:
         if ring == "minutes" and not self._ready_to_begin():
             return
-        for payload in self._page.rings[ring].drain():
-            self._hear(decode(payload))
+        for payload in self._shared_state.rings[ring].drain():
+            self._dispatch(decode(payload))
             if self._waiting is not None and ring == "minutes":
                 return  # what follows belongs to an episode that has not begun
 
@@ -174,7 +178,7 @@ class Media:
         self._begin(waiting)
         return True
 
-    def _hear(self, message: Message) -> None:
+    def _dispatch(self, message: Message) -> None:
         try:
             self._write(message)
         except RecordingError as error:
@@ -187,15 +191,15 @@ class Media:
         elif isinstance(message, TickDone):
             if message.sequence > self._newest:  # it was handed on before the tick could see it
                 self._drain("observations")
-            recorder.tick(message)
+            recorder.add_tick(message)
         elif isinstance(message, ChunkMerged):
-            recorder.merged(message)
+            recorder.add_merge(message)
         elif isinstance(message, PolicyAnswer):
-            recorder.answered(message)
+            recorder.add_answer(message)
         elif isinstance(message, Event):
-            recorder.mark(event_row(message))
+            recorder.add_event(event_row(message))
         elif isinstance(message, BeginEpisode):
-            self._leave_the_dead()  # it may have died, and the next one asked, since this digest began
+            self._end_orphaned_episode()  # it may have died, and the next one asked, since this digest began
             if message.generation != self._generation:
                 log.warning("run %d of a coordinator that has died is not recorded", message.run)
                 return
@@ -208,25 +212,25 @@ class Media:
             self._run_begun(message)
         elif isinstance(message, EndEpisode):
             self._drain("ticks")  # those that control did before the coordinator decided to end
-            self._say_truth(message.details.get("reached") or {})
+            self._emit_truth(message.details.get("reached") or {})
             self.end(message.status, message.reason, message.details)
             self._opened = None
             self._ask_source(EndRun())
 
     def _observe(self, message: Observed) -> None:
-        observation = as_observation(message, self._page)
+        observation = as_observation(message, self._shared_state)
         self._newest, self._truth = message.sequence, message.truth or {}
-        self._recorder.see(observation)
+        self._recorder.add_observation(observation)
         self._preview(observation)
 
     def _begin(self, message: BeginEpisode) -> None:
-        self._page.set_unrecorded(False)  # before anybody hears that it has begun
+        self._shared_state.set_unrecorded(False)  # before anybody hears that it has begun
         opened = EpisodeOpened(message.run, "", "")
         if message.manifest is not None:
-            with self._page.recorder_stage(RecorderStage.OPENING):
+            with self._shared_state.recorder_stage(RecorderStage.OPENING):
                 opened = self._open(message.run, message.manifest)
         if opened.error or not message.run:
-            self._tell(opened)
+            self._send(opened)
         else:
             self._opened = opened
             self._ask_source(BeginRun(message.run, self._generation))
@@ -237,8 +241,8 @@ class Media:
             return EpisodeOpened(run, "", "", error)
         try:
             # With its pictures as they are now: those of an earlier one may be overwritten by the time they are read.
-            if (newest := self._page.read_observation(self._page.layout.cameras)) is not None:
-                self._recorder.see(newest)
+            if (newest := self._shared_state.read_observation(self._shared_state.layout.cameras)) is not None:
+                self._recorder.add_observation(newest)
             identity, path = self._recorder.begin(manifest, run)
         except (RecordingError, TornReadError) as fault:
             return EpisodeOpened(run, "", "", str(fault))
@@ -248,36 +252,36 @@ class Media:
         """The source has: its first frame is here, and the run's first tick sees it."""
         opened = self._opened
         if opened is not None and message == RunBegun(opened.run, self._generation):
-            self._tell(opened)
+            self._send(opened)
             self._opened = None
 
     def _ask_source(self, message: BeginRun | EndRun) -> None:
-        if not self._page.rings["source"].push(encode(message)):
+        if not self._shared_state.rings["source"].push(encode(message)):
             log.warning("reception does not read: %s lost", type(message).__name__)
 
     def end(self, status: str, reason: str, details: Mapping[str, Any] | None = None) -> None:
         """Close the open episode, if there is one; the coordinator is told when that is done."""
         if self._recorder.recording:
             self._closing_uuid = self._recorder.recording
-            with self._page.recorder_stage(RecorderStage.CLOSING):
+            with self._shared_state.recorder_stage(RecorderStage.CLOSING):
                 self._closing = self._closer(self._recorder.end(status, reason, details or {}))  # type: ignore[arg-type]
-            self.collect()
+            self.report_closed()
 
     def finish(self, seconds: float) -> None:
         """Wait for an episode that is being closed, at most so long; what is missing then, repair completes."""
         if self._closing is not None:
             wait([self._closing], seconds)
-            self.collect()
+            self.report_closed()
         if self._closing is not None:
             log.error("episode %s was not closed within %g s", self._closing_uuid, seconds)
         while (late := self._unclosed.finish(seconds)) is not None:
             self._closed(late)
-        for uuid, why in self._unclosed.why.items():
+        for uuid, why in self._unclosed.errors.items():
             log.error("episode %s has no outcome, the next start completes it: %s", uuid, why)
 
-    def collect(self) -> None:
+    def report_closed(self) -> None:
         """Tell the coordinator of episodes that have been closed, at last or at once."""
-        if (late := self._unclosed.look()) is not None:
+        if (late := self._unclosed.poll()) is not None:
             self._closed(late)
         if self._closing is None or not self._closing.done():
             return
@@ -285,9 +289,9 @@ class Media:
         self._closed(closed)
 
     def _closed(self, closed: ClosedEpisode) -> None:
-        waits = closed.again is not None
+        waits = closed.retry is not None
         path, told = str(closed.path), (closed.status, closed.reason, closed.rows, closed.error)
-        self._tell(EpisodeClosed(closed.uuid, path, *told, waits))
+        self._send(EpisodeClosed(closed.uuid, path, *told, waits))
         if waits:
             log.error("episode %s waits for room on the disk: %s", closed.uuid, closed.error)
             self._unclosed.add(closed)
@@ -296,7 +300,7 @@ class Media:
 
     def _fail(self, error: RecordingError) -> None:
         log.error("recording failed: %s", error)
-        self._tell(Event("recording_failed", str(error), self._clock.now()))
+        self._send(Event("recording_failed", str(error), self._clock.now()))
         self.end("failed", str(error))
 
     def report(self) -> None:
@@ -304,24 +308,24 @@ class Media:
         recorder, now = self._recorder, self._clock.now()
         self._next_report = now + _REPORT_PERIOD
         recording = recorder.recording or self._closing_uuid  # until it is on disk
-        told = (recorder.rows, recording, recorder.repeated, self._unclosed.why)
-        self._tell(MediaReport(now, *told))
+        told = (recorder.rows, recording, recorder.repeated, self._unclosed.errors)
+        self._send(MediaReport(now, *told))
 
-    def _say_truth(self, reached: Mapping[str, float]) -> None:
+    def _emit_truth(self, reached: Mapping[str, float]) -> None:
         """Report a simulated bench's end state and the times of its milestones: the episode's score."""
         truth = self._truth
         if truth:
             how = _SUCCESS if truth["success"] else _NO_SUCCESS
             data = {**truth, "reached": dict(reached), "episode": self._recorder.recording}
-            self._say(Event("truth", _TRUTH(how=how), self._clock.now(), data=data))
+            self._emit(Event("truth", _TRUTH(how=how), self._clock.now(), data=data))
 
-    def _say(self, event: Event) -> None:
+    def _emit(self, event: Event) -> None:
         """An event of media's own: to the coordinator, and into the episode."""
-        self._tell(event)
-        self._hear(event)
+        self._send(event)
+        self._dispatch(event)
 
-    def _tell(self, message: Message) -> None:
-        if not self._page.rings["media_events"].push(encode(message)):
+    def _send(self, message: Message) -> None:
+        if not self._shared_state.rings["media_events"].push(encode(message)):
             log.warning("the coordinator does not read: %s lost", type(message).__name__)
 
 
@@ -345,28 +349,28 @@ def make_recorder(spec: StationSpec, now: Callable[[], float], patient: bool = F
 
 def main() -> None:
     """Run media until the supervisor is gone."""
-    heap.keep()
-    descriptors.allow_all()
-    member = join("media", unread=_UNREAD)
+    heap.keep_freed_memory()
+    descriptors.raise_file_limit()
+    member = join_station("media", unread=_UNREAD)
     spec, shared = member.spec, member.shared
     clock = MonotonicClock()
     shared.beat("media", clock.now())
     shared.set_unrecorded(False)  # a predecessor may have died with it
-    exports = Exports(spec.deployment.data, spec.deployment.recording.export)
-    start_repair(spec.deployment.episodes_dir, spec.deployment.station, exports.start)
+    exports = ExportQueue(spec.deployment.data, spec.deployment.recording.export)
+    start_repair(spec.deployment.episodes_dir, spec.deployment.station, exports.submit)
     previews = LowPriorityWorker(Previews(spec))  # late on a busy machine, rather than what is recorded
-    media = Media(shared, make_recorder(spec, clock.now), clock, previews, in_background, exports.start)
+    media = Media(shared, make_recorder(spec, clock.now), clock, previews, in_background, exports.submit)
     bell, rest = shared.bells["media"], rest_s(spec.deployment.control.heartbeat_timeout_s)
     try:
-        while not member.lifeline.cut:
+        while not member.lifeline.is_cut:
             now = clock.now()
             shared.beat("media", now)
-            media.digest()
+            media.poll()
             within = spec.deployment.heartbeat_timeout_s("coordinator")
             if media.recording and not shared.alive("coordinator", now, within):
                 media.end(
                     "interrupted",
-                    f"the coordinator has given no sign of life {shared.silence('coordinator', now)}",
+                    f"the coordinator has given no sign of life {shared.describe_silence('coordinator', now)}",
                 )
             if media.rests:
                 shared.set_unrecorded(True)

@@ -19,7 +19,7 @@ from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Float32, Observation
 from runtime.ipc.messages import ChunkMerged, Event, PolicyAnswer, TickDone, event_row
 from runtime.processes.media.camera_rows import CameraRows
-from runtime.processes.media.chunk_log import RecordedChunks
+from runtime.processes.media.chunk_log import ChunkLog
 from runtime.recording.base import VIDEO_LOST, ExecutedTick, Journal, Outcome, Row, Status
 from runtime.recording.bench_truth import truth_text
 from runtime.recording.files import UnclosedError
@@ -60,7 +60,7 @@ class ClosedEpisode:
     reason: str
     rows: int
     error: str = ""
-    again: Callable[[], ClosedEpisode] | None = (
+    retry: Callable[[], ClosedEpisode] | None = (
         None  # where its end waits for room on the disk: tries once more
     )
 
@@ -95,8 +95,8 @@ class Recorder:
         if not self._seen:
             raise RecordingError(_NO_OBSERVATION)
         newest = self._seen[-1]
-        self._schema = Schema.of(manifest)
-        self._cameras = self._schema.kept(self._grid.cameras)
+        self._schema = Schema.from_manifest(manifest)
+        self._cameras = self._schema.recorded_cameras(self._grid.cameras)
         missing = [camera for camera in self._cameras if camera not in newest.pictures]
         if missing:
             raise RecordingError(_NO_PICTURE(cameras=", ".join(missing)))
@@ -112,7 +112,7 @@ class Recorder:
         self._applied: Float32 | None = None  # the newest action that the robot reported
         self._lost: list[str] = []  # what was said of cameras whose video has ended
         self._bench = ""  # what a simulated bench said of itself in the row before
-        self._chunks = RecordedChunks(self._journal)
+        self._chunks = ChunkLog(self._journal)
         return identity, self._root / identity
 
     def _manifest(self, manifest: dict[str, Any], identity: str, newest: Observation) -> dict[str, Any]:
@@ -144,9 +144,9 @@ class Recorder:
         error, rows, lost = "", self.rows, self._lost
         identity, path = self._uuid, self._root / self._uuid
         try:
-            self._chunks.rest()
-            for event in self._shown.rest(self._now()):
-                self._journal.mark(event_row(event))
+            self._chunks.flush()
+            for event in self._shown.flush(self._now()):
+                self._journal.append_event(event_row(event))
         except RecordingError as fault:
             error = str(fault)
         self._uuid = ""
@@ -169,15 +169,15 @@ class Recorder:
             try:
                 self._journal.end(outcome)
             finally:
-                told.extend(loss.text for loss in self._journal.losses())
+                told.extend(loss.text for loss in self._journal.pop_lost_cameras())
 
         return partial(attempt, end_journal)
 
-    def news(self) -> list[Event]:
+    def pop_events(self) -> list[Event]:
         """Events of the open episode since the last call; they are in the episode already."""
         if not self._uuid:
             return []
-        for loss in self._journal.losses():
+        for loss in self._journal.pop_lost_cameras():
             self._lost.append(loss.text)
             self._news.append(
                 Event(VIDEO_LOST, loss.text, self._now(), data={"camera": loss.camera, "row": loss.row})
@@ -187,31 +187,31 @@ class Recorder:
 
     # --- what comes in -------------------------------------------------------------------------------------
 
-    def see(self, observation: Observation) -> None:
+    def add_observation(self, observation: Observation) -> None:
         """An observation from reception, before the record of a tick that has seen it."""
         self._seen.append(observation)
 
-    def mark(self, event: Mapping[str, Any]) -> None:
+    def add_event(self, event: Mapping[str, Any]) -> None:
         """An event for the log; nothing where no episode is open."""
         if self._uuid:
-            self._journal.mark(event)
+            self._journal.append_event(event)
 
-    def answered(self, answer: PolicyAnswer) -> None:
+    def add_answer(self, answer: PolicyAnswer) -> None:
         """A chunk as the policy gave it."""
         if self._uuid and answer.run == self._run:
-            self._chunks.answered(answer)
+            self._chunks.add_answer(answer)
 
-    def merged(self, merged: ChunkMerged) -> None:
+    def add_merge(self, merged: ChunkMerged) -> None:
         """Place that control gave a chunk; may come before the chunk itself."""
         if self._uuid and merged.run == self._run:
-            self._chunks.merged(merged)
+            self._chunks.add_merge(merged)
 
-    def tick(self, tick: TickDone) -> None:
+    def add_tick(self, tick: TickDone) -> None:
         """One control tick; writes the full-rate stream, and every row of the grid that is now known."""
         if not self._uuid or self._complete or (self._run and tick.run != self._run):
             return
         if self._schema.reported:
-            applied = self._as_applied(tick)
+            applied = self._reported_tick(tick)
             if applied is None:
                 return
             tick = applied
@@ -225,7 +225,7 @@ class Recorder:
         self._before = here
         self._complete = here[1] is not None and here[1].last
 
-    def _as_applied(self, tick: TickDone) -> TickDone | None:
+    def _reported_tick(self, tick: TickDone) -> TickDone | None:
         """A tick of a robot that drives itself, as if we had sent what it reports; None before it reports anything.
 
         Where it reports nothing for this frame, the action is the one before, and nobody's.
@@ -257,9 +257,9 @@ class Recorder:
         with_eef = bool(self._grid.robot["eef_dim"])
         pictures = self._shown.pictures(seen)
         self.repeated += sum(picture is None for picture in pictures.values())
-        for event in self._shown.look(tick.planned, self.rows):
+        for event in self._shown.check_ages(tick.planned, self.rows):
             self._news.append(event)
-            self._journal.mark(event_row(event))
+            self._journal.append_event(event_row(event))
         row = Row(
             index=self.rows,
             step=tick.step,

@@ -13,7 +13,7 @@ from runtime.processes.media.recorder import ClosedEpisode
 _FIRST_S, _MOST_S = 1.0, 30.0  # between two attempts, doubled each time
 
 
-class Unclosed:
+class UnclosedEpisodes:
     """The oldest is tried first; a disk that takes its end takes the next one at once."""
 
     def __init__(self, closer: Callable[[Close], Future[ClosedEpisode]], now: Callable[[], float]) -> None:
@@ -24,38 +24,38 @@ class Unclosed:
         self._back_off = BackOff(_FIRST_S, _MOST_S)
 
     @property
-    def why(self) -> dict[str, str]:
+    def errors(self) -> dict[str, str]:
         """Error that each of them waits for to be over, by uuid."""
         return {episode.uuid: episode.error for episode in self._episodes}
 
     def add(self, episode: ClosedEpisode) -> None:
         """One that has `again`."""
         if not self._episodes:
-            self._back_off.failed(self._now())
+            self._back_off.record_failure(self._now())
         self._episodes.append(episode)
 
-    def look(self) -> ClosedEpisode | None:
+    def poll(self) -> ClosedEpisode | None:
         """One that is closed now, None where none is; begins an attempt where one is due. Never waits for the disk."""
-        if self._attempt is None and self._episodes and not self._back_off.waiting(self._now()):
-            again = self._episodes[0].again
+        if self._attempt is None and self._episodes and not self._back_off.remaining_delay(self._now()):
+            again = self._episodes[0].retry
             assert again is not None
             self._attempt = self._closer(again)
         if self._attempt is None or not self._attempt.done():
             return None
         closed, self._attempt = self._attempt.result(), None
-        if closed.again is None:
+        if closed.retry is None:
             self._episodes.popleft()
-            self._back_off.forget()
+            self._back_off.reset()
             return closed
         self._episodes[0] = closed
-        self._back_off.failed(self._now())
+        self._back_off.record_failure(self._now())
         return None
 
     def finish(self, seconds: float) -> ClosedEpisode | None:
         """Try once more, and wait at most so long; the same as `look`. What is left then, repair completes."""
-        self._back_off.forget()
-        closed = self.look()
+        self._back_off.reset()
+        closed = self.poll()
         if closed is None and self._attempt is not None:
             wait([self._attempt], seconds)
-            closed = self.look()
+            closed = self.poll()
         return closed

@@ -16,7 +16,7 @@ _FAULT_GONE = Pattern("drives.fault_gone", "drive fault gone: {fault}")
 _QUIET_S = 0.2  # between two lines: a node that says something else in every frame floods no log
 
 
-class Drives:
+class DriveStatus:
     """The newest state that was said: {"enabled": bool, "faults": [str]}, {} while the node does not say."""
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class Drives:
         self._faults: tuple[str, ...] = ()
         self._told = -math.inf
 
-    def see(self, said: Mapping[str, Any] | None, now: float) -> str:
+    def update(self, said: Mapping[str, Any] | None, now: float) -> str:
         """Take what one observation says; returns a sentence of what has changed since the last one, or "".
 
         An observation that does not say is no change: one whose drive state could not be read is none either. A

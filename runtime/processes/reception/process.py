@@ -20,9 +20,9 @@ from runtime.ipc.membership import rest_s
 from runtime.ipc.messages import BeginRun, EndRun, Event, Message, ReceptionReport, RunBegun, decode, encode
 from runtime.ipc.observation_messages import as_message
 from runtime.ipc.shared_state import SharedState
-from runtime.processes.child import join
+from runtime.processes.child import join_station
 from runtime.processes.reception.receiver import ObservationReceiver
-from runtime.station.spec import StationSpec, delivered
+from runtime.station.spec import StationSpec, delivered_cameras
 from runtime.transports.base import Source
 
 log = logging.getLogger(__name__)
@@ -39,13 +39,13 @@ _RETRY_S = 1.0  # between two tries to connect
 _SHARE_S = 3.0
 
 
-class Share:
+class CpuShare:
     """The processor time that this process takes, over and over for `_SHARE_S` seconds."""
 
     def __init__(self) -> None:
         self._since: tuple[float, float] | None = None  # when, and what had been taken by then [s]
 
-    def too_much(self, now: float, taken: float) -> bool:
+    def exceeds_core(self, now: float, taken: float) -> bool:
         """True if it was more than a core over the last whole stretch; `taken` since the start [s]."""
         since = self._since or (now, taken)
         if now - since[0] < _SHARE_S:
@@ -59,41 +59,41 @@ class Reception:
     """One `pump` takes what there is; lockstep calls it tick by tick."""
 
     def __init__(self, shared: SharedState, source: Source, clock: Clock, scheduling: str = "") -> None:
-        self._page = shared
+        self._shared_state = shared
         self._clock = clock
         self._scheduling = scheduling
-        self._intake = ObservationReceiver(shared, source, clock, self._say, self._hand_on)
+        self._intake = ObservationReceiver(shared, source, clock, self._emit, self._hand_on)
         self._begun: RunBegun | None = None  # media is not told yet
         self._next_report = 0.0
         self._missed = 0  # observations that media had no room for
         for _ in shared.rings["source"].drain():
             pass  # addressed to a predecessor that died
 
-    def pump(self, timeout: float) -> None:
+    def poll(self, timeout: float) -> None:
         """Obey media, take one observation if there is one within `timeout` seconds, report when it is time."""
-        self.hear()
-        self._intake.pump(timeout)
+        self.poll_commands()
+        self._intake.poll(timeout)
         self._report_in_time()
 
-    def tend(self) -> None:
+    def poll_disconnected(self) -> None:
         """The same without an observation: the source is not connected."""
-        self.hear()
+        self.poll_commands()
         self._report_in_time()
 
-    def give_way(self) -> None:
+    def leave_realtime(self) -> None:
         """No real-time class any more: what comes in would take the processors from guard and coordinator."""
-        realtime.leave_all()
+        realtime.leave_realtime_all()
         self._scheduling = "ordinary"
         text = _CLASS_GIVEN_UP(seconds=_SHARE_S)
-        self._say(Event("scheduling", text, self._clock.now()))
+        self._emit(Event("scheduling", text, self._clock.now()))
 
     def _report_in_time(self) -> None:
         if self._clock.now() >= self._next_report:
             self.report()
 
-    def hear(self) -> bool:
+    def poll_commands(self) -> bool:
         """Let the source begin its run, or end it, as media says; whether a run has begun."""
-        for payload in self._page.rings["source"].drain():
+        for payload in self._shared_state.rings["source"].drain():
             message = decode(payload)
             if isinstance(message, BeginRun):
                 self._intake.begin_run()
@@ -111,7 +111,7 @@ class Reception:
         self._next_report = now + _REPORT_PERIOD
         faults, rates = intake.faults(), intake.rates()
         told = (intake.truth, intake.drives, intake.cameras, intake.age_ms(), self._scheduling)
-        self._tell(ReceptionReport(now, rates, faults, *told))
+        self._send(ReceptionReport(now, rates, faults, *told))
 
     def _hand_on(self, observation: Observation, numbers: Mapping[str, int]) -> None:
         """To media, before anybody else can see it: what a tick has seen is known there."""
@@ -122,17 +122,17 @@ class Reception:
         if self._missed == 1:
             log.warning("media does not read: rows miss what is observed now")
 
-    def _say(self, event: Event) -> None:
+    def _emit(self, event: Event) -> None:
         """An event of reception's own: to the coordinator, and into the episode."""
-        self._tell(event)
+        self._send(event)
         if not self._record(event):
             log.warning("media does not read: %s is missing from the record", event.kind)
 
     def _record(self, message: Message) -> bool:
-        return self._page.rings["observations"].push(encode(message))
+        return self._shared_state.rings["observations"].push(encode(message))
 
-    def _tell(self, message: Message) -> None:
-        if not self._page.rings["reception_events"].push(encode(message)):
+    def _send(self, message: Message) -> None:
+        if not self._shared_state.rings["reception_events"].push(encode(message)):
             log.warning("the coordinator does not read: %s lost", type(message).__name__)
 
 
@@ -145,21 +145,21 @@ def make_source(
     `build` stands in for that of the transport's kind.
     """
     settings = spec.deployment
-    own = settings.cameras.keys() & set(delivered(settings, spec.robot))
+    own = settings.cameras.keys() & set(delivered_cameras(settings, spec.robot))
     robot = replace(spec.robot, cameras=tuple(c for c in spec.robot.cameras if c.key not in own))
     build = build or variants("runtime.transports")[settings.transport.kind].source
     source = build(settings.transport, robot, clock)
     if not settings.cameras:
         return source
-    from runtime.cameras.attaching import attached
+    from runtime.cameras.attaching import attach_cameras
 
-    return attached(source, settings.cameras, clock)
+    return attach_cameras(source, settings.cameras, clock)
 
 
 def main() -> None:
     """Receive until the supervisor is gone, and control with it."""
-    heap.keep()
-    member = join("reception", unread=_UNREAD)
+    heap.keep_freed_memory()
+    member = join_station("reception", unread=_UNREAD)
     shared, clock = member.shared, MonotonicClock()
     shared.beat("reception", clock.now())
     scheduling = _scheduling(member.spec)  # before there are other threads, which are to have the same
@@ -168,19 +168,19 @@ def main() -> None:
     reception = Reception(shared, source, clock, scheduling)
     connected, retry_at = False, 0.0
     wait = min(_WAIT_S, rest_s(member.spec.deployment.control.heartbeat_timeout_s))
-    share = Share() if scheduling.startswith("FIFO") else None
-    while member.needed(clock.now()):
+    share = CpuShare() if scheduling.startswith("FIFO") else None
+    while member.is_needed(clock.now()):
         now = clock.now()
         shared.beat("reception", now)
-        if share is not None and share.too_much(now, time.process_time()):
-            reception.give_way()
+        if share is not None and share.exceeds_core(now, time.process_time()):
+            reception.leave_realtime()
             share = None
         if not connected and now >= retry_at:
             connected, retry_at = _connected(source), now + _RETRY_S
         if connected:
-            reception.pump(wait)
+            reception.poll(wait)
         else:
-            reception.tend()
+            reception.poll_disconnected()
             clock.sleep_until(now + wait)
     source.close()
 
@@ -190,7 +190,7 @@ def _scheduling(spec: StationSpec) -> str:
     settings = spec.deployment.control
     if settings.realtime == "off" or not spec.capabilities.moves_robot:
         return "ordinary"
-    return realtime.enter_below(settings.realtime_priority)
+    return realtime.enter_realtime_below(settings.realtime_priority)
 
 
 def _connected(source: Source) -> bool:

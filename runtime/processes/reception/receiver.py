@@ -18,7 +18,7 @@ from runtime.core.sentences import Pattern
 from runtime.core.types import Observation
 from runtime.ipc.messages import Event
 from runtime.ipc.shared_state import SharedState
-from runtime.processes.reception.drive_status import Drives
+from runtime.processes.reception.drive_status import DriveStatus
 from runtime.transports.base import Source
 
 log = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ class ObservationReceiver:
         say: Callable[[Event], None],
         hand_on: Callable[[Observation, Mapping[str, int]], None],
     ) -> None:
-        self._page = shared
+        self._shared_state = shared
         self._source = source
         self._clock = clock
         self._say, self._hand_on = say, hand_on
@@ -59,7 +59,7 @@ class ObservationReceiver:
         self._said_at: dict[str, float] = {}
         self._too_large: Counter[str] = Counter()
         self._failure = ""
-        self._drives = Drives()
+        self._drives = DriveStatus()
         self.truth: Mapping[str, Any] = {}
 
     @property
@@ -72,18 +72,18 @@ class ObservationReceiver:
         """Health of each camera of the deployment's own."""
         return self._source.camera_health()
 
-    def pump(self, timeout: float) -> None:
+    def poll(self, timeout: float) -> None:
         """Take one observation if there is one within `timeout` seconds."""
         observation = self._receive(timeout)
         if observation is not None:
-            self._take(observation)
+            self._accept(observation)
 
     def begin_run(self) -> None:
         """The source begins a run; its first frame is taken here, so that the run's first tick sees it."""
         self._source.begin_run()
         self._said_at = {name: at for name, at in self._said_at.items() if not name.endswith(_STANDING)}
         self._captured.clear()  # its pictures are new ones, even where time stands still between two frames
-        self.pump(0.0)
+        self.poll(0.0)
 
     def end_run(self) -> None:
         """Tell the source that the run is over."""
@@ -94,7 +94,7 @@ class ObservationReceiver:
 
         What a node never sends in a usable form is an event once in each run.
         """
-        for event in self._source.news():
+        for event in self._source.pop_events():
             self._say(event)
         now, faults = self._clock.now(), {**self._source.faults(), **self._too_large}
         for name, count in faults.items():
@@ -102,7 +102,7 @@ class ObservationReceiver:
             again = math.inf if name.endswith(_STANDING) else _REPEAT_S
             if count > known and now - self._said_at.get(name, -math.inf) >= again:
                 self._faults[name], self._said_at[name] = count, now
-                why = self._source.why(name)
+                why = self._source.describe_fault(name)
                 named = name.replace("_", " ").replace(".", ": ")
                 text = _SOURCE_FAULT(fault=named, count=count)
                 text = _BECAUSE(what=text, why=why) if why else text
@@ -137,27 +137,27 @@ class ObservationReceiver:
             self._failure = ""
         return observation
 
-    def _take(self, given: Observation) -> None:
-        observation = self._that_fits(given)
+    def _accept(self, given: Observation) -> None:
+        observation = self._drop_unknown_images(given)
         for camera, picture in observation.pictures.items():
             captured = observation.captured.get(camera, observation.arrived)
             if captured != self._captured.get(camera):
                 self._captured[camera] = captured
                 self._count(camera, observation.arrived)
                 self._numbers[camera] += 1
-                self._page.pictures[camera].write(self._numbers[camera], picture)
+                self._shared_state.pictures[camera].write(self._numbers[camera], picture)
         self._count("joints", observation.arrived)
         self.truth = observation.truth or {}
-        self._hear_drives(observation)
+        self._update_drives(observation)
         self._hand_on(observation, self._numbers)
-        self._page.publish_observation(observation, self._numbers)
+        self._shared_state.publish_observation(observation, self._numbers)
         age = self._clock.now() - observation.captured.get("joints", observation.arrived)
         self._ages[self._aged % _AGES_KEPT] = age
         self._aged += 1
 
-    def _that_fits(self, observation: Observation) -> Observation:
+    def _drop_unknown_images(self, observation: Observation) -> Observation:
         """With its number in the page; without pictures of other cameras, or that have no room there."""
-        most = self._page.layout.picture_bytes
+        most = self._shared_state.layout.picture_bytes
         ours = {camera: seen for camera, seen in observation.pictures.items() if camera in self._numbers}
         large = {camera for camera, picture in ours.items() if picture.nbytes > most}
         self._too_large.update(f"picture_too_large_{camera}" for camera in large)
@@ -168,8 +168,8 @@ class ObservationReceiver:
             captured={name: time for name, time in observation.captured.items() if name not in large},
         )
 
-    def _hear_drives(self, observation: Observation) -> None:
-        change = self._drives.see(observation.drives, observation.arrived)
+    def _update_drives(self, observation: Observation) -> None:
+        change = self._drives.update(observation.drives, observation.arrived)
         if change:
             self._say(Event("drives", change, observation.arrived, data=dict(self._drives.newest)))
 

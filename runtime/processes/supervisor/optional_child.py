@@ -29,7 +29,7 @@ class OptionalChild:
     def _begin(self) -> None:
         self.process, self._begun, self._due = self._start(), self._now(), None
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """See whether it lives; start it again where its time has come."""
         if self._due is not None:
             if self._now() >= self._due:

@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from types import FrameType
 
-from runtime.core.environment import for_programs
+from runtime.core.environment import program_environment
 from runtime.ipc.bells import Bell
 from runtime.ipc.bus import Endpoints, Key
 from runtime.ipc.lifeline import Lifeline
@@ -25,7 +25,7 @@ from runtime.ipc.membership import rest_s
 from runtime.ipc.shared_state import PROCESSES, WOKEN, SharedState
 from runtime.link.key_files import known_lab_path
 from runtime.processes.supervisor.optional_child import OptionalChild
-from runtime.station.lock import hold, unwritable
+from runtime.station.lock import acquire_station_lock, unwritable_error
 from runtime.station.spec import CAPABILITIES, StationSpec
 
 log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ class Supervisor:
         self._lifeline = lifeline  # of our own parent, where it wants us to end with it
         self._station_dir = spec.deployment.station_dir
         self._endpoints = Endpoints(self._station_dir)
-        self._environment = for_programs(os.environ)
+        self._environment = program_environment(os.environ)
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._driver: subprocess.Popen[bytes] | None = None
         self._companions: dict[str, OptionalChild] = {}
@@ -64,14 +64,14 @@ class Supervisor:
 
     def run(self, headless: bool) -> int:
         """Start, watch until a signal or the end of a headless run, end; returns the exit code."""
-        lock = hold(self._plan.deployment)
+        lock = acquire_station_lock(self._plan.deployment)
         try:
             self._resolved = self._write_resolved()
         except OSError as error:
-            raise unwritable(self._plan.deployment, error) from None
-        self._endpoints.begin()
+            raise unwritable_error(self._plan.deployment, error) from None
+        self._endpoints.prepare()
         Key(self._station_dir).secret()  # what is wrong with it is said before anything moves
-        self._page, self._page_fd = SharedState.create(self._plan.layout)
+        self._shared_state, self._page_fd = SharedState.create(self._plan.layout)
         self._bells, self._signalled = [Bell.made() for _ in WOKEN], Bell.made()
         # Children hold the reading end as their standard input: it ends when this process does, however it does.
         self._lifeline_out, self._lifeline_in = os.pipe()
@@ -101,12 +101,12 @@ class Supervisor:
         return path
 
     def _start(self, process: str) -> None:
-        self._page.beat(process, 0.0)  # not alive until it says so itself
-        self._page.set_generation(process, self._page.generation(process) + 1)
+        self._shared_state.beat(process, 0.0)  # not alive until it says so itself
+        self._shared_state.set_generation(process, self._shared_state.generation(process) + 1)
         self._children[process] = self._spawn(process)
-        self._tell_where()
+        self._write_endpoints()
 
-    def _tell_where(self) -> None:
+    def _write_endpoints(self) -> None:
         pids = {name: str(child.pid) for name, child in self._children.items()}
         self._endpoints.write("supervisor", {"boot": self.boot, **pids})
 
@@ -117,7 +117,7 @@ class Supervisor:
         return subprocess.Popen(
             [
                 *(sys.executable, "-m", _MODULES[process], "--boot", self.boot),
-                *(self._for_guard() if process == "guard" else self._for_readers(process)),
+                *(self._guard_arguments() if process == "guard" else self._reader_arguments(process)),
                 *shared,
             ],
             stdin=self._lifeline_out,
@@ -126,7 +126,7 @@ class Supervisor:
             start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them in order
         )
 
-    def _for_readers(self, process: str) -> tuple[str, ...]:
+    def _reader_arguments(self, process: str) -> tuple[str, ...]:
         known = CAPABILITIES.dump_json(self._plan.capabilities).decode()
         return (
             "--resolved",
@@ -134,7 +134,7 @@ class Supervisor:
             *(() if process == "headless" else ("--capabilities", known)),
         )
 
-    def _for_guard(self) -> tuple[str, ...]:
+    def _guard_arguments(self) -> tuple[str, ...]:
         """Values alone: the guard reads no deployment, which could name what fails to load."""
         spec, control = self._plan, self._plan.deployment.control
         punctual = control.realtime == "auto" and spec.capabilities.moves_robot
@@ -156,7 +156,7 @@ class Supervisor:
         )
 
     def _watch(self) -> int:
-        while not self._ending and not (self._lifeline and self._lifeline.cut):
+        while not self._ending and not (self._lifeline and self._lifeline.is_cut):
             if self._driver is not None and self._driver.poll() is not None:
                 return self._driver.returncode
             for process in PROCESSES:
@@ -166,9 +166,9 @@ class Supervisor:
             if "link" not in self._companions and known_lab_path(self._station_dir).exists():
                 self._companions["link"] = OptionalChild("link", partial(self._spawn_companion, _LINK))
             for companion in self._companions.values():
-                companion.look()
-            if self._endpoints.lost("supervisor"):
-                self._tell_where()
+                companion.poll()
+            if self._endpoints.is_missing("supervisor"):
+                self._write_endpoints()
             self._sleep()
         return 130
 
@@ -210,20 +210,20 @@ class Supervisor:
         """
         if self._driver is not None and self._driver.poll() is None:
             self._driver.terminate()
-            self._await("headless", self._driver, _DRIVER_PATIENCE_S)
+            self._wait_for_exit("headless", self._driver, _DRIVER_PATIENCE_S)
         os.close(self._lifeline_in)
         deadline = time.monotonic() + _PATIENCE_S
         for process, child in self._children.items():
-            self._await(process, child, max(0.1, deadline - time.monotonic()))
+            self._wait_for_exit(process, child, max(0.1, deadline - time.monotonic()))
         for name, companion in self._companions.items():
-            self._await(name, companion.process, _DRIVER_PATIENCE_S)
+            self._wait_for_exit(name, companion.process, _DRIVER_PATIENCE_S)
         os.close(self._lifeline_out)
         os.close(self._page_fd)
         for bell in (*self._bells, self._signalled):
             bell.close()
         self._endpoints.clear()
 
-    def _await(self, process: str, child: subprocess.Popen[bytes], seconds: float) -> None:
+    def _wait_for_exit(self, process: str, child: subprocess.Popen[bytes], seconds: float) -> None:
         try:
             child.wait(seconds)
         except subprocess.TimeoutExpired:

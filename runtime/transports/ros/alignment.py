@@ -73,7 +73,7 @@ class Alignment(Generic[Value]):
         for kept in self._samples.values():
             kept.clear()
 
-    def reached(self) -> float | None:
+    def newest_common_time(self) -> float | None:
         """The newest moment that all streams have reached; None while one has sent nothing."""
         if not all(self._samples.values()):
             return None
@@ -81,7 +81,7 @@ class Alignment(Generic[Value]):
 
     def frame(self, after: Aligned[Value] | None = None) -> Aligned[Value] | None:
         """The newest frame if it is later than `after`, the reader's last one, and has a sample that is not in that."""
-        time = self.reached()
+        time = self.newest_common_time()
         if time is None or (after is not None and time <= after.time):
             return None
         chosen = {name: _nearest(kept, time) for name, kept in self._samples.items()}
@@ -91,9 +91,9 @@ class Alignment(Generic[Value]):
             return None
         return Aligned(time, chosen)
 
-    def apart(self) -> list[str]:
+    def unaligned_streams(self) -> list[str]:
         """The streams that have no sample near enough to the moment that all have reached."""
-        time = self.reached()
+        time = self.newest_common_time()
         if time is None:
             return []
         return [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 
-from runtime.core.clock import ClockMap, Steps
+from runtime.core.clock import ClockMap, ClockStepDetector
 
 
 class RosClock:
@@ -16,7 +16,7 @@ class RosClock:
 
     def __init__(self) -> None:
         self._map = ClockMap()
-        self._steps: defaultdict[str, Steps] = defaultdict(Steps)
+        self._steps: defaultdict[str, ClockStepDetector] = defaultdict(ClockStepDetector)
 
     @property
     def backwards(self) -> int:
@@ -28,12 +28,12 @@ class RosClock:
         """Count of times that it was set ahead."""
         return self._map.leaps
 
-    def see(self, stream: str, stamp: float, arrival: float) -> float:
+    def to_monotonic(self, stream: str, stamp: float, arrival: float) -> float:
         """A stamp [s] in our clock, never later than its arrival; counts a step as one of those it has seen."""
         before = self._map.restarts + self._map.leaps
         time = self._map.map(stamp, arrival, self._steps[stream])
         if self._map.restarts + self._map.leaps > before:
             for name, steps in self._steps.items():
                 if name != stream:
-                    steps.forget()
+                    steps.reset()
         return time

@@ -22,7 +22,7 @@ from runtime.transports.ros.middleware import (
     Middleware,
     Publish,
     Topic,
-    incompatible,
+    describe_incompatible,
 )
 
 log = logging.getLogger(__name__)
@@ -241,7 +241,7 @@ class DdsMiddleware(Middleware):
         other = "" if peers else self._otherwise_typed(topic, publishes)
         if other or not status.total_count:
             return other
-        return incompatible(
+        return describe_incompatible(
             topic, _POLICIES.get(status.last_policy_id, f"policy {status.last_policy_id}"), publishes
         )
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from runtime.core.types import EEF_WIDTH, Float32, Float64, Observation, UInt8
-from runtime.transports.freshness import Freshness
+from runtime.transports.freshness import FrozenCameraDetector
 from runtime.transports.ros import reading
 from runtime.transports.ros.alignment import Aligned
 from runtime.transports.ros.messages import CompressedImage, Image, JointState, Message, PoseStamped
-from runtime.transports.ros.reading import JointOrder, Names, Unusable
-from runtime.transports.ros.topics import Part
+from runtime.transports.ros.reading import JointOrder, Names, UnusableMessage
+from runtime.transports.ros.topics import StreamSpec
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -34,21 +34,23 @@ Value: TypeAlias = Joints | Float32 | Image | CompressedImage
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Received:
+class StampedValue:
     """Value of one message, and its time of making in our clock [s]."""
 
     value: Value
     captured: float
 
 
-class Readers:
+class MessageReaders:
     """Reads a message for the part of the frame that it is about; Unusable names what is wrong."""
 
-    def __init__(self, robot: Robot, parts: tuple[Part, ...], names: Names) -> None:
+    def __init__(self, robot: Robot, parts: tuple[StreamSpec, ...], names: Names) -> None:
         self._orders = {part.name: JointOrder(part, names) for part in parts if part.message == "JointState"}
-        self._frames = {part.name: robot.group(part.of).frame or "" for part in parts if part.kind == "eef"}
+        self._frames = {
+            part.name: robot.group(part.source_key).frame or "" for part in parts if part.kind == "eef"
+        }
 
-    def read(self, part: Part, message: Message) -> Value:
+    def read(self, part: StreamSpec, message: Message) -> Value:
         if isinstance(message, JointState):
             return Joints(*self._orders[part.name].read(message))
         if isinstance(message, PoseStamped):
@@ -60,18 +62,20 @@ class Readers:
 class Assembly:
     """Makes an observation of one aligned set of messages; a picture is decoded once, when it is first wanted."""
 
-    def __init__(self, robot: Robot, parts: tuple[Part, ...], detect_frozen: bool) -> None:
+    def __init__(self, robot: Robot, parts: tuple[StreamSpec, ...], detect_frozen: bool) -> None:
         self._robot = robot
         self._parts = parts
         self._detect_frozen = detect_frozen
-        self._freshness = Freshness()
-        self._decoded: dict[str, tuple[Received, UInt8]] = {}
+        self._freshness = FrozenCameraDetector()
+        self._decoded: dict[str, tuple[StampedValue, UInt8]] = {}
 
-    def observation(self, number: int, aligned: Aligned[Received]) -> Observation:
+    def observation(self, number: int, aligned: Aligned[StampedValue]) -> Observation:
         """Raises Unusable where a picture cannot be decoded."""
         samples = aligned.samples
         values = {name: sample.value for name, sample in samples.items()}
-        pictures = {part.of: self._picture(part, values[part.name]) for part in self._of("camera")}
+        pictures = {
+            part.source_key: self._picture(part, values[part.name]) for part in self._stream("camera")
+        }
         position, velocity, effort = self._vectors({name: got.value for name, got in values.items()})
         eef = self._eef({name: got.value for name, got in values.items()}, position)
         return Observation(
@@ -89,31 +93,35 @@ class Assembly:
         """Cameras whose messages go on and show the same for too long; each named once."""
         return self._freshness.newly_frozen(time) if self._detect_frozen else []
 
-    def _of(self, kind: str) -> list[Part]:
+    def _stream(self, kind: str) -> list[StreamSpec]:
         return [part for part in self._parts if part.kind == kind]
 
-    def _picture(self, part: Part, got: Received) -> UInt8:
-        known = self._decoded.get(part.of)
+    def _picture(self, part: StreamSpec, got: StampedValue) -> UInt8:
+        known = self._decoded.get(part.source_key)
         if known is not None and known[0] is got:
             return known[1]
         assert isinstance(got.value, Image | CompressedImage)
         try:
             made = reading.picture(got.value)
-        except Unusable as error:
-            raise Unusable(error.fault, f"{part.topic}: {error}") from error
-        self._decoded[part.of] = (got, made)
+        except UnusableMessage as error:
+            raise UnusableMessage(error.fault, f"{part.topic}: {error}") from error
+        self._decoded[part.source_key] = (got, made)
         return made
 
-    def _captured(self, values: Mapping[str, Received], pictures: Mapping[str, UInt8]) -> dict[str, float]:
+    def _captured(
+        self, values: Mapping[str, StampedValue], pictures: Mapping[str, UInt8]
+    ) -> dict[str, float]:
         """By stream; joints are as old as the oldest of their messages."""
-        times = {"joints": min(values[p.name].captured for p in self._of("joints") + self._of("gripper"))}
-        poses = self._of("eef")
+        times = {
+            "joints": min(values[p.name].captured for p in self._stream("joints") + self._stream("gripper"))
+        }
+        poses = self._stream("eef")
         if poses:
             times["eef"] = min(values[part.name].captured for part in poses)
-        for part in self._of("camera"):
+        for part in self._stream("camera"):
             time = values[part.name].captured
-            shown = {part.of: pictures[part.of]}
-            times |= self._freshness.captured(shown, time) if self._detect_frozen else {part.of: time}
+            shown = {part.source_key: pictures[part.source_key]}
+            times |= self._freshness.captured(shown, time) if self._detect_frozen else {part.source_key: time}
         return times
 
     def _vectors(self, values: Mapping[str, Value]) -> tuple[Float32, Float32 | None, Float32 | None]:
@@ -125,14 +133,16 @@ class Assembly:
             assert isinstance(arm, Joints)
             assert hand is None or isinstance(hand, Joints)
             place = None if group.gripper is None else group.gripper.index
-            positions.append(_inserted(arm.position, None if hand is None else hand.position, place))
+            positions.append(_insert_gripper(arm.position, None if hand is None else hand.position, place))
             whole = hand is None or hand.velocity is not None
             velocities.append(
-                _inserted(arm.velocity, None if hand is None else hand.velocity, place) if whole else None
+                _insert_gripper(arm.velocity, None if hand is None else hand.velocity, place)
+                if whole
+                else None
             )
             whole = hand is None or hand.effort is not None
             efforts.append(
-                _inserted(arm.effort, None if hand is None else hand.effort, place) if whole else None
+                _insert_gripper(arm.effort, None if hand is None else hand.effort, place) if whole else None
             )
         joined = _joined(positions)
         assert joined is not None
@@ -140,7 +150,7 @@ class Assembly:
 
     def _eef(self, values: Mapping[str, Value], position: Float32) -> Float32 | None:
         """The poses that were measured, each with its gripper from the joints: float32 [8 * arms]."""
-        if not self._of("eef"):
+        if not self._stream("eef"):
             return None
         vectors = np.zeros((len(self._robot.arms), EEF_WIDTH), np.float32)
         for row, arm in zip(vectors, self._robot.arms, strict=True):
@@ -151,7 +161,7 @@ class Assembly:
         return vectors.reshape(-1)
 
 
-def _inserted(arm: Float64 | None, hand: Float64 | None, place: int | None) -> Float64 | None:
+def _insert_gripper(arm: Float64 | None, hand: Float64 | None, place: int | None) -> Float64 | None:
     """A group's numbers, the gripper's at its place where it came by itself."""
     return arm if arm is None or hand is None or place is None else np.insert(arm, place, hand[0])
 

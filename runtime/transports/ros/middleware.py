@@ -27,7 +27,7 @@ class Quality(Settings):
     depth: int | None = Field(default=None, ge=1, le=1000)
     """How many messages are kept for a reader that is behind: 1 command, 5 of all else."""
 
-    def otherwise(self, usual: Quality) -> Quality:
+    def merged_over(self, usual: Quality) -> Quality:
         """This one, with what it leaves open as in `usual`."""
         return usual.model_copy(update=self.model_dump(exclude_none=True))
 
@@ -74,7 +74,7 @@ class Middleware(ABC):
         """Release everything; nothing is delivered once it returns. Safe to call twice."""
 
 
-def incompatible(topic: Topic, policy: str, publishes: bool) -> str:
+def describe_incompatible(topic: Topic, policy: str, publishes: bool) -> str:
     """The sentence for a peer that was refused for a policy of its quality of service."""
     side, other = ("publish", "a subscriber") if publishes else ("subscribe to", "a publisher")
     ours = topic.quality.model_dump()

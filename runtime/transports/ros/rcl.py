@@ -20,7 +20,7 @@ from runtime.transports.ros.middleware import (
     Middleware,
     Publish,
     Topic,
-    incompatible,
+    describe_incompatible,
 )
 
 log = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ class RclMiddleware(Middleware):
         from rclpy.qos import qos_policy_name_from_kind
 
         policy = str(qos_policy_name_from_kind(event.last_policy_kind)).lower().removesuffix("_qos_policy")
-        self._refused[topic.name] = incompatible(topic, policy, publishes)
+        self._refused[topic.name] = describe_incompatible(topic, policy, publishes)
 
 
 def _kind(topic: Topic) -> Any:

@@ -10,14 +10,14 @@ from runtime.core.errors import CodecError
 from runtime.core.picture_bounds import MOST_PIXELS, require_scans
 from runtime.core.types import Float32, Float64, UInt8
 from runtime.transports.ros.messages import CompressedImage, Image, JointState, PoseStamped
-from runtime.transports.ros.topics import Part
+from runtime.transports.ros.topics import StreamSpec
 
 Names = Literal["check", "ignore"]
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4}
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 
 
-class Unusable(CodecError):
+class UnusableMessage(CodecError):
     """A message that cannot be used; `fault` is the name under which it is counted."""
 
     def __init__(self, fault: str, text: str) -> None:
@@ -32,34 +32,38 @@ class JointOrder:
     names = "ignore" the first numbers count as they come.
     """
 
-    def __init__(self, part: Part, names: Names, key: str = "transport.topics.groups") -> None:
+    def __init__(self, part: StreamSpec, names: Names, key: str = "transport.topics.groups") -> None:
         self._part = part
-        self._key = f"{key}.{part.of}.joints"  # of the deployment, for sentences
+        self._key = f"{key}.{part.source_key}.joints"  # of the deployment, for sentences
         self._check = names == "check"
         self._seen: tuple[str, ...] | None = None
         self._order: list[int] = []
 
     def read(self, message: JointState) -> tuple[Float64, Float64 | None, Float64 | None]:
         """Position, and velocity and effort where the message has them: float64 [joints]."""
-        order = self._places(message)
+        order = self._indices(message)
         position = message.position[order]
         if not np.isfinite(position).all():
-            raise Unusable("not_finite", f"positions are {position.tolist()}; expected finite numbers")
-        return position, _also(message.velocity, message, order), _also(message.effort, message, order)
+            raise UnusableMessage("not_finite", f"positions are {position.tolist()}; expected finite numbers")
+        return (
+            position,
+            _optional_values(message.velocity, message, order),
+            _optional_values(message.effort, message, order),
+        )
 
-    def _places(self, message: JointState) -> list[int]:
+    def _indices(self, message: JointState) -> list[int]:
         wanted, size = self._part.joints, len(message.position)
         if not self._check or not message.names:
             enough = size >= len(wanted) if not self._check else size == len(wanted)
             if not enough:
-                raise Unusable(
+                raise UnusableMessage(
                     "wrong_dimension",
                     f"{size} positions {'without names' if not message.names else ''} came; "
                     f"expected {len(wanted)}: {', '.join(wanted)}",
                 )
             return list(range(len(wanted)))
         if len(message.names) != size:
-            raise Unusable("wrong_dimension", f"{len(message.names)} names came with {size} positions")
+            raise UnusableMessage("wrong_dimension", f"{len(message.names)} names came with {size} positions")
         if message.names != self._seen:
             self._order = self._ordered(message.names)
             self._seen = message.names
@@ -71,7 +75,7 @@ class JointOrder:
         twice = [name for name in wanted if names.count(name) > 1]
         if missing or twice:
             wrong = f"lack {', '.join(missing)}" if missing else f"have {', '.join(twice)} more than once"
-            raise Unusable(
+            raise UnusableMessage(
                 "joint_names",
                 f"the joints {', '.join(names)} {wrong}; expected {', '.join(wanted)} "
                 f"({self._key} says what messages call them)",
@@ -79,7 +83,7 @@ class JointOrder:
         return [names.index(name) for name in wanted]
 
 
-def _also(numbers: Float64, message: JointState, order: list[int]) -> Float64 | None:
+def _optional_values(numbers: Float64, message: JointState, order: list[int]) -> Float64 | None:
     """Velocity or effort: drivers leave them empty, or shorter, where they do not know them."""
     if len(numbers) != len(message.position):
         return None
@@ -91,11 +95,11 @@ def pose(message: PoseStamped, frame: str) -> Float32:
     """x, y, z [m], quaternion w, x, y, z: float32 [7] in `frame`."""
     given = message.frame.lstrip("/")
     if frame and given and given != frame:
-        raise Unusable("wrong_frame", f"a pose is given in {given}; expected {frame}")
+        raise UnusableMessage("wrong_frame", f"a pose is given in {given}; expected {frame}")
     numbers = message.pose
     length = float(np.linalg.norm(numbers[3:]))
     if not np.isfinite(numbers).all() or abs(length - 1.0) > 0.05:
-        raise Unusable(
+        raise UnusableMessage(
             "bad_pose", f"a pose is {numbers.tolist()}; expected a finite one, its quaternion unit"
         )
     return np.concatenate([numbers[:3], numbers[[6, 3, 4, 5]] / length]).astype(np.float32)
@@ -106,7 +110,7 @@ def check_picture(message: Image | CompressedImage) -> None:
     if isinstance(message, Image):
         _check_raw(message)
     elif _kind_of(message) is None:
-        raise Unusable(
+        raise UnusableMessage(
             "wrong_encoding",
             f"a picture of format {message.format!r} begins with {bytes(message.data[:4]).hex() or 'nothing'}; "
             "allowed: jpeg, png (not compressedDepth)",
@@ -123,13 +127,13 @@ def picture(message: Image | CompressedImage) -> UInt8:
 def _check_raw(message: Image) -> None:
     channels = _CHANNELS.get(message.encoding)
     if channels is None:
-        raise Unusable(
+        raise UnusableMessage(
             "wrong_encoding", f"a picture is {message.encoding!r}; allowed: {', '.join(sorted(_CHANNELS))}"
         )
     _check_size(message.height, message.width)
     needed = message.step * message.height
     if message.step < message.width * channels or len(message.data) < needed:
-        raise Unusable(
+        raise UnusableMessage(
             "wrong_dimension",
             f"a picture of {message.width} x {message.height} {message.encoding} has rows of {message.step} bytes "
             f"and {len(message.data)} bytes; expected at least {message.width * channels} and {needed}",
@@ -138,7 +142,7 @@ def _check_raw(message: Image) -> None:
 
 def _check_size(height: int, width: int) -> None:
     if not 0 < height * width <= MOST_PIXELS:
-        raise Unusable(
+        raise UnusableMessage(
             "wrong_dimension", f"a picture has {width} x {height} pixels; allowed: 1 to {MOST_PIXELS}"
         )
 
@@ -174,7 +178,7 @@ def _decompressed(message: CompressedImage) -> UInt8:
     try:
         decoded = _jpeg(message) if _kind_of(message) == "jpeg" else _png(message)
     except (ValueError, OSError, SyntaxError) as error:  # SyntaxError: what Pillow calls a broken PNG
-        raise Unusable(
+        raise UnusableMessage(
             "broken_picture", f"a {message.format!r} picture cannot be decoded: {error}"
         ) from error
     # image_transport hands its files to OpenCV, which takes red for blue unless it swaps, as "compressed bgr8" says.
@@ -199,5 +203,7 @@ def _png(message: CompressedImage) -> UInt8:
     with Pillow.open(io.BytesIO(message.data.tobytes()), formats=["PNG"]) as opened:
         _check_size(opened.height, opened.width)
         if opened.mode not in ("1", "L", "LA", "P", "RGB", "RGBA"):
-            raise Unusable("wrong_encoding", f"a PNG of mode {opened.mode} came; allowed: 8 bits per channel")
+            raise UnusableMessage(
+                "wrong_encoding", f"a PNG of mode {opened.mode} came; allowed: 8 bits per channel"
+            )
         return np.array(opened.convert("RGB"), np.uint8)

@@ -37,7 +37,7 @@ _INSTALL = (
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class RosEnvironment:
     """ROS 1: the Python that has rospy, the master, the address under which nodes reach this machine."""
 
     python: str
@@ -73,7 +73,7 @@ def require(python: str) -> None:
 class RospyProcess:
     """One life of the child: a node that the master knows, once it is made."""
 
-    def __init__(self, site: Site, name: str) -> None:
+    def __init__(self, site: RosEnvironment, name: str) -> None:
         """Start it; SetupError without rospy, TransportError where the master does not answer."""
         require(site.python)
         self._telling, telling = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -97,9 +97,9 @@ class RospyProcess:
                 start_new_session=True,  # Ctrl-C is for its parent, which may still have to bring a robot to a stand
             )
         try:
-            self._greet(site)
+            self._await_ready(site)
         except BaseException:
-            self.end()
+            self.stop()
             raise
 
     @property
@@ -107,7 +107,7 @@ class RospyProcess:
         """The child's process."""
         return self._process.pid
 
-    def ask(self, **word: Any) -> None:
+    def request(self, **word: Any) -> None:
         """Have a topic opened; nothing where the child has ended, which `hear` says."""
         with contextlib.suppress(OSError):
             self._commands.send(bytes([WORD]) + json.dumps(word).encode())
@@ -121,7 +121,9 @@ class RospyProcess:
             return False
         return True
 
-    def hear(self, message: Callable[[int, bytes], None], word: Callable[[dict[str, Any]], None]) -> None:
+    def read_messages(
+        self, message: Callable[[int, bytes], None], word: Callable[[dict[str, Any]], None]
+    ) -> None:
         """Hand over all that the child tells, until it ends or is ended."""
         with contextlib.suppress(EOFError, OSError):
             while True:
@@ -137,7 +139,7 @@ class RospyProcess:
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
 
-    def end(self) -> int:
+    def stop(self) -> int:
         """Close the sockets and wait for the child, which takes leave of the master; returns how it ended."""
         self.interrupt()
         self._telling.close()
@@ -148,7 +150,7 @@ class RospyProcess:
             self._process.kill()
             return self._process.wait()
 
-    def _greet(self, site: Site) -> None:
+    def _await_ready(self, site: RosEnvironment) -> None:
         """Wait for its first word."""
         self._telling.settimeout(_START_S)
         try:

@@ -11,8 +11,8 @@ from runtime.core.pose_format import PoseFormat
 from runtime.core.settings import Settings
 from runtime.transports.base import Capabilities
 from runtime.transports.ros.reading import Names
-from runtime.transports.ros.source import Terms
-from runtime.transports.ros.topics import Outlet, Part, Target, TopicPlan, Topics
+from runtime.transports.ros.source import AcceptanceLimits
+from runtime.transports.ros.topics import CommandTopic, StreamSpec, Target, TopicPlan, Topics
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -52,9 +52,9 @@ class RosSettings(Settings):
         return self
 
     @property
-    def terms(self) -> Terms:
+    def acceptance_limits(self) -> AcceptanceLimits:
         """Terms on which this deployment takes messages."""
-        return Terms(
+        return AcceptanceLimits(
             self.max_skew_s,
             self.stalled_after_s,
             self.joint_names,
@@ -63,19 +63,21 @@ class RosSettings(Settings):
         )
 
     @property
-    def offers(self) -> Capabilities:
+    def capabilities(self) -> Capabilities:
         """Capabilities of the transport: a robot is attached to it."""
         spaces = frozenset({"joint", "eef"}) if self.eef_commands else frozenset({"joint"})
         return Capabilities(moves_robot=True, measures_eef=self.eef, spaces=spaces, poses=(PoseFormat(),))
 
-    def streams(self, robot: Robot, version: Literal[1, 2]) -> tuple[tuple[Part, ...], tuple[Outlet, ...]]:
+    def streams(
+        self, robot: Robot, version: Literal[1, 2]
+    ) -> tuple[tuple[StreamSpec, ...], tuple[CommandTopic, ...]]:
         """Topics that are listened to and those that are spoken on, the simulation's first."""
         plan = TopicPlan(robot, version, self.topics, self.disabled_cameras)
-        parts = plan.parts(self.eef)
+        parts = plan.streams(self.eef)
         chosen: list[Target] = [target for target in ("simulation", "robot") if target in self.commands_to]
-        return parts, plan.outlets(chosen, self.eef_commands)
+        return parts, plan.command_topics(chosen, self.eef_commands)
 
 
-def camera_keys(parts: tuple[Part, ...]) -> tuple[str, ...]:
+def camera_keys(parts: tuple[StreamSpec, ...]) -> tuple[str, ...]:
     """Keys of the cameras among what is listened to."""
-    return tuple(part.of for part in parts if part.kind == "camera")
+    return tuple(part.source_key for part in parts if part.kind == "camera")

@@ -14,7 +14,7 @@ from runtime.core.types import EEF_WIDTH, Float32, RobotCommand
 from runtime.transports.base import Sink
 from runtime.transports.ros.messages import JointState, Message, PoseStamped, Wire
 from runtime.transports.ros.middleware import Middleware, Publish, Topic
-from runtime.transports.ros.topics import Outlet
+from runtime.transports.ros.topics import CommandTopic
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -30,7 +30,7 @@ class RosSink(Sink):
     def __init__(
         self,
         robot: Robot,
-        outlets: tuple[Outlet, ...],
+        outlets: tuple[CommandTopic, ...],
         quality: Callable[[str], Quality],
         clock: Clock,
         wire: Wire,
@@ -41,7 +41,7 @@ class RosSink(Sink):
         self._clock, self._wire, self._open, self._wall = clock, wire, open_middleware, wall
         self._posed = any(outlet.message == "PoseStamped" for outlet in outlets)
         self._middleware: Middleware | None = None
-        self._publish: list[tuple[Outlet, Publish]] = []
+        self._publish: list[tuple[CommandTopic, Publish]] = []
 
     def connect(self) -> None:
         """Advertise every topic; subscribers that are not there yet are found by themselves when they come."""
@@ -71,7 +71,7 @@ class RosSink(Sink):
         for (_, publish), payload in zip(self._publish, messages, strict=True):
             publish(payload)
 
-    def unheard(self) -> dict[str, str]:
+    def missing_subscribers(self) -> dict[str, str]:
         """The command topics to which nobody listens, and why not where that is known, or ""."""
         matches = {} if self._middleware is None else self._middleware.matches()
         return {topic: match.refused for topic, match in matches.items() if not match.peers or match.refused}
@@ -83,7 +83,9 @@ class RosSink(Sink):
             self._middleware.close()
             self._middleware = None
 
-    def _message(self, outlet: Outlet, stamp: int, action: np.ndarray, eef: np.ndarray | None) -> Message:
+    def _message(
+        self, outlet: CommandTopic, stamp: int, action: np.ndarray, eef: np.ndarray | None
+    ) -> Message:
         if outlet.message == "JointState":
             return JointState(stamp, "", outlet.joints, action[list(outlet.dims)])
         assert eef is not None

@@ -18,11 +18,11 @@ from runtime.transports.base import Source
 from runtime.transports.freshness import FROZEN_S
 from runtime.transports.ros.alignment import Aligned, Alignment, Sample
 from runtime.transports.ros.clock import RosClock
-from runtime.transports.ros.frames import Assembly, Readers, Received
+from runtime.transports.ros.frames import Assembly, MessageReaders, StampedValue
 from runtime.transports.ros.messages import Message, Wire
 from runtime.transports.ros.middleware import Match, Middleware, Quality, Topic
-from runtime.transports.ros.reading import Names, Unusable
-from runtime.transports.ros.topics import Part
+from runtime.transports.ros.reading import Names, UnusableMessage
+from runtime.transports.ros.topics import StreamSpec
 
 if TYPE_CHECKING:
     from robots import Robot
@@ -55,15 +55,15 @@ _APART = Pattern(
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class Subscription:
     """A subscription: its topic, and the parts of a frame that its messages have."""
 
     topic: Topic
-    parts: tuple[Part, ...]
+    parts: tuple[StreamSpec, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
+class AcceptanceLimits:
     """Terms on which messages are taken."""
 
     skew: float  # s, window of the alignment
@@ -81,15 +81,15 @@ class RosSource(Source):
     coming is news, once for each reason.
     """
 
-    _cursor: Aligned[Received] | None  # the frame delivered last
+    _cursor: Aligned[StampedValue] | None  # the frame delivered last
     _count: int
     _news: list[Event]
 
     def __init__(
         self,
         robot: Robot,
-        heard: tuple[Heard, ...],
-        terms: Terms,
+        heard: tuple[Subscription, ...],
+        terms: AcceptanceLimits,
         clock: Clock,
         wire: Wire,
         open_middleware: Callable[[], Middleware],
@@ -109,7 +109,7 @@ class RosSource(Source):
         self._began = self._framed_at = self._clock.now()
         self._middleware = self._open()
         for one in self._heard:
-            self._middleware.subscribe(one.topic, self._taker(one))
+            self._middleware.subscribe(one.topic, self._make_callback(one))
 
     def receive(self, timeout: float) -> Observation | None:
         """The newest frame not yet delivered, as RGB; None after `timeout` seconds without one."""
@@ -121,17 +121,17 @@ class RosSource(Source):
             if aligned is not None:
                 self._cursor = aligned
         if aligned is None:
-            self._complain()
+            self._report_no_frame()
             return None
         self._count += 1
         self._framed_at = self._clock.now()
         try:
             made = self._assembly.observation(self._count, aligned)
-        except Unusable as error:
-            self._blame(error.fault, str(error))
+        except UnusableMessage as error:
+            self._count_fault(error.fault, str(error))
             return None
         for camera in self._assembly.newly_frozen(self._clock.now()):
-            self._blame(f"frozen_{camera}", _FROZEN(camera=camera, seconds=FROZEN_S))
+            self._count_fault(f"frozen_{camera}", _FROZEN(camera=camera, seconds=FROZEN_S))
         self._told.clear()
         return made
 
@@ -149,12 +149,12 @@ class RosSource(Source):
             jumps = {"clock_backwards": self._ros.backwards, "clock_forwards": self._ros.forwards}
         return counts | {name: count for name, count in jumps.items() if count}
 
-    def why(self, fault: str) -> str:
+    def describe_fault(self, fault: str) -> str:
         """The newest sentence of a fault."""
         with self._changed:
             return self._sentences.get(fault, "")
 
-    def news(self) -> list[Event]:
+    def pop_events(self) -> list[Event]:
         """Why no frame comes: a stream that is silent, with its age, and who is at the other side of its topic."""
         told, self._news = self._news, []
         return told
@@ -177,13 +177,13 @@ class RosSource(Source):
     def _forget(self) -> None:
         self._ros = RosClock()
         names = [part.name for part in self._parts]
-        self.alignment: Alignment[Received] = Alignment(
+        self.alignment: Alignment[StampedValue] = Alignment(
             names,
             self._terms.skew,
             max(_HISTORY_S, 2 * self._terms.skew),
             {part.name: _PICTURES_DEPTH for part in self._parts if part.kind == "camera"},
         )
-        self._readers = Readers(self._robot, self._parts, self._terms.names)
+        self._readers = MessageReaders(self._robot, self._parts, self._terms.names)
         self._assembly = Assembly(self._robot, self._parts, self._terms.detect_frozen)
         self._faults: Counter[str] = Counter()
         self._last_fault = ""
@@ -197,41 +197,43 @@ class RosSource(Source):
         self._count = 0
         self._began = self._framed_at = self._look_at = 0.0
 
-    def _taker(self, one: Heard) -> Callable[[bytes], None]:
+    def _make_callback(self, one: Subscription) -> Callable[[bytes], None]:
         def take(payload: bytes) -> None:
             arrived = self._clock.now()
             try:
                 message = self._wire.decode(one.topic.message, payload)
             except CodecError as error:
-                self._blame("malformed", f"{one.topic.name}: {error}", *(part.name for part in one.parts))
+                self._count_fault(
+                    "malformed", f"{one.topic.name}: {error}", *(part.name for part in one.parts)
+                )
                 return
             for part in one.parts:
                 self._take(part, message, arrived)
 
         return take
 
-    def _take(self, part: Part, message: Message, arrived: float) -> None:
+    def _take(self, part: StreamSpec, message: Message, arrived: float) -> None:
         """Keep one message; whatever is wrong with it is counted and ends nothing."""
         try:
             value = self._readers.read(part, message)
             stamp = self._stamp(message, arrived)
-        except Unusable as error:
-            self._blame(error.fault, f"{part.topic}: {error}", part.name)
+        except UnusableMessage as error:
+            self._count_fault(error.fault, f"{part.topic}: {error}", part.name)
             return
         except Exception as error:
             log.exception("reading %s failed", part.topic)
-            self._blame("reader_failed", f"{part.topic}: {type(error).__name__}: {error}", part.name)
+            self._count_fault("reader_failed", f"{part.topic}: {type(error).__name__}: {error}", part.name)
             return
         with self._changed:
             before, leaps = self._ros.backwards, self._ros.forwards
-            ours = self._ros.see(part.name, stamp, arrived)
+            ours = self._ros.to_monotonic(part.name, stamp, arrived)
             if self._ros.backwards > before:
                 self.alignment.clear()
                 self._cursor = None
                 self._sentences["clock_backwards"] = _BACK(stream=part.name)
             if self._ros.forwards > leaps:
                 self._sentences["clock_forwards"] = _AHEAD(stream=part.name)
-            if self.alignment.add(part.name, Sample(stamp, arrived, Received(value, ours))):
+            if self.alignment.add(part.name, Sample(stamp, arrived, StampedValue(value, ours))):
                 self._heard_at[part.name] = arrived
                 self._refusals.pop(part.name, None)
                 self._changed.notify_all()
@@ -244,7 +246,7 @@ class RosSource(Source):
         if not self._terms.stamped:
             return arrived
         if message.stamp <= 0:
-            raise Unusable(
+            raise UnusableMessage(
                 "unstamped",
                 'its header has no stamp; let the driver set it, or say transport.stamps = "arrival"',
             )
@@ -259,14 +261,16 @@ class RosSource(Source):
             self._last_fault = self._sentences[fault] = self._silence(name, now[name], Match(1))
         self._stalled = set(now)
 
-    def _complain(self) -> None:
+    def _report_no_frame(self) -> None:
         """Tell why no frame comes, once per reason; says nothing while streams are merely on their way."""
         with self._changed:
             stalled = self.stalled()
-            apart = [] if stalled or self._waited() <= self._terms.stalled else self.alignment.apart()
+            apart = (
+                [] if stalled or self._waited() <= self._terms.stalled else self.alignment.unaligned_streams()
+            )
         if apart and "apart" not in self._told:
             self._told.add("apart")
-            self._tell(self._distance(apart))
+            self._emit(self._distance(apart))
         if not stalled or (
             self._clock.now() < self._look_at and self._told.issuperset(self._reasons(stalled))
         ):
@@ -285,11 +289,11 @@ class RosSource(Source):
             self._told |= causes[name]
         shared = {match.refused for match in fresh.values()}
         if len(fresh) > 1 and len(shared) == 1 and any(shared) and not fresh.keys() & self._refusals.keys():
-            self._tell(_WAITING(streams=", ".join(fresh), why=shared.pop()))
+            self._emit(_WAITING(streams=", ".join(fresh), why=shared.pop()))
         elif fresh:
-            self._tell(series([self._silence(name, stalled[name], match) for name, match in fresh.items()]))
+            self._emit(series([self._silence(name, stalled[name], match) for name, match in fresh.items()]))
 
-    def _tell(self, sentence: str) -> None:
+    def _emit(self, sentence: str) -> None:
         self._last_fault = sentence
         self._news.append(Event("source_waiting", sentence, self._clock.now()))
 
@@ -319,7 +323,7 @@ class RosSource(Source):
         behind = max(stamps.values()) - stamps[slowest]
         return _APART(apart=", ".join(apart), skew=self._terms.skew, slowest=slowest, behind=behind)
 
-    def _blame(self, fault: str, text: str, *streams: str) -> None:
+    def _count_fault(self, fault: str, text: str, *streams: str) -> None:
         with self._changed:
             self._faults[fault] += 1
             self._last_fault = self._sentences[fault] = text
@@ -327,9 +331,11 @@ class RosSource(Source):
                 self._refusals[stream] = (fault, text)
 
 
-def subscriptions(parts: tuple[Part, ...], quality: Callable[[str], Quality]) -> tuple[Heard, ...]:
+def subscriptions(
+    parts: tuple[StreamSpec, ...], quality: Callable[[str], Quality]
+) -> tuple[Subscription, ...]:
     """One per topic: several groups may be on the same one, as on /joint_states."""
-    by_topic: dict[str, list[Part]] = defaultdict(list)
+    by_topic: dict[str, list[StreamSpec]] = defaultdict(list)
     for part in parts:
         by_topic[part.topic].append(part)
     for topic, found in by_topic.items():
@@ -341,6 +347,6 @@ def subscriptions(parts: tuple[Part, ...], quality: Callable[[str], Quality]) ->
                 "allowed: one type of message per topic"
             )
     return tuple(
-        Heard(Topic(topic, found[0].message, quality(topic)), tuple(found))
+        Subscription(Topic(topic, found[0].message, quality(topic)), tuple(found))
         for topic, found in by_topic.items()
     )

@@ -16,7 +16,7 @@ from typing import Any
 from runtime.core.errors import RuntimeFault
 from runtime.transports.ros.messages import PACKAGES
 from runtime.transports.ros.middleware import Deliver, Match, Middleware, Publish, Topic
-from runtime.transports.ros.rospy_process import RospyProcess, Site, require
+from runtime.transports.ros.rospy_process import RosEnvironment, RospyProcess, require
 
 log = logging.getLogger(__name__)
 _PAUSES_S = (0.2, 0.5, 1.0, 2.0)  # between two tries to start it again; the last one for all that follow
@@ -25,7 +25,7 @@ _PAUSES_S = (0.2, 0.5, 1.0, 2.0)  # between two tries to start it again; the las
 class TcpRosMiddleware(Middleware):
     """One node at a time; one thread hears it and replaces it."""
 
-    def __init__(self, site: Site, name: str) -> None:
+    def __init__(self, site: RosEnvironment, name: str) -> None:
         """Become a node behind the caller's back, as soon as the master answers; SetupError without rospy."""
         require(site.python)
         self._site, self._name = site, name
@@ -38,7 +38,7 @@ class TcpRosMiddleware(Middleware):
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._child: RospyProcess | None = None
-        self._thread = threading.Thread(target=self._live, name="rospy", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="rospy", daemon=True)
         self._thread.start()
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> None:
@@ -95,7 +95,7 @@ class TcpRosMiddleware(Middleware):
     def _request(self, child: RospyProcess, index: int) -> None:
         topic, deliver = self._topics[index]
         kind = f"{PACKAGES[topic.message]}/{topic.message}"
-        child.ask(
+        child.request(
             publish=deliver is None, index=index, name=topic.name, kind=kind, queue=topic.quality.depth or 1
         )
 
@@ -103,22 +103,22 @@ class TcpRosMiddleware(Middleware):
         # A master that is told of a second node of a name ends the first one.
         return RospyProcess(self._site, f"{self._name}_{uuid.uuid4().hex[:12]}")
 
-    def _live(self) -> None:
+    def _run(self) -> None:
         """The thread: hears one child after the other."""
-        child = self._begun(0.0)
+        child = self._start_child(0.0)
         while child is not None:
             self._farewell = ""
-            child.hear(self._deliver, self._obey)
+            child.read_messages(self._deliver, self._handle_word)
             with self._lock:
                 self._child = None
                 self._peers = {}
-            code = child.end()
+            code = child.stop()
             if self._ending.is_set():
                 return
             self._complain(self._farewell or f"the process of rospy has ended ({code}); starting it again")
-            child = self._begun(_PAUSES_S[0])
+            child = self._start_child(_PAUSES_S[0])
 
-    def _begun(self, pause: float) -> RospyProcess | None:
+    def _start_child(self, pause: float) -> RospyProcess | None:
         """A child that knows all topics, after `pause` [s] and as many more as it takes; None where none is wanted."""
         later = iter(_PAUSES_S)
         while not self._ending.wait(pause):
@@ -153,7 +153,7 @@ class TcpRosMiddleware(Middleware):
         except Exception:  # of one message: nobody else would hear the next
             log.exception("reading %s failed", self._topics[index][0].name)
 
-    def _obey(self, word: dict[str, Any]) -> None:
+    def _handle_word(self, word: dict[str, Any]) -> None:
         """Obey a word of the child that is no message."""
         if "peers" in word:
             self._take_status(word)

@@ -50,14 +50,14 @@ class Topics(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class StreamSpec:
     """One stream of a frame: what kind it is, of which group or camera (key), on which topic.
 
     `joints` are the names in the message of the numbers that are wanted, in the group's order.
     """
 
     kind: Literal["joints", "gripper", "eef", "camera"]
-    of: str
+    source_key: str
     topic: str
     message: MessageName
     joints: tuple[str, ...] = ()
@@ -65,11 +65,11 @@ class Part:
     @property
     def name(self) -> str:
         """The stream's name: a camera's key, or "left_arm joints"."""
-        return self.of if self.kind == "camera" else f"{self.of} {self.kind}"
+        return self.source_key if self.kind == "camera" else f"{self.source_key} {self.kind}"
 
 
 @dataclass(frozen=True, slots=True)
-class Outlet:
+class CommandTopic:
     """One topic of commands: the places in the robot's vector that go there, under these joint names.
 
     For a pose, `arm` is the arm's place among the robot's arms, and `frame` what the pose is expressed in.
@@ -96,26 +96,26 @@ class TopicPlan:
         for group in robot.groups:
             self._check_joints(group)
 
-    def parts(self, eef: bool) -> tuple[Part, ...]:
+    def streams(self, eef: bool) -> tuple[StreamSpec, ...]:
         """Everything that a frame consists of, with poses where `eef`."""
         made = [self._camera(camera) for camera in self.cameras]
         for group in self._robot.groups:
             made += self._state(group)
             if eef and group.chain is not None:
                 topic = self._required(group, "eef", "eef = true needs the poses of every arm")
-                made.append(Part("eef", group.name, topic, "PoseStamped"))
+                made.append(StreamSpec("eef", group.name, topic, "PoseStamped"))
         return tuple(made)
 
-    def outlets(self, targets: Sequence[Target], eef: bool) -> tuple[Outlet, ...]:
+    def command_topics(self, targets: Sequence[Target], eef: bool) -> tuple[CommandTopic, ...]:
         """Outlets of commands, in the order of the targets, with poses where `eef`; one message per topic."""
-        merged: dict[str, Outlet] = {}
+        merged: dict[str, CommandTopic] = {}
         for target in targets:
             for group in self._robot.groups:
                 for outlet in self._commands(group, target, eef):
                     merged[outlet.topic] = _merged(merged.get(outlet.topic), outlet)
         return tuple(merged.values())
 
-    def _camera(self, camera: Camera) -> Part:
+    def _camera(self, camera: Camera) -> StreamSpec:
         topic = self._given.cameras.get(camera.name)
         if topic is None and self._own is not None:
             topic = self._own.cameras.get(camera.name)
@@ -125,36 +125,36 @@ class TopicPlan:
                 f'transport.topics.cameras.{camera.name}, or "{camera.key}" among transport.disabled_cameras'
             )
         compressed = topic.endswith("/compressed")
-        return Part("camera", camera.key, topic, "CompressedImage" if compressed else "Image")
+        return StreamSpec("camera", camera.key, topic, "CompressedImage" if compressed else "Image")
 
-    def _state(self, group: Group) -> Iterator[Part]:
+    def _state(self, group: Group) -> Iterator[StreamSpec]:
         names = self._names(group)
         topic = self._required(group, "state", "every group says where it is")
         apart = self._topic(group, "gripper_state")
         index = None if group.gripper is None else group.gripper.index
         if not apart or index is None:
-            yield Part("joints", group.name, topic, "JointState", names)
+            yield StreamSpec("joints", group.name, topic, "JointState", names)
             return
-        yield Part("joints", group.name, topic, "JointState", names[:index] + names[index + 1 :])
-        yield Part("gripper", group.name, apart, "JointState", (names[index],))
+        yield StreamSpec("joints", group.name, topic, "JointState", names[:index] + names[index + 1 :])
+        yield StreamSpec("gripper", group.name, apart, "JointState", (names[index],))
 
-    def _commands(self, group: Group, target: Target, eef: bool) -> Iterator[Outlet]:
+    def _commands(self, group: Group, target: Target, eef: bool) -> Iterator[CommandTopic]:
         names, dims = self._names(group), tuple(range(group.slice.start, group.slice.stop))
         if target == "simulation":
             topic = self._required(group, "simulation", 'commands_to has "simulation"')
-            yield Outlet(topic, "JointState", dims, names)
+            yield CommandTopic(topic, "JointState", dims, names)
             return
         if eef and group.chain is not None:
             topic = self._required(group, "eef_command", "eef_commands = true needs one for every arm")
             place = [arm.name for arm in self._robot.arms].index(group.name)
-            yield Outlet(topic, "PoseStamped", arm=place, frame=group.frame or "")
+            yield CommandTopic(topic, "PoseStamped", arm=place, frame=group.frame or "")
             yield from self._joint_commands(group, names, dims, posed=True)
         else:
             yield from self._joint_commands(group, names, dims, posed=False)
 
     def _joint_commands(
         self, group: Group, names: tuple[str, ...], dims: tuple[int, ...], posed: bool
-    ) -> Iterator[Outlet]:
+    ) -> Iterator[CommandTopic]:
         """The group's joints, its gripper by itself where it has a topic; a posed arm needs the latter alone."""
         apart = self._topic(group, "gripper_command")
         index = None if group.gripper is None else group.gripper.index
@@ -162,10 +162,10 @@ class TopicPlan:
         if not topic and not (posed and (apart or index is None)):
             self._required(group, "command", "every number of the robot has to be told")
         if apart and index is not None:
-            yield Outlet(apart, "JointState", dims[index : index + 1], names[index : index + 1])
+            yield CommandTopic(apart, "JointState", dims[index : index + 1], names[index : index + 1])
             names, dims = names[:index] + names[index + 1 :], dims[:index] + dims[index + 1 :]
         if topic:
-            yield Outlet(topic, "JointState", dims, names)
+            yield CommandTopic(topic, "JointState", dims, names)
 
     def _names(self, group: Group) -> tuple[str, ...]:
         given = self._given.groups.get(group.name)
@@ -196,7 +196,7 @@ class TopicPlan:
         return topic
 
 
-def _merged(before: Outlet | None, outlet: Outlet) -> Outlet:
+def _merged(before: CommandTopic | None, outlet: CommandTopic) -> CommandTopic:
     """One message of both: groups may share a topic of commands where their joints have names of their own."""
     if before is None:
         return outlet

@@ -49,7 +49,7 @@ def posted(who, path, body):
 
 @pytest.fixture
 def unparsed(monkeypatch):
-    monkeypatch.setattr(bounded, "from_json", lambda *given, **named: pytest.fail("it was parsed"))
+    monkeypatch.setattr(bounded, "parse_json", lambda *given, **named: pytest.fail("it was parsed"))
 
 
 def test_of_a_viewer_and_of_a_stranger_nothing_is_parsed(viewer, unparsed):
@@ -74,7 +74,7 @@ def test_so_many_values_and_so_many_bytes_are_read(rest, path, monkeypatch):
         400,
         f"the body: more than {post.values} values; allowed: at most {post.values}",
     )
-    monkeypatch.setattr(bounded, "from_json", lambda *given, **named: pytest.fail("it was parsed"))
+    monkeypatch.setattr(bounded, "parse_json", lambda *given, **named: pytest.fail("it was parsed"))
     status, answer = posted(rest, path, b'"' + b"x" * post.largest + b'"')
     assert (status, f"at most {post.largest}" in answer["error"]) == (413, True)
 

@@ -12,7 +12,7 @@ from evaweb.episodes.models import Episode
 from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
-from runtime.recording.scrub import verify
+from runtime.recording.scrub import verify_episode
 from tests.runtime.recording.test_export import recorded
 
 
@@ -52,7 +52,7 @@ def test_damage_is_told_with_its_rows_and_can_be_asked_for(rest, episode, tmp_pa
     assert rest.get("episodes", damaged=True)[1]["total"] == 0
     path = tmp_path / f"episodes/{episode.uuid}/ticks.arrow"
     path.write_bytes(path.read_bytes()[:-100])
-    verifying.found(verify(path.parent))
+    verifying.found(verify_episode(path.parent))
     _, found = rest.get("episodes", damaged=True)
     (damage,) = found["items"][0]["damage"]
     assert (damage["file"], damage["text"][:16]) == ("ticks.arrow", "ticks.arrow has ")

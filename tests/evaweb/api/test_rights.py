@@ -9,7 +9,7 @@ from django.test import Client
 from evaweb.roles import Role, grant
 from evaweb.stations.models import Command
 from evaweb.trials.tables import _kinds
-from runtime.core.bounded_documents import DEEPEST
+from runtime.core.bounded_documents import MAX_DEPTH
 from tests.evaweb.api.test_stations import command
 
 CANARY = "EVA_SECRET_KEY"
@@ -80,7 +80,7 @@ def test_a_deep_body_is_refused_with_the_bound(rest, bench, wire):
         json.dumps({"uuid": str(uuid4()), "kind": "home", "page": "p"})[:-1] + ', "args": ' + '{"a":' * 5000
     )
     status, answer = deep(rest, "stations/bench-1/commands", nested)
-    assert (status, f"allowed: at most {DEEPEST}" in answer["error"]) == (400, True)
+    assert (status, f"allowed: at most {MAX_DEPTH}" in answer["error"]) == (400, True)
     assert not wire.heard
 
 

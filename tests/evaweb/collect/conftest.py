@@ -18,8 +18,8 @@ from evaweb.collect.models import CollectSession, Demonstration
 from evaweb.episodes import services as episodes
 from evaweb.stations.models import Station
 from runtime.core.types import Result
-from runtime.recording.export import export
-from runtime.recording.labels import Label, append
+from runtime.recording.export import write_export
+from runtime.recording.labels import Label, append_label
 from tests.evaweb.episodes.conftest import data, recorded, station
 from tests.evaweb.trials.builders import Wire
 from tests.runtime.recording.samples import resealed
@@ -76,7 +76,7 @@ def demonstrate(data: Path, recorded: dict[str, Path], session: CollectSession) 
         named = {"uuid": str(chosen.pk), "dataset": chosen.dataset}
         path.write_text(json.dumps(manifest | told | {"uuid": uuid, "session": named}))
         resealed(target)
-        export(target, data)
+        write_export(target, data)
         closed = {"uuid": uuid, "status": status}
         episodes.episode_closed(station=chosen.station, data=closed)
         made = following.demonstration_told(event={"kind": "episode_closed", "data": closed})
@@ -88,7 +88,7 @@ def demonstrate(data: Path, recorded: dict[str, Path], session: CollectSession) 
 
 def labelled(data: Path, made: Demonstration, result: Result | None, **said: Any) -> Demonstration:
     """As the station writes it down and tells of it."""
-    append(data, str(made.pk), Label(1_700_000_000.0, "ann", result, **said))
+    append_label(data, str(made.pk), Label(1_700_000_000.0, "ann", result, **said))
     told = following.demonstration_told(event={"kind": "labelled", "data": {"episode": str(made.pk)}})
     assert told is not None
     return told

@@ -18,7 +18,7 @@ from evaweb.console.feed import Feeds, History
 from evaweb.jobs.models import Job
 from evaweb.reviews.models import Standing
 from evaweb.stations.models import Station
-from runtime.recording.labels import Label, append
+from runtime.recording.labels import Label, append_label
 from tests.evaweb.collect.conftest import Demonstrate, collecting
 from tests.evaweb.stand_in import StandIn
 from tests.evaweb.trials.builders import Wire
@@ -122,7 +122,7 @@ def test_who_watches_is_told_that_something_has_changed(
 
 def test_a_label_comes_from_the_event_log_into_the_row(demonstrate: Demonstrate, data: Path) -> None:
     made = demonstrate()
-    append(data, str(made.pk), Label(1.0, "ann", "partial"))
+    append_label(data, str(made.pk), Label(1.0, "ann", "partial"))
     told = {
         "number": 1,
         "kind": "labelled",

@@ -59,7 +59,7 @@ def test_a_station_that_was_started_before_an_upgrade_says_what_its_state_means(
     before_an_upgrade(runtime, monkeypatch)
     runtime.enter(SessionEvent.ESTOPPED)
     _, state = ear.wait(lambda stream, content: stream == "state" and content["state"] == "faulted")
-    assert state["state_is"] == SessionState.FAULTED.told()
+    assert state["state_is"] == SessionState.FAULTED.meaning_dict()
 
 
 def test_events_are_complete_also_those_from_before(runtime):

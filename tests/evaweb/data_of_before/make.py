@@ -29,9 +29,9 @@ from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint
 from evaweb.trials.selectors import trial_open
 from runtime.core.types import Result
-from runtime.recording.labels import Label, append
+from runtime.recording.labels import Label, append_label
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import digests_of, sealed, told, write_outcome
+from runtime.recording.sealing import digests_of, seal_outcome, without_digests, write_outcome
 from tests.evaweb.collect.conftest import collecting as collects
 from tests.evaweb.data_of_before.reading import HERE, answers, restored, rows
 from tests.evaweb.trials import builders
@@ -211,7 +211,7 @@ def _collected(lab, recorded):  # noqa: F811
         _sealed(folder)
         episodes.episode_closed(station=station, data={"uuid": uuid, "status": "finished"})
         if result:
-            append(recorded.parent.parent, uuid, Label(1_700_000_000.0, "ann", result, note="n"))
+            append_label(recorded.parent.parent, uuid, Label(1_700_000_000.0, "ann", result, note="n"))
 
 
 def _slimmed(source: Path, target: Path) -> None:
@@ -230,6 +230,6 @@ def _slimmed(source: Path, target: Path) -> None:
 
 
 def _sealed(folder: Path) -> None:
-    outcome = told(json.loads((folder / "outcome.json").read_text()))
-    layout = Layout.of(json.loads((folder / "manifest.json").read_text()))
-    write_outcome(folder, sealed(outcome, digests_of(folder, layout)))
+    outcome = without_digests(json.loads((folder / "outcome.json").read_text()))
+    layout = Layout.from_manifest(json.loads((folder / "manifest.json").read_text()))
+    write_outcome(folder, seal_outcome(outcome, digests_of(folder, layout)))

@@ -34,7 +34,7 @@ from evaweb.stations.models import Station
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import PolicyError, RecordingError
 from runtime.datasets.consistency import check
-from runtime.datasets.journal import read_journal
+from runtime.datasets.journal import read_finished_episode
 from runtime.datasets.operations import convert
 from runtime.datasets.reader import open_dataset
 from runtime.policies import replay
@@ -117,7 +117,7 @@ def wide(**widths: int) -> dict[str, int]:
 def test_velocities_efforts_and_poses_come_along(data: Path, tmp_path: Path) -> None:
     names = {"observation.eef": POSES, "action_eef": POSES}
     source = theirs(tmp_path, widths=wide(), names=names)
-    journal = read_journal(data / "episodes" / str(imported(source).episodes[1]))
+    journal = read_finished_episode(data / "episodes" / str(imported(source).episodes[1]))
     for name, (stream, width) in BESIDE.items():
         stored = column(1, name, 8, Plan(smooth=True, widths=wide()))
         assert np.array_equal(journal.vectors(stream), stored)
@@ -134,7 +134,7 @@ def test_what_cannot_be_told_apart_or_has_another_width_is_left_out_and_named(
     wrong = [*POSES[:3], POSES[6], *POSES[3:6], *POSES[7:]]  # x, y, z, w last
     widths = wide(**{"observation.effort": 2})
     source = theirs(tmp_path, widths=widths, names={"observation.eef": wrong})
-    journal = read_journal(data / "episodes" / str(imported(source).episodes[0]))
+    journal = read_finished_episode(data / "episodes" / str(imported(source).episodes[0]))
     assert [stream for stream in VECTOR_STREAMS if journal.has_stream(stream)] == ["qvel"]
     reason = journal.outcome["reason"]
     assert "observation.effort is left out: its rows have 2 numbers, expected 6" in reason
@@ -151,7 +151,7 @@ def test_poses_of_others_are_sent_to_no_robot(data: Path, tmp_path: Path) -> Non
         assert not recorded.ours
     path = str(data / "episodes" / str(done.episodes[0]))
     policy = replay.build(
-        replay.Config(path=path, space="eef"), robots.load("agilex_piper"), VirtualClock(), 30.0
+        replay.Config(path=path, space="eef"), robots.load_robot("agilex_piper"), VirtualClock(), 30.0
     )
     with pytest.raises(PolicyError, match="was imported: nobody knows in which frames its poses are"):
         policy.connect()
@@ -218,7 +218,7 @@ def test_an_import_that_was_cut_short_is_gone_on_with(
 ) -> None:
     from evaweb.datasets import importing
 
-    real, calls = importing.bring, []
+    real, calls = importing.import_episode, []
 
     def cut(*args: Any) -> Any:
         calls.append(args)
@@ -226,7 +226,7 @@ def test_an_import_that_was_cut_short_is_gone_on_with(
             raise RecordingError("the disk is full")
         return real(*args)
 
-    monkeypatch.setattr(importing, "bring", cut)
+    monkeypatch.setattr(importing, "import_episode", cut)
     source = theirs(tmp_path)
     with pytest.raises(RecordingError, match="the disk is full"):
         imported(source)
@@ -304,7 +304,10 @@ def test_the_real_episode_is_imported_reviewed_and_converted_there_and_back(
     assert not report["unchecked"]
     told = browser.get(reverse("replay", args=[uuid])).context["config"]
     assert browser.get(told["geometry"]).status_code == 200
-    journal, source = read_journal(data / "episodes" / str(uuid)), open_dataset(Path(SAMPLE)).table(0)
+    journal, source = (
+        read_finished_episode(data / "episodes" / str(uuid)),
+        open_dataset(Path(SAMPLE)).table(0),
+    )
     for stream, name in journal.manifest["imported"]["columns"].items():
         assert np.array_equal(journal.vectors(stream), np.array(source[name].to_pylist(), np.float32))
     assert [name for name in VECTOR_STREAMS if journal.has_stream(name)] == list(VECTOR_STREAMS)

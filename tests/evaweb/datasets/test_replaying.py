@@ -26,7 +26,7 @@ from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station
 from runtime.datasets.operations import convert
 from runtime.datasets.published import publish
-from runtime.datasets.sides import attach
+from runtime.datasets.sides import attach_sidecar
 from runtime.recording.files import RecordingError
 from tests.runtime.datasets.foreign import column
 from tests.runtime.datasets.small import JOINTS
@@ -181,7 +181,7 @@ def ours(data: Path, journal: Callable[..., Path]) -> tuple[str, str]:
             }
         )
     )
-    attach(data / "datasets" / "home", episode.name, "annotations", said)
+    attach_sidecar(data / "datasets" / "home", episode.name, "annotations", said)
     convert(data / "datasets" / "home", data / "datasets" / "copy", "v3.0")
     return episode.name, "copy"
 

@@ -16,7 +16,7 @@ from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import work
 from evaweb.stations.models import Station
-from runtime.recording.export import export
+from runtime.recording.export import write_export
 from tests.once import made_once
 from tests.runtime.lockstep_station import Station as Bench
 from tests.runtime.lockstep_station import stubbed
@@ -74,7 +74,7 @@ def put(data: Path, recorded: dict[str, Path]) -> Put:
     def copy(status: str = "finished") -> Path:
         target = data / "episodes" / recorded[status].name
         shutil.copytree(recorded[status], target)
-        export(target, data)
+        write_export(target, data)
         return target
 
     return copy

@@ -21,7 +21,7 @@ from evaweb.stations.models import Station, StationKey
 from runtime.link.contents import contents_of
 from runtime.link.incoming import Shelf
 from runtime.link.wire import Offer, Piece, Want
-from runtime.recording.files import read_document
+from runtime.recording.files import read_json
 
 pytestmark = pytest.mark.django_db
 
@@ -53,7 +53,7 @@ def send(data: Path, folder: Path, pieces: int = 10**6) -> None:
 
 
 def folder_station(folder: Path) -> str:
-    return str(read_document(folder / "manifest.json")["station"])
+    return str(read_json(folder / "manifest.json")["station"])
 
 
 def test_one_that_is_away_is_what_its_station_said_and_nothing_looks_for_its_folder(away: Episode) -> None:

@@ -12,7 +12,7 @@ from evaweb.errors import NotFound
 
 
 def manifest(*groups: str, **said: Any) -> dict[str, Any]:
-    robot = robots.load("agilex_piper", groups or None)
+    robot = robots.load_robot("agilex_piper", groups or None)
     return {"robot": {"name": robot.name, "dim": robot.dim, "joint_names": list(robot.joint_names), **said}}
 
 

@@ -21,7 +21,7 @@ from evaweb.episodes.reconcile import reconcile
 from evaweb.errors import Conflict
 from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job, JobStatus
-from runtime.recording.quarantine import marked
+from runtime.recording.quarantine import marked_damage
 from runtime.recording.repair import repair
 from runtime.recording.verdict import UNSEALED
 from tests.runtime.recording.samples import unended, unsealed
@@ -114,7 +114,7 @@ def test_damage_is_kept_on_the_disk_and_shown_until_the_files_are_back(
         assert found["uuid"] == str(old.uuid)
         assert "ticks.arrow is changed, rows " in found["why"]
         old.refresh_from_db()
-        assert old.damage == marked(data, str(old.uuid))
+        assert old.damage == marked_damage(data, str(old.uuid))
         assert list(selectors.episode_list(quality="damaged")) == [old]
         assert "ticks.arrow is changed" in client.get(f"/replay/{old.uuid}/").content.decode()
         assert "ticks.arrow is changed" in client.get("/replay/?quality=damaged").content.decode()
@@ -128,7 +128,7 @@ def test_damage_is_kept_on_the_disk_and_shown_until_the_files_are_back(
     Episode.objects.update(verified_at=None, created_at=timezone.now() - timedelta(days=7))
     assert scrubbed().result["sound"] == 1
     old.refresh_from_db()
-    assert (old.damage, marked(data, str(old.uuid))) == ([], [])
+    assert (old.damage, marked_damage(data, str(old.uuid))) == ([], [])
     assert not selectors.episode_list(quality="damaged").exists()
     assert recorded_at(str(old.uuid)).rows == old.frames
 
@@ -199,11 +199,11 @@ def test_a_closed_recording_that_lost_its_outcome_is_damaged_until_it_is_back(
         assert (job.result["damaged"], job.result["open"]) == (1, 0)
         assert "outcome.json is absent, though" in job.result["found"][0]["why"]
         old.refresh_from_db()
-        assert (old.status, old.damage) == ("finished", marked(data, str(old.uuid)))
+        assert (old.status, old.damage) == ("finished", marked_damage(data, str(old.uuid)))
     assert repair(folder).verdict == "restored"
     assert again().result["sound"] == 1
     old.refresh_from_db()
-    assert (old.damage, marked(data, str(old.uuid))) == ([], [])
+    assert (old.damage, marked_damage(data, str(old.uuid))) == ([], [])
 
 
 def test_one_that_lost_both_is_marked_and_then_not_sealed_by_repair(old: Episode, data: Path) -> None:
@@ -240,11 +240,11 @@ def test_one_that_was_sealed_anew_before_anybody_looked_is_damaged_and_not_publi
         (folder / name).write_bytes(content)
     assert again().result["sound"] == 1
     assert reconcile().problems == ()
-    assert marked(data, str(old.uuid)) == []
+    assert marked_damage(data, str(old.uuid)) == []
 
 
 def test_a_folder_with_nothing_by_which_it_is_an_episode_is_damaged(old: Episode, data: Path) -> None:
     unended(folder_of(data, old))
     (folder_of(data, old) / "manifest.json").unlink()
     assert again().result["damaged"] == 1
-    assert [one["file"] for one in marked(data, str(old.uuid))] == ["manifest.json", "outcome.json"]
+    assert [one["file"] for one in marked_damage(data, str(old.uuid))] == ["manifest.json", "outcome.json"]

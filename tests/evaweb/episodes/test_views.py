@@ -509,7 +509,7 @@ def test_the_robot_is_drawn_in_the_groups_that_were_recorded(
     assert browser.get(address).json()["groups"] == ["left_arm", "right_arm"]
     path = data / "episodes" / str(previewed.uuid) / "manifest.json"
     whole = json.loads(path.read_text())
-    one = robots.load("agilex_piper", ["right_arm"])
+    one = robots.load_robot("agilex_piper", ["right_arm"])
     whole["robot"] |= {"dim": one.dim, "joint_names": list(one.joint_names)}
     path.write_text(json.dumps(whole))
     assert browser.get(address).json()["groups"] == ["right_arm"]

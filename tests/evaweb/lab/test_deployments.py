@@ -34,7 +34,7 @@ def draft(name="real-1", robot="agilex_piper", **parts):
     return deployments.write_draft(name=name, robot=robot, task='say "hi"', parts=REAL | parts)
 
 
-@pytest.mark.parametrize("robot", robots.names())
+@pytest.mark.parametrize("robot", robots.robot_names())
 def test_a_simulated_station_of_every_robot_is_one_that_the_lab_brings(robot):
     kept = deployments.write_simulated(name="bench-2", robot=robot)
     resolved = kept.resolved()

@@ -15,7 +15,7 @@ from evaweb.preflights.models import Preflight
 from evaweb.preflights.reading import STAGES, ago, read
 from evaweb.preflights.services import preflight_ask
 from evaweb.trials.models import Checkpoint
-from runtime.preflight.verdict import Stage
+from runtime.preflight.verdict import PreflightStage
 from tests.evaweb.preflights.conftest import CLOSED, OK
 from tests.evaweb.trials import builders
 
@@ -115,7 +115,7 @@ def test_nobody_sees_one_without_logging_in(row):
 
 
 def test_stages_and_verdicts_are_those_of_the_runtime():
-    assert tuple(Stage) == STAGES
+    assert tuple(PreflightStage) == STAGES
     assert read(None) is None
     assert [stage.state for stage in read({"stage": "infer"}).stages][3:6] == ["done", "failed", "waiting"]
     assert {stage.state for stage in read({"stage": "nowhere"}).stages} == {"waiting"}

@@ -170,7 +170,8 @@ def resting(other, tmp_path):
 def test_where_the_station_does_not_run_the_worker_asks(ask, resting, checkpoint, monkeypatch):
     asked = []
     monkeypatch.setattr(
-        "runtime.station.preflight_child.fly", lambda line, longest: asked.append(line) or dict(CLOSED)
+        "runtime.station.preflight_child.run_preflight",
+        lambda line, longest: asked.append(line) or dict(CLOSED),
     )
     row = ask(station=resting)
     assert (row.by, row.status) == ("worker", "running")
@@ -186,7 +187,7 @@ def test_where_the_station_does_not_run_the_worker_asks(ask, resting, checkpoint
 def test_a_job_that_is_done_twice_asks_once(ask, resting, monkeypatch):
     asked = []
     monkeypatch.setattr(
-        "runtime.station.preflight_child.fly", lambda line, longest: asked.append(line) or dict(OK)
+        "runtime.station.preflight_child.run_preflight", lambda line, longest: asked.append(line) or dict(OK)
     )
     row = ask(station=resting)
     done = job_kinds.Work({"preflight": str(row.pk)}, lambda text: None)
@@ -226,7 +227,7 @@ def test_a_table_that_fits_no_deployment_is_what_the_report_says(ask, resting, c
 
 
 def test_verdicts_have_the_runtimes_words():
-    assert set(Verdict.values) == set(runtimes_own.Verdict)
+    assert set(Verdict.values) == set(runtimes_own.PreflightVerdict)
 
 
 def test_a_row_says_in_words_how_it_stands(ask):

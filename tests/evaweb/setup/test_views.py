@@ -48,7 +48,7 @@ def test_the_sizes_that_are_drawn_are_those_of_the_simulated_bench():
     assert SIZES["apart"] == layout.APART_M
     assert [tuple(side) for side in SIZES["sides"]] == list(layout._SIDES)
     assert SIZES["reach"] == layout._REACH
-    assert layout.layout_of(1, SIZES["first"]).plate
+    assert layout.draw_layout(1, SIZES["first"]).plate
 
 
 def test_the_corners_are_where_the_camera_from_above_sees_them():

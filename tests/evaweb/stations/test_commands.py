@@ -52,11 +52,11 @@ def test_an_accepted_command_is_a_row_with_its_answer(held, runtime):
     [
         ("tune", {"strategy": {"kind": "sync"}, "task": "wave"}, GuardFacts()),
         ("step", {}, GuardFacts(mode="step")),
-        ("commit", {}, GuardFacts(mode="preview", proposed=True)),
+        ("commit", {}, GuardFacts(mode="preview", has_proposal=True)),
         ("cancel", {}, GuardFacts(mode="manual")),
         ("move", {"joints": [0.1] * 14, "speed": 0.5}, GuardFacts(mode="manual")),
         ("gripper", {"arm": "left_arm", "action": "lock"}, GuardFacts()),
-        ("approach", {}, GuardFacts(mode="preview", proposed=True)),
+        ("approach", {}, GuardFacts(mode="preview", has_proposal=True)),
     ],
 )
 def test_what_a_run_by_hand_is_steered_with_arrives_with_its_arguments(held, runtime, kind, args, situation):

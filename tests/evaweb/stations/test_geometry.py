@@ -15,7 +15,7 @@ from evaweb.stations.robot_geometry import looks_of
 from evaweb.stations.surroundings import BENCH
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_a_robot_has_parts_shapes_and_a_pose_to_begin_with(name):
     found = geometry(name, simulated=False)
     assert json.loads(json.dumps(found)) == found
@@ -27,7 +27,7 @@ def test_a_robot_has_parts_shapes_and_a_pose_to_begin_with(name):
     assert found["bench"] is None
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_end_effectors_and_the_frames_of_their_poses_are_frames(name):
     looks = looks_of(name)
     frames = geometry(name, simulated=False)["frames"]
@@ -40,7 +40,7 @@ def test_end_effectors_and_the_frames_of_their_poses_are_frames(name):
     assert references == {looks.scene.link_of(arm.name, arm.frame) for arm in looks.robot.arms}
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_a_pose_of_an_arm_leads_from_its_frame_to_its_end_effector(name):
     looks = looks_of(name)
     frames = geometry(name, simulated=False)["frames"]

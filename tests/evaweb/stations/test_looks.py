@@ -14,7 +14,7 @@ from runtime.sim.bench import tip_in_world
 from tests.processes import PATIENCE_S
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_matrices_go_column_by_column(name):
     looks = looks_of(name)
     q = np.asarray(looks.robot.poses["home"])
@@ -24,7 +24,7 @@ def test_matrices_go_column_by_column(name):
     assert np.allclose(poses[0].reshape(-1, 4, 4).swapaxes(-1, -2), looks.scene.poses(q), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_until_the_kernels_are_there_numpy_says_the_same(name):
     looks = looks_of(name)
     q = np.random.default_rng(1).uniform(looks.robot.lower, looks.robot.upper, (2, 3, looks.robot.dim))
@@ -56,7 +56,7 @@ def test_kernels_that_cannot_be_made_leave_the_robot_drawn(monkeypatch):
     def broken(scene):
         raise KinematicsError("no numba")
 
-    monkeypatch.setattr(looks_module, "Links", broken)
+    monkeypatch.setattr(looks_module, "LinkPoses", broken)
     known = looks_of("agilex_piper")
     looks = Looks(known.robot, known.scene)
     looks_module._kernels.submit(int).result(PATIENCE_S)  # what was begun before is over
@@ -65,7 +65,7 @@ def test_kernels_that_cannot_be_made_leave_the_robot_drawn(monkeypatch):
     assert said == ["no numba"]
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_the_tips_are_where_the_bench_has_them(name):
     looks = looks_of(name)
     q = np.stack([looks.robot.poses["home"], (looks.robot.lower + looks.robot.upper) / 2])
@@ -77,7 +77,7 @@ def test_the_tips_are_where_the_bench_has_them(name):
             assert np.allclose(tips[row, index], wanted, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_every_number_has_a_name_and_a_unit(name):
     facts = looks_of(name).facts()
     assert len(facts["units"]) == len(facts["joint_names"])

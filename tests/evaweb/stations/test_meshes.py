@@ -14,7 +14,7 @@ from evaweb.stations import robot_geometry as looks
 from evaweb.stations.geometry import geometry
 from evaweb.stations.meshes import mesh_content
 
-PIPER = robots.load("agilex_piper").folder
+PIPER = robots.load_robot("agilex_piper").folder
 CORNERS = ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.0, 0.2, 0.3))
 
 

@@ -31,7 +31,7 @@ def rectangle(table):
     return x - width / 2, x + width / 2, y - depth / 2, y + depth / 2
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_things_lie_on_the_table_and_no_body_stands_in_it(name):
     looks = looks_of(name)
     found = surroundings(looks)
@@ -46,7 +46,7 @@ def test_things_lie_on_the_table_and_no_body_stands_in_it(name):
         assert beside or not through
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_the_whole_robot_is_in_view_in_each_of_its_poses(name):
     looks = looks_of(name)
     view = surroundings(looks)["view"]
@@ -58,7 +58,7 @@ def test_the_whole_robot_is_in_view_in_each_of_its_poses(name):
         assert (middles <= np.array(view["high"]) + 0.1).all()
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_a_robot_looks_at_the_table(name):
     ahead = surroundings(looks_of(name))["ahead"]
     assert np.hypot(*ahead) == pytest.approx(1.0)

@@ -138,7 +138,7 @@ def test_where_the_disk_does_not_take_them_either_the_newest_are_kept(halted, mo
     def full(path, data):
         raise DiskFullError("disk full")
 
-    monkeypatch.setattr(unwritten, "write_whole", full)
+    monkeypatch.setattr(unwritten, "write_atomic", full)
     monkeypatch.setattr(unwritten, "_MOST", 3)
     one, rows = Unwritten(commands._written), [halted() for _ in range(5)]
     for row in rows:

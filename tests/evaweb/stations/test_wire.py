@@ -25,7 +25,7 @@ def test_status_is_the_snapshot_as_json_may_carry_it(runtime):
 def test_a_station_that_was_started_before_an_upgrade_says_what_its_state_means(runtime, monkeypatch):
     before_an_upgrade(runtime, monkeypatch)
     runtime.ready()
-    assert wire_to(runtime.name).status()["state_is"] == SessionState.READY.told()
+    assert wire_to(runtime.name).status()["state_is"] == SessionState.READY.meaning_dict()
 
 
 def test_a_station_that_was_never_started_is_not_asked():

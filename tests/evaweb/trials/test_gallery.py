@@ -13,7 +13,7 @@ from evaweb.trials.clips import clip_of
 from evaweb.trials.gallery import FailureFilters, failed_list, failure_groups, shown_group
 from evaweb.trials.models import Checkpoint, FailureTerm, Trial
 from evaweb.trials.selectors import TrialFilters
-from runtime.datasets.pictures import Pictures
+from runtime.datasets.pictures import VideoFrames
 from tests.evaweb.trials import builders
 from tests.runtime.datasets.small import write_video
 
@@ -217,7 +217,7 @@ def test_the_zip_has_a_clip_of_every_failure_that_can_be_played_and_the_table_sa
     (tmp_path / "clip.mp4").write_bytes(content)
     begin = float(rows[0]["file_begin_s"])
     assert begin <= float(rows[0]["begin_s"]) == 3.0
-    with Pictures(tmp_path / "clip.mp4") as pictures:
+    with VideoFrames(tmp_path / "clip.mp4") as pictures:
         assert len(pictures) == round((5.0 - begin) * 8)
     only, none = archive(browser.get("/result/failures.zip?failure=not said"))
     assert (len(only), none) == (2, {})

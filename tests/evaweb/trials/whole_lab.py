@@ -10,7 +10,7 @@ from evaweb.episodes.services import episode_closed
 from evaweb.jobs import doorbell
 from evaweb.trials import services
 from evaweb.trials.station_commands import trial_command
-from runtime.recording.export import export
+from runtime.recording.export import write_export
 from tests.evaweb.trials import builders
 from tests.runtime.lockstep_station import Station as Lockstep
 from tests.runtime.lockstep_station import stubbed
@@ -93,7 +93,7 @@ class Lab:
         for event in self.station.coordinator.events.since(self._heard):
             self._heard = event["number"]
             if event["kind"] == "episode_closed":
-                export(Path(event["data"]["path"]), self.station.spec.deployment.data)  # as media does
+                write_export(Path(event["data"]["path"]), self.station.spec.deployment.data)  # as media does
                 episode_closed(station=self.bench.station, data=event["data"])
             services.run_changed(station=self.bench.station, event=event, boot=self.station.coordinator.boot)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from runtime.recording.reader import open_episode
-from runtime.recording.scrub import verify
+from runtime.recording.scrub import verify_episode
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]
@@ -95,7 +95,7 @@ def plain(value):
 
 def test_a_recording_is_as_it_was_recorded(lab):
     [folder] = (lab / "episodes").iterdir()
-    assert verify(folder).state == "sound"
+    assert verify_episode(folder).state == "sound"
     episode = open_episode(folder)
     assert episode.frames == len(episode.rows) > 0
 

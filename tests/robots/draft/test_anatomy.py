@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from robots import RobotError, load, urdf
-from robots.draft.anatomy import Limb, anatomy
+from robots import RobotError, load_robot, urdf
+from robots.draft.anatomy import GroupGuess, guess_groups
 from tests.robots.draft.urdfs import arm, base, dual, jaws, joint, link, single, write
 
 
-def limbs(folder: Path, body: str) -> dict[str, Limb]:
-    return {limb.name: limb for limb in anatomy(urdf.read(write(folder, body)))}
+def limbs(folder: Path, body: str) -> dict[str, GroupGuess]:
+    return {limb.name: limb for limb in guess_groups(urdf.read(write(folder, body)))}
 
 
 def test_one_arm_with_a_gripper(tmp_path: Path) -> None:
@@ -123,8 +123,8 @@ def test_what_does_not_move_is_refused(tmp_path: Path) -> None:
 )
 def test_the_robots_that_come_with_the_program_are_seen_as_they_are(robot: str, names: list[str]) -> None:
     """Their own URDFs suggest the joints that their descriptions name."""
-    described = load(robot)
-    found = anatomy(urdf.read(described.urdf))
+    described = load_robot(robot)
+    found = guess_groups(urdf.read(described.urdf))
     assert [limb.name for limb in found] == names
     for limb, described_arm in zip(found, described.arms, strict=False):
         assert limb.joints == described_arm.urdf_joints

@@ -6,21 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robots import Body, Robot, RobotError, description, load
+from robots import Body, Robot, RobotError, description, load_robot
 from robots.__main__ import main
-from robots.clearance import problems
-from robots.draft import Drafted, draft
+from robots.clearance import collision_problems
+from robots.draft import DraftResult, draft_robot
 from tests.robots.draft.urdfs import arm, base, dual, jaws, joint, link, single, write
 
 
-def drafted(tmp_path: Path, body: str, copies: int = 1) -> tuple[Drafted, Robot]:
+def drafted(tmp_path: Path, body: str, copies: int = 1) -> tuple[DraftResult, Robot]:
     """The draft, and the robot with all of its groups."""
-    made = draft("mine", write(tmp_path / "from", body), tmp_path / "into", copies)
+    made = draft_robot("mine", write(tmp_path / "from", body), tmp_path / "into", copies)
     assert made.inspection.errors == ()
-    usual = load(made.folder)
-    assert problems(usual) == []
+    usual = load_robot(made.folder)
+    assert collision_problems(usual) == []
     names = [group.name for group in description.read(made.folder / "robot.toml").groups]
-    return made, load(made.folder, names)
+    return made, load_robot(made.folder, names)
 
 
 def test_one_arm_with_a_gripper_is_seven_numbers(tmp_path: Path) -> None:
@@ -54,7 +54,7 @@ def test_ready_is_over_the_table_with_fingers_down_and_inside_the_limits(tmp_pat
 
 def test_the_same_urdf_gives_the_same_draft(tmp_path: Path) -> None:
     first, _ = drafted(tmp_path, single())
-    again = draft("mine", tmp_path / "from" / "made_up.urdf", tmp_path / "other")
+    again = draft_robot("mine", tmp_path / "from" / "made_up.urdf", tmp_path / "other")
     assert (first.folder / "robot.toml").read_text() == (again.folder / "robot.toml").read_text()
 
 
@@ -67,7 +67,7 @@ def test_an_arm_without_a_gripper_is_six_numbers(tmp_path: Path) -> None:
 
 def test_two_arms_on_a_torso_with_head_and_wheels(tmp_path: Path) -> None:
     made, robot = drafted(tmp_path, dual())
-    assert [group.name for group in load(made.folder).groups] == ["left_arm", "right_arm"]
+    assert [group.name for group in load_robot(made.folder).groups] == ["left_arm", "right_arm"]
     assert [(group.name, group.kind, group.dof) for group in robot.groups] == [
         ("left_arm", "arm", 7),
         ("right_arm", "arm", 7),
@@ -100,9 +100,9 @@ def test_two_copies_of_one_arm_stand_side_by_side(tmp_path: Path) -> None:
 
 def test_copies_are_of_one_arm(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match="2 copies of 2 arms; allowed: copies of a URDF with one arm"):
-        draft("mine", write(tmp_path, dual()), tmp_path / "into", 2)
+        draft_robot("mine", write(tmp_path, dual()), tmp_path / "into", 2)
     with pytest.raises(RobotError, match="0 copies; allowed: 1 to 8"):
-        draft("mine", write(tmp_path, single()), tmp_path / "into", 0)
+        draft_robot("mine", write(tmp_path, single()), tmp_path / "into", 0)
 
 
 def test_limits_that_nobody_meant_are_overridden_and_say_so(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_every_guess_is_marked_until_somebody_has_looked(tmp_path: Path) -> None
     assert any("GUESS stands in lines" in warning for warning in made.inspection.warnings)
     file = made.folder / "robot.toml"
     file.write_text(file.read_text().replace("GUESS", ""))
-    assert load(made.folder).dim == 7
+    assert load_robot(made.folder).dim == 7
     readme = (made.folder / "README.md").read_text()
     assert "- [ ] Forward kinematics: `python -m robots fk mine arm Q...`" in readme
 
@@ -129,13 +129,13 @@ def test_what_a_urdf_calls_itself_is_the_title(tmp_path: Path) -> None:
     source.write_text(
         source.read_text().replace('robot name="made_up"', 'robot name="L&apos;arm &quot;é&quot; \\n"')
     )
-    assert load(draft("mine", source, tmp_path / "into").folder).title == 'L\'arm "é" \\n'
+    assert load_robot(draft_robot("mine", source, tmp_path / "into").folder).title == 'L\'arm "é" \\n'
 
 
 def test_a_gripper_alone_is_a_hand(tmp_path: Path) -> None:
     body = base() + jaws("base_link")
-    made = draft("mine", write(tmp_path / "from", body), tmp_path / "into")
-    (group,) = load(made.folder).groups
+    made = draft_robot("mine", write(tmp_path / "from", body), tmp_path / "into")
+    (group,) = load_robot(made.folder).groups
     assert (group.kind, group.joints, group.chain) == ("hand", ("finger_joint1",), None)
 
 
@@ -152,7 +152,7 @@ def test_a_refused_draft_names_the_file_that_was_given(tmp_path: Path) -> None:
     body = single() + link("lamp", odd) + joint("bolt", "base_link", "lamp", kind="fixed")
     source = write(tmp_path / "from", body)
     with pytest.raises(RobotError, match="origin xyz is '0 x 0'") as refused:
-        draft("mine", source, tmp_path / "into")
+        draft_robot("mine", source, tmp_path / "into")
     assert str(source) in str(refused.value)
     assert ".mine-" not in str(refused.value)
 
@@ -161,7 +161,7 @@ def test_a_refused_draft_leaves_nothing_behind(tmp_path: Path) -> None:
     into = tmp_path / "into"
     body = base() + link("lamp") + joint("bolt", "base_link", "lamp", kind="fixed")
     with pytest.raises(RobotError, match="no joint moves by itself"):
-        draft("mine", write(tmp_path, body), into)
+        draft_robot("mine", write(tmp_path, body), into)
     assert list(into.iterdir()) == []
 
 
@@ -175,22 +175,22 @@ def test_a_refused_draft_leaves_nothing_behind(tmp_path: Path) -> None:
 )
 def test_a_name_that_cannot_be_is_refused(tmp_path: Path, name: str, said: str) -> None:
     with pytest.raises(RobotError, match=said):
-        draft(name, write(tmp_path, single()), tmp_path / "into")
+        draft_robot(name, write(tmp_path, single()), tmp_path / "into")
 
 
 def test_nothing_is_written_over(tmp_path: Path) -> None:
     drafted(tmp_path, single())
     with pytest.raises(RobotError, match="into/mine is there already; allowed: a new folder"):
-        draft("mine", tmp_path / "from" / "made_up.urdf", tmp_path / "into")
+        draft_robot("mine", tmp_path / "from" / "made_up.urdf", tmp_path / "into")
 
 
 @pytest.mark.some(1)
 @pytest.mark.parametrize("robot", ["agilex_piper", "dual_franka", "agibot_g2"])
 def test_a_urdf_of_ours_gives_a_robot_with_the_same_kinematics(tmp_path: Path, robot: str) -> None:
-    described = load(robot)
-    made = draft("mine", described.urdf, tmp_path)
+    described = load_robot(robot)
+    made = draft_robot("mine", described.urdf, tmp_path)
     assert made.inspection.errors == ()
-    ours, first = load(made.folder).arms[0], described.arms[0]
+    ours, first = load_robot(made.folder).arms[0], described.arms[0]
     assert ours.chain is not None
     assert first.chain is not None
     assert (ours.urdf_joints, ours.eef_link, ours.frame) == (first.urdf_joints, first.eef_link, first.frame)
@@ -257,7 +257,7 @@ def test_a_robot_that_is_not_among_ours_stands_where_its_maker_says(
     answer = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose(answer["position"], [0.207, 0.0, 0.112], atol=5e-4)
     np.testing.assert_allclose(np.abs(answer["wxyz"]), [0, 1, 0, 0], atol=1e-6)  # turned half round x
-    gripper = load(folder).arms[0].gripper
+    gripper = load_robot(folder).arms[0].gripper
     assert gripper is not None
     assert (gripper.open, gripper.close, gripper.unit) == (0.0, 0.85, "rad")
     assert gripper.apart == pytest.approx((0.0, 0.085), abs=0.012)  # the maker says 0 to 85 mm

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robots import load, shapes, urdf
-from robots.draft.anatomy import anatomy
+from robots import load_robot, shapes, urdf
+from robots.draft.anatomy import guess_groups
 from robots.draft.geometry import corners
-from robots.draft.gripper import GripperDraft, end_link, gripper_of
+from robots.draft.gripper import GripperDraft, end_link, guess_gripper
 from robots.rotations import matrix_of_quaternion
 from tests.robots.draft.urdfs import BOX, arm, base, jaws, joint, link, single, write
 
@@ -16,15 +16,15 @@ from tests.robots.draft.urdfs import BOX, arm, base, jaws, joint, link, single, 
 def drafted(path: Path) -> tuple[str, GripperDraft]:
     """The first arm's end effector and gripper."""
     tree = urdf.read(path)
-    limb = anatomy(tree)[0]
+    limb = guess_groups(tree)[0]
     eef_link = end_link(tree, limb)
-    return eef_link, gripper_of(tree, limb, eef_link, corners(shapes.read(path)))
+    return eef_link, guess_gripper(tree, limb, eef_link, corners(shapes.read_shapes(path)))
 
 
 def test_fingers_that_slide_open_by_twice_their_way(tmp_path: Path) -> None:
     eef_link, gripper = drafted(write(tmp_path, single()))
     assert eef_link == "link6"
-    assert (gripper.driver, gripper.unit, gripper.doubts) == ("finger_joint1", "m", ())
+    assert (gripper.driver, gripper.unit, gripper.placeholder_notes) == ("finger_joint1", "m", ())
     assert (gripper.lower, gripper.upper, gripper.open, gripper.close) == (0.0, 0.04, 0.04, 0.0)
     assert (gripper.velocity, gripper.apart) == (0.2, 0.08)
     assert gripper.fingers == {"finger_joint1": (0.0, 0.04)}
@@ -59,7 +59,7 @@ def test_a_flange_ends_an_arm_without_a_gripper(tmp_path: Path) -> None:
     body = base() + arm("base_link") + link("tool0") + joint("flange", "link6", "tool0", kind="fixed")
     for text, wanted in ((body, "tool0"), (base() + arm("base_link"), "link6")):
         tree = urdf.read(write(tmp_path, text))
-        assert end_link(tree, anatomy(tree)[0]) == wanted
+        assert end_link(tree, guess_groups(tree)[0]) == wanted
 
 
 def test_a_jaw_that_turns_against_one_that_stands_still(tmp_path: Path) -> None:
@@ -81,9 +81,9 @@ def test_what_the_urdf_does_not_say_is_a_doubt(tmp_path: Path) -> None:
     _, gripper = drafted(
         write(tmp_path, single().replace(limit, '<limit lower="0" upper="0" velocity="1000"/>'))
     )
-    assert len(gripper.doubts) == 2
-    assert "gives finger_joint1 no range" in gripper.doubts[0]
-    assert "gives finger_joint1 1000/s" in gripper.doubts[1]
+    assert len(gripper.placeholder_notes) == 2
+    assert "gives finger_joint1 no range" in gripper.placeholder_notes[0]
+    assert "gives finger_joint1 1000/s" in gripper.placeholder_notes[1]
     assert (gripper.lower, gripper.upper, gripper.velocity) == (0.0, 0.04, 0.08)
 
 
@@ -91,21 +91,21 @@ def test_without_shapes_fingers_are_where_their_origins_are(tmp_path: Path) -> N
     body = link("base_link") + arm("base_link", visual=False) + jaws("link6")
     body = body.replace(body[body.index("<visual>") : body.index("</visual>") + 9], "")
     tree = urdf.read(write(tmp_path, body))
-    limb = anatomy(tree)[0]
-    gripper = gripper_of(tree, limb, "link6", {})
+    limb = guess_groups(tree)[0]
+    gripper = guess_gripper(tree, limb, "link6", {})
     assert gripper.apart == 0.08
     np.testing.assert_allclose(gripper.tip[:3], [0, 0, 0.04], atol=1e-9)
 
 
 @pytest.mark.parametrize("robot", ["agilex_piper", "arx_r5", "dual_franka", "ur5e", "r1_lite", "agibot_g2"])
 def test_the_robots_that_come_with_the_program_open_as_far_as_their_descriptions_say(robot: str) -> None:
-    described = load(robot)
+    described = load_robot(robot)
     first = described.arms[0]
     assert first.gripper is not None
     assert first.tip is not None
     tree = urdf.read(described.urdf)
-    limb = anatomy(tree)[0]
-    gripper = gripper_of(tree, limb, str(first.eef_link), corners(shapes.read(described.urdf)))
+    limb = guess_groups(tree)[0]
+    gripper = guess_gripper(tree, limb, str(first.eef_link), corners(shapes.read_shapes(described.urdf)))
     (low, high), ends = first.gripper.fingers[gripper.driver], (first.gripper.lower, first.gripper.upper)
     opened = low if first.gripper.open == ends[0] else high
     if robot != "agilex_piper":  # which declares more than its fingers do

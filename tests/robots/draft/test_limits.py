@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 
 from robots import urdf
-from robots.draft.limits import Placeholder, placeholder
+from robots.draft.limits import Placeholder, placeholder_limits
 from tests.robots.draft.urdfs import LIMIT, base, joint, link, write
 
 
 def of(folder: Path, more: str, kind: str = "revolute") -> Placeholder | None:
     body = base() + link("a") + joint("j", "base_link", "a", kind=kind, more=more)
-    return placeholder(urdf.read(write(folder, body)).joint("j"))
+    return placeholder_limits(urdf.read(write(folder, body)).joint("j"))
 
 
 def test_limits_that_can_be_meant_stay(tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from runtime.cameras.attached import Attached
-from runtime.cameras.base import Camera, Condition, Health, Shot
+from runtime.cameras.attached import SourceWithCameras
+from runtime.cameras.base import Camera, CameraCondition, CameraHealth, CapturedImage
 from runtime.core.clock import VirtualClock
 from runtime.core.types import Observation
 from runtime.ipc.messages import Event
@@ -45,10 +45,10 @@ class Robot(Source):
     def faults(self) -> dict[str, int]:
         return {"malformed": 1}
 
-    def why(self, fault: str) -> str:
+    def describe_fault(self, fault: str) -> str:
         return f"why {fault}"
 
-    def news(self) -> list[Event]:
+    def pop_events(self) -> list[Event]:
         told, self.told = self.told, []
         return told
 
@@ -60,19 +60,19 @@ class Hand(Camera):
 
     def __init__(self) -> None:
         self.heard: list[str] = []
-        self.shot: Shot | None = None
-        self.how = Health(Condition.OPENING, 100.0, "it is being opened")
+        self.shot: CapturedImage | None = None
+        self.how = CameraHealth(CameraCondition.OPENING, 100.0, "it is being opened")
 
     def start(self) -> None:
         self.heard.append("start")
 
-    def newest(self) -> Shot | None:
+    def latest(self) -> CapturedImage | None:
         return self.shot
 
-    def health(self) -> Health:
+    def health(self) -> CameraHealth:
         return self.how
 
-    def leave(self) -> None:
+    def request_stop(self) -> None:
         self.heard.append("leave")
 
     def close(self) -> None:
@@ -92,7 +92,7 @@ class Bench:
     def __init__(self) -> None:
         self.clock = VirtualClock(100.0)
         self.robot, self.camera = Robot(self.clock), Hand()
-        self.source = Attached(self.robot, [self.camera], self.clock)
+        self.source = SourceWithCameras(self.robot, [self.camera], self.clock)
 
     def seen(self) -> Observation:
         observation = self.source.receive(0.0)
@@ -100,7 +100,7 @@ class Bench:
         return observation
 
     def told(self) -> list[tuple[str, str]]:
-        return [(event.kind, event.text) for event in self.source.news()]
+        return [(event.kind, event.text) for event in self.source.pop_events()]
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def bench() -> Bench:
 def test_a_picture_of_ours_joins_the_observation_with_its_own_time_and_leaves_the_others(
     bench: Bench,
 ) -> None:
-    bench.camera.shot = Shot(OURS, 99.9, 99.95)
+    bench.camera.shot = CapturedImage(OURS, 99.9, 99.95)
     seen = bench.seen()
     assert seen.pictures["wrist"] is OURS
     assert seen.pictures["high"] is THEIRS
@@ -125,14 +125,14 @@ def test_before_its_first_picture_a_camera_is_missing_even_where_the_transport_h
 
 
 def test_a_picture_that_stays_keeps_its_time_and_grows_old(bench: Bench) -> None:
-    bench.camera.shot = Shot(OURS, 99.9, 99.95)
+    bench.camera.shot = CapturedImage(OURS, 99.9, 99.95)
     bench.clock.advance(3.0)
     assert bench.seen().captured["wrist"] == 99.9
     assert bench.source.camera_health()["wrist"]["age"] == pytest.approx(3.1)
 
 
 def test_pictures_alone_are_no_observation(bench: Bench) -> None:
-    bench.camera.shot = Shot(OURS, 99.9, 99.95)
+    bench.camera.shot = CapturedImage(OURS, 99.9, 99.95)
     bench.robot.silent = True
     assert bench.source.receive(0.0) is None
 
@@ -149,28 +149,31 @@ def test_what_the_robots_own_link_says_is_said_too(bench: Bench) -> None:
     bench.robot.told = [Event("source_waiting", "waiting for the node", 100.0)]
     assert bench.told() == [("source_waiting", "waiting for the node")]
     assert bench.told() == []
-    assert bench.source.why("malformed") == "why malformed"
+    assert bench.source.describe_fault("malformed") == "why malformed"
 
 
 def test_that_a_camera_is_a_video_is_said_once(bench: Bench) -> None:
     bench.camera.kind, bench.camera.shown = "file", "a.mp4"
     text = "camera wrist plays the video a.mp4: it does not show what is there"
     assert bench.told() == [("camera_is_a_video", text)]
-    bench.camera.how = Health(Condition.LIVE, 101.0)
+    bench.camera.how = CameraHealth(CameraCondition.LIVE, 101.0)
     assert [kind for kind, _ in bench.told()] == ["camera_back"]
 
 
 def test_what_happens_to_a_camera_is_said_once_with_which_why_and_since_when(bench: Bench) -> None:
     camera = bench.camera
     assert bench.told() == [], "it is being opened"
-    camera.how = Health(Condition.OPENING, 100.0, "refused", failed=True)
+    camera.how = CameraHealth(CameraCondition.OPENING, 100.0, "refused", failed=True)
     assert bench.told() == [("camera_absent", "camera wrist (rtsp://10.0.0.7/x): refused")]
     assert bench.told() == []
-    camera.how = Health(Condition.LIVE, 102.5)
+    camera.how = CameraHealth(CameraCondition.LIVE, 102.5)
     assert bench.told() == [("camera_back", "camera wrist (rtsp://10.0.0.7/x) gives pictures after 2.5 s")]
-    camera.how, camera.shot = Health(Condition.LOST, 110.0, "mute", 1, failed=True), Shot(OURS, 109.0, 109.0)
+    camera.how, camera.shot = (
+        CameraHealth(CameraCondition.LOST, 110.0, "mute", 1, failed=True),
+        CapturedImage(OURS, 109.0, 109.0),
+    )
     bench.clock.advance(11.0)
-    (event,) = bench.source.news()
+    (event,) = bench.source.pop_events()
     assert (event.kind, event.text) == ("camera_lost", "camera wrist (rtsp://10.0.0.7/x) is lost: mute")
     assert dict(event.data) == {
         "camera": "wrist",
@@ -184,5 +187,5 @@ def test_what_happens_to_a_camera_is_said_once_with_which_why_and_since_when(ben
     }
     camera.how = replace(camera.how, why="refused")
     assert bench.told() == [("camera_lost", "camera wrist (rtsp://10.0.0.7/x) is lost: refused")]
-    camera.how = Health(Condition.ENDED, 112.0, "the file is over")
+    camera.how = CameraHealth(CameraCondition.ENDED, 112.0, "the file is over")
     assert bench.told()[0][0] == "camera_ended"

@@ -5,14 +5,14 @@ from typing import Any
 
 import pytest
 
-from runtime.cameras.attached import Attached
-from runtime.cameras.attaching import attached
+from runtime.cameras.attached import SourceWithCameras
+from runtime.cameras.attaching import attach_cameras
 from runtime.cameras.live import LiveCamera
 from runtime.config import loader
 from runtime.core.clock import MonotonicClock, VirtualClock
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.processes.reception.process import make_source
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 from runtime.transports.node_source import NodeSource
 
@@ -28,13 +28,13 @@ def planned(tmp_path: Path, cameras: dict[str, Any], **transport: Any) -> Statio
         "policy": {"kind": "mock"},
         "cameras": cameras,
     }
-    return checked_spec(loader.resolve(tree, {}, "test.toml"))
+    return check_deployment(loader.resolve_deployment(tree, {}, "test.toml"))
 
 
 def waits_for(spec: StationSpec) -> set[str]:
     """The cameras that the transport itself must deliver."""
     source = make_source(spec, MonotonicClock())
-    inner = source._source if isinstance(source, Attached) else source
+    inner = source._source if isinstance(source, SourceWithCameras) else source
     assert isinstance(inner, NodeSource)
     return set(inner._messages._cameras)
 
@@ -55,7 +55,7 @@ def test_a_camera_that_the_transport_leaves_out_may_come_from_elsewhere(tmp_path
 
 def test_without_cameras_of_its_own_a_source_is_itself() -> None:
     source = NodeSource.__new__(NodeSource)
-    assert attached(source, {}, MonotonicClock()) is source
+    assert attach_cameras(source, {}, MonotonicClock()) is source
 
 
 def test_a_camera_that_the_robot_does_not_have_is_refused_with_those_it_has(tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_a_password_is_in_no_manifest_and_in_no_sentence(
     wanted = {"kind": "rtsp", "url": "rtsp://h/x", "user": "me", "password_env": "CAMERA_PASSWORD"}
     spec = planned(tmp_path, {"cam_high": wanted})
     source = make_source(spec, MonotonicClock())
-    assert isinstance(source, Attached)
+    assert isinstance(source, SourceWithCameras)
     (camera,) = source._cameras
     assert isinstance(camera, LiveCamera)
     assert "s3cret" in camera._address.url

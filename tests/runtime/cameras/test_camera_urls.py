@@ -1,12 +1,12 @@
 import pytest
 
-from runtime.cameras.camera_urls import checked, with_password
+from runtime.cameras.camera_urls import check_url, with_password
 from runtime.core.errors import ConfigurationError
 
 
 @pytest.mark.parametrize("url", ["rtsp://10.0.0.7/stream", "rtsps://camera.lab:8554/a/b?c=1"])
 def test_a_url_of_the_scheme_is_left_as_it_is(url):
-    assert checked("url", url, ("rtsp", "rtsps")) == url
+    assert check_url("url", url, ("rtsp", "rtsps")) == url
 
 
 @pytest.mark.parametrize(
@@ -14,12 +14,12 @@ def test_a_url_of_the_scheme_is_left_as_it_is(url):
 )
 def test_what_is_no_such_url_is_refused_with_what_is_allowed(url):
     with pytest.raises(ConfigurationError, match=r"allowed: rtsp://HOST\[:PORT\]/PATH"):
-        checked("url", url, ("rtsp",))
+        check_url("url", url, ("rtsp",))
 
 
 def test_a_password_in_a_url_is_refused_and_not_repeated():
     with pytest.raises(ConfigurationError, match="password_env") as refused:
-        checked("url", "rtsp://admin:s3cret@10.0.0.7/x", ("rtsp",))
+        check_url("url", "rtsp://admin:s3cret@10.0.0.7/x", ("rtsp",))
     assert "s3cret" not in str(refused.value)
 
 

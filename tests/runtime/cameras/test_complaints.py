@@ -1,4 +1,4 @@
-from runtime.cameras.complaints import complaints
+from runtime.cameras.complaints import describe_camera_problems
 
 TOLD = {
     "high": {"source": "rtsp://h/x", "condition": "lost", "why": "mute"},
@@ -8,14 +8,14 @@ TOLD = {
 
 
 def test_every_camera_that_is_not_live_has_a_sentence():
-    assert complaints(TOLD) == [
+    assert describe_camera_problems(TOLD) == [
         "camera high (rtsp://h/x) is lost: mute",
         "camera low (a.mp4) is opening: there is no such file",
     ]
 
 
 def test_of_some_cameras_only_those_that_are_ours_are_told():
-    assert complaints(TOLD, ["low", "of_the_transport"]) == [
+    assert describe_camera_problems(TOLD, ["low", "of_the_transport"]) == [
         "camera low (a.mp4) is opening: there is no such file"
     ]
-    assert complaints({}) == []
+    assert describe_camera_problems({}) == []

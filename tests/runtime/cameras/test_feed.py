@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from runtime.cameras.base import Address, CameraError
-from runtime.cameras.feed import Backlog, Feed
+from runtime.cameras.feed import Backlog, VideoStream
 from runtime.sim.mjpeg_server import MjpegServer
 from tests.processes import PATIENCE_S
 from tests.runtime.cameras.movies import movie, number_of
 
 
-def opened(path: Path) -> Feed:
-    return Feed(Address(f"file:{path}", str(path)), 2.0, 2.0)
+def opened(path: Path) -> VideoStream:
+    return VideoStream(Address(f"file:{path}", str(path)), 2.0, 2.0)
 
 
 def test_a_file_is_read_to_its_end_with_the_stamp_of_each_picture(tmp_path: Path) -> None:
@@ -45,7 +45,7 @@ def test_what_is_closed_goes_with_its_decoder_and_without_the_collector(tmp_path
 def test_a_stream_without_a_time_of_its_own_has_no_stamps() -> None:
     server = MjpegServer()
     url = server.start()
-    feed = Feed(Address(url, url, "mpjpeg", stamped=False), 2.0, 2.0)
+    feed = VideoStream(Address(url, url, "mpjpeg", stamped=False), 2.0, 2.0)
     frame = feed.read()
     assert frame is not None
     assert frame.stamp is None
@@ -64,14 +64,14 @@ def test_pictures_that_are_larger_than_any_cameras_are_refused_with_their_size(
     url = server.start()
     address = Address(url, url, "mpjpeg", stamped=False)
     with pytest.raises(CameraError, match=f"its pictures are {size} x {size}; allowed: 16777216 pixels"):
-        Feed(address, PATIENCE_S, PATIENCE_S).read()
+        VideoStream(address, PATIENCE_S, PATIENCE_S).read()
     server.close()
 
 
 def test_of_a_stream_without_stamps_that_is_read_too_slowly_what_has_waited_is_passed_over() -> None:
     server = MjpegServer(rate=1e6)  # as fast as it is taken
     url = server.start()
-    feed = Feed(Address(url, url, "mpjpeg", stamped=False), 2.0, 2.0)
+    feed = VideoStream(Address(url, url, "mpjpeg", stamped=False), 2.0, 2.0)
     read = 0
     while server.sent - read < 100:  # so many were sent and not shown; a busy machine takes longer for it
         assert feed.read() is not None
@@ -97,14 +97,14 @@ def test_of_a_file_no_picture_is_passed_over_however_fast_it_is_read(tmp_path: P
 
 def test_a_backlog_begins_with_the_third_packet_in_a_row_and_ends_with_a_wait() -> None:
     backlog = Backlog()
-    assert [backlog.passes(waited) for waited in (0.03, 0.0, 0.0, 0.0, 0.0, 0.03, 0.0)] == [
+    assert [backlog.should_skip(waited) for waited in (0.03, 0.0, 0.0, 0.0, 0.0, 0.03, 0.0)] == [
         False, False, False, True, True, False, False,
     ]  # fmt: skip
 
 
 def test_of_a_stream_that_never_pauses_something_is_shown() -> None:
     backlog = Backlog()
-    passed = [backlog.passes(0.0) for _ in range(1000)]
+    passed = [backlog.should_skip(0.0) for _ in range(1000)]
     assert passed.count(False) == 2 + 10
 
 

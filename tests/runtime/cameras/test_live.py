@@ -7,7 +7,7 @@ import threading
 import numpy as np
 
 from runtime.cameras import rtsp, v4l2
-from runtime.cameras.base import Condition
+from runtime.cameras.base import CameraCondition
 from runtime.cameras.live import LiveCamera
 from runtime.core.clock import MonotonicClock
 from runtime.sim.rtsp_server import RtspServer
@@ -18,22 +18,22 @@ from tests.runtime.cameras.watched import CLOCK, both, live, looking, watched
 @both
 def test_pictures_are_rgb_new_and_never_from_the_future(kind: str) -> None:
     with watched(kind) as (_, camera):
-        until(camera.newest)
-        first = camera.newest()
+        until(camera.latest)
+        first = camera.latest()
         assert first is not None
         assert first.picture.shape == (120, 160, 3)
         np.testing.assert_allclose(first.picture[10, 10], (220, 0, 0), atol=12)
         np.testing.assert_allclose(first.picture[10, -10], (0, 0, 220), atol=12)
         assert first.captured <= first.arrived <= CLOCK.now()
-        until(lambda: camera.newest().captured > first.captured)  # type: ignore[union-attr]
+        until(lambda: camera.latest().captured > first.captured)  # type: ignore[union-attr]
         assert camera.health().why == ""
 
 
 @both
 def test_settings_shape_its_pictures(kind: str) -> None:
     with watched(kind, rotate=90, size=[60, 80], colours="bgr") as (_, camera):
-        until(camera.newest)
-        shot = camera.newest()
+        until(camera.latest)
+        shot = camera.latest()
         assert shot is not None
         assert shot.picture.shape == (80, 60, 3)
         np.testing.assert_allclose(
@@ -52,8 +52,8 @@ def test_a_slow_camera_is_no_lost_one() -> None:
         until(lambda: live(camera))
         server.rate = 4.0
         seen: set[float] = set()
-        until(lambda: seen.add(camera.newest().captured) or len(seen) > 3)  # type: ignore[func-returns-value, union-attr]
-        assert (camera.health().condition, camera.health().losses) == (Condition.LIVE, 0)
+        until(lambda: seen.add(camera.latest().captured) or len(seen) > 3)  # type: ignore[func-returns-value, union-attr]
+        assert (camera.health().condition, camera.health().losses) == (CameraCondition.LIVE, 0)
 
 
 def test_a_stream_whose_time_jumps_is_counted_and_its_pictures_stay_new() -> None:
@@ -64,14 +64,14 @@ def test_a_stream_whose_time_jumps_is_counted_and_its_pictures_stay_new() -> Non
             server.stamp_offset = offset
             until(lambda count=count: camera.faults() == {"camera_clock_jumped_wrist": count})
             jumped = CLOCK.now()
-            until(lambda jumped=jumped: camera.newest().captured > jumped)  # type: ignore[union-attr]
+            until(lambda jumped=jumped: camera.latest().captured > jumped)  # type: ignore[union-attr]
         assert camera.health().losses == 0
 
 
 def test_a_mute_camera_does_not_keep_another_one_waiting_and_both_end() -> None:
     with watched("rtsp", "mute") as (_, mute), watched("mjpeg") as (_, playing):
         until(lambda: live(playing))
-        assert mute.newest() is None
+        assert mute.latest() is None
     until(lambda: not [t for t in threading.enumerate() if t.name == "camera-wrist"])
 
 
@@ -89,7 +89,7 @@ def test_a_reader_that_never_returns_is_noticed_from_outside() -> None:
         clock.late = 60.0
         camera._clock = clock
         health = camera.health()
-        assert (health.condition, health.losses) == (Condition.LOST, 1)
+        assert (health.condition, health.losses) == (CameraCondition.LOST, 1)
         assert health.why == "no picture for over 1.5 s, and reading it does not return"
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from runtime.cameras.base import Condition, Shot
+from runtime.cameras.base import CameraCondition, CapturedImage
 from runtime.cameras.file import Config
 from runtime.cameras.playing import FileCamera
 from runtime.core.clock import Clock, MonotonicClock, VirtualClock
@@ -18,8 +18,8 @@ def stepped(path: Path, clock: Clock, **settings: Any) -> FileCamera:
     return camera
 
 
-def shot(camera: FileCamera) -> Shot:
-    newest = camera.newest()
+def shot(camera: FileCamera) -> CapturedImage:
+    newest = camera.latest()
     assert newest is not None, camera.health().why
     return newest
 
@@ -41,7 +41,7 @@ def test_the_first_picture_stands_and_stays_new_until_a_run_begins(film: Path, c
         assert number_of(seen.picture) == 0
         assert 0 <= clock.now() - seen.captured <= 0.1
         clock.advance(0.1)
-    assert camera.health().condition is Condition.LIVE
+    assert camera.health().condition is CameraCondition.LIVE
 
 
 def test_a_run_plays_each_picture_when_it_is_due_and_stamps_it_so(film: Path, clock: VirtualClock) -> None:
@@ -87,10 +87,10 @@ def test_it_stops_at_its_end_grows_old_and_stands_again_after_the_run(
         clock.advance(0.1)
     assert number_of(last.picture) == 9
     assert clock.now() - last.captured == pytest.approx(1.1)
-    assert (camera.health().condition, camera.health().why) == (Condition.ENDED, "the file is over")
+    assert (camera.health().condition, camera.health().why) == (CameraCondition.ENDED, "the file is over")
     camera.end_run()
     assert number_of(shot(camera).picture) == 0
-    assert camera.health().condition is Condition.LIVE
+    assert camera.health().condition is CameraCondition.LIVE
 
 
 def test_the_next_run_begins_with_the_first_picture(film: Path, clock: VirtualClock) -> None:
@@ -106,7 +106,7 @@ def test_a_thread_of_its_own_plays_by_the_real_clock(film: Path) -> None:
     camera = FileCamera("cam", Config(path=str(film)), MonotonicClock(), threaded=True)
     camera.start()
     try:
-        until(camera.newest)
+        until(camera.latest)
         assert number_of(shot(camera).picture) == 0
         camera.begin_run()
         seen: list[int] = []
@@ -132,18 +132,18 @@ def test_what_is_no_video_is_said(
     if content is not None:
         path.write_bytes(content)
     camera = stepped(path, clock)
-    assert camera.newest() is None
-    assert (camera.health().condition, camera.health().why) == (Condition.OPENING, why)
+    assert camera.latest() is None
+    assert (camera.health().condition, camera.health().why) == (CameraCondition.OPENING, why)
 
 
 def test_a_file_that_comes_later_is_played(tmp_path: Path, clock: VirtualClock) -> None:
     camera = stepped(tmp_path / "film.mp4", clock)
-    assert camera.newest() is None
+    assert camera.latest() is None
     movie(tmp_path / "film.mp4")
     assert number_of(shot(camera).picture) == 0
 
 
 def test_a_size_that_does_not_fit_its_crop_is_said(film: Path, clock: VirtualClock) -> None:
     camera = stepped(film, clock, crop=[60, 0, 32, 32])
-    assert camera.newest() is None
+    assert camera.latest() is None
     assert "does not lie within its 64x48 pixels" in camera.health().why

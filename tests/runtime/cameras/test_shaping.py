@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from runtime.cameras.base import CameraError, CameraSettings
-from runtime.cameras.shaping import Shaping
+from runtime.cameras.shaping import ImageTransform
 from runtime.core.errors import ConfigurationError
 
 PICTURE = np.arange(16 * 20 * 3, dtype=np.uint32).reshape(16, 20, 3).astype(np.uint8)
 
 
 def shaped(**settings):
-    return Shaping(CameraSettings(**settings))(PICTURE)
+    return ImageTransform(CameraSettings(**settings))(PICTURE)
 
 
 def test_without_settings_a_picture_is_as_it_was_contiguous_and_read_only():
@@ -56,13 +56,13 @@ def test_a_crop_that_leaves_nothing_is_a_mistake_of_the_file():
 
 def test_a_picture_that_nobody_could_hand_on_says_what_to_set():
     with pytest.raises(CameraError, match=r"2560x1440.*set size or crop"):
-        Shaping(CameraSettings())(np.zeros((1440, 2560, 3), np.uint8))
-    made = Shaping(CameraSettings(size=[640, 360]))(np.zeros((1440, 2560, 3), np.uint8))
+        ImageTransform(CameraSettings())(np.zeros((1440, 2560, 3), np.uint8))
+    made = ImageTransform(CameraSettings(size=[640, 360]))(np.zeros((1440, 2560, 3), np.uint8))
     assert made.shape == (360, 640, 3)
 
 
 def test_another_size_later_is_refused_and_the_first_one_taken_again():
-    shaping = Shaping(CameraSettings())
+    shaping = ImageTransform(CameraSettings())
     shaping(PICTURE)
     with pytest.raises(CameraError, match="were 20x16 and are 10x8 now"):
         shaping(PICTURE[::2, ::2])
@@ -70,7 +70,7 @@ def test_another_size_later_is_refused_and_the_first_one_taken_again():
 
 
 def test_another_size_of_the_same_shape_is_scaled_where_a_size_is_set():
-    shaping = Shaping(CameraSettings(size=[20, 16]))
+    shaping = ImageTransform(CameraSettings(size=[20, 16]))
     shaping(PICTURE)
     assert shaping(PICTURE[::2, ::2]).shape == (16, 20, 3)
     with pytest.raises(CameraError, match="of another shape"):
@@ -78,7 +78,7 @@ def test_another_size_of_the_same_shape_is_scaled_where_a_size_is_set():
 
 
 def test_another_size_under_a_crop_shows_another_part_and_is_refused():
-    shaping = Shaping(CameraSettings(crop=[0, 0, 8, 8], size=[16, 16]))
+    shaping = ImageTransform(CameraSettings(crop=[0, 0, 8, 8], size=[16, 16]))
     shaping(PICTURE)
     with pytest.raises(CameraError, match="without crop"):
         shaping(np.repeat(np.repeat(PICTURE, 2, 0), 2, 1))

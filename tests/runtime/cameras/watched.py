@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from runtime.cameras import mjpeg, rtsp
-from runtime.cameras.base import Condition
+from runtime.cameras.base import CameraCondition
 from runtime.cameras.live import LiveCamera
 from runtime.core.clock import MonotonicClock
 from runtime.sim.camera_server import CameraServer
@@ -46,8 +46,8 @@ def watched(kind: str, fault: str = "", **settings: Any) -> Iterator[tuple[Camer
 
 
 def live(camera: LiveCamera) -> bool:
-    return camera.health().condition is Condition.LIVE
+    return camera.health().condition is CameraCondition.LIVE
 
 
 def lost(camera: LiveCamera) -> bool:
-    return camera.health().condition is Condition.LOST
+    return camera.health().condition is CameraCondition.LOST

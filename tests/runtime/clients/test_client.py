@@ -100,7 +100,7 @@ def test_a_command_is_given_under_the_lease_and_by_the_newest_status(client, sta
 
 
 def test_a_station_that_was_started_before_an_upgrade_is_read_as_one_of_today(client, station):
-    assert client.status()["state_is"] == SessionState.READY.told()
+    assert client.status()["state_is"] == SessionState.READY.meaning_dict()
 
 
 def test_arguments_may_have_the_words_of_the_clients_own(client, station):

@@ -7,7 +7,7 @@ import pytest
 
 from runtime import __main__ as command_line
 from runtime.clients import headless
-from runtime.clients.headless import drive, summary
+from runtime.clients.headless import run_headless, summary
 from runtime.core.errors import RecordingError, RuntimeFault, SetupError, TransportError
 from runtime.recording import export
 from tests.sources import ROOT
@@ -94,7 +94,7 @@ def plan(tmp_path):
 def files(monkeypatch):
     """What is on disk of an episode: here nothing, only what would be read from it."""
     found = {"duration_s": 8.0, "safety": {"ticks": 240, "refused": 0, "limited": 2}}
-    monkeypatch.setattr(headless, "_of_episode", lambda path: found)
+    monkeypatch.setattr(headless, "_episode_figures", lambda path: found)
     return found
 
 
@@ -111,7 +111,7 @@ def kept(monkeypatch):
         done.append("publish")
         return {"dataset_path": "/data/datasets/demo", "episode_index": 4, "published_frames": 240}
 
-    monkeypatch.setattr(export, "export", exported)
+    monkeypatch.setattr(export, "write_export", exported)
     monkeypatch.setattr(headless, "_publish", published)
     return done
 
@@ -133,7 +133,7 @@ def a_good_run(*events):
 
 def test_a_run_is_set_up_run_and_its_end_on_disk_waited_for(plan, capsys):
     station = a_good_run()
-    result = drive(plan, station)
+    result = run_headless(plan, station)
     assert station.given == ["claim", "setup", "run"]
     assert (result["ended"], result["frames"], result["episode_status"]) == (
         FINISHED["reason"],
@@ -147,7 +147,9 @@ def test_a_run_is_set_up_run_and_its_end_on_disk_waited_for(plan, capsys):
 
 
 def test_events_that_matter_are_told_once_and_others_not(plan, capsys):
-    drive(plan, a_good_run(event(3, "chunk_dropped", "chunk 7 dropped"), event(4, "command", "stop by anna")))
+    run_headless(
+        plan, a_good_run(event(3, "chunk_dropped", "chunk 7 dropped"), event(4, "command", "stop by anna"))
+    )
     shown = capsys.readouterr().out
     assert shown.count("  chunk_dropped: chunk 7 dropped\n") == 1
     assert "stop by anna" not in shown
@@ -163,14 +165,14 @@ def test_the_events_of_another_main_are_read_from_its_first(plan, capsys):
     )
     station.events_since = lambda number: [e for e in station.events if e["number"] == number + 1]
     with pytest.raises(RuntimeFault, match="set-up failed: the process coordinator died"):
-        drive(plan, station)
+        run_headless(plan, station)
     assert "of the second" in capsys.readouterr().out
 
 
 def test_a_set_up_that_fails_is_an_error_with_its_reason(plan):
     station = Station(status("idle"), status("idle"), status("idle", reason="no policy server listens"))
     with pytest.raises(RuntimeFault, match="set-up failed: no policy server listens"):
-        drive(plan, station)
+        run_headless(plan, station)
     assert station.given == ["claim", "setup"]
 
 
@@ -181,7 +183,7 @@ def test_a_run_that_fell_back_without_an_episode_raises_at_once_with_its_reason(
     )
     monkeypatch.setattr(headless, "_CLOSE_S", -math.inf)  # any wait for the episode would be an error
     with pytest.raises(RuntimeFault, match="did not end well: 3 GB free, 1000 needed; episode: none"):
-        drive(plan, station)
+        run_headless(plan, station)
     assert "ended     3 GB free, 1000 needed" in capsys.readouterr().out
 
 
@@ -193,7 +195,7 @@ def test_a_run_that_is_not_recorded_ends_without_waiting_for_an_episode(plan, mo
         status("ready", reason=FINISHED["reason"], last_run=FINISHED),
     )
     monkeypatch.setattr(headless, "_CLOSE_S", -math.inf)
-    result = drive(plan, station)
+    result = run_headless(plan, station)
     assert (result["episode_path"], result["frames"]) == ("", 0)
 
 
@@ -208,7 +210,7 @@ def test_a_run_that_held_is_stopped_and_no_success_although_it_was_recorded(plan
         events=[event(1, "episode_opened"), event(2, "episode_closed")],
     )
     with pytest.raises(RuntimeFault, match="did not end well: policy lost; episode: /data/episodes/one"):
-        drive(plan, station)
+        run_headless(plan, station)
     assert station.given[-1] == "stop"
 
 
@@ -223,18 +225,18 @@ def test_an_episode_that_is_never_closed_is_an_error(plan):
         RuntimeFault,
         match=r"ended \(over\), but then: the end of the recording: not within 30 s; ready: over",
     ):
-        drive(plan, station)
+        run_headless(plan, station)
 
 
 def test_an_episode_that_cannot_be_read_is_no_success(plan, monkeypatch):
     def damaged(path):
         raise RecordingError("rows.arrow is damaged")
 
-    monkeypatch.setattr(headless, "_of_episode", damaged)
+    monkeypatch.setattr(headless, "_episode_figures", damaged)
     with pytest.raises(
         RuntimeFault, match=r"the run ended \(the run's 8 s are over\), but then: rows.arrow is damaged"
     ):
-        drive(plan, a_good_run())
+        run_headless(plan, a_good_run())
 
 
 @pytest.mark.parametrize(
@@ -247,7 +249,7 @@ def test_an_episode_that_cannot_be_read_is_no_success(plan, monkeypatch):
 )
 def test_every_run_is_exported_and_what_moved_a_robot_is_published(plan, kept, mode, dataset, done):
     plan.run.mode, plan.publish.dataset = mode, dataset
-    result = drive(plan, a_good_run())
+    result = run_headless(plan, a_good_run())
     assert kept == done
     assert result["export_path"] == str(plan.data / "exports" / "one")
     assert ("dataset_path" in result) is ("publish" in done)
@@ -258,7 +260,7 @@ def test_a_run_that_did_not_end_well_is_exported_and_not_published(plan, kept):
     station = a_good_run()
     station.statuses[-1] = station.statuses[-1] | {"last_run": FINISHED | {"status": "failed"}}
     with pytest.raises(RuntimeFault, match="did not end well"):
-        drive(plan, station)
+        run_headless(plan, station)
     assert kept == ["export"]
 
 
@@ -266,9 +268,9 @@ def test_an_export_that_fails_is_told_on_top_of_how_the_run_ended(plan, monkeypa
     def full(episode, root):
         raise RecordingError("the disk is full")
 
-    monkeypatch.setattr(export, "export", full)
+    monkeypatch.setattr(export, "write_export", full)
     with pytest.raises(RuntimeFault, match=r"ended \(the run's 8 s are over\), but then: the disk is full"):
-        drive(plan, a_good_run())
+        run_headless(plan, a_good_run())
 
 
 @pytest.mark.parametrize("mode", ["step", "preview", "manual"])
@@ -277,7 +279,7 @@ def test_a_mode_that_needs_a_person_is_refused_before_anything_is_done(plan, mod
     station = Station(status("idle"))
     says = f"run.mode = '{mode}' needs a person; headless: continuous, sim.*ctl bench-1 run --mode {mode}"
     with pytest.raises(SetupError, match=says):
-        drive(plan, station)
+        run_headless(plan, station)
     assert station.given == []
 
 

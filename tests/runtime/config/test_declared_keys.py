@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from robots.description import RobotTable
 from robots.robot import Gripper, Group, Robot
 from runtime.config.schema import Deployment
-from runtime.core.plugins import parts
+from runtime.core.plugins import union_members
 from tests.runtime.reading import Reads, reads_of
 
 ROOT = Path(__file__).parents[3]
@@ -81,7 +81,7 @@ def _tables(annotation: Any, seen: list[type]) -> None:
         seen.append(annotation)
         for inner in _fields(annotation).values():
             _tables(inner, seen)
-    for part in parts(annotation):
+    for part in union_members(annotation):
         _tables(part, seen)
 
 

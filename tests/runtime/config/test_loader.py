@@ -14,7 +14,7 @@ from runtime.config.schema import Deployment
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.plugins import variants
 from runtime.core.settings import Settings
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 
 DEPLOYMENTS = Path(__file__).parents[3] / "deployments"
 SMALL = """\
@@ -397,7 +397,7 @@ def test_the_hash_does_not_depend_on_where_or_in_what_order_a_key_stands(write, 
     assert load(small, ["control.rate=30.0"]).digest == digest
     tree = dict(load(top).tree)
     for seed in range(5):
-        assert loader.resolve(shuffled(tree, seed), {}, "x").digest == digest
+        assert loader.resolve_deployment(shuffled(tree, seed), {}, "x").digest == digest
 
 
 def test_a_default_that_is_written_out_is_the_same_deployment(small):
@@ -423,10 +423,10 @@ def test_every_deployment_that_comes_with_it_loads_and_survives_the_way_to_the_f
     }
     resolved = load(path, needed.get(path.name, []))
     handed_over = json.loads(json.dumps(dict(resolved.tree), allow_nan=False))
-    again = loader.resolve(handed_over, {}, "resolved.json")
+    again = loader.resolve_deployment(handed_over, {}, "resolved.json")
     assert (again.deployment, again.digest) == (resolved.deployment, resolved.digest)
     if path.name != "base.toml":
-        assert checked_spec(resolved).robot.name == resolved.deployment.robot
+        assert check_deployment(resolved).robot.name == resolved.deployment.robot
 
 
 # --- a plan: the parts fit each other ----------------------------------------------------------------------
@@ -438,7 +438,7 @@ def demo():
 
 
 def planned(path, *assignments):
-    return checked_spec(load(path, assignments))
+    return check_deployment(load(path, assignments))
 
 
 def test_report_only_is_refused_where_a_robot_can_move(demo):
@@ -481,26 +481,26 @@ def test_without_a_rate_the_robots_own_counts(demo):
 
 def test_changes_go_on_top_like_a_file_over_what_it_extends(write):
     own = load(write())
-    changed = loader.changed(own, {"task": "fold", "policy": {"amplitude": 0.1}}, "setup")
+    changed = loader.apply_changes(own, {"task": "fold", "policy": {"amplitude": 0.1}}, "setup")
     assert (changed.deployment.task, changed.deployment.policy.amplitude) == ("fold", 0.1)
     assert changed.deployment.transport == own.deployment.transport
     assert changed.digest != own.digest
-    assert loader.changed(own, {}, "setup") == own
+    assert loader.apply_changes(own, {}, "setup") == own
     assert own == load(write())
 
 
 def test_a_change_of_kind_replaces_the_table_whole(write):
     own = load(write(SMALL + "amplitude = 0.1\n"))
-    changed = loader.changed(own, {"policy": {"kind": "openpi", "url": "ws://a:1"}}, "setup")
+    changed = loader.apply_changes(own, {"policy": {"kind": "openpi", "url": "ws://a:1"}}, "setup")
     assert (changed.deployment.policy.kind, changed.deployment.policy.url) == ("openpi", "ws://a:1")
 
 
 def test_a_wrong_change_names_where_it_came_from(write):
     own = load(write())
     with pytest.raises(ConfigurationError, match=r"^setup: policy\.amplitud = 1: unknown key"):
-        loader.changed(own, {"policy": {"amplitud": 1}}, "setup")
+        loader.apply_changes(own, {"policy": {"amplitud": 1}}, "setup")
     with pytest.raises(ConfigurationError, match=r"^setup: policy\.kind = \[\]: must be one of 'gr00t'"):
-        loader.changed(own, {"policy": {"kind": []}}, "setup")
+        loader.apply_changes(own, {"policy": {"kind": []}}, "setup")
 
 
 def test_a_policy_may_be_left_out_where_there_is_a_collection_and_nowhere_else(small):

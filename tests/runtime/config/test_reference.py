@@ -1,7 +1,7 @@
 import re
 from pathlib import Path
 
-from runtime.config.reference import reference
+from runtime.config.reference import render_reference
 from runtime.config.schema import Deployment
 from runtime.core.plugins import variants
 
@@ -10,19 +10,19 @@ ROW = re.compile(r"^\| `(\w+)` \| (.+?) \| (.+?) \| (.*?) \|$", re.MULTILINE)
 
 
 def test_the_committed_file_is_what_the_models_say():
-    assert COMMITTED.read_text("utf-8") == reference(), (
+    assert COMMITTED.read_text("utf-8") == render_reference(), (
         "the keys of a deployment have changed: python -m runtime.config.reference > docs/configuration.md"
     )
 
 
 def test_every_key_has_a_type_a_default_and_a_meaning():
-    rows = ROW.findall(reference())
+    rows = ROW.findall(render_reference())
     assert len(rows) > 80
     assert [name for name, *cells in rows if not all(cell.strip() for cell in cells)] == []
 
 
 def test_every_table_and_every_variant_has_its_section():
-    text = reference()
+    text = render_reference()
     for name, field in Deployment.model_fields.items():
         if name in ("station", "robot", "task", "operator", "data_dir"):
             assert f"| `{name}` | string" in text
@@ -38,7 +38,7 @@ def test_every_table_and_every_variant_has_its_section():
 
 
 def test_types_and_defaults_are_in_words():
-    text = reference()
+    text = render_reference()
     assert '| `realtime` | `"auto"`, `"off"` | `"auto"` |' in text
     assert "| `rate` | number > 0, ≤ 1000 | none |" in text
     assert '| `blend_window` | integer ≥ 1 or `"all"` | `8` |' in text

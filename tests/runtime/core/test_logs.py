@@ -33,7 +33,7 @@ def pipe():
 
 
 def lines_on(descriptor):
-    made = log.Lines(descriptor)
+    made = log.NonBlockingHandler(descriptor)
     made.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
     return made
 

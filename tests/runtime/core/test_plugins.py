@@ -6,7 +6,7 @@ import pytest
 from pydantic import ValidationError, create_model
 
 from runtime.core.errors import ConfigurationError
-from runtime.core.plugins import UnreadSection, parts, union, variants
+from runtime.core.plugins import UnreadSection, kind_union, union_members, variants
 from runtime.core.settings import Settings
 
 PACKAGES = ["cameras", "kinematics", "policies", "strategies", "teleoperators", "transports"]
@@ -42,7 +42,7 @@ def package(tmp_path, monkeypatch):
 
 def section(name, table, **context):
     """A table read as one of the kinds of the package `name`."""
-    model = create_model("Deployment", __base__=Settings, part=(union(name), ...))
+    model = create_model("Deployment", __base__=Settings, part=(kind_union(name), ...))
     return model.model_validate({"part": table}, context=context).part
 
 
@@ -100,8 +100,8 @@ def test_a_section_that_a_process_does_not_read_is_kept_as_it_is_and_loads_nothi
 
 def test_the_kinds_of_a_section_are_its_parts(package):
     name = package(wire=MODULE.format(kind="wire"))
-    assert parts(union(name)) == (variants(name)["wire"].Config,)
-    assert parts(int | None) == (int, type(None))
+    assert union_members(kind_union(name)) == (variants(name)["wire"].Config,)
+    assert union_members(int | None) == (int, type(None))
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -4,7 +4,7 @@ import pytest
 from pydantic import AfterValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from runtime.core.settings import Settings, explanation
+from runtime.core.settings import Settings, explain_validation_error
 
 
 class Leg(Settings):
@@ -20,7 +20,7 @@ class Table(Settings):
 def explained(tree, **more):
     with pytest.raises(ValidationError) as invalid:
         Table.model_validate(tree)
-    return explanation(invalid.value, Table, tree, "shop", **more)
+    return explain_validation_error(invalid.value, Table, tree, "shop", **more)
 
 
 def test_a_key_deep_inside_is_named_with_its_way_there_and_what_is_allowed_beside_it():
@@ -65,7 +65,7 @@ def test_secrets_are_not_shown():
     tree = {"key": "hush", "Passphrase": "hush", "api_token": "hush"}
     with pytest.raises(ValidationError) as invalid:
         Keyed.model_validate(tree)
-    assert explanation(invalid.value, Keyed, tree, "shop").splitlines() == [
+    assert explain_validation_error(invalid.value, Keyed, tree, "shop").splitlines() == [
         "shop: key: name a file",
         "shop: Passphrase: unknown key; allowed here: key",
         "shop: api_token: unknown key; allowed here: key",

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from runtime.core.errors import RecordingError
 from runtime.datasets.__main__ import main
-from runtime.datasets.consistency import check, examine, rounded
+from runtime.datasets.consistency import check, check_with_remarks, is_rounding_error
 from runtime.datasets.published import publish
 from runtime.datasets.rows import read_rows, write_table
 from tests.runtime.datasets.small import record, write_video
@@ -149,7 +149,7 @@ def test_a_deviation_of_constant_joints_off_by_rounding_is_a_remark(
     width = constant.shape[1]
     exact = {name: [float(np.float32(2.1))] * width for name in ("min", "max", "mean")}
     restate(dataset, lambda stats: stats["action"].update(exact, std=[0.0013] * width))
-    found = examine(dataset)
+    found = check_with_remarks(dataset)
     assert found.problems == []
     (remark,) = found.remarks
     assert remark.startswith("episode 0: std of 'action' is [0.0013, ")
@@ -158,7 +158,7 @@ def test_a_deviation_of_constant_joints_off_by_rounding_is_a_remark(
     assert f"remark: {remark}" in said
     assert f"{dataset} is whole" in said
     restate(dataset, lambda stats: stats["action"].update(std=[0.02] * width))
-    assert examine(dataset).remarks == []
+    assert check_with_remarks(dataset).remarks == []
     assert "std of 'action' is [0.02" in check(dataset)[0]
 
 
@@ -175,5 +175,5 @@ def test_sums_in_single_precision_are_never_called_wrong(
     known = (np.float32(offset) + noise).astype(np.float32)
     mean, std = single(known)
     exact = known.astype(np.float64)
-    assert rounded("mean", mean, exact.mean(axis=0), exact)
-    assert rounded("std", std.astype(np.float64), exact.std(axis=0), exact)
+    assert is_rounding_error("mean", mean, exact.mean(axis=0), exact)
+    assert is_rounding_error("std", std.astype(np.float64), exact.std(axis=0), exact)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from runtime.core.errors import RecordingError
-from runtime.datasets.cut import NotCopyableError, cut, encode
+from runtime.datasets.cut import NotCopyableError, copy_segment, encode_segment
 from runtime.datasets.entries import Span
-from runtime.datasets.pictures import Pictures, Stretch
+from runtime.datasets.pictures import VideoFrames, VideoSegment
 from runtime.datasets.reader import open_dataset
 from tests.runtime.datasets.foreign import Plan, shown, write
 from tests.runtime.datasets.small import seen, write_video
@@ -39,14 +39,17 @@ def test_each_episode_of_a_common_video_becomes_one_of_its_own(tmp_path: Path, p
     dataset, parts = open_dataset(tmp_path / "set"), []
     for index, length in enumerate(plan.lengths):
         span, target = dataset.episode(index).videos["cam_high"], tmp_path / f"{index}.mp4"
-        cut(span, target, length, plan.fps)
+        copy_segment(span, target, length, plan.fps)
         assert index_first(target)
-        with Pictures(target) as pictures:
+        with VideoFrames(target) as pictures:
             assert len(pictures) == length
             assert np.allclose(pictures.times, np.arange(length) / plan.fps, atol=1e-4)
             assert [seen(pictures[k]) for k in range(length)] == [shown(index, k) for k in range(length)]
         assert span.start is not None
-        with Pictures(target) as one, Pictures(span.path, Stretch(span.start, length, plan.fps)) as other:
+        with (
+            VideoFrames(target) as one,
+            VideoFrames(span.path, VideoSegment(span.start, length, plan.fps)) as other,
+        ):
             assert all(np.array_equal(one[k], other[k]) for k in range(length))
         parts += coded(target)
     assert parts == coded(dataset.episode(0).videos["cam_high"].path)
@@ -54,8 +57,8 @@ def test_each_episode_of_a_common_video_becomes_one_of_its_own(tmp_path: Path, p
 
 def test_a_file_that_is_ready_is_copied_as_it_is(tmp_path: Path) -> None:
     write_video(tmp_path / "film.mp4", 12, 30.0)
-    cut(Span(tmp_path / "film.mp4"), tmp_path / "once.mp4", 12, 30.0)
-    cut(Span(tmp_path / "once.mp4"), tmp_path / "twice.mp4", 12, 30.0)
+    copy_segment(Span(tmp_path / "film.mp4"), tmp_path / "once.mp4", 12, 30.0)
+    copy_segment(Span(tmp_path / "once.mp4"), tmp_path / "twice.mp4", 12, 30.0)
     assert not index_first(tmp_path / "film.mp4")
     assert (tmp_path / "once.mp4").read_bytes() == (tmp_path / "twice.mp4").read_bytes()
     assert coded(tmp_path / "film.mp4") == coded(tmp_path / "twice.mp4")
@@ -63,16 +66,16 @@ def test_a_file_that_is_ready_is_copied_as_it_is(tmp_path: Path) -> None:
 
 def test_a_longer_file_is_cut_where_nothing_later_is_needed(tmp_path: Path) -> None:
     write_video(tmp_path / "film.mp4", 12, 30.0, b_frames=0)
-    cut(Span(tmp_path / "film.mp4"), tmp_path / "new.mp4", 7, 30.0)
-    with Pictures(tmp_path / "new.mp4") as pictures:
+    copy_segment(Span(tmp_path / "film.mp4"), tmp_path / "new.mp4", 7, 30.0)
+    with VideoFrames(tmp_path / "new.mp4") as pictures:
         assert [seen(pictures[k]) for k in range(7)] == list(range(7))
         assert len(pictures) == 7
 
 
 def test_pictures_at_another_rate_get_the_times_of_their_rows(tmp_path: Path) -> None:
     write_video(tmp_path / "film.mp4", 12, 25.0)
-    cut(Span(tmp_path / "film.mp4"), tmp_path / "new.mp4", 12, 30.0)
-    with Pictures(tmp_path / "new.mp4") as pictures:
+    copy_segment(Span(tmp_path / "film.mp4"), tmp_path / "new.mp4", 12, 30.0)
+    with VideoFrames(tmp_path / "new.mp4") as pictures:
         assert np.allclose(pictures.times, np.arange(12) / 30, atol=1e-4)
 
 
@@ -81,9 +84,9 @@ def test_an_episode_without_a_key_frame_at_its_start_is_coded_again_only_when_as
     write(tmp_path / "set", plan)
     span = open_dataset(tmp_path / "set").episode(1).videos["cam_high"]
     with pytest.raises(NotCopyableError, match="does not begin with a key frame"):
-        cut(span, tmp_path / "new.mp4", 5, plan.fps)
-    encode(span, tmp_path / "new.mp4", 5, plan.fps)
-    with Pictures(tmp_path / "new.mp4") as pictures:
+        copy_segment(span, tmp_path / "new.mp4", 5, plan.fps)
+    encode_segment(span, tmp_path / "new.mp4", 5, plan.fps)
+    with VideoFrames(tmp_path / "new.mp4") as pictures:
         assert [seen(pictures[k]) for k in range(5)] == [shown(1, k) for k in range(5)]
         assert np.allclose(pictures.times, np.arange(5) / plan.fps, atol=1e-4)
 
@@ -91,10 +94,10 @@ def test_an_episode_without_a_key_frame_at_its_start_is_coded_again_only_when_as
 def test_pictures_of_others_between_are_told(tmp_path: Path) -> None:
     write_video(tmp_path / "film.mp4", 12, 30.0, b_frames=3)
     with pytest.raises(NotCopyableError, match="pictures of others lie between"):
-        cut(Span(tmp_path / "film.mp4"), tmp_path / "new.mp4", 7, 30.0)
+        copy_segment(Span(tmp_path / "film.mp4"), tmp_path / "new.mp4", 7, 30.0)
 
 
 def test_too_few_pictures_are_told(tmp_path: Path) -> None:
     write_video(tmp_path / "film.mp4", 6, 30.0)
     with pytest.raises(RecordingError, match="has 6 frames for 7 rows"):
-        cut(Span(tmp_path / "film.mp4"), tmp_path / "new.mp4", 7, 30.0)
+        copy_segment(Span(tmp_path / "film.mp4"), tmp_path / "new.mp4", 7, 30.0)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from runtime.core.errors import RecordingError
-from runtime.datasets.stats import aggregate, column_statistic, video_statistic
+from runtime.datasets.stats import aggregate_statistics, column_statistic, video_statistic
 from tests.runtime.datasets.small import picture, write_video
 
 ROWS = arrays(np.float32, st.tuples(st.integers(1, 9), st.just(3)), elements=st.floats(-100, 100, width=32))
@@ -18,7 +18,7 @@ ROWS = arrays(np.float32, st.tuples(st.integers(1, 9), st.just(3)), elements=st.
 @given(parts=st.lists(ROWS, min_size=1, max_size=5))
 def test_statistics_of_parts_together_are_those_of_the_whole(parts: list[np.ndarray]) -> None:
     statistics = [{"x": statistic} for part in parts if (statistic := column_statistic(part))]
-    together, whole = aggregate(statistics)["x"], column_statistic(np.concatenate(parts))
+    together, whole = aggregate_statistics(statistics)["x"], column_statistic(np.concatenate(parts))
     assert whole is not None
     assert together["count"] == whole["count"]
     for name in ("min", "max", "mean", "std"):

@@ -12,7 +12,7 @@ import pytest
 
 from runtime.core.errors import RecordingError
 from runtime.datasets import identities, layout
-from runtime.datasets.identities import identity, named_copy, uuids_of
+from runtime.datasets.identities import content_uuid, copy_with_uuids, uuids_of
 from runtime.datasets.operations import convert
 from runtime.datasets.reader import open_dataset
 from tests.runtime.datasets.foreign import Plan, write
@@ -70,24 +70,26 @@ CHANGES: dict[str, Callable[[Path], None]] = {
 @pytest.mark.parametrize("change", CHANGES)
 def test_an_episode_that_differs_in_anything_is_another_one(tmp_path: Path, change: str) -> None:
     one, other = written(tmp_path / "one"), written(tmp_path / "other")
-    before = identity(open_dataset(one), 1)
-    assert identity(open_dataset(other), 1) == before
+    before = content_uuid(open_dataset(one), 1)
+    assert content_uuid(open_dataset(other), 1) == before
     CHANGES[change](other)
-    assert identity(open_dataset(other), 1) != before
-    named_copy(one, tmp_path / "copy")
+    assert content_uuid(open_dataset(other), 1) != before
+    copy_with_uuids(one, tmp_path / "copy")
     with pytest.raises(RecordingError, match="holds other episodes"):
-        named_copy(other, tmp_path / "copy")
+        copy_with_uuids(other, tmp_path / "copy")
 
 
 def test_an_episode_is_known_again_in_other_files_under_other_names_and_coded_again(tmp_path: Path) -> None:
     source = written(tmp_path / "source", replace(PLAN, version="v3.0"))  # its videos hold several episodes
     convert(source, tmp_path / "v21", layout.V21)
-    known = [identity(open_dataset(source), index) for index in (0, 1)]
-    assert [identity(open_dataset(tmp_path / "v21"), index) for index in (0, 1)] == known
-    named_copy(source, tmp_path / "copy", rename={"observation.images.cam_side": "observation.images.left"})
-    named_copy(source, tmp_path / "again", reencode=True)
+    known = [content_uuid(open_dataset(source), index) for index in (0, 1)]
+    assert [content_uuid(open_dataset(tmp_path / "v21"), index) for index in (0, 1)] == known
+    copy_with_uuids(
+        source, tmp_path / "copy", rename={"observation.images.cam_side": "observation.images.left"}
+    )
+    copy_with_uuids(source, tmp_path / "again", reencode=True)
     for copy in ("copy", "again"):
-        assert uuids_of(named_copy(source, tmp_path / copy).root) == dict(enumerate(known))
+        assert uuids_of(copy_with_uuids(source, tmp_path / copy).root) == dict(enumerate(known))
 
 
 def test_what_an_earlier_version_imported_is_taken_with_a_word(
@@ -95,13 +97,13 @@ def test_what_an_earlier_version_imported_is_taken_with_a_word(
 ) -> None:
     source, said = written(tmp_path / "source"), []
     with monkeypatch.context() as before:
-        before.setattr(identities, "identity", identities._identity_of_numbers)
-        named_copy(source, tmp_path / "copy")
+        before.setattr(identities, "content_uuid", identities._identity_of_numbers)
+        copy_with_uuids(source, tmp_path / "copy")
     older = uuids_of(tmp_path / "copy")
     assert older[1] == OF_NUMBERS
-    named_copy(source, tmp_path / "copy", tell=said.append)
+    copy_with_uuids(source, tmp_path / "copy", tell=said.append)
     assert uuids_of(tmp_path / "copy") == older
     assert "compared numbers alone" in said[0]
     CHANGES["a float"](source)
     with pytest.raises(RecordingError, match="holds other episodes"):
-        named_copy(source, tmp_path / "copy")
+        copy_with_uuids(source, tmp_path / "copy")

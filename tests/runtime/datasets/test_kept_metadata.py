@@ -13,7 +13,7 @@ import pytest
 from runtime.core.errors import RecordingError
 from runtime.datasets import parquet_lists
 from runtime.datasets.consistency import check
-from runtime.datasets.identities import named_copy
+from runtime.datasets.identities import copy_with_uuids
 from runtime.datasets.operations import convert, delete, merge, split
 from runtime.datasets.published import publish
 from runtime.datasets.reader import open_dataset
@@ -127,7 +127,7 @@ def test_an_episode_that_is_published_is_for_training_and_changes_no_other_split
 def test_what_an_imported_copy_leaves_out_is_told(root: Path, tmp_path: Path) -> None:
     tell(root, splits={"train": "0:5", "val": "?"})
     said: list[str] = []
-    named_copy(root, tmp_path / "copy", tell=said.append)
+    copy_with_uuids(root, tmp_path / "copy", tell=said.append)
     assert splits(tmp_path / "copy") == {"train": "0:5"}
     assert said == [f"left out: {root}: split 'val' is '?', expected episodes such as '0:40' or '0:3,5:8'"]
 

@@ -20,10 +20,10 @@ from PIL import Image
 from runtime.core.errors import RecordingError
 from runtime.datasets.catalog import Catalog
 from runtime.datasets.consistency import check
-from runtime.datasets.cut import encode
+from runtime.datasets.cut import encode_segment
 from runtime.datasets.entries import Span
 from runtime.datasets.operations import convert, delete
-from runtime.datasets.pictures import StoredPictures
+from runtime.datasets.pictures import StoredImages
 from runtime.datasets.reader import open_dataset
 from runtime.datasets.stats import video_statistic
 from tests.runtime.datasets.foreign import Plan, write
@@ -276,7 +276,7 @@ def test_depth_is_not_coded_again_with_8_bits(tmp_path: Path) -> None:
     deep_video(tmp_path / "film.mp4", 3)
     assert video_statistic(tmp_path / "film.mp4", 3)["max"][0][0][0] == pytest.approx(3000 / 4095)
     with pytest.raises(RecordingError, match=r"film\.mp4 has depth of more than 8 bits"):
-        encode(Span(tmp_path / "film.mp4"), tmp_path / "new.mp4", 3, 10.0)
+        encode_segment(Span(tmp_path / "film.mp4"), tmp_path / "new.mp4", 3, 10.0)
 
 
 @pytest.mark.parametrize("kind", [pa.binary(), pa.large_binary()])
@@ -506,7 +506,7 @@ def test_a_damaged_picture_is_named_or_seen(stills: Path, kind: str) -> None:
         for place in chance.integers(0, min(len(whole), 200), 2):
             content[place] = chance.integers(0, 256)
         damaged.append({"bytes": bytes(content), "path": None})
-    pictures = StoredPictures("column", damaged, stills)
+    pictures = StoredImages("column", damaged, stills)
     said = []
     for number in range(len(pictures)):
         try:

@@ -21,7 +21,7 @@ from runtime.datasets.consistency import check
 from runtime.datasets.operations import convert, delete, merge, repair, split
 from runtime.datasets.published import publish
 from runtime.datasets.reader import open_dataset
-from runtime.datasets.sides import attach, side_files
+from runtime.datasets.sides import attach_sidecar, sidecar_paths
 from tests.runtime.datasets.foreign import Plan, column, shown, write
 from tests.runtime.datasets.small import record, seen
 
@@ -346,8 +346,8 @@ def test_deleted_episodes_are_gone_and_later_ones_move_up(ours: Path) -> None:
         for key in ("observation.state", "action", "timestamp", "frame_index"):
             assert one["sums"][key] == other["sums"][key]
         assert one["brightness"] == other["brightness"]
-    assert side_files(ours, names[1]) == {}
-    assert "streams" in side_files(ours, names[2])
+    assert sidecar_paths(ours, names[1]) == {}
+    assert "streams" in sidecar_paths(ours, names[2])
     assert sorted(path.name for path in ours.parent.iterdir()) == ["episodes", "set"]
 
 
@@ -490,7 +490,7 @@ def test_streams_annotations_and_reviews_travel_with_the_dataset(tmp_path: Path)
     publish(episodes[0], tmp_path / "one", sides=given)
     publish(episodes[1], tmp_path / "two", version="v3.0")
     merge([tmp_path / "one", tmp_path / "two"], tmp_path / "both", "v3.0")
-    first, second = (side_files(tmp_path / "both", episode.name) for episode in episodes)
+    first, second = (sidecar_paths(tmp_path / "both", episode.name) for episode in episodes)
     assert sorted(first) == ["annotations", "reviews", "streams"]
     assert sorted(second) == ["streams"]
     assert first["annotations"].read_bytes() == given["annotations"].read_bytes()
@@ -503,20 +503,20 @@ def test_streams_annotations_and_reviews_travel_with_the_dataset(tmp_path: Path)
 def test_a_side_file_is_attached_to_a_published_episode(ours: Path, tmp_path: Path) -> None:
     name = uuids(ours)[1]
     for verdict in ("pass", "fail"):
-        attach(ours, name, "reviews", lines(tmp_path / "r.jsonl", {"verdict": verdict}))
-    assert json.loads(side_files(ours, name)["reviews"].read_text()) == {"verdict": "fail"}
-    attach(ours, name, "reviews", None)
-    assert sorted(side_files(ours, name)) == ["streams"]
+        attach_sidecar(ours, name, "reviews", lines(tmp_path / "r.jsonl", {"verdict": verdict}))
+    assert json.loads(sidecar_paths(ours, name)["reviews"].read_text()) == {"verdict": "fail"}
+    attach_sidecar(ours, name, "reviews", None)
+    assert sorted(sidecar_paths(ours, name)) == ["streams"]
     assert check(ours) == []
 
 
 Attached = Callable[[Path, Path], object]
 REFUSED: list[tuple[Attached, str]] = [
-    (lambda d, p: attach(d, "00000000-0000-0000-0000-000000000000", "reviews", p), "has no episode"),
-    (lambda d, p: attach(d, "../../etc", "reviews", p), "is no uuid"),
-    (lambda d, p: attach(d, uuids(d)[0], "thoughts", p), "no kind of side file"),
-    (lambda d, p: attach(d, uuids(d)[0], "streams", p), "cannot be attached"),
-    (lambda d, p: attach(d, uuids(d)[0], "reviews", p / "absent"), "there is no file"),
+    (lambda d, p: attach_sidecar(d, "00000000-0000-0000-0000-000000000000", "reviews", p), "has no episode"),
+    (lambda d, p: attach_sidecar(d, "../../etc", "reviews", p), "is no uuid"),
+    (lambda d, p: attach_sidecar(d, uuids(d)[0], "thoughts", p), "no kind of side file"),
+    (lambda d, p: attach_sidecar(d, uuids(d)[0], "streams", p), "cannot be attached"),
+    (lambda d, p: attach_sidecar(d, uuids(d)[0], "reviews", p / "absent"), "there is no file"),
 ]
 
 
@@ -538,7 +538,7 @@ def test_a_torn_side_file_is_refused(tmp_path: Path) -> None:
 
 def test_a_side_file_of_nobody_is_found_by_the_check(ours: Path) -> None:
     shutil.copy(
-        side_files(ours, uuids(ours)[0])["streams"],
+        sidecar_paths(ours, uuids(ours)[0])["streams"],
         ours / "eva/streams/00000000-0000-0000-0000-000000000000.parquet",
     )
     assert any("is of an episode that is not in the dataset" in problem for problem in check(ours))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from runtime.core.errors import RecordingError
-from runtime.datasets.pictures import Pictures, StoredPictures
+from runtime.datasets.pictures import StoredImages, VideoFrames
 from tests.examples import some
 from tests.runtime.datasets.small import seen, write_video
 
@@ -28,7 +28,7 @@ def video(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def test_frames_read_in_order_are_the_frames_written(video: Path) -> None:
-    with Pictures(video) as pictures:
+    with VideoFrames(video) as pictures:
         assert len(pictures) == FRAMES
         assert [seen(pictures[k]) for k in range(FRAMES)] == list(range(FRAMES))
 
@@ -36,17 +36,17 @@ def test_frames_read_in_order_are_the_frames_written(video: Path) -> None:
 @given(order=st.lists(st.integers(0, FRAMES - 1), min_size=1, max_size=12))
 @settings(max_examples=some(25))
 def test_any_order_gives_the_same_pictures(video: Path, order: list[int]) -> None:
-    with Pictures(video) as pictures:
+    with VideoFrames(video) as pictures:
         assert [seen(pictures[k]) for k in order] == order
 
 
 def test_it_goes_back_after_the_end(video: Path) -> None:
-    with Pictures(video) as pictures:
+    with VideoFrames(video) as pictures:
         assert [seen(pictures[k]) for k in (FRAMES - 1, 0, FRAMES - 1, FRAMES - 2)] == [39, 0, 39, 38]
 
 
 def test_a_picture_is_rgb_and_read_only(video: Path) -> None:
-    with Pictures(video) as pictures:
+    with VideoFrames(video) as pictures:
         first = pictures[0]
         assert (first.dtype, first.shape) == (np.uint8, (48, 64, 3))
         with pytest.raises(ValueError, match="read-only"):
@@ -64,22 +64,22 @@ def test_colours_come_as_rgb(tmp_path: Path) -> None:
         red[..., 0] = 200
         container.mux(stream.encode(av.VideoFrame.from_ndarray(red, format="rgb24")))
         container.mux(stream.encode())
-    with Pictures(path) as pictures:
+    with VideoFrames(path) as pictures:
         assert np.abs(pictures[0].reshape(-1, 3).mean(axis=0) - (200, 0, 0)).max() < 8
 
 
 @pytest.mark.parametrize("index", [-1, FRAMES])
 def test_a_frame_beyond_the_video_is_refused(video: Path, index: int) -> None:
-    with Pictures(video) as pictures, pytest.raises(IndexError, match="frames 0 to 39"):
+    with VideoFrames(video) as pictures, pytest.raises(IndexError, match="frames 0 to 39"):
         pictures[index]
 
 
 def test_a_file_that_is_no_video_is_named(tmp_path: Path) -> None:
     (tmp_path / "film.mp4").write_bytes(b"no video at all")
     with pytest.raises(RecordingError, match=r"film\.mp4"):
-        Pictures(tmp_path / "film.mp4")
+        VideoFrames(tmp_path / "film.mp4")
     with pytest.raises(RecordingError, match=r"no video .*absent\.mp4"):
-        Pictures(tmp_path / "absent.mp4")
+        VideoFrames(tmp_path / "absent.mp4")
 
 
 def damage(path: Path, frame: int) -> None:
@@ -111,10 +111,10 @@ def noise(path: Path, frames: int) -> None:
 def test_a_damaged_frame_is_an_error_and_never_a_guess(tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
     noise(path, 12)
-    with Pictures(path) as pictures:
+    with VideoFrames(path) as pictures:
         whole = [pictures[k] for k in range(12)]
     damage(path, 4)
-    with Pictures(path) as pictures:
+    with VideoFrames(path) as pictures:
         for k in (0, 3, 8, 11):
             assert np.array_equal(pictures[k], whole[k])
         with pytest.raises(RecordingError, match=r"film\.mp4, frame 4 cannot be decoded"):
@@ -129,13 +129,13 @@ def test_going_backwards_decodes_a_group_a_few_times_and_not_once_a_frame(
     path = tmp_path / "film.mp4"
     write_video(path, frames, 30)
     monkeypatch.setattr("runtime.datasets.pictures.KEPT_BYTES", kept * 48 * 64 * 3 // 2)
-    with Pictures(path) as pictures:
+    with VideoFrames(path) as pictures:
         seeks = []
         seek = pictures._seek
         monkeypatch.setattr(pictures, "_seek", lambda index: (seeks.append(index), seek(index)))
         shades = [float(pictures[k].mean()) for k in reversed(range(frames))]
     assert seeks == [39, 27, 15, 3]
-    with Pictures(path) as pictures:
+    with VideoFrames(path) as pictures:
         assert shades == [float(pictures[k].mean()) for k in range(frames)][::-1]
 
 
@@ -146,15 +146,15 @@ def test_a_picture_whose_header_says_that_it_is_huge_is_not_decoded(tmp_path: Pa
     size = content.index(b"\xff\xc0") + 5
     huge = content[:size] + struct.pack(">HH", 5000, 6000) + content[size + 4 :]
     with pytest.raises(RecordingError, match="picture 0 is 6000 x 5000; allowed: 16777216 pixels"):
-        StoredPictures("cam", [{"bytes": huge}], tmp_path)[0]
+        StoredImages("cam", [{"bytes": huge}], tmp_path)[0]
 
 
 def test_a_picture_of_thousands_of_scans_is_not_decoded(tmp_path: Path) -> None:
     coded = io.BytesIO()
     Image.new("RGB", (16, 16)).save(coded, "JPEG", progressive=True)
     content = coded.getvalue()
-    assert StoredPictures("cam", [{"bytes": content}], tmp_path)[0].shape == (16, 16, 3)
+    assert StoredImages("cam", [{"bytes": content}], tmp_path)[0].shape == (16, 16, 3)
     last = content.rindex(b"\xff\xda")
     many = content[:last] + 1000 * content[last:-2] + content[-2:]
     with pytest.raises(RecordingError, match=r"picture 0 has 10\d+ scans; allowed: 64"):
-        StoredPictures("cam", [{"bytes": many}], tmp_path)[0]
+        StoredImages("cam", [{"bytes": many}], tmp_path)[0]

@@ -560,7 +560,7 @@ def test_recovery_takes_back_every_trace(
     tmp_path: Path, interrupted_of_another_task: Interrupted, steps: int
 ) -> None:
     dataset = interrupted_of_another_task.copy(steps, tmp_path / "set")
-    with staging.locked(dataset):
+    with staging.lock_dataset(dataset):
         staging.recover(dataset)
     assert contents(dataset) == contents(interrupted_of_another_task.old)
     assert check(dataset) == []
@@ -720,7 +720,7 @@ def test_in_v30_a_crash_between_renames_is_taken_back_without_a_trace(
 ) -> None:
     dataset = interrupted_v30.copy(steps, tmp_path / "set")
     assert [entry.length for entry in open_dataset(dataset).episodes] == [6]
-    with staging.locked(dataset):
+    with staging.lock_dataset(dataset):
         staging.recover(dataset)
     assert contents(dataset) == contents(interrupted_v30.old)
     done = publish(interrupted_v30.episode, dataset)

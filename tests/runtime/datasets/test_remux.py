@@ -8,7 +8,7 @@ import av
 import pytest
 
 from runtime.core.errors import RecordingError
-from runtime.datasets.pictures import Pictures
+from runtime.datasets.pictures import VideoFrames
 from runtime.datasets.remux import VideoFacts, cut, remux
 from tests.runtime.datasets.small import record, seen, write_video
 
@@ -26,7 +26,7 @@ def test_frame_k_is_shown_at_k_over_fps(tmp_path: Path, fps: float) -> None:
 def test_the_video_is_cut_at_the_rows(tmp_path: Path) -> None:
     write_video(tmp_path / "film.mp4", 20, 30, b_frames=0)
     remux(tmp_path / "film.mp4", tmp_path / "out.mp4", 13, 30)
-    with Pictures(tmp_path / "out.mp4") as pictures:
+    with VideoFrames(tmp_path / "out.mp4") as pictures:
         assert [seen(pictures[k]) for k in range(len(pictures))] == list(range(13))
 
 
@@ -40,7 +40,7 @@ def test_the_index_comes_first(tmp_path: Path) -> None:
 def test_it_reads_the_fragments_of_the_recorder(tmp_path: Path) -> None:
     episode = record(tmp_path, frames=40)
     remux(episode / "cam_high.mp4", tmp_path / "out.mp4", 40, 30)
-    with Pictures(tmp_path / "out.mp4") as pictures:
+    with VideoFrames(tmp_path / "out.mp4") as pictures:
         assert [seen(pictures[k]) for k in (39, 0, 20)] == [39, 0, 20]
 
 
@@ -83,7 +83,7 @@ def test_a_clip_begins_with_the_key_frame_before_and_ends_where_it_is_said(tmp_p
         target = io.BytesIO()
         assert cut(tmp_path / "film.mp4", target, begin, end) == pytest.approx(first / 10)
         (tmp_path / "clip.mp4").write_bytes(target.getvalue())
-        with Pictures(tmp_path / "clip.mp4") as pictures:
+        with VideoFrames(tmp_path / "clip.mp4") as pictures:
             assert [seen(pictures[k]) for k in range(len(pictures))] == list(range(first, last + 1))
     with pytest.raises(RecordingError, match="no pictures from"):
         cut(tmp_path / "film.mp4", io.BytesIO(), 0.0, 0.0)

@@ -10,7 +10,14 @@ from pathlib import Path
 import pytest
 
 from runtime.core.errors import TransportError
-from runtime.ipc.endpoints import LONGEST, Endpoints, fresh_path, identity, socket_folder, trouble
+from runtime.ipc.endpoints import (
+    LONGEST,
+    Endpoints,
+    connection_problem,
+    file_identity,
+    new_socket_path,
+    socket_folder,
+)
 
 
 @pytest.fixture
@@ -56,7 +63,7 @@ def test_two_stations_of_one_name_in_different_data_folders_do_not_meet(
 
 def test_a_long_name_makes_no_longer_path(runtime_dir: Path, tmp_path: Path) -> None:
     station = tmp_path.joinpath(*["x" * 60] * 5)
-    assert len(os.fsencode(fresh_path(station, "commands"))) <= LONGEST
+    assert len(os.fsencode(new_socket_path(station, "commands"))) <= LONGEST
 
 
 def test_a_folder_whose_sockets_would_have_too_long_paths_is_refused(
@@ -68,7 +75,7 @@ def test_a_folder_whose_sockets_would_have_too_long_paths_is_refused(
     for folder in (fits, too_long):
         folder.mkdir(mode=0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(fits))
-    assert len(os.fsencode(fresh_path(tmp_path, "commands"))) == LONGEST
+    assert len(os.fsencode(new_socket_path(tmp_path, "commands"))) == LONGEST
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(too_long))
     with pytest.raises(TransportError, match=r"up to 108 bytes; allowed: 107; set XDG_RUNTIME_DIR"):
         socket_folder(tmp_path)
@@ -110,10 +117,10 @@ def test_a_session_folder_in_which_others_may_write_is_refused(runtime_dir: Path
 def test_what_dead_processes_left_of_a_socket_is_removed_by_the_next(
     runtime_dir: Path, tmp_path: Path
 ) -> None:
-    left, other = fresh_path(tmp_path, "commands"), fresh_path(tmp_path, "state")
+    left, other = new_socket_path(tmp_path, "commands"), new_socket_path(tmp_path, "state")
     left.touch()
     other.touch()
-    assert fresh_path(tmp_path, "commands") != left
+    assert new_socket_path(tmp_path, "commands") != left
     assert (left.exists(), other.exists()) == (False, True)
     Endpoints(tmp_path).clear()
     assert list((runtime_dir / "eva-web").iterdir()) == []
@@ -127,11 +134,11 @@ def test_a_file_that_somebody_removes_is_missed(
     endpoints = Endpoints(tmp_path)
     endpoints.write("guard", {"estop": "ipc://x"})
     now = 2.0
-    assert not endpoints.lost("guard")
+    assert not endpoints.is_missing("guard")
     (tmp_path / "endpoints" / "guard.json").unlink()
-    assert not endpoints.lost("guard"), "it has looked just now"
+    assert not endpoints.is_missing("guard"), "it has looked just now"
     now = 4.0
-    assert endpoints.lost("guard")
+    assert endpoints.is_missing("guard")
 
 
 @pytest.mark.parametrize("spoiled", [b"", b"garbage", b"5", b"[]", b"{}", b"\xff", b"[" * 200_000])
@@ -144,14 +151,14 @@ def test_a_file_that_holds_something_else_is_missed(
     endpoints.write("guard", {"estop": "ipc://x"})
     (tmp_path / "endpoints" / "guard.json").write_bytes(spoiled)
     now = 2.0
-    assert endpoints.lost("guard")
+    assert endpoints.is_missing("guard")
     if spoiled != b"{}":
         with pytest.raises(TransportError, match="is not running here"):
             endpoints.read("guard")
     successor = Endpoints(tmp_path)
     successor.write("guard", {"estop": "ipc://y"})
     now = 4.0
-    assert not endpoints.lost("guard"), "what another process says of itself stays"
+    assert not endpoints.is_missing("guard"), "what another process says of itself stays"
 
 
 # --- what happens to the folder while a station runs -------------------------------------------------------
@@ -166,13 +173,13 @@ def test_a_station_that_runs_goes_elsewhere_where_its_folder_is_of_no_use_and_sa
     station = runtime_dir / "s"
     station.mkdir()
     runtime_dir.chmod(0o777)
-    assert fresh_path(station, "estop").is_relative_to(home)
+    assert new_socket_path(station, "estop").is_relative_to(home)
     assert "has the mode 0777" in caplog.text
     (home / ".cache").rename(home / "away")
     (home / ".cache").symlink_to(tmp_path / "nowhere")
-    assert fresh_path(station, "estop").parent == station / "sockets"
+    assert new_socket_path(station, "estop").parent == station / "sockets"
     with pytest.raises(TransportError, match="mode 0777"):
-        Endpoints(station).begin()
+        Endpoints(station).prepare()
     Endpoints(station).clear()
     assert not (station / "sockets").exists()
 
@@ -183,7 +190,7 @@ def test_a_socket_that_clients_cannot_trust_to_be_there_is_none(runtime_dir: Pat
     folder.mkdir(0o700)
     path = folder / "estop-1"
     path.touch()
-    before = identity(path)
+    before = file_identity(path)
     if what == "removed":
         path.unlink()
     elif what == "another file":
@@ -194,17 +201,19 @@ def test_a_socket_that_clients_cannot_trust_to_be_there_is_none(runtime_dir: Pat
     else:
         folder.rename(runtime_dir / "g")
     assert before != (0, 0)
-    assert identity(path) != before
+    assert file_identity(path) != before
 
 
 def test_what_is_wrong_with_a_socket_is_said_with_what_to_do(runtime_dir: Path) -> None:
     path = runtime_dir / "estop-1"
-    assert trouble(f"ipc://{path}").startswith(f"nobody listens at {path} (No such file or directory): where")
+    assert connection_problem(f"ipc://{path}").startswith(
+        f"nobody listens at {path} (No such file or directory): where"
+    )
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(str(path))
-        assert "Connection refused" in trouble(f"ipc://{path}")
+        assert "Connection refused" in connection_problem(f"ipc://{path}")
         listening.listen(1)
-        assert trouble(f"ipc://{path}") == ""
+        assert connection_problem(f"ipc://{path}") == ""
 
 
 def test_a_file_that_the_disk_does_not_give_up_ends_nobody(tmp_path, caplog):

@@ -13,8 +13,8 @@ import zmq
 from runtime.core.errors import TransportError
 from runtime.ipc import bus
 from runtime.ipc.bus import CommandServer, Endpoints
-from runtime.ipc.endpoints import account
-from runtime.ipc.estop_client import NoAnswer, NotSent, urgent
+from runtime.ipc.endpoints import account_name
+from runtime.ipc.estop_client import NoAnswer, NotSent, send_urgent
 from runtime.ipc.messages import Ack, Command
 
 PRESS = Command("u", "estop", {"why": "smoke"})
@@ -42,7 +42,7 @@ class Answering:
                 self.pressed.append(asked[1].uuid)
                 if not self.deaf:
                     self.server.answer(asked[0], Ack(asked[1].uuid, "done"))
-            if self.server.moved():
+            if self.server.rebind_if_unreachable():
                 self._tell()
 
     def close(self) -> None:
@@ -92,7 +92,7 @@ def test_a_press_reaches_a_station_whose_folder_changes_while_it_runs(
         session.rename(session.with_name(f"{session.name}-away"))
     else:
         next((session / "eva-web").iterdir()).chmod(0o777)
-    assert urgent(context, guard.endpoints, GUARD, PRESS, 30.0).status == "done"
+    assert send_urgent(context, guard.endpoints, GUARD, PRESS, 30.0).status == "done"
     assert "u" in guard.pressed
 
 
@@ -116,7 +116,7 @@ def test_a_press_waits_for_the_file_that_says_where_as_long_as_the_socket_is_the
             guard._tell()  # as the guard does within its next looks
 
     monkeypatch.setattr(Endpoints, "read", missed_once)
-    assert urgent(context, endpoints, GUARD, PRESS, 30.0).status == "done"
+    assert send_urgent(context, endpoints, GUARD, PRESS, 30.0).status == "done"
     assert guard.pressed == ["u"]
 
 
@@ -125,12 +125,12 @@ def test_where_nobody_listens_it_is_said_that_nothing_was_sent_and_what_to_do(
 ) -> None:
     endpoints = Endpoints(folder)
     with pytest.raises(TransportError, match="'bench' is not running here"):
-        urgent(context, endpoints, GUARD, PRESS, 0.1)
+        send_urgent(context, endpoints, GUARD, PRESS, 0.1)
     endpoints.write("guard", {"estop": f"ipc://{folder}/nobody"})
     with pytest.raises(
         NotSent, match=r"estop was not sent: nobody listens at .*: press again; else start it again"
     ):
-        urgent(context, endpoints, GUARD, PRESS, 0.1)
+        send_urgent(context, endpoints, GUARD, PRESS, 0.1)
 
 
 def test_a_guard_that_does_not_answer_is_an_unknown_outcome(
@@ -138,7 +138,7 @@ def test_a_guard_that_does_not_answer_is_an_unknown_outcome(
 ) -> None:
     guard.deaf = True
     with pytest.raises(NoAnswer, match=r"no answer to estop within 0.1 s: outcome unknown$"):
-        urgent(context, guard.endpoints, GUARD, PRESS, 0.1)
+        send_urgent(context, guard.endpoints, GUARD, PRESS, 0.1)
 
 
 def test_the_answer_of_another_account_is_no_acknowledgement(
@@ -146,7 +146,7 @@ def test_the_answer_of_another_account_is_no_acknowledgement(
 ) -> None:
     monkeypatch.setattr(bus, "_peer", lambda frame: (4711, 99))
     with pytest.raises(
-        NoAnswer, match=rf"the process 99 of {account(4711)} answers at ipc://.*: not believed"
+        NoAnswer, match=rf"the process 99 of {account_name(4711)} answers at ipc://.*: not believed"
     ):
-        urgent(context, guard.endpoints, GUARD, PRESS, 0.5)
+        send_urgent(context, guard.endpoints, GUARD, PRESS, 0.5)
     assert guard.pressed == ["u"], "it was sent there all the same"

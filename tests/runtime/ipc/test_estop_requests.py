@@ -8,14 +8,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.ipc.estop_requests import LONGEST, WHY, in_json, in_packed, why_in
+from runtime.ipc.estop_requests import (
+    DEFAULT_REASON,
+    LONGEST,
+    json_reason,
+    parse_json_press,
+    parse_packed_press,
+)
 from runtime.ipc.messages import Command, decode, encode
 from tests import presses
 
 
 @pytest.mark.parametrize("name", presses.PACKED)
 def test_a_message_of_the_bus_that_says_so_is_a_press_whatever_is_wrong_with_it(name: str) -> None:
-    press = in_packed(presses.PACKED[name])
+    press = parse_packed_press(presses.PACKED[name])
     assert press is not None
     assert press.kind == "estop"
     assert 0 < len(press.uuid) <= 64
@@ -24,7 +30,7 @@ def test_a_message_of_the_bus_that_says_so_is_a_press_whatever_is_wrong_with_it(
 
 
 def test_a_press_with_nothing_wrong_is_read_as_it_was_written() -> None:
-    assert in_packed(presses.WHOLE) == Command("u", "estop", {"why": "smoke"}, "ann", "ann")
+    assert parse_packed_press(presses.WHOLE) == Command("u", "estop", {"why": "smoke"}, "ann", "ann")
 
 
 @pytest.mark.parametrize(
@@ -39,26 +45,26 @@ def test_a_press_with_nothing_wrong_is_read_as_it_was_written() -> None:
     ],
 )
 def test_what_was_wrong_is_said_in_the_reason(name: str, why: str) -> None:
-    press = in_packed(presses.PACKED[name])
+    press = parse_packed_press(presses.PACKED[name])
     assert press is not None
     assert press.args["why"] == why
 
 
 @pytest.mark.parametrize("name", presses.OTHERS)
 def test_a_message_of_another_kind_is_no_press_though_the_word_is_in_it(name: str) -> None:
-    assert in_packed(presses.OTHERS[name]) is None
+    assert parse_packed_press(presses.OTHERS[name]) is None
 
 
 @given(presses.packed())
 def test_any_mutation_on_the_bus_that_still_names_it_presses(payload: bytes) -> None:
-    press = in_packed(payload)
+    press = parse_packed_press(payload)
     assert press is not None
     assert decode(encode(press)) == press
 
 
 @given(st.binary())
 def test_bytes_without_the_word_are_no_press(payload: bytes) -> None:
-    assert in_packed(payload) is None or b"estop" in payload
+    assert parse_packed_press(payload) is None or b"estop" in payload
 
 
 @pytest.mark.parametrize("key", ["type", "kind"])
@@ -66,14 +72,14 @@ def test_bytes_without_the_word_are_no_press(payload: bytes) -> None:
 def test_a_message_in_json_that_says_so_is_a_press_whatever_is_wrong_with_it(key: str, name: str) -> None:
     text = presses.in_json(key)[name]
     for said in (text, text.encode("utf-8"), text.encode("utf-16"), text.encode() + b"\xff"):
-        found = in_json(said, key)
+        found = parse_json_press(said, key)
         assert found is not None
-        assert 0 < len(why_in(found)) <= LONGEST
+        assert 0 < len(json_reason(found)) <= LONGEST
 
 
 @given(presses.json_texts("type"))
 def test_any_mutation_in_json_that_still_names_it_presses(text: str) -> None:
-    assert in_json(text, "type") is not None
+    assert parse_json_press(text, "type") is not None
 
 
 @pytest.mark.parametrize(
@@ -89,12 +95,12 @@ def test_any_mutation_in_json_that_still_names_it_presses(text: str) -> None:
     ],
 )
 def test_json_that_says_something_else_is_no_press(said: object) -> None:
-    assert in_json(json.dumps(said), "type") is None
+    assert parse_json_press(json.dumps(said), "type") is None
 
 
 @given(st.text() | st.binary())
 def test_a_text_without_the_word_is_no_press(said: str | bytes) -> None:
-    assert in_json(said, "type") is None or ("estop" if isinstance(said, str) else b"estop") in said
+    assert parse_json_press(said, "type") is None or ("estop" if isinstance(said, str) else b"estop") in said
 
 
 @pytest.mark.parametrize(
@@ -103,29 +109,33 @@ def test_a_text_without_the_word_is_no_press(said: str | bytes) -> None:
         ({"why": "smoke"}, "smoke"),
         ({"args": {"why": "smoke"}}, "smoke"),
         ({"arguments": {"why": "smoke"}, "why": ""}, "smoke"),
-        ({"why": [], "args": 3}, WHY),
+        ({"why": [], "args": 3}, DEFAULT_REASON),
         ({"why": "a\x00\ud800"}, "a?"),
     ],
 )
 def test_the_reason_is_found_where_people_write_it(said: dict[str, object], why: str) -> None:
-    assert why_in(said) == why
+    assert json_reason(said) == why
 
 
 @pytest.mark.parametrize("many", [3_000, 200_000])
 def test_a_long_message_is_looked_at_where_it_begins_and_ends(many):
     """What whoever sends a lot costs must not keep the presses of others waiting."""
     noise = ("kind" + " " * 9 + ":" + " " * 9) * (many // 22)
-    assert in_json(noise + "\\u0041 estop", "kind") in (None, {})
+    assert parse_json_press(noise + "\\u0041 estop", "kind") in (None, {})
     looked = []
-    told = in_json('{"kind": "estop", "why": "smoke", "uuid": "u-1", "args": "' + "x" * many + '"}', "kind")
+    told = parse_json_press(
+        '{"kind": "estop", "why": "smoke", "uuid": "u-1", "args": "' + "x" * many + '"}', "kind"
+    )
     looked.append(told)
     looked.append(
-        in_json('{"args": "' + "x" * many + '", "uuid": "u-1", "why": "smoke", "kind": "estop"}', "kind")
+        parse_json_press(
+            '{"args": "' + "x" * many + '", "uuid": "u-1", "why": "smoke", "kind": "estop"}', "kind"
+        )
     )
     assert [(one["why"], one["uuid"]) for one in looked] == [("smoke", "u-1")] * 2
-    assert in_json('{"kind": "move", "args": "' + "estop " * many + '"}', "kind") is None
+    assert parse_json_press('{"kind": "move", "args": "' + "estop " * many + '"}', "kind") is None
 
 
 def test_a_long_message_that_is_no_press_is_not_parsed(monkeypatch):
     monkeypatch.setattr("runtime.ipc.estop_requests._JSON", None)
-    assert in_json("[" + '{"a":1},' * 20_000 + '{"type": "\\u0041 estop"}]', "kind") is None
+    assert parse_json_press("[" + '{"a":1},' * 20_000 + '{"type": "\\u0041 estop"}]', "kind") is None

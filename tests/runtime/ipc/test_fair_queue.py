@@ -13,9 +13,9 @@ import zmq
 
 from runtime.core.msgpack_arrays import pack
 from runtime.ipc import bus
-from runtime.ipc.bus import GREEDY, TURN, CommandServer
+from runtime.ipc.bus import MAX_MESSAGES_PER_TURN, MAX_WAITING_PER_CONNECTION, CommandServer
 from runtime.ipc.estop_requests import kind_of
-from runtime.ipc.fair_queue import Turns
+from runtime.ipc.fair_queue import FairQueue
 from runtime.ipc.messages import Ack, Command, decode, encode
 from tests.processes import PATIENCE_MS, PATIENCE_S
 
@@ -29,7 +29,7 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self.context: zmq.Context[Any] = zmq.Context()
         self.server = CommandServer(self.context, folder, "commands")
-        self.turns = Turns(self.server, STOPS, SHARE)
+        self.turns = FairQueue(self.server, STOPS, SHARE)
 
     def client(self) -> zmq.Socket[bytes]:
         made: zmq.Socket[bytes] = self.context.socket(zmq.DEALER)
@@ -40,8 +40,8 @@ class Bench:
 
     def take(self) -> tuple[list[str], list[str]]:
         """The uuids of one turn; each is answered."""
-        self.server.socket.poll(0 if self.turns.waiting else 2000)
-        urgent, others = self.turns.take()
+        self.server.socket.poll(0 if self.turns.has_waiting else 2000)
+        urgent, others = self.turns.take_turn()
         for call, command in (*urgent, *others):
             self.server.answer(call, Ack(command.uuid, "done"))
         return [command.uuid for _, command in urgent], [command.uuid for _, command in others]
@@ -131,17 +131,17 @@ def test_a_stop_behind_ten_thousand_questions_of_ones_own_is_seen_too(bench: Ben
     for number in range(10_000):
         client.send(said("status", str(number)))
     client.send(said("halt", "mine"))
-    assert bench.turns_until("mine") < 10_000 / GREEDY
+    assert bench.turns_until("mine") < 10_000 / MAX_WAITING_PER_CONNECTION
 
 
 def test_a_turn_is_bounded_however_much_has_come(bench: Bench) -> None:
     client = bench.client()
-    for number in range(3 * TURN):
+    for number in range(3 * MAX_MESSAGES_PER_TURN):
         client.send(said("status", str(number)))
     for _ in range(3):
         urgent, others = bench.take()
         assert (len(urgent), len(others) <= SHARE) == (0, True)
-        assert sum(map(len, bench.turns._waiting.values())) <= GREEDY
+        assert sum(map(len, bench.turns._waiting.values())) <= MAX_WAITING_PER_CONNECTION
 
 
 def test_what_is_too_much_is_refused_unread_and_says_so(bench: Bench) -> None:
@@ -165,12 +165,12 @@ def test_what_is_too_much_is_refused_unread_and_says_so(bench: Bench) -> None:
 
 def test_each_connection_has_its_turn(bench: Bench) -> None:
     greedy, modest = bench.client(), bench.client()
-    for number in range(GREEDY):
+    for number in range(MAX_WAITING_PER_CONNECTION):
         greedy.send(said("status", str(number)))
     bench.turns._share = 0
-    while sum(map(len, bench.turns._waiting.values())) < GREEDY:
+    while sum(map(len, bench.turns._waiting.values())) < MAX_WAITING_PER_CONNECTION:
         assert bench.server.socket.poll(PATIENCE_MS)
-        bench.turns.take()
+        bench.turns.take_turn()
     bench.turns._share = SHARE
     assert len(bench.take()[1]) == SHARE
     modest.send(said("status", "modest"))
@@ -208,7 +208,7 @@ def test_no_more_of_a_flood_of_long_garbage_is_read_in_a_turn_than_its_share(
 
 
 def test_what_is_too_long_for_a_server_is_refused_unread_but_for_a_press(bench: Bench) -> None:
-    bench.turns = Turns(bench.server, (), SHARE, 100)
+    bench.turns = FairQueue(bench.server, (), SHARE, 100)
     client = bench.client()
     client.send(said("status", more="x" * 200))
     client.send(said("estop", "mine", why="x" * 200_000))

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from runtime.core.errors import ConfigurationError
-from runtime.ipc.endpoints import account
-from runtime.ipc.identity import Key, forged, identified, lacking, named
+from runtime.ipc.endpoints import account_name
+from runtime.ipc.identity import Key, authenticate, display_name, missing_role, unverified_reason
 from runtime.ipc.messages import Command, decode, encode
 
 OWN = os.geteuid()
@@ -24,7 +24,7 @@ def key(tmp_path: Path) -> Key:
 
 
 def as_known(command: Command, key: Key, signature: bytes = b"", uid: int | None = OWN) -> Command:
-    return identified(command, encode(command), signature, uid, key)
+    return authenticate(command, encode(command), signature, uid, key)
 
 
 # --- the key -------------------------------------------------------------------------------------------------
@@ -95,7 +95,7 @@ def test_a_key_that_was_replaced_is_taken(key: Key) -> None:
 def test_what_the_web_signs_is_believed(key: Key) -> None:
     known = as_known(RUN, key, key.sign(encode(RUN)))
     assert known == RUN
-    assert (forged(known), lacking(known), named(known)) == ("", "", "ann (operator)")
+    assert (unverified_reason(known), missing_role(known), display_name(known)) == ("", "", "ann (operator)")
 
 
 CHANGES = {
@@ -119,7 +119,7 @@ def test_a_signature_is_for_this_command_and_no_other(key: Key, field: str) -> N
     known = as_known(replace(RUN, **{field: CHANGES[field]}), key, signature)
     assert known.role == "unverified"
     assert known.user.endswith(" (unverified)")
-    assert "not signed by this lab's web" in forged(known)
+    assert "not signed by this lab's web" in unverified_reason(known)
 
 
 @pytest.mark.parametrize("signature", [b"\0", bytes(32), b"x" * 1000])
@@ -139,33 +139,37 @@ def test_every_field_of_a_command_is_signed() -> None:
 def test_a_program_is_the_account_that_connects_whatever_it_says(key: Key) -> None:
     said = Command("u", "run", user="root", holder="terminal:root@moon", role="admin")
     known = as_known(said, key)
-    assert (known.user, known.role) == (f"account:{account(OWN)}", "local")
-    assert (forged(known), lacking(known)) == ("", "")
-    assert named(known) == f"account:{account(OWN)}"
+    assert (known.user, known.role) == (f"account:{account_name(OWN)}", "local")
+    assert (unverified_reason(known), missing_role(known)) == ("", "")
+    assert display_name(known) == f"account:{account_name(OWN)}"
 
 
 @pytest.mark.parametrize("uid", [None, 4711])
 def test_who_is_not_known_or_another_account_is_not_obeyed(key: Key, uid: int | None) -> None:
     known = as_known(Command("u", "run", user="ann", holder="terminal:ann@bench"), key, uid=uid)
     assert (known.user, known.role) == ("ann (unverified)", "unverified")
-    assert forged(known)
-    assert forged(as_known(Command("u", "run", holder="channel:lab#1"), key, uid=uid)), "nor as a script"
+    assert unverified_reason(known)
+    assert unverified_reason(as_known(Command("u", "run", holder="channel:lab#1"), key, uid=uid)), (
+        "nor as a script"
+    )
 
 
 def test_without_a_signature_nobody_is_a_page(key: Key) -> None:
     known = as_known(RUN, key)
-    assert (known.user, bool(forged(known))) == ("ann (unverified)", True)
+    assert (known.user, bool(unverified_reason(known))) == ("ann (unverified)", True)
 
 
 def test_a_script_is_obeyed_and_never_called_verified(key: Key) -> None:
     known = as_known(Command("u", "run", holder="channel:lab#1"), key)
-    assert (known.user, known.role, forged(known)) == ("channel:lab#1 (unverified)", "script", "")
+    assert (known.user, known.role, unverified_reason(known)) == ("channel:lab#1 (unverified)", "script", "")
 
 
 @pytest.mark.parametrize(("role", "may"), [("viewer", False), ("", False), ("guest", False), ("admin", True)])
 def test_a_role_is_asked_for_what_changes_something(key: Key, role: str, may: bool) -> None:
     said = replace(RUN, role=role)
     known = as_known(said, key, key.sign(encode(said)))
-    assert (lacking(known) == "") is may
-    assert lacking(replace(known, kind="lease_claim")) == lacking(known).replace("run", "lease_claim", 1)
-    assert all(lacking(replace(known, kind=kind)) == "" for kind in ("status", "lease_renew", "aim"))
+    assert (missing_role(known) == "") is may
+    assert missing_role(replace(known, kind="lease_claim")) == missing_role(known).replace(
+        "run", "lease_claim", 1
+    )
+    assert all(missing_role(replace(known, kind=kind)) == "" for kind in ("status", "lease_renew", "aim"))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from robots import Robot, load
+from robots import Robot, load_robot
 
 
 def _limit(lower: float, upper: float, velocity: float) -> str:
@@ -76,4 +76,4 @@ def crane(folder: Path) -> Robot:
     tree = "".join(f'<link name="{link}"/>' for link in sorted(links)) + joints
     (folder / "crane.urdf").write_text(f'<robot name="crane">{tree}</robot>', "utf-8")
     (folder / "robot.toml").write_text(_DESCRIPTION, "utf-8")
-    return load(folder)
+    return load_robot(folder)

@@ -7,7 +7,7 @@ from runtime.kinematics.__main__ import main
 def test_every_robot_is_made_ready_and_named(capsys):
     assert main([]) == 0
     said = capsys.readouterr().out
-    assert [line.split(":")[0] for line in said.splitlines()] == list(robots.names())
+    assert [line.split(":")[0] for line in said.splitlines()] == list(robots.robot_names())
 
 
 def test_a_robot_that_does_not_exist_is_named_with_those_that_do(capsys):

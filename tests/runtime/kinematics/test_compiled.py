@@ -16,18 +16,18 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from robots import Robot, load, names
+from robots import Robot, load_robot, robot_names
 from robots.rotations import transform_of
 from runtime.kinematics import kernel_cache
 from runtime.kinematics.base import IkFlag, IkResult, KinematicsError
 from runtime.kinematics.compiled import CompiledKinematics, Config, build
-from runtime.kinematics.kernels.chains import poses_of
+from runtime.kinematics.kernels.chains import compute_poses
 from runtime.kinematics.kernels.chunks import solve_chunk
 from tests.examples import some
 from tests.runtime.kinematics.crane import crane
 from tests.sources import ROOT
 
-ROBOT = load("agilex_piper")
+ROBOT = load_robot("agilex_piper")
 KINEMATICS = CompiledKinematics(ROBOT)
 HOME = ROBOT.poses["home"]
 ARM_DIMS = np.concatenate([arm.joint_dims for arm in ROBOT.arms])
@@ -169,7 +169,7 @@ def one_armed(tmp_path: Path) -> Robot:
     text = file.read_text()
     assert text.count(arm) == 2
     file.write_text(text.replace(arm, "", 1))
-    return load(folder)
+    return load_robot(folder)
 
 
 def test_tolerances_decide_what_counts_as_reached() -> None:
@@ -242,9 +242,9 @@ def test_recorded_poses_of_both_arms_are_solved_close_to_the_recorded_joints() -
 # Arms of any make
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", robot_names())
 def test_forward_is_what_the_chains_of_every_robot_say(name: str) -> None:
-    robot = load(name)
+    robot = load_robot(name)
     q = np.random.default_rng(1).uniform(
         np.maximum(robot.lower, -9), np.minimum(robot.upper, 9), (20, robot.dim)
     )
@@ -408,7 +408,7 @@ def test_a_great_rest_weight_holds_the_arm_back_from_its_targets() -> None:
 
 def test_nothing_is_compiled_once_a_robot_is_built_whatever_the_arrays_are() -> None:
     kinematics = build(Config(), ROBOT)
-    known = len(solve_chunk.signatures), len(poses_of.signatures)  # type: ignore[attr-defined]
+    known = len(solve_chunk.signatures), len(compute_poses.signatures)  # type: ignore[attr-defined]
     seed = within(np.full(14, 0.5))
     targets = KINEMATICS.forward(np.stack([seed] * 4))
     expected = kinematics.solve(targets, seed).q
@@ -423,7 +423,7 @@ def test_nothing_is_compiled_once_a_robot_is_built_whatever_the_arrays_are() -> 
         np.testing.assert_array_equal(kinematics.solve(given_targets, given_seed).q, expected)  # type: ignore[arg-type]
     kinematics.solve(single, seed.astype(np.float32), np.float32(0.1), ROBOT.poses["home"], np.int64(1))  # type: ignore[arg-type]
     kinematics.forward(ROBOT.poses["home"])
-    assert (len(solve_chunk.signatures), len(poses_of.signatures)) == known  # type: ignore[attr-defined]
+    assert (len(solve_chunk.signatures), len(compute_poses.signatures)) == known  # type: ignore[attr-defined]
 
 
 def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -494,7 +494,7 @@ def test_what_is_kept_on_disk_and_broken_is_compiled_again(tmp_path: Path) -> No
         "compiled.build(compiled.Config(), robots.load('ur5e'))"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    build(Config(), load("ur5e"))  # so that it is kept
+    build(Config(), load_robot("ur5e"))  # so that it is kept
     kept_at = kernel_cache.folder()
     assert kept_at is not None
     shutil.copytree(kept_at, tmp_path / kept_at.name)

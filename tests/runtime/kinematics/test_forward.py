@@ -15,9 +15,9 @@ from runtime.kinematics.forward import ChainForward
 from tests.sources import ROOT
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_it_says_what_the_compiled_kinematics_say(name: str) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     q = np.random.default_rng(2).uniform(
         np.maximum(robot.lower, -9), np.minimum(robot.upper, 9), (4, 3, robot.dim)
     )
@@ -28,7 +28,7 @@ def test_it_says_what_the_compiled_kinematics_say(name: str) -> None:
 
 def test_joints_of_another_width_are_refused() -> None:
     with pytest.raises(KinematicsError, match=r"shape \(16,\) were given; allowed: \[\.\.\., 14\]"):
-        ChainForward(robots.load("agilex_piper")).forward(np.zeros(16))
+        ChainForward(robots.load_robot("agilex_piper")).forward(np.zeros(16))
 
 
 def test_control_and_media_load_no_compiler() -> None:

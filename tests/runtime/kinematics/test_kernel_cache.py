@@ -10,7 +10,7 @@ import pytest
 import robots
 from runtime.kinematics import kernel_cache
 
-ROBOT = robots.load("ur5e")
+ROBOT = robots.load_robot("ur5e")
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_what_is_there_is_compiled_for_that_robot_alone(kept: Path) -> None:
     assert kernel_cache.is_compiled(ROBOT)
-    assert not kernel_cache.is_compiled(robots.load("agilex_piper"))
+    assert not kernel_cache.is_compiled(robots.load_robot("agilex_piper"))
     (kept / "chunks.solve-65.py311.3.nbc").write_bytes(b"another robot's")
     assert kernel_cache.is_compiled(ROBOT)
     assert kernel_cache.forget()

@@ -15,12 +15,12 @@ from runtime.core.errors import SetupError
 from runtime.kinematics import compiled
 from runtime.kinematics.base import Kinematics
 from runtime.kinematics.forward import ChainForward
-from runtime.kinematics.loading import Loading
+from runtime.kinematics.loading import LazyKinematics
 from runtime.processes.coordinator.inference.worker import LockstepRunner, ThreadRunner
 from tests.processes import PATIENCE_S, joined
 from tests.runtime.lockstep_station import Station, stubbed
 
-ROBOT = robots.load("ur5e")
+ROBOT = robots.load_robot("ur5e")
 Q = ROBOT.poses["home"]
 
 
@@ -49,14 +49,14 @@ class Aside:
 
 def test_nothing_is_made_for_joints_that_become_poses() -> None:
     aside = Aside()
-    loading = Loading(ChainForward(ROBOT), made, aside)
+    loading = LazyKinematics(ChainForward(ROBOT), made, aside)
     assert np.array_equal(loading.forward(Q), ChainForward(ROBOT).forward(Q))
     assert aside.calls == []
 
 
 def test_it_is_made_once_and_until_then_nobody_who_goes_forward_waits() -> None:
     aside = Aside()
-    loading = Loading(ChainForward(ROBOT), made, aside)
+    loading = LazyKinematics(ChainForward(ROBOT), made, aside)
     assert not loading.prepare()
     assert not loading.prepare()
     assert np.array_equal(loading.forward(Q), ChainForward(ROBOT).forward(Q))
@@ -78,7 +78,7 @@ def test_who_solves_waits_for_it_and_gets_what_the_backend_says() -> None:
         assert gate.wait(PATIENCE_S)
         return made()
 
-    loading = Loading(ChainForward(ROBOT), slowly, ThreadRunner().aside)
+    loading = LazyKinematics(ChainForward(ROBOT), slowly, ThreadRunner().run_in_background)
     targets = loading.forward(Q)[None]
     found: list[np.ndarray] = []
     solving = threading.Thread(target=lambda: found.append(loading.solve(targets, Q, 0.1, Q, 0).q))
@@ -91,7 +91,7 @@ def test_who_solves_waits_for_it_and_gets_what_the_backend_says() -> None:
 
 
 def test_in_lockstep_it_is_made_at_once() -> None:
-    loading = Loading(ChainForward(ROBOT), made, LockstepRunner(3).aside)
+    loading = LazyKinematics(ChainForward(ROBOT), made, LockstepRunner(3).run_in_background)
     assert loading.prepare()
 
 
@@ -106,7 +106,7 @@ def test_what_cannot_be_made_is_said_to_who_solves_and_forward_goes_on(error: Ex
     def broken() -> Kinematics:
         raise error
 
-    loading = Loading(ChainForward(ROBOT), broken, LockstepRunner(0).aside)
+    loading = LazyKinematics(ChainForward(ROBOT), broken, LockstepRunner(0).run_in_background)
     assert loading.prepare()
     with pytest.raises(SetupError, match=said):
         loading.solve(loading.forward(Q)[None], Q)
@@ -136,15 +136,15 @@ def test_a_run_by_hand_begins_when_steps_can_be_answered(
     station.command("run", mode="manual")
     station.go(30)
     assert station.coordinator.run is not None
-    assert station.coordinator.run.begun is None
+    assert station.coordinator.run.begun_at is None
     assert station._handle("move", {"pose": "ready"}).status == "refused"
     station.command("halt")
     loaded.append(True)
     station.go(10)
-    assert station.coordinator.run.begun is None, "who has halted it has not resumed it"
+    assert station.coordinator.run.begun_at is None, "who has halted it has not resumed it"
     station.command("resume")
     station.go(3)
-    assert station.coordinator.run.begun is not None
+    assert station.coordinator.run.begun_at is not None
     station.stop()
     loaded.clear()
     station.command("run", mode="manual")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from benchmarks.ik_paths import arm_dims, invented
 from benchmarks.ik_postures import LOOPS, PATHS, SETTLED, drift, path, worst
-from robots import Robot, load, names
+from robots import Robot, load_robot, robot_names
 from runtime.kinematics.base import IkFlag, IkResult
 from runtime.kinematics.compiled import CompiledKinematics, Config
 from tests.examples import some
@@ -21,7 +21,7 @@ SEVEN = ("dual_franka", "agibot_g2")
 
 @cache
 def robot_of(name: str) -> tuple[Robot, CompiledKinematics]:
-    robot = load(name)
+    robot = load_robot(name)
     return robot, CompiledKinematics(robot)
 
 
@@ -103,7 +103,7 @@ def test_six_joints_have_no_choice_and_are_as_without_a_home() -> None:
             np.testing.assert_array_equal(kinematics.solve(*asked).q, free.solve(*asked).q)
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", robot_names())
 def test_a_long_path_that_joints_have_is_missed_by_no_arm(name: str) -> None:
     robot, kinematics = robot_of(name)
     off = np.array([worst(robot, kinematics, path(robot, number)) for number in range(PATHS)])
@@ -111,7 +111,7 @@ def test_a_long_path_that_joints_have_is_missed_by_no_arm(name: str) -> None:
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", robot_names())
 def test_a_smooth_path_is_met_within_ten_micrometres(name: str) -> None:
     robot, kinematics = robot_of(name)
     for chunk in invented(robot)["smooth"]:
@@ -133,7 +133,7 @@ def held_to(robot: Robot, result: IkResult, anchor: np.ndarray, row: int, dt: fl
 
 
 @settings(max_examples=some(60))
-@given(st.sampled_from(names()), st.integers(0, 10_000), st.integers(0, 12), st.floats(0.0, 0.5))
+@given(st.sampled_from(robot_names()), st.integers(0, 10_000), st.integers(0, 12), st.floats(0.0, 0.5))
 def test_whatever_is_planned_anew_keeps_to_limits_and_velocities(
     name: str, number: int, row: int, off: float
 ) -> None:

@@ -16,7 +16,7 @@ RATE = 30.0
 def both(request):
     """A robot, PyRoki's kinematics of it, and the default ones."""
     pytest.importorskip("pyroki", reason="PyRoki is not installed: it is on no package index")
-    robot = robots.load(request.param)
+    robot = robots.load_robot(request.param)
     return robot, pyroki.build(pyroki.Config(), robot), compiled.build(compiled.Config(), robot)
 
 
@@ -32,7 +32,7 @@ def smooth(robot, rows=50, by=0.2):
 def test_without_pyroki_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyroki", None)
     with pytest.raises(SetupError, match=r"kinematics\.kind = \"pyroki\".*from their repositories.*compiled"):
-        pyroki.build(pyroki.Config(), robots.load("agilex_piper"))
+        pyroki.build(pyroki.Config(), robots.load_robot("agilex_piper"))
 
 
 def test_nothing_of_pyroki_is_imported_by_choosing_another_backend():

@@ -7,15 +7,15 @@ import pytest
 
 from benchmarks.ik_paths import ROWS, arm_dims
 from benchmarks.ik_postures import followed, path, worst
-from robots import load
+from robots import load_robot
 from runtime.kinematics import compiled
 from runtime.kinematics.base import IkFlag, IkResult
 from runtime.kinematics.compiled import CompiledKinematics
-from runtime.kinematics.replanning import missed, postures, replanned
+from runtime.kinematics.replanning import arms_missing_targets, replan, sample_postures
 
-ARX = load("arx_r5")
+ARX = load_robot("arx_r5")
 KINEMATICS = CompiledKinematics(ARX)
-FRANKA = load("dual_franka")
+FRANKA = load_robot("dual_franka")
 SEVEN = CompiledKinematics(FRANKA)
 DT = 1 / ARX.control_rate
 JOINTS = path(ARX, 47, 1)  # comes by a singularity at once, behind which one of two branches ends at a limit
@@ -28,19 +28,19 @@ def result_of(reached: list[list[bool]]) -> IkResult:
 
 def test_an_arm_that_meets_its_first_pose_and_misses_a_later_one_is_planned_again() -> None:
     rows = [[False, True, True], [True, True, False], [True, False, False]]
-    assert missed(result_of(rows), 0).tolist() == [1, 2]
-    assert missed(result_of(rows), 1).tolist() == [1]
-    assert missed(result_of(rows), 2).tolist() == []
-    assert missed(result_of(rows), 3).tolist() == []
+    assert arms_missing_targets(result_of(rows), 0).tolist() == [1, 2]
+    assert arms_missing_targets(result_of(rows), 1).tolist() == [1]
+    assert arms_missing_targets(result_of(rows), 2).tolist() == []
+    assert arms_missing_targets(result_of(rows), 3).tolist() == []
 
 
 def test_postures_are_home_and_others_within_limits_and_the_same_each_time() -> None:
     lower, upper = np.array([-1.0, -np.inf]), np.array([2.0, np.inf])
-    made = postures(np.array([0.5, 0.1]), lower, upper, 40)
+    made = sample_postures(np.array([0.5, 0.1]), lower, upper, 40)
     np.testing.assert_array_equal(made[0], [0.5, 0.1])
     assert made.shape == (41, 2)
     assert ((made >= [-1, -np.pi]) & (made <= [2, np.pi])).all()
-    np.testing.assert_array_equal(made, postures(np.array([0.5, 0.1]), lower, upper, 40))
+    np.testing.assert_array_equal(made, sample_postures(np.array([0.5, 0.1]), lower, upper, 40))
 
 
 @pytest.mark.parametrize("anchor", [JOINTS[0], None])
@@ -51,7 +51,7 @@ def test_a_branch_that_ends_at_a_limit_is_left_for_the_other(
     found = KINEMATICS.solve(targets, JOINTS[0], DT, anchor, 0)
     assert found.reached.all()
     assert found.position_error.max() < 1e-5
-    monkeypatch.setattr(compiled, "replanned", lambda *_: None)
+    monkeypatch.setattr(compiled, "replan", lambda *_: None)
     alone = KINEMATICS.solve(targets, JOINTS[0], DT, anchor, 0)
     assert alone.position_error[:, 0].max() > 0.02
     right = ARX.arms[1].joint_dims  # which missed nothing
@@ -63,7 +63,7 @@ def test_rows_before_the_first_that_is_executed_stay_as_they_were(monkeypatch: p
     targets = KINEMATICS.forward(np.concatenate([stale, JOINTS]))
     found = KINEMATICS.solve(targets, JOINTS[0], DT, JOINTS[0], 5)
     assert found.reached.all()
-    monkeypatch.setattr(compiled, "replanned", lambda *_: None)
+    monkeypatch.setattr(compiled, "replan", lambda *_: None)
     alone = KINEMATICS.solve(targets, JOINTS[0], DT, JOINTS[0], 5)
     np.testing.assert_array_equal(found.q[:5], alone.q[:5])
 
@@ -78,7 +78,7 @@ def test_where_the_last_pose_is_out_of_reach_no_more_than_a_few_postures_are_tri
     starts = np.zeros((25, 6))
     targets = KINEMATICS.forward(JOINTS)[:, :1]
     dims = arm_dims(ARX)[:6]
-    assert replanned(sweep, targets, ARX.poses["home"], DT, dims, starts, lambda q: np.inf) is None
+    assert replan(sweep, targets, ARX.poses["home"], DT, dims, starts, lambda q: np.inf) is None
     assert len(asked) == 4
     assert all(len(poses) == 1 for poses in asked)
 
@@ -92,7 +92,7 @@ def test_a_chunk_that_ends_by_a_limit_has_another_posture_so_that_the_next_ones_
     assert worst(FRANKA, SEVEN, joints, ROWS).max() < 1e-3
     q = followed(SEVEN, FRANKA, SEVEN.forward(joints), joints[0], ROWS).q
     assert (np.abs(np.diff(q, axis=0)) <= FRANKA.velocity / FRANKA.control_rate + 1e-9).all()
-    monkeypatch.setattr(compiled, "CRAMPED", -np.inf)
+    monkeypatch.setattr(compiled, "MIN_LIMIT_MARGIN", -np.inf)
     assert worst(FRANKA, SEVEN, joints, ROWS).max() > 15e-3
 
 
@@ -104,8 +104,8 @@ def test_a_path_that_going_home_leads_away_from_is_met_by_a_posture_that_stays(
     q = followed(SEVEN, FRANKA, SEVEN.forward(joints), joints[0], len(joints)).q
     assert worst(FRANKA, SEVEN, joints).max() < 1e-3
     assert (np.abs(np.diff(q, axis=0)) <= FRANKA.velocity / FRANKA.control_rate + 1e-9).all()
-    swept = SEVEN._sweep
-    monkeypatch.setattr(SEVEN, "_sweep", lambda *given, home_rate=None, **named: swept(*given, **named))
+    swept = SEVEN._solve_rows
+    monkeypatch.setattr(SEVEN, "_solve_rows", lambda *given, home_rate=None, **named: swept(*given, **named))
     assert worst(FRANKA, SEVEN, joints).max() > 50e-3
 
 
@@ -115,8 +115,8 @@ def test_room_is_that_of_the_nearest_limit_and_none_is_missed_where_home_has_les
     arm, dims = SEVEN._arms[0], FRANKA.arms[0].joint_dims
     q = FRANKA.poses["home"].copy()
     q[dims[3]] = FRANKA.upper[dims[3]] - 0.2
-    assert compiled._room(arm, q) == pytest.approx(0.25)
+    assert compiled._limit_margin(arm, q) == pytest.approx(0.25)
     near_home = arm.copy()
     near_home["above"][3] = 0.1
-    assert compiled._room(near_home, q) > 0.25
-    assert compiled._room(KINEMATICS._arms[0], ARX.lower) == np.inf
+    assert compiled._limit_margin(near_home, q) > 0.25
+    assert compiled._limit_margin(KINEMATICS._arms[0], ARX.lower) == np.inf

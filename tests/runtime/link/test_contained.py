@@ -67,7 +67,7 @@ def pressed(lab, dial):
         return decode(packed)
 
     def press():
-        client.post(Command("p1", "estop", {"why": "a test"}, user="ann", holder="ann", role="operator"))
+        client.send(Command("p1", "estop", {"why": "a test"}, user="ann", holder="ann", role="operator"))
         return answer
 
     yield press
@@ -91,7 +91,7 @@ def test_a_program_of_another_release_unlinks_no_station_that_is_linked(lab, dia
         zmq.Context.instance(), str(Endpoints(folder).read("coordinator")["commands"]), Key(folder)
     )
     try:
-        client.post(Command("u1", "status", user="ann", holder="ann", role="operator"))
+        client.send(Command("u1", "status", user="ann", holder="ann", role="operator"))
         asked = said(lines[COMMANDS], Ask)
         older = dial()
         older.send_multipart(write(Hello(RELEASE + 9, "9", OTHER, STOPS, b"older")))

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from runtime.motion.resampling import length, resample
+from runtime.motion.resampling import resample, resampled_length
 from runtime.motion.timeline import DimensionKinds, Timeline
-from runtime.strategies.base import Arrival
+from runtime.strategies.base import ArrivedChunk
 from runtime.strategies.ensemble import EnsembleMerge
 
 
@@ -45,7 +45,7 @@ def test_every_row_is_of_a_time_that_the_given_rows_cover_and_linear_between_the
     given_rows = np.sin(ramp(count))
     made, source = resample(given_rows, rate, wanted)
     times, last = np.arange(len(made)) / wanted, (count - 1) / rate
-    assert 1 <= len(made) == length(count, rate, wanted)
+    assert 1 <= len(made) == resampled_length(count, rate, wanted)
     assert times[-1] <= last + 1e-9 < times[-1] + 1 / wanted + 2e-9
     np.testing.assert_allclose(
         made[:, 0], np.interp(times, np.arange(count) / rate, given_rows[:, 0]), atol=1e-6
@@ -66,7 +66,7 @@ def test_chunks_that_agree_average_to_what_they_agree_on(
         step += later
         times = step / control + np.arange(count) / rate
         rows, _ = resample(0.3 * times[:, None] - 0.1, rate, control)
-        merge(timeline, Arrival(number, step, rows), step)
+        merge(timeline, ArrivedChunk(number, step, rows), step)
         for planned in range(step, step + timeline.remaining(step)):
             assert abs(timeline.at(planned).action[0] - (0.3 * planned / control - 0.1)) < 1e-9  # type: ignore[union-attr]
 

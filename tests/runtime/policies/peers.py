@@ -17,8 +17,10 @@ from robots import Robot
 from runtime.core import msgpack_arrays
 from runtime.core.types import Observation
 
-FRANKA = robots.load("dual_franka", ["left_arm"])  # the arm of DROID: seven joints and a gripper, 1 is open
-PIPER = robots.load("agilex_piper")
+FRANKA = robots.load_robot(
+    "dual_franka", ["left_arm"]
+)  # the arm of DROID: seven joints and a gripper, 1 is open
+PIPER = robots.load_robot("agilex_piper")
 Handler = Callable[[ServerConnection], None]
 
 

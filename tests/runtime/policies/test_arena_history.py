@@ -20,7 +20,7 @@ def at(arrived: float, number: int) -> Observation:
 
 
 def numbers(history: History, observation: Observation) -> list[int]:
-    return [int(pictures["cam"][0, 0, 0]) for pictures in history.before(observation)]
+    return [int(pictures["cam"][0, 0, 0]) for pictures in history.frames_before(observation)]
 
 
 def test_at_the_steps_of_dreamzeros_clients_its_pictures_are_theirs() -> None:
@@ -44,7 +44,7 @@ def test_as_long_as_there_are_no_older_ones_the_oldest_is_repeated() -> None:
 def test_after_it_was_forgotten_only_what_came_since_is_shown() -> None:
     history = History(STEPS, 15.0)
     history.add(at(1.0, 1))
-    history.forget()
+    history.reset()
     assert numbers(history, at(2.0, 2)) == [2, 2, 2, 2]
 
 

@@ -17,8 +17,8 @@ from runtime.core.clock import MonotonicClock
 from runtime.core.errors import (
     ConfigurationError,
     ContradictionError,
+    PolicyDisconnected,
     PolicyError,
-    PolicyGone,
     PolicyLostError,
     PolicyTimeout,
 )
@@ -30,7 +30,7 @@ from runtime.sim.faults import NONE, Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from tests.processes import PATIENCE_S, eventually
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 PARTS = {group.name: list(range(group.slice.start, group.slice.stop)) for group in ROBOT.groups}
 FORMS = [
     ("n1.6", False, "nested"),
@@ -215,7 +215,7 @@ def test_a_server_that_went_between_two_requests_is_lost() -> None:
         assert policy._link._socket is not None
         wire = policy._link._socket
         eventually(lambda: not wire.poll(0, zmq.POLLOUT), "the end of the connection")
-        with pytest.raises(PolicyGone, match="since the last request"):
+        with pytest.raises(PolicyDisconnected, match="since the last request"):
             policy.infer(observation())
         with pytest.raises(PolicyLostError, match="no policy server listens"):
             policy.infer(observation())

@@ -22,7 +22,7 @@ from runtime.sim.faults import NONE, Fault
 pytest.importorskip("grpc", reason="the extra lerobot-grpc is not installed")
 from runtime.sim.lerobot_server import LerobotBehaviour, LerobotServer
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 NOWHERE = "grpc://127.0.0.1:1"
 
 

@@ -18,7 +18,7 @@ RATE = 30.0
 
 
 def policy(name: str = "agilex_piper", clock: VirtualClock | None = None, **settings: float) -> MockPolicy:
-    return mock.build(Config.model_validate(settings), robots.load(name), clock or VirtualClock(), RATE)
+    return mock.build(Config.model_validate(settings), robots.load_robot(name), clock or VirtualClock(), RATE)
 
 
 def observation(qpos: Float64, step: int = 0) -> Observation:
@@ -27,9 +27,9 @@ def observation(qpos: Float64, step: int = 0) -> Observation:
     )
 
 
-@given(st.sampled_from(robots.names()), st.integers(0, 2**32 - 1), st.integers(0, 10_000))
+@given(st.sampled_from(robots.robot_names()), st.integers(0, 2**32 - 1), st.integers(0, 10_000))
 def test_every_row_is_within_the_limits_wherever_the_robot_starts(name: str, seed: int, steps: int) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     start = np.random.default_rng(seed).uniform(robot.lower, robot.upper)
     asked = policy(name, amplitude=1.0)
     asked.infer(observation(start, 5))
@@ -40,7 +40,7 @@ def test_every_row_is_within_the_limits_wherever_the_robot_starts(name: str, see
 
 
 def test_it_starts_at_rest_exactly_where_the_robot_is() -> None:
-    robot = robots.load("agilex_piper")
+    robot = robots.load_robot("agilex_piper")
     start = np.clip(robot.poses["home"] + 0.01, robot.lower, robot.upper)
     rows = policy().infer(observation(start)).actions
     np.testing.assert_allclose(rows[0], start, atol=1e-6)
@@ -48,7 +48,7 @@ def test_it_starts_at_rest_exactly_where_the_robot_is() -> None:
 
 
 def test_it_moves_every_joint_visibly_and_comes_back() -> None:
-    robot = robots.load("agilex_piper")
+    robot = robots.load_robot("agilex_piper")
     rows = policy(horizon=180, period_s=6.0).infer(observation(robot.poses["home"])).actions
     joints = np.setdiff1d(np.arange(robot.dim), robot.gripper_dims)
     assert np.ptp(rows, axis=0)[joints].min() > 0.19
@@ -56,14 +56,14 @@ def test_it_moves_every_joint_visibly_and_comes_back() -> None:
 
 
 def test_binary_grippers_stay() -> None:
-    for name in robots.names():
-        robot = robots.load(name)
+    for name in robots.robot_names():
+        robot = robots.load_robot(name)
         rows = policy(name).infer(observation(robot.poses["home"])).actions
         assert np.ptp(rows[:, list(robot.binary_dims)], axis=0).tolist() == [0.0] * len(robot.binary_dims)
 
 
 def test_chunks_of_different_steps_agree_on_the_same_target_step() -> None:
-    start = robots.load("agilex_piper").poses["home"]
+    start = robots.load_robot("agilex_piper").poses["home"]
     asked = policy()
     first = asked.infer(observation(start, 100)).actions
     later = asked.infer(observation(start + 0.05, 107)).actions
@@ -71,7 +71,7 @@ def test_chunks_of_different_steps_agree_on_the_same_target_step() -> None:
 
 
 def test_reset_starts_anew_from_where_the_robot_is_now() -> None:
-    robot = robots.load("agilex_piper")
+    robot = robots.load_robot("agilex_piper")
     elsewhere = np.clip(robot.poses["home"] + 0.05, robot.lower, robot.upper)
     asked = policy()
     asked.infer(observation(robot.poses["home"], 0))
@@ -81,7 +81,7 @@ def test_reset_starts_anew_from_where_the_robot_is_now() -> None:
 
 def test_its_latency_passes_on_the_clock() -> None:
     clock = VirtualClock(10.0)
-    policy(clock=clock, latency_s=0.25).infer(observation(robots.load("agilex_piper").poses["home"]))
+    policy(clock=clock, latency_s=0.25).infer(observation(robots.load_robot("agilex_piper").poses["home"]))
     assert clock.now() == 10.25
 
 

@@ -21,8 +21,8 @@ from runtime.core.clock import MonotonicClock
 from runtime.core.errors import (
     ConfigurationError,
     ContradictionError,
+    PolicyDisconnected,
     PolicyError,
-    PolicyGone,
     PolicyLostError,
     PolicyTimeout,
     UnreachableError,
@@ -32,15 +32,15 @@ from runtime.core.errors import (
 from runtime.core.pose_format import PoseFormat
 from runtime.core.types import Conditioning, Observation
 from runtime.policies import openpi
-from runtime.policies.link import WebsocketLink, headline
+from runtime.policies.link import WebsocketLink, error_headline
 from runtime.policies.openpi import Config, OpenpiPolicy
 from runtime.sim.faults import NONE, TOO_LARGE, Fault
-from runtime.sim.in_poses import InPoses
+from runtime.sim.in_poses import PoseScript
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.script import Waving
+from runtime.sim.script import WavingScript
 from tests.processes import PATIENCE_S, joined
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 CAMERAS = tuple(camera.key for camera in ROBOT.cameras)
 Handler = Callable[[ServerConnection], None]
 POSES = np.array([0.1, 0.2, 0.3, 0.1, 0.7, -0.5, 0.5, 0.02, 0.4, 0.5, 0.6, 0, 1, 0, 0, 0.03], np.float32)
@@ -619,7 +619,7 @@ def test_metadata_that_say_the_same_are_no_contradiction(
 @contextlib.contextmanager
 def posing(pose: PoseFormat) -> Iterator[str]:
     """The stand-in server, answering in poses of that format and saying so."""
-    script = InPoses(Waving(ROBOT, 12, 30.0), ROBOT, 30.0, pose)
+    script = PoseScript(WavingScript(ROBOT, 12, 30.0), ROBOT, 30.0, pose)
     with contextlib.closing(OpenpiServer(ROBOT, Behaviour(horizon=12, rtc="none"), script=script)) as server:
         yield str(server.start()["url"])
 
@@ -760,7 +760,7 @@ def test_a_text_frame_at_any_time_is_the_servers_error() -> None:
     ],
 )
 def test_of_what_a_server_says_the_sentence_comes_first(text: str, line: str) -> None:
-    assert headline(text) == line
+    assert error_headline(text) == line
 
 
 # What happens to the connection
@@ -800,7 +800,7 @@ def test_a_connection_that_ends_within_an_answer_is_opened_anew() -> None:
     with served(Fault("close_mid_reply", "1")) as url, policy_at(url) as policy:
         policy.connect()
         policy.infer(observation())
-        with pytest.raises(PolicyGone, match="closed the connection"):
+        with pytest.raises(PolicyDisconnected, match="closed the connection"):
             policy.infer(observation())
     with served() as url, policy_at(url) as policy:
         policy.connect()
@@ -816,7 +816,7 @@ def left_by_its_server(**config: Any) -> Iterator[tuple[OpenpiPolicy, int]]:
         policy.connect()
         policy.infer(observation())
         server.close()
-        with pytest.raises(PolicyGone):
+        with pytest.raises(PolicyDisconnected):
             policy.infer(observation())
         yield policy, int(str(address["port"]))
 

@@ -22,7 +22,7 @@ from runtime.core.clock import MonotonicClock
 from runtime.core.errors import PolicyLostError
 from runtime.core.plugins import variants
 from runtime.policies.openpi import OpenpiPolicy
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from tests.processes import PATIENCE_S
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 
@@ -47,7 +47,7 @@ def built(shown: dict[str, Any], **policy: Any) -> tuple[Any, Robot]:
         **shown,
         "policy": shown["policy"] | policy,
     }
-    made = checked_spec(loader.resolve(tree, {}, "policies.md"))
+    made = check_deployment(loader.resolve_deployment(tree, {}, "policies.md"))
     settings = made.deployment.policy
     build = variants("runtime.policies")[settings.kind].build
     return build(settings, made.robot, MonotonicClock(), made.rate), made.robot

@@ -13,7 +13,7 @@ from runtime.core.clock import VirtualClock
 from runtime.core.errors import PolicyError
 from runtime.core.pose_format import PoseFormat
 from runtime.core.types import Observation
-from runtime.datasets.journal import read_journal
+from runtime.datasets.journal import read_finished_episode
 from runtime.datasets.mapping import ColumnMapping
 from runtime.policies import replay
 from runtime.policies.replay import Config, ReplayPolicy
@@ -204,7 +204,9 @@ def test_a_recorded_episode_is_replayed_without_a_dataset(tmp_path: Path) -> Non
     policy = replay.build(Config(path=str(episode), horizon=3), robot(), VirtualClock(), FPS)
     info = policy.connect()
     assert info.name == f"replay of {episode}"
-    assert np.array_equal(policy.infer(observation(0)).actions, read_journal(episode).vectors("action")[:3])
+    assert np.array_equal(
+        policy.infer(observation(0)).actions, read_finished_episode(episode).vectors("action")[:3]
+    )
 
 
 def test_a_recorded_episode_has_no_further_ones(tmp_path: Path) -> None:

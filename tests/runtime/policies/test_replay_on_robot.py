@@ -34,7 +34,7 @@ def recorded(station: Station, root: Path) -> tuple[Path, np.ndarray]:
         fields["action"] = action(index)
 
     name = station.coordinator.snapshot()["facts"]["robot"]
-    assert name in robots.names()
+    assert name in robots.robot_names()
     folder = built.record_of(root / "told", name, swing, frames=ROWS)
     return folder, np.stack([action(index) for index in range(ROWS)])
 

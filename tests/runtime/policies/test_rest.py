@@ -15,7 +15,7 @@ class Telling(Policy):
 
     def __init__(self) -> None:
         self.rests = 0
-        self.glances_s = 0.25
+        self.observe_period_s = 0.25
         self.glanced: list[Observation] = []
 
     def connect(self) -> PolicyInfo:
@@ -24,13 +24,13 @@ class Telling(Policy):
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         raise AssertionError("nobody asks here")
 
-    def glance(self, observation: Observation) -> None:
+    def observe(self, observation: Observation) -> None:
         self.glanced.append(observation)
 
     def reset(self) -> None:
         raise AssertionError("nobody resets here")
 
-    def rest(self) -> None:
+    def end_episode(self) -> None:
         self.rests += 1
 
     def close(self) -> None:
@@ -42,9 +42,9 @@ def test_a_tunnel_hands_the_end_of_a_rollout_on_and_what_is_seen_between_request
     settings: Any = nothing
     far: Any = nothing
     tunnelled = TunnelledPolicy(policy, settings, far, "ssh")
-    tunnelled.rest()
+    tunnelled.end_episode()
     assert policy.rests == 1
-    assert tunnelled.glances_s == 0.25
+    assert tunnelled.observe_period_s == 0.25
     observation = seen(FRANKA)
-    tunnelled.glance(observation)
+    tunnelled.observe(observation)
     assert policy.glanced == [observation]

@@ -17,8 +17,8 @@ from runtime.core.clock import MonotonicClock
 from runtime.core.errors import (
     ConfigurationError,
     ContradictionError,
+    PolicyDisconnected,
     PolicyError,
-    PolicyGone,
     PolicyLostError,
     PolicyTimeout,
 )
@@ -27,7 +27,7 @@ from runtime.core.types import Conditioning, Observation
 from runtime.policies import roboarena
 from runtime.policies.roboarena import Config, RoboarenaPolicy
 from runtime.sim.faults import Fault
-from runtime.sim.roboarena_server import Arena, RoboarenaServer
+from runtime.sim.roboarena_server import RoboarenaBehaviour, RoboarenaServer
 from tests.runtime.policies.peers import FRANKA, PIPER, answering, seen, serving
 
 VECTORS = Path(__file__).parents[1] / "vectors"
@@ -58,7 +58,7 @@ def policy_at(url: str, **settings: Any) -> Iterator[RoboarenaPolicy]:
 @contextlib.contextmanager
 def served(**arena: Any) -> Iterator[tuple[RoboarenaServer, str]]:
     robot = arena.pop("robot", FRANKA)
-    server = RoboarenaServer(robot, Arena(**{"resolution": (24, 32), **arena}))
+    server = RoboarenaServer(robot, RoboarenaBehaviour(**{"resolution": (24, 32), **arena}))
     with contextlib.closing(server):
         yield server, str(server.start()["url"])
 
@@ -164,7 +164,7 @@ def test_moments_before_a_request_are_shown_from_the_second_on_although_nobody_a
         serving(answering(SIX | {"image_resolution": None}, changing(), asked)) as url,
         policy_at(url, frame_steps=[23, 16, 8, 0]) as policy,
     ):
-        assert policy.glances_s == pytest.approx(1 / 15)
+        assert policy.observe_period_s == pytest.approx(1 / 15)
         for run in range(2):
             for frame in range(48):
                 number = np.uint8(100 * run + frame)
@@ -172,7 +172,7 @@ def test_moments_before_a_request_are_shown_from_the_second_on_although_nobody_a
                 shown = dataclasses.replace(
                     seen(FRANKA, pictures=pictures), arrived=1000.0 * run + frame / 15
                 )
-                policy.glance(shown)
+                policy.observe(shown)
                 if frame in (0, 23, 47):
                     policy.infer(shown)
             policy.reset()
@@ -512,11 +512,11 @@ def test_each_run_has_a_session_of_its_own_which_is_ended_on_the_server() -> Non
 
 def test_the_end_of_a_rollout_ends_its_session_on_the_server_once() -> None:
     with served() as (server, url), policy_at(url) as policy:
-        policy.rest()  # nothing was begun
+        policy.end_episode()  # nothing was begun
         policy.infer(seen(FRANKA))
-        policy.rest()
+        policy.end_episode()
         assert server.heard.frames == {}
-        policy.rest()
+        policy.end_episode()
         policy.reset()
         policy.infer(seen(FRANKA))
     assert [call[0] for call in server.heard.calls] == ["infer", "reset", "infer"]
@@ -528,7 +528,7 @@ def test_no_connection_is_opened_to_end_a_session_and_the_next_request_ends_it()
     with served() as (server, url), policy_at(url) as policy:
         policy.infer(seen(FRANKA))
         policy._link.drop()
-        policy.rest()
+        policy.end_episode()
         assert not policy._link.is_open
         policy.infer(seen(FRANKA))
     assert [call[0] for call in server.heard.calls] == ["infer", "reset", "infer"]
@@ -541,7 +541,7 @@ def test_an_end_that_is_not_acknowledged_is_an_error_and_owed() -> None:
     with serving(answering(SIX, lambda m: next(answers), asked)) as url, policy_at(url) as policy:
         policy.infer(seen(FRANKA))
         with pytest.raises(PolicyError, match="no such session"):
-            policy.rest()
+            policy.end_episode()
         policy.infer(seen(FRANKA))
     sent = [msgpack_arrays.unpack(request)["endpoint"] for request in asked]
     assert sent == ["infer", "reset", "reset", "infer"]
@@ -600,7 +600,7 @@ def test_a_connection_that_the_server_ended_while_nobody_asked_is_opened_anew() 
     """As vLLM-Omni does it after half a minute."""
     with served(idle=0.05) as (server, url), policy_at(url) as policy:
         policy.connect()
-        while not policy._link.was_left:
+        while not policy._link.closed_by_peer:
             assert policy._link.is_open
         server._idle = None  # the next connection is left alone, however slow this machine is
         assert policy.infer(seen(FRANKA)).actions.shape == (24, 8)
@@ -664,4 +664,4 @@ def test_a_traceback_ends_the_connection_and_the_next_request_opens_another() ->
         for _ in range(2):
             with pytest.raises(PolicyError, match="RuntimeError: CUDA out of memory") as raised:
                 policy.infer(seen(FRANKA))
-            assert not isinstance(raised.value, PolicyGone)
+            assert not isinstance(raised.value, PolicyDisconnected)

@@ -18,7 +18,7 @@ from runtime.core.types import Conditioning, Observation
 from runtime.policies import starvla
 from runtime.policies.starvla import Config, StarvlaPolicy
 from runtime.sim.faults import NONE, Fault
-from runtime.sim.starvla_server import Star, StarvlaServer
+from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
 from tests.processes import PATIENCE_S, joined
 from tests.runtime.policies.peers import FRANKA, PIPER, Handler, seen, serving
 
@@ -42,7 +42,7 @@ def policy_at(url: str, **settings: Any) -> Iterator[StarvlaPolicy]:
 @contextlib.contextmanager
 def served(fault: Fault = NONE, **star: Any) -> Iterator[tuple[StarvlaServer, str]]:
     star = {"size": (24, 32), "views": tuple(VIEWS), **star}
-    server = StarvlaServer(FRANKA, Star(fault=fault, **star))
+    server = StarvlaServer(FRANKA, StarvlaBehaviour(fault=fault, **star))
     with contextlib.closing(server):
         yield server, str(server.start()["url"])
 
@@ -105,7 +105,7 @@ def test_the_recorded_answer_is_understood() -> None:
     reply = msgpack_arrays.unpack((VECTORS / "starvla_infer_reply.bin").read_bytes())
     policy = built(PIPER, cameras=["cam_high"])
     policy._width = 7
-    policy._require_answered(reply, {"request_id": "r1"})
+    policy._check_reply(reply, {"request_id": "r1"})
     chunk = policy._chunk(reply["data"], 1.0)
     np.testing.assert_array_equal(chunk.actions, np.arange(14, dtype=np.float32).reshape(2, 7) / 4)
     assert chunk.actions.dtype == np.float32
@@ -127,14 +127,14 @@ def test_the_recorded_answer_is_understood() -> None:
 )
 def test_recorded_errors_and_pongs_are_told_apart(frame: str, says: str) -> None:
     with pytest.raises(PolicyError, match=says):
-        built()._require_answered(msgpack_arrays.unpack(bytes.fromhex(frame)), {"request_id": "p2"})
+        built()._check_reply(msgpack_arrays.unpack(bytes.fromhex(frame)), {"request_id": "p2"})
 
 
 def test_the_pong_answers_the_ping() -> None:
     pong = msgpack_arrays.unpack(
         bytes.fromhex("84a6737461747573a26f6ba26f6bc3a474797065a470696e67aa726571756573745f6964a27031")
     )
-    built()._require_answered(pong, {"request_id": "p1"})
+    built()._check_reply(pong, {"request_id": "p1"})
     assert msgpack_arrays.pack({"type": "ping", "request_id": "p1"}).hex() == (
         "82a474797065a470696e67aa726571756573745f6964a27031"
     )

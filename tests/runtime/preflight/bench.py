@@ -9,10 +9,10 @@ from typing import Any
 
 from robots import Robot
 from runtime.config import loader
-from runtime.preflight.course import Course
+from runtime.preflight.course import PreflightRunner
 from runtime.preflight.report import Report
 from runtime.sim.faults import NONE, Fault
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 from tests.runtime.policies.peers import FRANKA, PIPER
 
@@ -41,15 +41,17 @@ def _openpi(fault: Fault) -> Any:
 
 
 def _arena(variant: Any) -> Callable[[Fault], Any]:
-    from runtime.sim.roboarena_server import Arena, RoboarenaServer
+    from runtime.sim.roboarena_server import RoboarenaBehaviour, RoboarenaServer
 
-    return lambda fault: RoboarenaServer(FRANKA, Arena(fault=fault, variant=variant, resolution=SIZE))
+    return lambda fault: RoboarenaServer(
+        FRANKA, RoboarenaBehaviour(fault=fault, variant=variant, resolution=SIZE)
+    )
 
 
 def _starvla(old: bool) -> Callable[[Fault], Any]:
-    from runtime.sim.starvla_server import Star, StarvlaServer
+    from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
 
-    return lambda fault: StarvlaServer(FRANKA, Star(fault=fault, size=SIZE, old=old))
+    return lambda fault: StarvlaServer(FRANKA, StarvlaBehaviour(fault=fault, size=SIZE, old=old))
 
 
 def _gr00t(version: Any) -> Callable[[Fault], Any]:
@@ -104,7 +106,7 @@ def planned(wire: Wire, url: str, settings: Mapping[str, Any] | None = None, **t
         "policy": {**wire.settings, **PATIENT, "url": url, **(settings or {})},
         **tables,
     }
-    return checked_spec(loader.resolve(tree, {}, "test"))
+    return check_deployment(loader.resolve_deployment(tree, {}, "test"))
 
 
 @contextlib.contextmanager
@@ -118,4 +120,4 @@ def flown(name: str, fault: str = "", deadline: float = 60.0, **settings: Any) -
     """The report about a stand-in with a fault NAME[:ARG]."""
     kind, _, argument = fault.partition(":")
     with served(name, Fault(kind, argument) if fault else NONE) as url:
-        return Course(planned(WIRES[name], url, settings)).run(deadline)
+        return PreflightRunner(planned(WIRES[name], url, settings)).run(deadline)

@@ -15,11 +15,11 @@ from websockets.exceptions import ConnectionClosed, ConnectionClosedOK
 from websockets.sync.server import ServerConnection
 
 from runtime.config import loader
-from runtime.config.loader import server_of
+from runtime.config.loader import server_address
 from runtime.core import msgpack_arrays
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import PreflightRequest
-from runtime.policies.link import LEAVING, await_left
+from runtime.policies.link import CLOSING, wait_closed
 from runtime.station import preflight_child as module
 from runtime.station.preflight_child import Preflights
 from tests.processes import PATIENCE_S, eventually
@@ -63,13 +63,13 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
 
 def test_what_its_process_says_is_the_report(bench: Bench) -> None:
     bench.start(checkpoint={"id": 3, "name": "pi0"})
-    assert bench.preflights.under_way == "the checkpoint pi0"
+    assert bench.preflights.current == "the checkpoint pi0"
     assert bench.over() == {"running": False, "report": {"verdict": "ok"}, "failure": ""}
-    ended = bench.preflights.look()
+    ended = bench.preflights.poll()
     assert ended is not None
-    assert (ended.id, ended.told) == ("one", {"verdict": "ok"})
-    assert bench.preflights.look() is None
-    assert bench.preflights.under_way == ""
+    assert (ended.id, ended.finished) == ("one", {"verdict": "ok"})
+    assert bench.preflights.poll() is None
+    assert bench.preflights.current == ""
 
 
 @pytest.mark.parametrize("bench", [HANGS], indirect=True)
@@ -86,10 +86,10 @@ def test_there_is_one_at_a_time_and_the_same_asked_again_is_the_same(bench: Benc
 def test_one_that_outlasts_its_deadline_is_ended(bench: Bench) -> None:
     assert bench.preflights.start(PreflightRequest(id="one", deadline_s=5.0), OWN) == 185.0
     bench.time = 184.0
-    assert bench.preflights.look() is None
+    assert bench.preflights.poll() is None
     assert bench.children[0].poll() is None
     bench.time = 186.0
-    bench.preflights.look()
+    bench.preflights.poll()
     assert bench.over()["failure"] == "it did not end in time"
 
 
@@ -98,7 +98,7 @@ def test_one_that_is_cancelled_says_for_what(bench: Bench) -> None:
     bench.start()
     bench.preflights.cancel("setup by ann")
     assert bench.over() == {"running": False, "report": None, "failure": "cancelled: setup by ann"}
-    bench.preflights.look()
+    bench.preflights.poll()
     bench.preflights.cancel("nothing is under way")
 
 
@@ -115,7 +115,7 @@ def test_the_oldest_reports_are_forgotten(bench: Bench, monkeypatch: pytest.Monk
     for id in ("one", "two", "three"):
         bench.start(id)
         bench.over(id)
-        assert bench.preflights.look() is not None
+        assert bench.preflights.poll() is not None
     with pytest.raises(RuntimeFault, match="preflight 'one' is not known here"):
         bench.preflights.report("one")
     assert bench.preflights.report("three")["report"] == {"verdict": "ok"}
@@ -128,16 +128,16 @@ def test_a_process_that_cannot_be_started_is_the_reason() -> None:
     preflights = Preflights(full)
     with pytest.raises(RuntimeFault, match="cannot be started"):
         preflights.start(PreflightRequest(id="one"), OWN)
-    assert preflights.under_way == ""
+    assert preflights.current == ""
 
 
 def test_who_waits_for_one_gets_the_report_or_why_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench("")
-    monkeypatch.setattr(module, "_spawn", lambda: bench.spawn(SAYS))
-    assert module.fly({}, 30.0) == {"verdict": "ok"}
-    monkeypatch.setattr(module, "_spawn", lambda: bench.spawn(HANGS))
+    monkeypatch.setattr(module, "_spawn_child", lambda: bench.spawn(SAYS))
+    assert module.run_preflight({}, 30.0) == {"verdict": "ok"}
+    monkeypatch.setattr(module, "_spawn_child", lambda: bench.spawn(HANGS))
     with pytest.raises(RuntimeFault, match="its process ended with -9"):
-        module.fly({}, 0.2)
+        module.run_preflight({}, 0.2)
 
 
 # --- the program itself
@@ -216,12 +216,12 @@ def test_a_terminal_is_told_in_lines_or_in_json(tmp_path: Any, capfd: Any) -> No
     ],
 )
 def test_a_server_has_one_spelling(url: str, server: str) -> None:
-    assert server_of(planned(WIRES["openpi"], url).deployment) == server
+    assert server_address(planned(WIRES["openpi"], url).deployment) == server
 
 
 def test_a_policy_without_a_server_has_none() -> None:
-    changed = loader.changed(OWN, {"policy": {"kind": "mock"}}, "test")
-    assert server_of(changed.deployment) == ""
+    changed = loader.apply_changes(OWN, {"policy": {"kind": "mock"}}, "test")
+    assert server_address(changed.deployment) == ""
 
 
 @pytest.mark.exhaustive
@@ -246,8 +246,8 @@ def test_the_program_leaves_a_server_with_a_close_frame() -> None:
 
 def test_a_server_that_is_being_left_is_given_a_moment() -> None:
     told = threading.Event()
-    leaving = threading.Thread(target=told.wait, args=(30,), name=LEAVING)
+    leaving = threading.Thread(target=told.wait, args=(30,), name=CLOSING)
     leaving.start()
     threading.Timer(0.0, told.set).start()
-    await_left(30.0)
+    wait_closed(30.0)
     assert not leaving.is_alive()

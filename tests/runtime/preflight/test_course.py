@@ -15,11 +15,11 @@ from runtime.core.errors import ConfigurationError
 from runtime.core.plugins import variants
 from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.preflight.course import Course
-from runtime.preflight.report import Report, shown
-from runtime.preflight.subject import Subject, pictures
-from runtime.preflight.verdict import Stage, Verdict
-from runtime.station.preflight_child import patience
+from runtime.preflight.course import PreflightRunner
+from runtime.preflight.report import Report, truncate_value
+from runtime.preflight.subject import VirtualRobot, noise_images
+from runtime.preflight.verdict import PreflightStage, PreflightVerdict
+from runtime.station.preflight_child import default_deadline
 from tests.processes import PATIENCE_S
 from tests.runtime.policies.peers import FRANKA
 from tests.runtime.preflight.bench import WIRES, planned
@@ -63,7 +63,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Any:
     def fly(policy: Policy, deadline: float = PATIENCE_S, **tables: Any) -> Report:
         monkeypatch.setattr(variants("runtime.policies")["mock"], "build", lambda *given: policy)
         tables = {"policy": {"kind": "mock"}, **tables}
-        return Course(planned(MOCK, "", **tables)).run(deadline)
+        return PreflightRunner(planned(MOCK, "", **tables)).run(deadline)
 
     return fly
 
@@ -103,11 +103,11 @@ def test_the_policy_is_shown_the_robot_at_its_pose_with_grey_pictures(flown: Any
 
 def test_what_it_is_shown_is_the_same_every_time() -> None:
     spec = planned(MOCK, "", policy={"kind": "mock"})
-    once, again = pictures(spec), pictures(spec)
+    once, again = noise_images(spec), noise_images(spec)
     assert all(np.array_equal(once[key], again[key]) for key in once)
-    subject = Subject(spec, VirtualClock(5.0))
+    subject = VirtualRobot(spec, VirtualClock(5.0))
     assert subject.commanded() is None
-    assert set(subject.now("go").captured.values()) == {5.0}
+    assert set(subject.latest("go").captured.values()) == {5.0}
 
 
 def test_what_works_and_is_worth_knowing_is_noted(flown: Any) -> None:
@@ -191,7 +191,7 @@ def test_what_does_not_fit_the_robot_is_said_before_anybody_is_asked(flown: Any,
 
     spec = planned(MOCK, "", policy={"kind": "mock"})
     monkeypatch.setattr(variants("runtime.policies")["mock"], "build", build)
-    report = Course(spec).run(30.0)
+    report = PreflightRunner(spec).run(30.0)
     assert (report.verdict, report.stage, report.calls) == ("misconfigured", "resolve", ())
 
 
@@ -207,8 +207,8 @@ def test_a_policy_that_never_comes_back_is_a_timeout_at_the_deadline(flown: Any)
 
 def test_the_deadline_is_what_the_policys_own_come_to() -> None:
     spec = planned(WIRES["openpi"], "ws://127.0.0.1:1")
-    assert patience(spec.deployment) == pytest.approx(20.0 + 30.0 + 2 * 20.0 + 10.0)
-    assert patience(planned(MOCK, "", policy={"kind": "mock"}).deployment) == 10.0
+    assert default_deadline(spec.deployment) == pytest.approx(20.0 + 30.0 + 2 * 20.0 + 10.0)
+    assert default_deadline(planned(MOCK, "", policy={"kind": "mock"}).deployment) == 10.0
 
 
 def test_a_report_is_json_whatever_the_server_says(flown: Any) -> None:
@@ -234,21 +234,30 @@ def test_a_report_is_json_whatever_the_server_says(flown: Any) -> None:
     assert "..." in json.dumps(said["deep"])
     assert (told["verdict"], told["stage"], told["ok"]) == ("ok", "space", True)
     assert told["latency_ms"] == told["calls"][3]["ms"]
-    assert shown(True) is True
+    assert truncate_value(True) is True
     assert report.lines()[0] == "ok  at space"
 
 
 def test_a_failed_call_is_shown_with_how_long_it_took() -> None:
-    report = Course(planned(WIRES["openpi"], "ws://127.0.0.1:1")).run(30.0)
+    report = PreflightRunner(planned(WIRES["openpi"], "ws://127.0.0.1:1")).run(30.0)
     assert [(call.name, call.ok) for call in report.calls] == [("connect", False)]
     assert report.latency_ms is report.warm_up_ms is None
     assert "(failed)" in "\n".join(report.lines())
 
 
 def test_a_report_without_a_policy_is_two_lines_and_advice() -> None:
-    report = Report(Verdict.MISCONFIGURED, Stage.RESOLVE, "no such key", Verdict.MISCONFIGURED.advice)
-    assert report.lines() == ["misconfigured  at resolve", "no such key", Verdict.MISCONFIGURED.advice]
-    assert report.plain()["chunk"] is None
+    report = Report(
+        PreflightVerdict.MISCONFIGURED,
+        PreflightStage.RESOLVE,
+        "no such key",
+        PreflightVerdict.MISCONFIGURED.advice,
+    )
+    assert report.lines() == [
+        "misconfigured  at resolve",
+        "no such key",
+        PreflightVerdict.MISCONFIGURED.advice,
+    ]
+    assert report.to_dict()["chunk"] is None
 
 
 @pytest.mark.slow

@@ -10,8 +10,8 @@ from runtime.core.clock import VirtualClock
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.messages import Command, Event
 from runtime.ipc.session_state import SessionState
-from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightDesk
-from runtime.station.preflight_child import Flight
+from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightService
+from runtime.station.preflight_child import PreflightRun
 from tests.runtime.lockstep_station import Station, stubbed
 from tests.runtime.preflight.bench import LEROBOT, WIRES, planned
 from tests.standing import standing
@@ -26,13 +26,13 @@ class Recorder:
     def __init__(self) -> None:
         self.started: list[Any] = []
         self.cancelled: list[str] = []
-        self.ended: Flight | None = None
+        self.ended: PreflightRun | None = None
 
     def start(self, asked: Any, resolved: Any) -> float:
         self.started.append((asked, resolved))
         return 60.0
 
-    def look(self) -> Flight | None:
+    def look(self) -> PreflightRun | None:
         ended, self.ended = self.ended, None
         return ended
 
@@ -53,7 +53,7 @@ class Desk:
         self.state = SessionState.IDLE
         self.events: list[Event] = []
         self.flights = Recorder()
-        self.desk = PreflightDesk(
+        self.desk = PreflightService(
             lambda: in_force,
             OWN,
             lambda: self.state,
@@ -117,13 +117,13 @@ def test_a_server_with_one_clients_checkpoint_is_not_taken_from_a_station_that_i
 
 def test_its_end_is_an_event_with_the_verdict_alone() -> None:
     desk = Desk()
-    desk.flights.ended = Flight(
+    desk.flights.ended = PreflightRun(
         "one", "the checkpoint pi0", None, 0.0, {"verdict": "bad_shape", "sentence": "s"}
     )  # type: ignore[arg-type]
-    desk.desk.look()
-    desk.flights.ended = Flight("two", "the checkpoint pi1", None, 0.0, {}, "cancelled: run by ann")  # type: ignore[arg-type]
-    desk.desk.look()
-    desk.desk.look()
+    desk.desk.poll()
+    desk.flights.ended = PreflightRun("two", "the checkpoint pi1", None, 0.0, {}, "cancelled: run by ann")  # type: ignore[arg-type]
+    desk.desk.poll()
+    desk.desk.poll()
     assert [event.text for event in desk.events] == [
         "preflight of the checkpoint pi0: bad_shape",
         "preflight of the checkpoint pi1: cancelled: run by ann",

@@ -11,8 +11,8 @@ import pytest
 from websockets.sync.server import serve
 
 from runtime.core.errors import PolicyError, PolicyLostError, RuntimeFault, SetupError
-from runtime.preflight.course import Course
-from runtime.preflight.verdict import Stage, Verdict, stage_of, verdict_of
+from runtime.preflight.course import PreflightRunner
+from runtime.preflight.verdict import PreflightStage, PreflightVerdict, stage_of, verdict_of
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from tests.runtime.policies.peers import PIPER
 from tests.runtime.preflight.bench import HURRIED, WIRES, flown, planned, served
@@ -147,7 +147,7 @@ def test_a_closed_port_and_a_host_that_is_not_known_are_told_apart(
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     scheme = {"gr00t": "tcp", "lerobot": "grpc"}.get(WIRES[name].settings["kind"], "ws")
-    closed = Course(planned(WIRES[name], f"{scheme}://127.0.0.1:{port}")).run(60.0)
+    closed = PreflightRunner(planned(WIRES[name], f"{scheme}://127.0.0.1:{port}")).run(60.0)
     assert (closed.verdict, closed.stage) == ("port_closed", "connect"), closed.sentence
 
     def unknown(*given: object, **options: object) -> None:
@@ -155,7 +155,7 @@ def test_a_closed_port_and_a_host_that_is_not_known_are_told_apart(
 
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
     url = f"{scheme}://localhost:{port}"
-    report = Course(planned(WIRES[name], url)).run(60.0)
+    report = PreflightRunner(planned(WIRES[name], url)).run(60.0)
     assert (report.verdict, report.stage) == ("unreachable", "connect"), report.sentence
     assert url in report.sentence
 
@@ -163,7 +163,7 @@ def test_a_closed_port_and_a_host_that_is_not_known_are_told_apart(
 @pytest.mark.parametrize("name", WEBSOCKETS)
 def test_tls_against_a_server_without_is_tls(name: str) -> None:
     with served(name) as url:
-        report = Course(planned(WIRES[name], url.replace("ws://", "wss://"))).run(60.0)
+        report = PreflightRunner(planned(WIRES[name], url.replace("ws://", "wss://"))).run(60.0)
     assert (report.verdict, report.stage) == ("tls", "connect"), report.sentence
 
 
@@ -176,7 +176,7 @@ def test_a_server_that_wants_a_key_refuses(status: HTTPStatus) -> None:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         url = f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
-        report = Course(planned(WIRES["openpi"], url)).run(60.0)
+        report = PreflightRunner(planned(WIRES["openpi"], url)).run(60.0)
         server.shutdown()
         thread.join()
     assert (report.verdict, report.stage) == ("refused", "protocol"), report.sentence
@@ -186,11 +186,11 @@ def test_a_server_that_wants_a_key_refuses(status: HTTPStatus) -> None:
 def test_a_gr00t_server_that_wants_a_token_refuses() -> None:
     server = Gr00tServer(PIPER, Gr00tBehaviour("n1.6", token="secret"))
     try:
-        report = Course(planned(WIRES["gr00t-n1.6"], str(server.start()["url"]))).run(60.0)
+        report = PreflightRunner(planned(WIRES["gr00t-n1.6"], str(server.start()["url"]))).run(60.0)
     finally:
         server.close()
     assert (report.verdict, report.stage) == ("refused", "protocol"), report.sentence
-    assert "secret" not in str(report.plain())
+    assert "secret" not in str(report.to_dict())
 
 
 @pytest.mark.parametrize("server", ["openpi", "roboarena", "starvla", "gr00t-n1.6"])
@@ -203,7 +203,7 @@ def test_the_server_of_another_protocol_is_never_taken_for_well(client: str, ser
     scheme = {"gr00t": "tcp", "lerobot": "grpc"}.get(WIRES[client].settings["kind"], "ws")
     with served(server) as url:
         place = url.partition("://")[2].partition("/")[0]
-        report = Course(planned(WIRES[client], f"{scheme}://{place}", HURRIED)).run(60.0)
+        report = PreflightRunner(planned(WIRES[client], f"{scheme}://{place}", HURRIED)).run(60.0)
     assert report.verdict in ("wrong_protocol", "timeout", "server_error"), report.sentence
     same_wire = client in WEBSOCKETS and server in WEBSOCKETS
     if not same_wire:
@@ -224,11 +224,11 @@ def test_an_error_without_a_class_of_its_own_has_a_verdict_too(error: RuntimeFau
 
 
 def test_every_verdict_but_ok_says_what_to_do() -> None:
-    assert {verdict for verdict in Verdict if not verdict.advice} == {Verdict.OK}
+    assert {verdict for verdict in PreflightVerdict if not verdict.advice} == {PreflightVerdict.OK}
 
 
 @pytest.mark.parametrize("call", ["connect", "infer", "reset", ""])
 def test_every_verdict_has_its_stage_whatever_was_under_way(call: str) -> None:
-    for verdict in Verdict:
-        assert stage_of(verdict, call) in Stage
-    assert stage_of(Verdict.MISCONFIGURED, call) is Stage.RESOLVE
+    for verdict in PreflightVerdict:
+        assert stage_of(verdict, call) in PreflightStage
+    assert stage_of(PreflightVerdict.MISCONFIGURED, call) is PreflightStage.RESOLVE

@@ -161,7 +161,7 @@ def record_of(
     root: Path, name: str, spoil: Spoil | None = None, frames: int = FRAMES, **changes: Any
 ) -> Path:
     """The same by a robot that is described here, with its cameras; two of its joints move."""
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     keys = [camera.key for camera in robot.cameras]
     rest = next(iter(robot.poses.values())).astype(np.float32)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from runtime.core.errors import RecordingError
-from runtime.quality.inspection import inspect
+from runtime.quality.inspection import check_episode
 from runtime.quality.settings import QualitySettings, read_settings
 from tests.runtime.quality import built
 from tests.runtime.quality.built import FPS, FRAMES, at, late, record, shown
@@ -22,7 +22,7 @@ def good(tmp_path_factory):
 
 def found(folder, settings=None):
     """kind, severity, first, last, stream of each flag but remarks."""
-    report = inspect(folder, settings)
+    report = check_episode(folder, settings)
     return [
         (flag.kind, flag.severity, flag.first, flag.last, flag.stream)
         for flag in report.flags
@@ -31,7 +31,7 @@ def found(folder, settings=None):
 
 
 def test_a_good_episode_is_clean(good):
-    report = inspect(good)
+    report = check_episode(good)
     assert report.flags == ()
     assert report.clean
     assert report.frames == FRAMES
@@ -130,7 +130,7 @@ def test_a_drawn_camera_that_nothing_moves_before_is_not_frozen(tmp_path):
 
 def test_a_camera_of_half_the_rate_is_flagged_once(tmp_path):
     twice = shown(range(FRAMES), lambda index: built.picture(index - index % 2))
-    flags = inspect(record(tmp_path, twice)).flags
+    flags = check_episode(record(tmp_path, twice)).flags
     assert [(flag.kind, flag.severity, flag.stream) for flag in flags] == [
         ("duplicate", "warning", "cam_high")
     ]
@@ -142,7 +142,7 @@ def test_who_stands_at_the_start_and_the_end_is_flagged(tmp_path):
         moment = min(max(index, 45), 90)
         row["qpos"], row["action"] = built.wanted(moment - built.LAG), built.wanted(moment)
 
-    flags = inspect(record(tmp_path, rest, frames=180)).flags
+    flags = check_episode(record(tmp_path, rest, frames=180)).flags
     kinds = {flag.kind: flag for flag in flags if flag.kind.startswith("idle")}
     assert kinds["idle_head"].first == 0
     assert kinds["idle_head"].value == pytest.approx(45 / FPS, abs=0.1)
@@ -166,7 +166,7 @@ def test_one_picture_proves_nothing_where_the_robot_stands(tmp_path):
 def test_an_arm_at_its_limit_is_flagged_only_while_its_group_moves(tmp_path):
     import robots
 
-    robot = robots.load("ur5e")
+    robot = robots.load_robot("ur5e")
     names = list(robot.joint_names)
     described = {"name": "ur5e", "joint_names": names, "dim": robot.dim, "eef_dim": 8, "eef_names": ["p"] * 8}
 
@@ -181,7 +181,9 @@ def test_an_arm_at_its_limit_is_flagged_only_while_its_group_moves(tmp_path):
         row["qvel"] = np.zeros(robot.dim)
         row["qpos"], row["action"] = row["qpos"].astype(np.float32), row["action"].astype(np.float32)
 
-    report = inspect(record(tmp_path, push, robot=described, configuration={"robot": "ur5e"}, frames=120))
+    report = check_episode(
+        record(tmp_path, push, robot=described, configuration={"robot": "ur5e"}, frames=120)
+    )
     assert report.unchecked == ()
     saturated = [flag for flag in report.flags if flag.kind == "saturation"]
     assert [flag.stream for flag in saturated] == ["action"]
@@ -192,7 +194,7 @@ def test_an_arm_at_its_limit_is_flagged_only_while_its_group_moves(tmp_path):
 
 def test_a_joint_that_rests_at_its_limit_from_the_start_is_where_it_belongs(tmp_path):
     resting = built.record_of(tmp_path, "agilex_piper")  # at home two joints of each arm are at a limit
-    report = inspect(resting)
+    report = check_episode(resting)
     assert report.unchecked == ()
     assert report.flags == ()
 
@@ -213,7 +215,9 @@ def test_missing_pictures_rows_and_videos_are_errors(good, tmp_path):
     cut = tmp_path / good.name
     shutil.copytree(good, cut)
     (cut / "cam_high.mp4").unlink()
-    assert [flag.text for flag in inspect(cut).flags if flag.kind == "damaged"] == ["cam_high.mp4 is absent"]
+    assert [flag.text for flag in check_episode(cut).flags if flag.kind == "damaged"] == [
+        "cam_high.mp4 is absent"
+    ]
     unsealed(cut)
     assert found(cut) == [("video", "error", -1, -1, "cam_high")]
 
@@ -235,7 +239,7 @@ def test_a_longer_video_is_only_a_remark(good, tmp_path):
     short = record(tmp_path, frames=FRAMES - 20)
     shutil.copy(good / "cam_high.mp4", short / "cam_high.mp4")
     unsealed(short)
-    report = inspect(short)
+    report = check_episode(short)
     assert [(flag.kind, flag.severity) for flag in report.flags] == [("video_length", "info")]
     assert report.clean
 
@@ -276,17 +280,17 @@ def test_an_unfinished_episode_is_judged_as_far_as_it_goes(good, tmp_path):
     shutil.copytree(good, folder)
     (folder / "outcome.json").unlink()
     assert found(folder) == [("unfinished", "error", -1, -1, "")]
-    assert inspect(folder).frames == FRAMES
+    assert check_episode(folder).frames == FRAMES
 
 
 def test_a_failed_recording_is_an_error_and_an_interrupted_run_a_remark(tmp_path):
     assert found(record(tmp_path, status="failed")) == [("recording_failed", "error", -1, -1, "")]
-    assert inspect(record(tmp_path, status="interrupted")).clean
+    assert check_episode(record(tmp_path, status="interrupted")).clean
 
 
 def test_a_folder_without_a_manifest_is_no_episode(tmp_path):
     with pytest.raises(RecordingError, match=r"manifest\.json"):
-        inspect(tmp_path)
+        check_episode(tmp_path)
 
 
 @pytest.mark.exhaustive
@@ -295,9 +299,9 @@ def test_memory_does_not_grow_with_the_episode(tmp_path):
     peaks = []
     for frames in (60, 300):
         folder = record(tmp_path, frames=frames, cameras=plain, capture_streams=["joints", "cam_high"])
-        inspect(folder)  # imports and caches are not the episode's
+        check_episode(folder)  # imports and caches are not the episode's
         tracemalloc.start()
-        inspect(folder)
+        check_episode(folder)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < peaks[0] + 200_000

@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 
 from runtime.datasets.published import publish
-from runtime.quality.inspection import inspect, inspect_dataset
+from runtime.quality.inspection import check_dataset_episode, check_episode
 from tests.runtime.quality.built import CAMERAS, FRAMES, record, shown
 from tests.runtime.recording.failing import fail_at
 from tests.runtime.recording.samples import resealed
@@ -34,7 +34,7 @@ def losing(root, *stretches):
 
 
 def test_lost_pictures_are_flagged_by_rows_and_nobody_says_that_the_camera_gave_none(tmp_path):
-    report = inspect(losing(tmp_path, range(20, 23), range(40, 41), range(50, 75)))
+    report = check_episode(losing(tmp_path, range(20, 23), range(40, 41), range(50, 75)))
     assert flags(report) == [
         ("lost", "warning", 20, 22, CAMERA),
         ("lost", "warning", 40, 40, CAMERA),
@@ -51,13 +51,13 @@ def test_lost_pictures_are_flagged_by_rows_and_nobody_says_that_the_camera_gave_
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_a_dataset_says_the_same(tmp_path, version):
     publish(losing(tmp_path / "episodes", range(20, 23)), tmp_path / "set", version=version)
-    assert flags(inspect_dataset(tmp_path / "set", 0)) == [("lost", "warning", 20, 22, CAMERA)]
+    assert flags(check_dataset_episode(tmp_path / "set", 0)) == [("lost", "warning", 20, 22, CAMERA)]
 
 
 def test_a_video_that_was_lost_is_one_flag_from_its_end_to_the_last_row(tmp_path, monkeypatch):
     fail_at(monkeypatch, CAMERA, 30, ValueError("lost its mind"))
     folder = record(tmp_path)
-    report = inspect(folder)
+    report = check_episode(folder)
     assert flags(report) == [("video_lost", "error", 30, FRAMES - 1, CAMERA)]
     assert report.flags[0].text.startswith(f"from frame 30 on the video of {CAMERA} ended: ")
     assert "lost its mind" in report.flags[0].text
@@ -76,13 +76,13 @@ def test_a_video_may_be_lost_before_the_first_row_and_after_the_last(tmp_path, r
     if row == 0:
         (folder / f"{CAMERA}.mp4").unlink()
     told_of(folder, {CAMERA: {"row": row, "reason": "the encoder failed"}})
-    assert flags(inspect(folder)) == [expected]
+    assert flags(check_episode(folder)) == [expected]
 
 
 def test_a_loss_that_says_no_row_is_an_error_that_names_it(tmp_path):
     folder = record(tmp_path)
     told_of(folder, {CAMERA: {"row": "thirty"}})
-    (flag,) = inspect(folder).flags
+    (flag,) = check_episode(folder).flags
     assert (flag.kind, flag.severity) == ("unfinished", "error")
     assert f"lost_cameras.{CAMERA} is {{'row': 'thirty'}}, must be a table with a row from 0" in flag.text
 

@@ -13,7 +13,7 @@ from runtime.core.errors import RecordingError
 from runtime.datasets.operations import convert
 from runtime.datasets.published import publish
 from runtime.quality.__main__ import main
-from runtime.quality.inspection import inspect, inspect_dataset
+from runtime.quality.inspection import check_dataset_episode, check_episode
 from tests.runtime.quality import built
 from tests.runtime.quality.built import FPS, FRAMES, record, shown
 
@@ -48,7 +48,7 @@ def test_what_is_published_is_judged_as_the_episode_was(dataset, tmp_path, versi
     if version != "v2.1":
         convert(dataset, tmp_path / "other", version)
         dataset = tmp_path / "other"
-    good, bad = inspect_dataset(dataset, 0), inspect_dataset(dataset, 1)
+    good, bad = check_dataset_episode(dataset, 0), check_dataset_episode(dataset, 1)
     assert good.clean
     assert flags(good) == []
     assert good.figures["tracking_lag_s"] == pytest.approx(built.LAG / FPS)
@@ -68,13 +68,13 @@ def test_uneven_timestamps_are_errors(dataset, tmp_path):
     copied = copy_of(dataset, tmp_path)
     times = (np.arange(FRAMES) / FPS + np.where(np.arange(FRAMES) == 20, 0.004, 0)).astype(np.float32)
     edit(copied, "timestamp", lambda column: pa.array(times))
-    assert flags(inspect_dataset(copied, 0)) == [("time_grid", 20, 20, "timestamp")]
+    assert flags(check_dataset_episode(copied, 0)) == [("time_grid", 20, 20, "timestamp")]
 
 
 def test_rows_out_of_order_are_errors(dataset, tmp_path):
     copied = copy_of(dataset, tmp_path)
     edit(copied, "frame_index", lambda column: pa.array([*range(50), *range(51, FRAMES + 1)]))
-    assert flags(inspect_dataset(copied, 0)) == [("missing_rows", 50, 50, "")]
+    assert flags(check_dataset_episode(copied, 0)) == [("missing_rows", 50, 50, "")]
 
 
 def test_rows_of_another_width_and_without_numbers_are_errors(dataset, tmp_path):
@@ -86,7 +86,7 @@ def test_rows_of_another_width_and_without_numbers_are_errors(dataset, tmp_path)
         return pa.array(rows, pa.list_(pa.float32()))
 
     edit(copied, "observation.state", spoil)
-    found = flags(inspect_dataset(copied, 0))
+    found = flags(check_dataset_episode(copied, 0))
     assert ("dimensions", 10, 10, "observation.state") in found
     assert ("missing_values", 20, 20, "observation.state") in found
     assert ("not_finite", 30, 30, "observation.state") in found
@@ -95,7 +95,7 @@ def test_rows_of_another_width_and_without_numbers_are_errors(dataset, tmp_path)
 
 def test_an_episode_that_is_not_there_is_refused_by_number(dataset):
     with pytest.raises(RecordingError, match="no episode 7"):
-        inspect_dataset(dataset, 7)
+        check_dataset_episode(dataset, 7)
 
 
 def test_a_dataset_without_a_state_says_what_it_did_not_judge(dataset, tmp_path):
@@ -111,13 +111,13 @@ def test_a_dataset_without_a_state_says_what_it_did_not_judge(dataset, tmp_path)
         ),
         path,
     )
-    report = inspect_dataset(copied, 0)
+    report = check_dataset_episode(copied, 0)
     assert any("--state" in sentence for sentence in report.unchecked)
-    assert inspect_dataset(copied, 0, state="joints").figures["tracking_lag_s"] == pytest.approx(
+    assert check_dataset_episode(copied, 0, state="joints").figures["tracking_lag_s"] == pytest.approx(
         built.LAG / FPS
     )
     with pytest.raises(RecordingError, match="no column 'elsewhere'"):
-        inspect_dataset(copied, 0, state="elsewhere")
+        check_dataset_episode(copied, 0, state="elsewhere")
 
 
 def test_the_command_says_which_episodes_are_flagged(dataset, tmp_path, capsys):
@@ -142,7 +142,7 @@ def test_the_command_takes_a_folder_of_episodes_and_other_bounds(tmp_path, capsy
 
 
 def test_the_report_of_an_episode_is_plain_json(tmp_path):
-    document = inspect(record(tmp_path, frames=20)).document()
+    document = check_episode(record(tmp_path, frames=20)).to_dict()
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert document["worst"] == "warning"
 
@@ -150,7 +150,7 @@ def test_the_report_of_an_episode_is_plain_json(tmp_path):
 @pytest.mark.exhaustive
 @pytest.mark.skipif(not SAMPLE, reason="EVA_SAMPLE_EPISODE does not name the real episode")
 def test_the_real_episode_is_flagged_for_standing_at_its_end_alone():
-    report = inspect_dataset(Path(str(SAMPLE)), 0)
+    report = check_dataset_episode(Path(str(SAMPLE)), 0)
     assert [flag.kind for flag in report.flags] == ["idle_tail"]
     assert report.flags[0].last == 397
     assert report.figures["tracking_lag_s"] == pytest.approx(4 / 30)  # its action leads by four rows

@@ -6,12 +6,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.quality.report import Flag, Flags, Run, Runs
+from runtime.quality.report import Flag, FlagCollector, FrameRun, RunCollector
 
 
 def runs_of(marked, values, cuts, apart):
     found = []
-    runs = Runs(found.append, apart)
+    runs = RunCollector(found.append, apart)
     edges = [0, *sorted({cut % (len(marked) + 1) for cut in cuts}), len(marked)]
     for first, end in itertools.pairwise(edges):
         runs.add(first, np.array(marked[first:end], bool), np.array(values[first:end], float))
@@ -32,7 +32,7 @@ def plainly(marked, values, apart):
     told = []
     for frames in found:
         worst = max(frames, key=lambda frame: (values[frame], -frame))
-        told.append(Run(frames[0], frames[-1], values[worst], worst))
+        told.append(FrameRun(frames[0], frames[-1], values[worst], worst))
     return told
 
 
@@ -46,17 +46,17 @@ def test_runs_are_the_same_in_whatever_blocks_frames_come(frames, cuts, apart):
 
 
 def test_a_report_lists_some_flags_and_counts_all():
-    flags = Flags(3)
+    flags = FlagCollector(3)
     for frame in range(10):
         flags.add(Flag("gap", "warning", 2 * frame, 2 * frame + 1, "tick_time", "a gap"))
     report = flags.report("it", 20, 30.0, {"skew": float("nan")})
     assert len(report.flags) == 3
     assert (report.counts["gap"].flags, report.counts["gap"].frames) == (10, 20)
-    assert report.document()["figures"] == {"skew": None}
+    assert report.to_dict()["figures"] == {"skew": None}
 
 
 def test_an_episode_with_remarks_alone_is_clean():
-    flags = Flags(3)
+    flags = FlagCollector(3)
     flags.add(Flag("interrupted", "info", -1, -1, "", "it was interrupted"))
     assert flags.report("it", 1, 30.0, {}).clean
     flags.add(Flag("gap", "warning", 0, 0, "", "a gap"))

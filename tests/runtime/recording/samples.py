@@ -13,7 +13,14 @@ import numpy as np
 
 from runtime.recording.base import ExecutedTick, RawChunk, Row
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import OUTCOME, SECOND, digests_of, sealed, told, write_outcome
+from runtime.recording.sealing import (
+    OUTCOME,
+    OUTCOME_COPY,
+    digests_of,
+    seal_outcome,
+    without_digests,
+    write_outcome,
+)
 from runtime.recording.settings import RecordingSettings
 from tests.processes import PATIENCE_S
 
@@ -136,19 +143,19 @@ def chunk(chunk_id: int, horizon: int = 4, width: int = 2) -> RawChunk:
 def unsealed(folder: Path, **changes: object) -> None:
     """Make the outcome one from before there were digests and copies of it, with `changes`."""
     path = folder / "outcome.json"
-    (folder / SECOND).unlink(missing_ok=True)
-    path.write_text(json.dumps(told(json.loads(path.read_text())) | changes))
+    (folder / OUTCOME_COPY).unlink(missing_ok=True)
+    path.write_text(json.dumps(without_digests(json.loads(path.read_text())) | changes))
 
 
 def unended(folder: Path) -> None:
     """Take its outcome and the copy of that away, as if the recorder had been killed just before it wrote them."""
-    for name in (SECOND, OUTCOME):
+    for name in (OUTCOME_COPY, OUTCOME):
         (folder / name).unlink()
 
 
 def resealed(folder: Path, **changes: object) -> None:
     """Give an episode whose files a test has changed the digests of these, as if it had been recorded so."""
     path = folder / "outcome.json"
-    outcome = told(json.loads(path.read_text())) | changes
-    layout = Layout.of(json.loads((folder / "manifest.json").read_text()))
-    write_outcome(folder, sealed(outcome, digests_of(folder, layout)))
+    outcome = without_digests(json.loads(path.read_text())) | changes
+    layout = Layout.from_manifest(json.loads((folder / "manifest.json").read_text()))
+    write_outcome(folder, seal_outcome(outcome, digests_of(folder, layout)))

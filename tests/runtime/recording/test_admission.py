@@ -11,7 +11,7 @@ from runtime.recording.layout import Layout
 
 from .samples import CAMERAS, chunk, manifest, numbered, row, tick
 
-LAYOUT = Layout.of(manifest())
+LAYOUT = Layout.from_manifest(manifest())
 
 
 def test_a_row_is_copied_and_gives_up_its_pictures() -> None:

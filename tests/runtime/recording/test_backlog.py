@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.recording.backlog import RUN, Pace, Picture, PictureQueue, codings
+from runtime.recording.backlog import RUN, Pace, Picture, PictureQueue, encode_count
 from tests.examples import some
 
 from .samples import numbered
@@ -47,10 +47,10 @@ class Simulated:
         while self._free <= until and self._queue.waiting():
             entry = self._queue.take()
             frames = 1 if isinstance(entry, Picture) else entry
-            coded = 1 if isinstance(entry, Picture) else codings(frames)
+            coded = 1 if isinstance(entry, Picture) else encode_count(frames)
             took = coded * self._cost(self._free)
             self._free += took
-            self._queue.coded(coded, took)
+            self._queue.report_encoded(coded, took)
             for _ in range(frames):
                 self.lags.append(self._free - self._put[self._done])
                 self._done += 1
@@ -134,18 +134,18 @@ def test_a_place_is_free_again_once_a_picture_was_taken() -> None:
 
 def test_what_would_wait_too_long_is_not_taken_and_an_empty_queue_takes_anything() -> None:
     queue = PictureQueue(places=8, max_lag_s=0.5)
-    queue.coded(1, 0.2)
+    queue.report_encoded(1, 0.2)
     assert [queue.put(PICTURE) for _ in range(4)] == [True, True, False, False]
     for _ in range(3):
         queue.take()
-    queue.coded(1, 60.0)
+    queue.report_encoded(1, 60.0)
     assert queue.put(PICTURE)
     assert not queue.put(PICTURE)
 
 
 def test_a_patient_caller_waits_for_a_place_however_slow_the_encoder_is() -> None:
     queue = PictureQueue(places=2, max_lag_s=0.5)
-    queue.coded(1, 60.0)
+    queue.report_encoded(1, 60.0)
     assert queue.put(numbered(0), patience=60.0)
     assert queue.put(numbered(1), patience=60.0)
     taker = threading.Thread(target=queue.take)
@@ -156,15 +156,15 @@ def test_a_patient_caller_waits_for_a_place_however_slow_the_encoder_is() -> Non
 
 @given(st.integers(1, 100_000))
 def test_a_run_of_repeats_is_coded_in_three_frames_at_most(repeats: int) -> None:
-    assert codings(repeats) <= min(repeats, 3)
-    assert repeats < RUN or (repeats - codings(repeats)) % 2 == 0
+    assert encode_count(repeats) <= min(repeats, 3)
+    assert repeats < RUN or (repeats - encode_count(repeats)) % 2 == 0
 
 
 def test_the_pace_is_slower_at_once_and_faster_after_a_while() -> None:
     pace = Pace()
-    pace.see(2, 0.4)
+    pace.update(2, 0.4)
     assert pace.coding_s == pytest.approx(0.2)
-    pace.see(1, 0.5)
+    pace.update(1, 0.5)
     assert pace.coding_s == pytest.approx(0.5)
-    pace.see(1, 0.0)
+    pace.update(1, 0.0)
     assert pace.coding_s == pytest.approx(0.4)

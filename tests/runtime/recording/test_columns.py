@@ -15,7 +15,7 @@ from runtime.recording.tables import SCHEMAS, TableWriter, read_table, write_tab
 
 from .samples import CAMERAS, STARTED, chunk, manifest, row, tick
 
-LAYOUT = Layout.of(manifest())
+LAYOUT = Layout.from_manifest(manifest())
 
 
 def written(folder: Path, name: str, *records: object) -> pa.Table:
@@ -65,7 +65,7 @@ def test_a_row_keeps_every_field_and_times_count_from_the_start(tmp_path: Path) 
 
 
 def test_rows_whose_streams_are_too_far_apart_are_flagged(tmp_path: Path) -> None:
-    layout = Layout.of(manifest(max_skew_s=0.05))
+    layout = Layout.from_manifest(manifest(max_skew_s=0.05))
     captured = [
         {"joints": 1000.0, CAMERAS[0]: 1000.03, CAMERAS[1]: 999.99},
         {"joints": 1000.0, CAMERAS[0]: 1000.03, CAMERAS[1]: 999.97},

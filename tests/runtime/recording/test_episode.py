@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from runtime.core.errors import RecordingError
-from runtime.recording.base import Loss, Outcome
+from runtime.recording.base import LostCamera, Outcome
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.files import DiskFullError, UnclosedError
 from runtime.recording.fragments import count_frames
@@ -68,7 +68,7 @@ def append_for_ever(journal: EpisodeJournal) -> None:
     for k in range(100_000):
         journal.append(row(k))
         journal.append(tick(k))
-        journal.mark({"k": k})
+        journal.append_event({"k": k})
 
 
 def fill(path: Path) -> None:
@@ -83,13 +83,13 @@ def test_a_whole_episode_comes_back(tmp_path: Path) -> None:
     journal, folder = begun(tmp_path / "episodes")
     given = json.loads((folder / "manifest.json").read_text())
     assert folder.name == given["uuid"]
-    journal.mark({"kind": "started", "delay": np.float64(0.5)})
+    journal.append_event({"kind": "started", "delay": np.float64(0.5)})
     for k in range(40):
         journal.append(row(k, control_source="hold" if k >= 30 else "policy"))
         journal.append(tick(3 * k))
         journal.append(tick(3 * k + 1, smoothed=None))
     journal.append(chunk(1))
-    journal.mark({"kind": "stopped"})
+    journal.append_event({"kind": "stopped"})
     journal.end(FINISHED)
     assert journal.folder is None
     episode = open_episode(folder)
@@ -160,7 +160,11 @@ def test_an_episode_is_never_written_twice(tmp_path: Path) -> None:
 
 def test_begin_and_end_come_in_turns(tmp_path: Path) -> None:
     journal = EpisodeJournal(tmp_path, SETTINGS)
-    for call in (lambda: journal.append(row(0)), lambda: journal.mark({}), lambda: journal.end(FINISHED)):
+    for call in (
+        lambda: journal.append(row(0)),
+        lambda: journal.append_event({}),
+        lambda: journal.end(FINISHED),
+    ):
         with pytest.raises(RecordingError, match="no episode has begun"):
             call()
     journal.begin(manifest())
@@ -259,11 +263,11 @@ def test_a_patient_journal_repeats_nothing(tmp_path: Path) -> None:
     assert numbers(episode.videos[CAMERAS[1]]) == list(range(1, 201))
 
 
-def append_until_lost(journal: EpisodeJournal) -> tuple[int, Loss]:
+def append_until_lost(journal: EpisodeJournal) -> tuple[int, LostCamera]:
     """Append rows until a camera is said to be lost; how many, and the loss."""
     for k in range(10_000):
         journal.append(row(k))
-        losses = journal.losses()
+        losses = journal.pop_lost_cameras()
         if losses:
             assert len(losses) == 1
             return k + 1, losses[0]
@@ -279,7 +283,7 @@ def test_a_failing_encoder_costs_its_video_and_all_else_is_recorded_on(
     for k in range(told, told + 30):
         journal.append(row(k))
         journal.append(tick(k))
-    assert journal.losses() == []
+    assert journal.pop_lost_cameras() == []
     journal.end(FINISHED)
     assert (loss.camera, loss.row) == (CAMERAS[0], 20)
     assert f"camera {CAMERAS[0]}: the encoder failed" in loss.text
@@ -331,7 +335,7 @@ def test_an_episode_whose_every_camera_is_lost_keeps_its_rows(
     for k in range(50):
         journal.append(row(k))
     journal.end(FINISHED)
-    assert sorted(loss.camera for loss in journal.losses()) == sorted(CAMERAS)
+    assert sorted(loss.camera for loss in journal.pop_lost_cameras()) == sorted(CAMERAS)
     episode = open_episode(folder)
     assert episode.frames == 50
     assert sorted(episode.outcome["lost_cameras"]) == sorted(CAMERAS)  # type: ignore[index]
@@ -361,7 +365,7 @@ def test_an_encoder_that_never_ends_is_named_and_the_episode_is_kept(
     for k in range(5):
         journal.append(row(k))
     journal.end(FINISHED)
-    (loss,) = journal.losses()
+    (loss,) = journal.pop_lost_cameras()
     stuck.free.set()
     assert f"camera {CAMERAS[0]}: the encoder did not end in time" in loss.reason
     episode = open_episode(folder)
@@ -383,7 +387,7 @@ def test_an_encoder_that_stands_still_is_given_up_while_all_else_is_recorded_on(
     for k in range(60):
         eventually(lambda: healthy.waiting() < 10, "the other camera keeps up")  # else it is given up too
         journal.append(row(k, pictures={**row(k).pictures, CAMERAS[1]: None}))
-    (loss,) = journal.losses()
+    (loss,) = journal.pop_lost_cameras()
     assert loss.camera == CAMERAS[0]
     assert "is given up" in loss.reason
     stuck.free.set()
@@ -454,7 +458,7 @@ def test_an_end_that_finds_no_room_is_whole_once_there_is_some(small_disk: Path)
     journal, folder = begun(small_disk, patient=True)
     for k in range(60):
         journal.append(row(k))
-        journal.mark({"k": k})
+        journal.append_event({"k": k})
     ballast = small_disk / "ballast"
     with pytest.raises(OSError, match="No space"):
         fill(ballast)
@@ -497,5 +501,5 @@ def test_something_that_is_no_record_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="not dict"):
         journal.append({"index": 0})  # type: ignore[arg-type]
     with pytest.raises(RecordingError, match="an event cannot be written"):
-        journal.mark({"what": object()})
+        journal.append_event({"what": object()})
     journal.end(FINISHED)

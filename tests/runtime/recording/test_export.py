@@ -17,8 +17,8 @@ from runtime.core.errors import RecordingError
 from runtime.recording import export as exporting
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
-from runtime.recording.export import FOLDER, NO_PROMPT, SCHEMA, export, is_exported, place, slug
-from runtime.recording.files import document
+from runtime.recording.export import FOLDER, NO_PROMPT, SCHEMA, export_path, is_exported, slug, write_export
+from runtime.recording.files import to_json
 
 from .samples import DIM, SETTINGS, STARTED, chunk, manifest, row, tick, unsealed
 
@@ -46,7 +46,7 @@ def recorded(root: Path, **changes: Any) -> Path:
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("data")
-    return export(recorded(root), root)
+    return write_export(recorded(root), root)
 
 
 def rows(path: Path, stream: str) -> list[dict[str, Any]]:
@@ -131,22 +131,22 @@ def test_each_stream_begins_a_row_group(exported: Path) -> None:
 
 def test_exporting_again_writes_nothing_until_the_episode_was_repaired(tmp_path: Path) -> None:
     folder = recorded(tmp_path)
-    first = export(folder, tmp_path)
+    first = write_export(folder, tmp_path)
     before = first.stat()
-    assert export(folder, tmp_path) == first
+    assert write_export(folder, tmp_path) == first
     assert first.stat().st_mtime_ns == before.st_mtime_ns
     assert first.stat().st_ino == before.st_ino
     content = first.read_bytes()
     os.utime(folder / "outcome.json", ns=(before.st_mtime_ns + 1, before.st_mtime_ns + 1))
     assert not is_exported(folder, first)
-    export(folder, tmp_path)
+    write_export(folder, tmp_path)
     assert first.stat().st_ino != before.st_ino
     assert first.read_bytes() == content
 
 
 def test_several_at_once_leave_one_whole_table(tmp_path: Path) -> None:
     folder = recorded(tmp_path)
-    threads = [threading.Thread(target=export, args=(folder, tmp_path)) for _ in range(4)]
+    threads = [threading.Thread(target=write_export, args=(folder, tmp_path)) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -159,7 +159,7 @@ def test_what_has_no_outcome_is_refused_and_leaves_nothing(tmp_path: Path) -> No
     folder = recorded(tmp_path)
     (folder / "outcome.json").unlink()
     with pytest.raises(RecordingError, match=r"has no outcome\.json"):
-        export(folder, tmp_path)
+        write_export(folder, tmp_path)
     assert not (tmp_path / FOLDER).exists()
 
 
@@ -168,7 +168,7 @@ def test_an_episode_that_lost_a_table_or_a_video_is_exported_with_what_there_is(
     (folder / "ticks.arrow").unlink()
     next(folder.glob("*.mp4")).unlink()
     unsealed(folder)
-    path = export(folder, tmp_path)
+    path = write_export(folder, tmp_path)
     assert rows(path, "executed") == []
     assert len(rows(path, "smoothed")) == 12
     assert "time" not in rows(path, "raw")[1]
@@ -178,7 +178,7 @@ def test_a_disk_that_takes_nothing_is_a_sentence(tmp_path: Path, monkeypatch: py
     folder = recorded(tmp_path)
     (tmp_path / FOLDER).write_text("in the way")
     with pytest.raises(RecordingError, match="exports"):
-        export(folder, tmp_path)
+        write_export(folder, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +218,7 @@ def test_whatever_a_manifest_says_the_table_stays_below_the_data_folder(
     prompt: str, mode: str, strategy: str
 ) -> None:
     root = Path("/data")
-    path = place(manifest(task=prompt, mode=mode, strategy=strategy), root)
+    path = export_path(manifest(task=prompt, mode=mode, strategy=strategy), root)
     parts = path.relative_to(root).parts
     assert len(parts) == 5
     assert parts[0] == FOLDER
@@ -237,13 +237,13 @@ def test_two_prompts_never_share_a_folder(one: str, other: str) -> None:
 def test_a_manifest_whose_uuid_leads_elsewhere_is_refused(tmp_path: Path) -> None:
     folder = recorded(tmp_path)
     told = json.loads((folder / "manifest.json").read_text()) | {"uuid": "../../outside"}
-    (folder / "manifest.json").write_bytes(document(told, "the manifest"))
+    (folder / "manifest.json").write_bytes(to_json(told, "the manifest"))
     with pytest.raises(RecordingError, match="uuid"):
-        export(folder, tmp_path)
+        write_export(folder, tmp_path)
 
 
 def test_a_long_run_is_many_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporting, "_ROWS_TOGETHER", 5)
-    path = export(recorded(tmp_path), tmp_path)
+    path = write_export(recorded(tmp_path), tmp_path)
     assert pq.ParquetFile(path).num_row_groups == 2 + 3 + 4
     assert len(rows(path, "executed")) == 16

@@ -10,10 +10,10 @@ import pytest
 from runtime.core.errors import RecordingError
 from runtime.recording.files import (
     AppendFile,
-    document,
-    read_document,
+    read_json,
     require_room,
-    write_whole,
+    to_json,
+    write_atomic,
 )
 
 
@@ -94,14 +94,14 @@ def test_an_existing_file_is_never_written_again(tmp_path: Path) -> None:
 def test_a_document_that_cannot_be_written_leaves_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_whole(tmp_path / "outcome.json", b"old")
+    write_atomic(tmp_path / "outcome.json", b"old")
 
     def failing(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", failing)
     with pytest.raises(RecordingError, match=r"disk full while writing .*outcome\.json"):
-        write_whole(tmp_path / "outcome.json", b"new")
+        write_atomic(tmp_path / "outcome.json", b"new")
     assert (tmp_path / "outcome.json").read_bytes() == b"old"
     assert [path.name for path in tmp_path.iterdir()] == ["outcome.json"]
 
@@ -116,7 +116,7 @@ def test_too_little_room_says_how_much_there_is_how_much_is_wanted_and_where(tmp
 
 def test_numpy_values_become_plain_and_unknown_numbers_null() -> None:
     value = {"a": np.float32(1.5), "b": np.arange(2), "c": float("nan"), "d": (1, np.inf), "e": Path("x")}
-    assert json.loads(document(value, "an event")) == {
+    assert json.loads(to_json(value, "an event")) == {
         "a": 1.5,
         "b": [0, 1],
         "c": None,
@@ -127,11 +127,11 @@ def test_numpy_values_become_plain_and_unknown_numbers_null() -> None:
 
 def test_a_value_that_json_does_not_know_is_named() -> None:
     with pytest.raises(RecordingError, match=r"an event cannot be written as JSON.*object"):
-        document({"a": object()}, "an event")
+        to_json({"a": object()}, "an event")
 
 
 @pytest.mark.parametrize("content", [b'{"a": ', b"", b"\xff\xfe", b"[1]"])
 def test_a_torn_document_is_an_error_that_names_it(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "manifest.json").write_bytes(content)
     with pytest.raises(RecordingError, match=r"manifest\.json"):
-        read_document(tmp_path / "manifest.json")
+        read_json(tmp_path / "manifest.json")

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.recording.histogram import Histogram
+from runtime.recording.histogram import DurationHistogram
 
 
 @given(st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=300))
 def test_quantiles_are_those_of_the_durations_to_one_per_cent(durations: list[float]) -> None:
-    spread = Histogram()
+    spread = DurationHistogram()
     for seconds in durations:
         spread.add(seconds)
     told = spread.milliseconds()
@@ -23,7 +23,7 @@ def test_quantiles_are_those_of_the_durations_to_one_per_cent(durations: list[fl
 
 
 def test_what_is_not_known_does_not_count_and_extremes_do() -> None:
-    spread = Histogram()
+    spread = DurationHistogram()
     for unknown in (math.nan, math.inf, -math.inf):
         spread.add(unknown)
     assert spread.milliseconds() is None

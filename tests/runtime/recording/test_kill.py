@@ -10,7 +10,7 @@ import pytest
 import runtime
 from runtime.recording.reader import open_episode
 from runtime.recording.repair import repair
-from runtime.recording.scrub import verify
+from runtime.recording.scrub import verify_episode
 
 from .samples import CAMERAS, numbers
 
@@ -53,7 +53,7 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path: Path, rows: i
     report = repair(folder)
     assert report.verdict == "repaired"
     assert report.frames >= appended - FPS
-    assert verify(folder).state == "sound"
+    assert verify_episode(folder).state == "sound"
     episode = open_episode(folder)
     assert episode.rows.column("index").to_pylist() == list(range(report.frames))
     assert episode.ticks.num_rows >= 3 * (appended - FPS)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.recording.labels import FOLDER, Label, append, labels, newest
+from runtime.recording.labels import FOLDER, Label, append_label, latest_label, read_labels
 from tests.runtime.datasets.odd_lines import ENDS_NO_LINE
 
 
@@ -21,9 +21,9 @@ def test_what_only_some_programs_take_for_the_end_of_a_line_ends_none(tmp_path: 
         Label(3.0, "ann", "fail", odd, discarded=True),
     ]
     for label in said:
-        append(tmp_path, episode, label)
-    assert labels(tmp_path, episode) == said
-    assert newest(tmp_path, episode) == said[-1]
+        append_label(tmp_path, episode, label)
+    assert read_labels(tmp_path, episode) == said
+    assert latest_label(tmp_path, episode) == said[-1]
 
 
 def test_a_label_after_a_byte_order_mark_counts(tmp_path: Path) -> None:
@@ -32,4 +32,4 @@ def test_a_label_after_a_byte_order_mark_counts(tmp_path: Path) -> None:
     path.parent.mkdir()
     line = {"time": 1.0, "by": "ann", "result": None, "note": "", "discarded": True}
     path.write_text("\ufeff" + json.dumps(line) + "\n", "utf-8")
-    assert [label.discarded for label in labels(tmp_path, episode)] == [True]
+    assert [label.discarded for label in read_labels(tmp_path, episode)] == [True]

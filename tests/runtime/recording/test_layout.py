@@ -9,7 +9,7 @@ from .samples import CAMERAS, manifest
 
 
 def test_it_reads_what_decides_the_files() -> None:
-    layout = Layout.of(manifest())
+    layout = Layout.from_manifest(manifest())
     assert layout.streams == ("qvel", "eef", "eef_action")
     assert (layout.dim, layout.eef_dim, layout.fps, layout.started) == (3, 8, 30.0, 1000.0)
     assert layout.cameras == dict.fromkeys(CAMERAS, (48, 64))
@@ -40,10 +40,10 @@ def test_it_reads_what_decides_the_files() -> None:
 )
 def test_what_is_wrong_is_named_with_what_is_allowed(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(RecordingError, match=words):
-        Layout.of(manifest(**changes))
+        Layout.from_manifest(manifest(**changes))
 
 
 def test_a_robot_without_arms_needs_no_pose_width() -> None:
-    layout = Layout.of(manifest(robot={"dim": 3}, streams={}, cameras={}, capture_streams=()))
+    layout = Layout.from_manifest(manifest(robot={"dim": 3}, streams={}, cameras={}, capture_streams=()))
     assert layout.eef_dim == 0
     assert layout.streams == ()

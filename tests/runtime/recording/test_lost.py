@@ -19,14 +19,14 @@ from runtime.datasets.published import publish
 from runtime.recording.__main__ import main
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
-from runtime.recording.export import export
-from runtime.recording.files import write_whole
-from runtime.recording.labels import Label, append
+from runtime.recording.export import write_export
+from runtime.recording.files import write_atomic
+from runtime.recording.labels import Label, append_label
 from runtime.recording.marks import mark_file
-from runtime.recording.quarantine import keep, marked
+from runtime.recording.quarantine import marked_damage, update_mark
 from runtime.recording.repair import repair
-from runtime.recording.scrub import require_sound, verify
-from runtime.recording.sealing import OUTCOME, SECOND, read_outcome
+from runtime.recording.scrub import require_intact, verify_episode
+from runtime.recording.sealing import OUTCOME, OUTCOME_COPY, read_outcome
 from runtime.recording.tables import SCHEMAS
 from runtime.recording.verdict import UNSEALED, DamagedError
 from tests.examples import some
@@ -47,7 +47,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k in range(ROWS):
         journal.append(row(k))
         journal.append(tick(k))
-        journal.mark({"kind": "note", "text": str(k)})
+        journal.append_event({"kind": "note", "text": str(k)})
     journal.append(chunk(1))
     journal.end(Outcome("finished", "", 1.7e9))
     return folder
@@ -92,10 +92,10 @@ def test_a_lost_outcome_is_brought_back_where_nothing_else_has_changed(folder: P
         assert (report.verdict, report.frames) == ("restored", ROWS)
         assert OUTCOME in report.problem or "no outcome" in report.problem
         assert (folder / OUTCOME).read_bytes() == before
-        harm(folder / SECOND)
-        assert [damage.file for damage in verify(folder).damage] == [SECOND]
+        harm(folder / OUTCOME_COPY)
+        assert [damage.file for damage in verify_episode(folder).damage] == [OUTCOME_COPY]
         assert repair(folder).verdict == "restored"
-        assert (folder / SECOND).read_bytes() == before
+        assert (folder / OUTCOME_COPY).read_bytes() == before
     assert repair(folder).verdict == "complete"
 
 
@@ -120,9 +120,9 @@ def test_an_outcome_without_its_digests_is_no_older_recording(folder: Path) -> N
     (folder / OUTCOME).write_text(
         json.dumps({name: outcome[name] for name in outcome if name not in ("digests", "seal")})
     )
-    assert verify(folder).text == "outcome.json has lost its digests: there is sealed.json"
+    assert verify_episode(folder).text == "outcome.json has lost its digests: there is sealed.json"
     with pytest.raises(DamagedError):
-        require_sound(folder, ("manifest.json",))
+        require_intact(folder, ("manifest.json",))
     assert repair(folder).verdict == "restored"
     assert json.loads((folder / OUTCOME).read_text()) == outcome
 
@@ -131,7 +131,7 @@ def test_two_outcomes_that_contradict_are_damage_that_nobody_mends(folder: Path)
     first = (folder / OUTCOME).read_bytes()
     resealed(folder, status="failed")
     (folder / OUTCOME).write_bytes(first)
-    assert verify(folder).text == "sealed.json is not the copy of outcome.json that it was"
+    assert verify_episode(folder).text == "sealed.json is not the copy of outcome.json that it was"
     assert repair(folder).verdict == "damaged"
 
 
@@ -142,20 +142,20 @@ def test_of_one_that_was_ended_repair_says_what_nobody_can_say_any_more(folder: 
     report = repair(folder)
     assert (report.verdict, report.rows_cut) == ("repaired", 0)
     assert "all its tables were ended" in report.problem
-    assert (verify(folder).state, verify(folder).text) == ("unsealed", report.problem)
+    assert (verify_episode(folder).state, verify_episode(folder).text) == ("unsealed", report.problem)
     assert report.problem in str(read_outcome(folder)["reason"])
     assert publish(folder, tmp_path / "set", include_interrupted=True).remark == report.problem
 
 
 def test_of_one_that_was_exported_too(folder: Path) -> None:
-    export(folder, folder.parents[1])
+    write_export(folder, folder.parents[1])
     unended(folder)
     half(folder / "rows.arrow")
     assert (
         f"exports/stack-the-blocks/continuous/async/{folder.name}.parquet was made of it"
         in repair(folder).problem
     )
-    assert verify(folder).state == "unsealed"
+    assert verify_episode(folder).state == "unsealed"
 
 
 # --- marks ---------------------------------------------------------------------------------------------------
@@ -165,20 +165,20 @@ def test_a_mark_outlives_the_outcome_and_its_repair(folder: Path, capsys: pytest
     data = folder.parents[1]
     half(folder / "raw.arrow")
     assert main(["scrub", str(data)]) == 1
-    mark = marked(data, folder.name)
+    mark = marked_damage(data, folder.name)
     unended(folder)
     assert main(["scrub", str(data)]) == 1
     assert main(["repair", str(folder)]) == 1
     assert "raw.arrow has " in capsys.readouterr().out
     assert not (folder / OUTCOME).exists()
-    assert marked(data, folder.name) == mark
+    assert marked_damage(data, folder.name) == mark
 
 
 @pytest.mark.parametrize("spoil", [half, empty])
 def test_a_mark_that_is_damaged_itself_keeps_repair_from_sealing(folder: Path, spoil: Harm) -> None:
     data = folder.parents[1]
     half(folder / "raw.arrow")
-    keep(verify(folder))
+    update_mark(verify_episode(folder))
     spoil(data / f"quarantine/{folder.name}.json")
     unended(folder)
     assert repair(folder).problem == f"quarantine/{folder.name}.json is no mark any more, and was one"
@@ -187,22 +187,22 @@ def test_a_mark_that_is_damaged_itself_keeps_repair_from_sealing(folder: Path, s
 def test_a_mark_stays_on_what_was_sealed_elsewhere(folder: Path, tmp_path: Path) -> None:
     data = folder.parents[1]
     half(folder / "raw.arrow")
-    keep(verify(folder))
-    mark = marked(data, folder.name)
+    update_mark(verify_episode(folder))
+    mark = marked_damage(data, folder.name)
     for seal in (repair, resealed):
         away = Path(shutil.copytree(folder, tmp_path / seal.__name__))
         unended(away) if seal is repair else None
         seal(away)  # type: ignore[operator]
         shutil.rmtree(folder)
         shutil.move(away, folder)
-        assert verify(folder).state == "sound"
-        keep(verify(folder))
-        assert marked(data, folder.name) == mark
+        assert verify_episode(folder).state == "sound"
+        update_mark(verify_episode(folder))
+        assert marked_damage(data, folder.name) == mark
         with pytest.raises(DamagedError, match=r"raw\.arrow has"):
             publish(folder, data / "set", include_interrupted=True)
     unsealed(folder)
-    keep(verify(folder))
-    assert marked(data, folder.name) == mark
+    update_mark(verify_episode(folder))
+    assert marked_damage(data, folder.name) == mark
 
 
 def test_a_mark_goes_once_the_files_are_back_also_those_of_an_older_recording(
@@ -212,42 +212,42 @@ def test_a_mark_goes_once_the_files_are_back_also_those_of_an_older_recording(
     for make_old in (False, True):
         unsealed(folder) if make_old else None
         empty(folder / "ticks.arrow")
-        keep(verify(folder))
-        assert marked(data, folder.name)
+        update_mark(verify_episode(folder))
+        assert marked_damage(data, folder.name)
         shutil.copy(whole / "ticks.arrow", folder)
-        keep(verify(folder))
-        assert marked(data, folder.name) == []
+        update_mark(verify_episode(folder))
+        assert marked_damage(data, folder.name) == []
 
 
 def test_a_mark_that_came_meanwhile_stays(folder: Path) -> None:
-    data, before = folder.parents[1], verify(folder)
+    data, before = folder.parents[1], verify_episode(folder)
     half(folder / "raw.arrow")
-    keep(verify(folder))
-    keep(before)
-    assert marked(data, folder.name)
+    update_mark(verify_episode(folder))
+    update_mark(before)
+    assert marked_damage(data, folder.name)
 
 
 def test_a_mark_of_an_earlier_version_goes_with_the_files(whole: Path, folder: Path) -> None:
     data = folder.parents[1]
     half(folder / "raw.arrow")
-    keep(verify(folder))
+    update_mark(verify_episode(folder))
     path = data / f"quarantine/{folder.name}.json"
     told = json.loads(path.read_text())
     path.write_text(json.dumps({name: told[name] for name in ("uuid", "found", "damage")}))
     unsealed(folder)
-    keep(verify(folder))
-    assert marked(data, folder.name)
-    for name in ("raw.arrow", OUTCOME, SECOND):
+    update_mark(verify_episode(folder))
+    assert marked_damage(data, folder.name)
+    for name in ("raw.arrow", OUTCOME, OUTCOME_COPY):
         shutil.copy(whole / name, folder)
-    keep(verify(folder))
-    assert marked(data, folder.name) == []
+    update_mark(verify_episode(folder))
+    assert marked_damage(data, folder.name) == []
 
 
 def _marks(folder: Path, times: int, failed: Path) -> None:
     try:
         for _ in range(times):
             mark_file(folder.parents[1], folder.name).unlink(missing_ok=True)
-            keep(verify(folder))
+            update_mark(verify_episode(folder))
     except (RecordingError, OSError) as error:
         failed.write_text(repr(error))
 
@@ -263,7 +263,7 @@ def test_two_scrubs_at_once_are_in_nobodys_way(folder: Path, tmp_path: Path) -> 
     for worker in workers:
         worker.join()
     assert [path.read_text() for path in tmp_path.glob("failed*")] == []
-    assert marked(folder.parents[1], folder.name) == verify(folder).document()["damage"]
+    assert marked_damage(folder.parents[1], folder.name) == verify_episode(folder).to_dict()["damage"]
     assert [path.name for path in (tmp_path / "data/quarantine").iterdir()] == [f"{folder.name}.json"]
 
 
@@ -278,7 +278,7 @@ def test_a_draft_of_another_writer_is_waited_for_and_one_that_a_kill_left_is_tak
         if not replaced:
             replaced.append("first")
             # Not forked: a child would have a copy of our lock, and wait for itself.
-            other = multiprocessing.get_context("spawn").Process(target=write_whole, args=(path, b"second"))
+            other = multiprocessing.get_context("spawn").Process(target=write_atomic, args=(path, b"second"))
             other.start()
             replaced.append(str(other.pid))
             real(draft, path)
@@ -286,7 +286,7 @@ def test_a_draft_of_another_writer_is_waited_for_and_one_that_a_kill_left_is_tak
             real(draft, path)
 
     monkeypatch.setattr(os, "replace", while_another_waits)
-    write_whole(tmp_path / "a", b"first")
+    write_atomic(tmp_path / "a", b"first")
     os.waitpid(int(replaced[1]), 0)
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"second")]
 
@@ -300,11 +300,11 @@ def test_a_draft_of_another_writer_is_waited_for_and_one_that_a_kill_left_is_tak
 )
 def test_what_is_torn_or_absent_of_an_older_recording_is_named(folder: Path, name: str, harm: Harm) -> None:
     unsealed(folder)
-    assert verify(folder).text == UNSEALED
+    assert verify_episode(folder).text == UNSEALED
     harm(folder / name)
     if (name, harm) == ("events.jsonl", empty):
         return  # one in which nothing happened is no other
-    verdict = verify(folder)
+    verdict = verify_episode(folder)
     assert verdict.state == "damaged"
     assert name in verdict.text
     assert "torn" in verdict.text or "absent" in verdict.text or "rows readable" in verdict.text
@@ -315,7 +315,7 @@ def test_what_is_torn_or_absent_of_an_older_recording_is_named(folder: Path, nam
 def test_an_older_recording_that_failed_may_end_anywhere(folder: Path) -> None:
     unsealed(folder, status="failed")
     half(folder / "raw.arrow")
-    assert verify(folder).state == "unsealed"
+    assert verify_episode(folder).state == "unsealed"
 
 
 # --- any sequence --------------------------------------------------------------------------------------------
@@ -354,13 +354,13 @@ class Lab:
 
     def step(self, kind: str, name: str, harm: Harm, number: int) -> None:
         if kind == "scrub":
-            keep(verify(self.folder))
+            update_mark(verify_episode(self.folder))
         elif kind == "repair":
             repair(self.folder)
         elif kind == "killed repair":
             self._killed_repair(number)
         elif kind == "label":
-            append(self.data, self.folder.name, Label(1.0, "ann", "success"))
+            append_label(self.data, self.folder.name, Label(1.0, "ann", "success"))
         elif kind == "export":
             self._export()
         elif kind == "back":
@@ -369,10 +369,10 @@ class Lab:
             away = Path(shutil.move(self.folder, self.data))
             repair(away)
             shutil.move(away, self.folder)
-        elif kind == "lose outcome" and ((self.folder / SECOND).exists() or self.mark.exists()):
+        elif kind == "lose outcome" and ((self.folder / OUTCOME_COPY).exists() or self.mark.exists()):
             (self.folder / OUTCOME).unlink(missing_ok=True)
         elif kind == "lose copy" and ((self.folder / OUTCOME).exists() or self.mark.exists()):
-            (self.folder / SECOND).unlink(missing_ok=True)
+            (self.folder / OUTCOME_COPY).unlink(missing_ok=True)
         elif kind == "harm" and (self.folder / name).exists():
             harm(self.folder / name)
         elif kind == "spoil mark" and self.mark.exists():
@@ -400,7 +400,7 @@ class Lab:
 
     def _export(self) -> None:
         try:
-            export(self.folder, self.data)
+            write_export(self.folder, self.data)
         except RecordingError:
             return
 
@@ -416,14 +416,14 @@ class Lab:
     def told(self) -> bool:
         """Whether one of its own outcomes is there."""
         seal = (self.whole / OUTCOME).read_bytes()
-        there = [self.folder / name for name in (OUTCOME, SECOND) if (self.folder / name).exists()]
+        there = [self.folder / name for name in (OUTCOME, OUTCOME_COPY) if (self.folder / name).exists()]
         return bool(there) and all(path.read_bytes() == seal for path in there)
 
     @property
     def passes(self) -> bool:
         """Whether it would be taken for what was recorded."""
-        keep(verify(self.folder))
-        return verify(self.folder).state == "sound" and not self.mark.exists()
+        update_mark(verify_episode(self.folder))
+        return verify_episode(self.folder).state == "sound" and not self.mark.exists()
 
 
 BEGINNINGS = (
@@ -469,4 +469,4 @@ def test_nor_where_both_outcomes_are_lost_as_long_as_its_tables_have_their_ends(
     (lab.folder / name).write_bytes(content)
     unended(lab.folder)
     assert repair(lab.folder).verdict == "repaired"
-    assert verify(lab.folder).state == "unsealed"
+    assert verify_episode(lab.folder).state == "unsealed"

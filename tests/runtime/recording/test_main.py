@@ -20,7 +20,7 @@ def folder(tmp_path: Path) -> Path:
         journal.append(row(k))
         journal.append(tick(k))
     journal.append(chunk(1))
-    journal.mark({"kind": "started"})
+    journal.append_event({"kind": "started"})
     journal.end(Outcome("finished", "done", 1.7e9))
     return folder
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.recording.planes import planes
+from runtime.recording.planes import to_yuv_planes
 from tests.examples import some
 
 LUMA = np.array([65.481, 128.553, 24.966]) / 255  # ITU-R BT.601, limited range
@@ -22,7 +22,7 @@ def exact(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def made(picture: np.ndarray, size: tuple[int, int]) -> list[np.ndarray]:
     height, width = size
-    whole = planes(picture, size).to_ndarray().astype(float)
+    whole = to_yuv_planes(picture, size).to_ndarray().astype(float)
     return [whole[:height], *whole[height:].reshape(2, height // 2, width // 2)]
 
 
@@ -61,8 +61,8 @@ def test_pictures_of_another_size_are_scaled_first(size: tuple[int, int]) -> Non
 
 
 def test_the_frame_says_how_its_colours_are_written_and_keeps_its_pixels() -> None:
-    frame = planes(np.full((16, 16, 3), 200, np.uint8), (16, 16))
-    other = planes(np.zeros((16, 16, 3), np.uint8), (16, 16))
+    frame = to_yuv_planes(np.full((16, 16, 3), 200, np.uint8), (16, 16))
+    other = to_yuv_planes(np.zeros((16, 16, 3), np.uint8), (16, 16))
     assert (frame.format.name, frame.width, frame.height) == ("yuv420p", 16, 16)
     assert (int(frame.colorspace), int(frame.color_range)) == (5, 1)
     assert frame.to_ndarray()[0, 0] == 188

@@ -9,7 +9,7 @@ from runtime.core.errors import RecordingError
 from runtime.recording import repair as repair_module
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
-from runtime.recording.export import export
+from runtime.recording.export import write_export
 from runtime.recording.layout import Layout
 from runtime.recording.reader import open_episode
 from runtime.recording.repair import UNCUT, repair, repair_all
@@ -34,7 +34,7 @@ def unfinished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k in range(ROWS):
         journal.append(row(k, control_source="none" if k < 10 else "policy"))
         journal.append(tick(k))
-        journal.mark({"row": k})
+        journal.append_event({"row": k})
     journal.append(chunk(1))
     journal.end(Outcome("finished", "", 1.7e9))
     unended(folder)
@@ -166,7 +166,7 @@ def test_missing_files_are_made_good_as_empty_ones(folder: Path) -> None:
         (folder / name).unlink()
     report = repair(folder)
     assert (report.verdict, report.frames, report.rows_cut) == ("repaired", 0, ROWS)
-    layout = Layout.of(manifest())
+    layout = Layout.from_manifest(manifest())
     assert read_table(folder / "ticks.arrow", SCHEMAS["ticks"](layout)).closed
     assert (folder / "events.jsonl").read_bytes() == b""
 
@@ -235,4 +235,4 @@ def test_an_episode_from_before_strategies_were_written_down_is_repaired_and_ope
     assert raw["index"].to_pylist() == [0, 1]
     assert raw["strategy"].to_pylist() == [None, None]
     assert read_table(folder / "raw.arrow", SCHEMAS["raw"](open_episode(folder).layout)).closed
-    assert export(folder, folder.parent).is_file()
+    assert write_export(folder, folder.parent).is_file()

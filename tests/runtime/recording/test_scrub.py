@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import PolicyError, RecordingError
 from runtime.datasets.__main__ import main as datasets
-from runtime.datasets.importing import Whose, bring
+from runtime.datasets.importing import SourceRobot, import_episode
 from runtime.datasets.published import publish
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.policies.replay import Config, ReplayPolicy
@@ -32,9 +32,9 @@ from runtime.recording.__main__ import main
 from runtime.recording.base import ExecutedTick, Outcome, RawChunk
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.layout import Layout
-from runtime.recording.quarantine import keep, marked
+from runtime.recording.quarantine import marked_damage, update_mark
 from runtime.recording.repair import PLAN, repair, repair_all
-from runtime.recording.scrub import verify
+from runtime.recording.scrub import verify_episode
 from runtime.recording.sealing import DIGESTS, SEAL, digest_of, digests_of, read_outcome
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.tables import SCHEMAS, read_table
@@ -65,7 +65,7 @@ def begun(root: Path) -> EpisodeJournal:
         journal.append(row(k, 0))
         journal.append(tick(k))
         journal.append(chunk(k + 1))
-        journal.mark({"kind": "note", "text": str(k)})
+        journal.append_event({"kind": "note", "text": str(k)})
         if k % 15 == 14:
             _flushed(journal, k + 1)
     return journal
@@ -75,7 +75,7 @@ def _flushed(journal: EpisodeJournal, rows: int) -> None:
     """Wait until so many rows, and the answers of the policy with them, are batches on the disk."""
     folder = journal.folder
     assert folder is not None
-    layout = Layout.of(json.loads((folder / "manifest.json").read_text()))
+    layout = Layout.from_manifest(json.loads((folder / "manifest.json").read_text()))
     while read_table(folder / "raw.arrow", SCHEMAS["raw"](layout)).table.num_rows < 4 * rows:
         time.sleep(0.005)
 
@@ -118,7 +118,7 @@ def scrubbed(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, list[
 
 
 def test_what_was_recorded_is_sound_and_its_digests_are_those_of_any_other_program(folder: Path) -> None:
-    verdict = verify(folder)
+    verdict = verify_episode(folder)
     assert (verdict.state, verdict.damage) == ("sound", ())
     digests = read_outcome(folder)[DIGESTS]
     assert set(digests) == {path.name for path in folder.iterdir()} - {"outcome.json", "sealed.json"}
@@ -129,7 +129,7 @@ def test_what_was_recorded_is_sound_and_its_digests_are_those_of_any_other_progr
 
 
 def test_what_the_recorder_counted_in_its_files_is_what_lies_there(folder: Path) -> None:
-    layout = Layout.of(json.loads((folder / "manifest.json").read_text()))
+    layout = Layout.from_manifest(json.loads((folder / "manifest.json").read_text()))
     for name, told in read_outcome(folder)[DIGESTS].items():
         found = digest_of(folder / name, layout)
         if name != "events.jsonl":  # one piece for each time that it was written
@@ -207,13 +207,13 @@ def test_harm_to_any_file_is_named_and_such_a_recording_is_neither_published_nor
     after = HARMS[harm](bytearray(whole), at, how)
     assume(after != whole)
     with harmed(folder / name, after):
-        verdict = verify(folder)
+        verdict = verify_episode(folder)
         assert verdict.state == "damaged"
         assert [damage.file for damage in verdict.damage] == [name]
         with pytest.raises(DamagedError, match=name):
             publish(folder, lab / "set", include_interrupted=True)
         with pytest.raises(DamagedError, match=name):
-            bring(dataset, 0, lab / "episodes", Whose("observation.state"))
+            import_episode(dataset, 0, lab / "episodes", SourceRobot("observation.state"))
         policy = ReplayPolicy(Config(path=str(folder)), robot(), VirtualClock(), 30.0)
         if (name, harm) != (
             "manifest.json",
@@ -224,7 +224,7 @@ def test_harm_to_any_file_is_named_and_such_a_recording_is_neither_published_nor
         wanted = ("restored",) if name in ("outcome.json", "sealed.json") else ("damaged", "unreadable")
         assert repair(folder).verdict in wanted
     assert (lab / "set/meta/info.json").stat().st_mtime_ns == before
-    assert verify(folder).state == "sound"
+    assert verify_episode(folder).state == "sound"
 
 
 @pytest.mark.parametrize("table", SCHEMAS)
@@ -237,7 +237,7 @@ def test_the_rows_of_a_damaged_batch_are_named_with_their_times(folder: Path, ta
         content = bytearray(whole)
         content[(int(begin) + int(end)) // 2] ^= 4
         path.write_bytes(content)
-        (damage,) = verify(folder).damage
+        (damage,) = verify_episode(folder).damage
         if int(last) > int(first):
             assert damage.rows == ((int(first), int(last) - 1),)
             assert damage.text.startswith(f"{path.name} is changed, rows {first} to {int(last) - 1}")
@@ -247,7 +247,7 @@ def test_the_rows_of_a_damaged_batch_are_named_with_their_times(folder: Path, ta
         if table in ("rows", "ticks"):
             assert damage.times == tuple((one / 30, (other + 1) / 30) for one, other in damage.rows)
     path.write_bytes(whole)
-    assert verify(folder).state == "sound"
+    assert verify_episode(folder).state == "sound"
 
 
 def test_the_rows_of_a_damaged_stretch_of_a_video_are_named(folder: Path) -> None:
@@ -260,7 +260,7 @@ def test_the_rows_of_a_damaged_stretch_of_a_video_are_named(folder: Path) -> Non
         content = bytearray(whole)
         content[place + 5] ^= 1
         path.write_bytes(content)
-        (damage,) = verify(folder).damage
+        (damage,) = verify_episode(folder).damage
         ((first, last),) = damage.rows
         assert first <= row_of_it <= last
         assert last - first < 2 * 30  # a second, and the fragment that ends it
@@ -270,7 +270,7 @@ def test_damage_far_apart_is_named_apart_and_what_is_cut_off_to_the_end(folder: 
     path = folder / "events.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join([b"{}" + lines[0][2:], *lines[1:20]]))
-    (damage,) = verify(folder).damage
+    (damage,) = verify_episode(folder).damage
     assert damage.rows[0][0] == 0
     assert damage.rows[-1][1] == FRAMES - 1
     assert "lines 0 to" in damage.text
@@ -284,19 +284,19 @@ def test_a_scrub_says_each_episode_marks_what_is_damaged_and_takes_the_mark_back
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data, uuid = folder.parents[1], folder.name
-    assert scrubbed(data, capsys) == (0, [verify(folder).document()])
+    assert scrubbed(data, capsys) == (0, [verify_episode(folder).to_dict()])
     assert not (data / "quarantine").exists()
     with harmed(folder / "ticks.arrow", a_bit_off(folder / "ticks.arrow")):
         code, (told,) = scrubbed(folder.parent, capsys)
         assert (code, told["state"], told["episode"]) == (1, "damaged", uuid)
-        assert marked(data, uuid) == told["damage"]
+        assert marked_damage(data, uuid) == told["damage"]
         mark = (data / f"quarantine/{uuid}.json").read_bytes()
         assert main(["scrub", str(folder)]) == 1
         assert "ticks.arrow is changed, rows" in capsys.readouterr().out
         assert (data / f"quarantine/{uuid}.json").read_bytes() == mark
         assert main(["repair", str(folder)]) == 1
     assert scrubbed(data, capsys)[0] == 0
-    assert marked(data, uuid) == []
+    assert marked_damage(data, uuid) == []
 
 
 def test_one_that_cannot_be_scrubbed_keeps_none_of_the_others(
@@ -313,10 +313,10 @@ def test_one_that_cannot_be_scrubbed_keeps_none_of_the_others(
 def test_a_mark_that_is_damaged_itself_is_nothing_found_until_the_next_scrub(folder: Path) -> None:
     data, uuid = folder.parents[1], folder.name
     (folder / "raw.arrow").write_bytes(a_bit_off(folder / "raw.arrow"))
-    keep(verify(folder))
-    told = marked(data, uuid)
+    update_mark(verify_episode(folder))
+    told = marked_damage(data, uuid)
     assert told
-    assert told == verify(folder).document()["damage"]
+    assert told == verify_episode(folder).to_dict()["damage"]
     mark = data / f"quarantine/{uuid}.json"
     fields = [told[0] | {name: None} for name in told[0]]
     for spoiled in (
@@ -328,9 +328,9 @@ def test_a_mark_that_is_damaged_itself_is_nothing_found_until_the_next_scrub(fol
         *([one] for one in fields),
     ):
         mark.write_text(json.dumps({"damage": spoiled}), "utf-8")
-        assert marked(data, uuid) == []
-    keep(verify(folder))
-    assert marked(data, uuid) == told
+        assert marked_damage(data, uuid) == []
+    update_mark(verify_episode(folder))
+    assert marked_damage(data, uuid) == told
 
 
 def test_one_that_is_closed_to_us_or_cannot_be_marked_keeps_none_of_the_others(
@@ -354,15 +354,15 @@ def test_one_that_is_closed_to_us_or_cannot_be_marked_keeps_none_of_the_others(
     assert capsys.readouterr().err.count("disk error while creating") == 2
     shutil.rmtree(first)
     (folder / "raw.arrow").mkdir()
-    assert verify(folder).text == "raw.arrow is a folder"
+    assert verify_episode(folder).text == "raw.arrow is a folder"
 
 
 def test_a_recording_that_lies_elsewhere_is_scrubbed_and_marked_nowhere(folder: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "stick" / folder.name
     shutil.copytree(folder, elsewhere)
     (elsewhere / "raw.arrow").unlink()
-    verdict = verify(elsewhere)
-    keep(verdict)
+    verdict = verify_episode(elsewhere)
+    update_mark(verdict)
     assert verdict.text == "raw.arrow is absent"
     assert [path.name for path in (tmp_path / "stick").iterdir()] == [folder.name]
 
@@ -372,10 +372,12 @@ def test_a_disk_that_fails_is_damage_and_a_file_closed_to_us_is_none(
 ) -> None:
     error = OSError(errno.EIO, os.strerror(errno.EIO))
     monkeypatch.setattr("runtime.recording.scrub.hashlib.file_digest", Raises(error))
-    assert {damage.what for damage in verify(folder).damage} == {"cannot be read: the disk fails"}
+    assert {damage.description for damage in verify_episode(folder).damage} == {
+        "cannot be read: the disk fails"
+    }
     error.errno = errno.EACCES
     with pytest.raises(RecordingError, match="verifying"):
-        verify(folder)
+        verify_episode(folder)
 
 
 class Raises:
@@ -394,11 +396,11 @@ def test_an_older_recording_is_said_to_have_no_digests_and_refused_nowhere(
 ) -> None:
     unsealed(folder)
     assert scrubbed(folder, capsys)[0] == 0
-    assert verify(folder).text == UNSEALED
+    assert verify_episode(folder).text == UNSEALED
     assert publish(folder, tmp_path / "one").remark == UNSEALED
     assert datasets(["publish", str(folder), "--to", str(tmp_path / "two")]) == 0
     assert f"remark: {UNSEALED}" in capsys.readouterr().out
-    assert bring(dataset, 0, folder.parent, Whose("observation.state")) == (folder.name, False)
+    assert import_episode(dataset, 0, folder.parent, SourceRobot("observation.state")) == (folder.name, False)
     policy = ReplayPolicy(Config(path=str(folder)), robot(), VirtualClock(), 30.0)
     assert policy.connect().metadata["files"] == "unsealed"
     assert repair(folder).verdict == "complete"
@@ -406,7 +408,7 @@ def test_an_older_recording_is_said_to_have_no_digests_and_refused_nowhere(
 
 def test_an_older_recording_that_cannot_be_read_is_damaged_all_the_same(folder: Path) -> None:
     unsealed(folder, frames=FRAMES + 1)
-    verdict = verify(folder)
+    verdict = verify_episode(folder)
     assert verdict.state == "damaged"
     assert f"{FRAMES} rows readable, its outcome says {FRAMES + 1}" in verdict.text
 
@@ -460,9 +462,9 @@ def test_a_repair_killed_anywhere_leaves_nothing_that_is_called_damaged(
                 repair(copy)
         except Killed:
             closed, sealed = (copy / "outcome.json").exists(), (copy / "sealed.json").exists()
-            assert verify(copy).state == ("sound" if closed else "open")
+            assert verify_episode(copy).state == ("sound" if closed else "open")
             assert repair(copy).verdict == ("complete" if closed else "restored" if sealed else "repaired")
-            assert verify(copy).state == "sound"
+            assert verify_episode(copy).state == "sound"
             assert not (copy / PLAN).exists()
             figures.append(outcome_of(copy))
         else:
@@ -471,7 +473,9 @@ def test_a_repair_killed_anywhere_leaves_nothing_that_is_called_damaged(
     assert all(one == outcome_of(copy) for one in figures)  # the rows, bytes and lines that were cut, too
     digests = read_outcome(copy)[DIGESTS]
     assert "rows.uncut.arrow" in digests
-    assert digests == digests_of(copy, Layout.of(json.loads((folder / "manifest.json").read_text())))
+    assert digests == digests_of(
+        copy, Layout.from_manifest(json.loads((folder / "manifest.json").read_text()))
+    )
 
 
 def test_what_a_repair_has_sealed_is_named_when_it_is_damaged(folder: Path) -> None:
@@ -495,9 +499,9 @@ def test_an_end_killed_anywhere_leaves_nothing_that_is_called_damaged(
             with killed_at(monkeypatch, number):
                 journal.end(Outcome("finished", "", 1.7e9))
         except Killed:
-            states.append(verify(folder).state)
+            states.append(verify_episode(folder).state)
             continue
-        assert verify(folder).state == "sound"
+        assert verify_episode(folder).state == "sound"
         break
     assert states
     assert set(states) <= {"open", "sound"}
@@ -521,5 +525,5 @@ def test_a_recording_that_failed_is_sealed_as_it_lies_there(
     with pytest.raises(RecordingError, match=r"ticks\.arrow"):
         journal.end(Outcome("finished", "", 1.7e9))
     monkeypatch.undo()
-    assert verify(folder).state == "sound"
+    assert verify_episode(folder).state == "sound"
     assert read_outcome(folder)["status"] == "failed"

@@ -66,7 +66,7 @@ def test_an_encoder_that_this_machine_lacks_is_named_with_those_that_it_has(
     def create(name: str, mode: str) -> object:
         raise ValueError(f"no such codec {name!r}")
 
-    trial.require(RecordingSettings())
+    trial.require_encoder(RecordingSettings())
     real = trial.av.CodecContext.create
     monkeypatch.setattr(
         trial.av.CodecContext,
@@ -76,4 +76,4 @@ def test_an_encoder_that_this_machine_lacks_is_named_with_those_that_it_has(
     with pytest.raises(
         ConfigurationError, match=r"recording.codec = 'libx265' does not work .*allowed here: libx264$"
     ):
-        trial.require(RecordingSettings(codec="libx265"))
+        trial.require_encoder(RecordingSettings(codec="libx265"))

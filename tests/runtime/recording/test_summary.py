@@ -10,7 +10,7 @@ from runtime.recording.tables import TableWriter
 
 from .samples import CAMERAS, manifest, row
 
-LAYOUT = Layout.of(manifest())
+LAYOUT = Layout.from_manifest(manifest())
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_only_the_first_rows_count(rows: Path) -> None:
 
 def test_an_episode_without_rows_has_no_skew(rows: Path) -> None:
     summary = summarise(rows, LAYOUT, 0)
-    assert summary.fields()["skew"] == {"mean_s": None, "max_s": None}
+    assert summary.to_dict()["skew"] == {"mean_s": None, "max_s": None}
     assert summary.duration_s == 0.0
 
 

@@ -21,7 +21,7 @@ from runtime.recording.tables import (
 
 from .samples import manifest, row, tick
 
-LAYOUT = Layout.of(manifest())
+LAYOUT = Layout.from_manifest(manifest())
 SCHEMA = rows_schema(LAYOUT)
 BATCHES = (3, 1, 5, 2)
 

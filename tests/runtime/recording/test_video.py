@@ -9,12 +9,12 @@ import pytest
 import zmq
 
 from runtime.datasets.remux import remux
-from runtime.recording.backlog import RUN, codings
+from runtime.recording.backlog import RUN, encode_count
 from runtime.recording.codecs import CODECS, CodecName
 from runtime.recording.files import AppendFile
 from runtime.recording.fragments import count_frames
 from runtime.recording.settings import RecordingSettings
-from runtime.recording.trial import works
+from runtime.recording.trial import is_encoder_usable
 from runtime.recording.video import FragmentedVideo
 
 from .samples import HEIGHT, SETTINGS, WIDTH, decoded, number_of, numbered, numbers
@@ -162,7 +162,7 @@ def held(path: Path, counts: list[int], settings: RecordingSettings = SETTINGS) 
 def test_repeats_are_frames_of_their_own_however_they_were_made(
     tmp_path: Path, codec: CodecName, counts: list[int]
 ) -> None:
-    if not works(codec):
+    if not is_encoder_usable(codec):
         pytest.skip(f"{codec} does not work on this machine")
     path = held(tmp_path / "a.mp4", counts, SETTINGS.model_copy(update={"codec": codec}))
     assert numbers(path) == [k + 1 for k, count in enumerate(counts) for _ in range(count + 1)]
@@ -173,7 +173,7 @@ def test_repeats_are_frames_of_their_own_however_they_were_made(
 
 @pytest.mark.parametrize("codec", sorted(CODECS))
 def test_no_thread_of_an_encoder_is_real_time(tmp_path: Path, codec: CodecName) -> None:
-    if not works(codec):
+    if not is_encoder_usable(codec):
         pytest.skip(f"{codec} does not work on this machine")
     file = AppendFile(tmp_path / "a.mp4")
     video = FragmentedVideo(file, SIZE, 30.0, SETTINGS.model_copy(update={"codec": codec}))
@@ -202,7 +202,7 @@ def test_a_long_run_of_repeats_costs_three_codings(tmp_path: Path, monkeypatch: 
     for count in (RUN - 1, RUN, 2_001):
         coded.clear()
         video.repeat(count)
-        assert len(coded) == codings(count)
+        assert len(coded) == encode_count(count)
     video.encode(numbered(2))
     assert coded[-1], "what follows copies begins a group of its own"
     video.close()

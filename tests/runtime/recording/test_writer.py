@@ -10,12 +10,12 @@ from runtime.recording.layout import Layout
 from runtime.recording.reader import read_events
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.tables import SCHEMAS, TableWriter, read_table
-from runtime.recording.writer import DiskWriter, Faults
+from runtime.recording.writer import DiskWriter, ErrorLatch
 from tests.processes import PATIENCE_S
 
 from .samples import SETTINGS, manifest, tick
 
-LAYOUT = Layout.of(manifest())
+LAYOUT = Layout.from_manifest(manifest())
 NEVER = RecordingSettings(min_free_bytes=0, flush_period_s=1.0)
 
 
@@ -28,21 +28,21 @@ def steps(folder: Path) -> list[int]:
 
 
 def test_the_first_fault_is_told_every_time_and_later_ones_are_noted() -> None:
-    faults = Faults()
-    faults.tell()
+    faults = ErrorLatch()
+    faults.raise_pending()
     assert not faults.told
     faults.report(RecordingError("first"))
     faults.report(RecordingError("second"))
     for _ in range(2):
         with pytest.raises(RecordingError, match="first"):
-            faults.tell()
+            faults.raise_pending()
     assert faults.told
     assert faults.first is not None
     assert faults.first.__notes__ == ["second"]
 
 
 def test_records_and_lines_reach_the_disk_without_being_asked(tmp_path: Path) -> None:
-    faults = Faults()
+    faults = ErrorLatch()
     writer = DiskWriter(tmp_path, LAYOUT, SETTINGS, [], faults)
     writer.add("ticks", tick(0))
     writer.add_line(b'{"kind": "start"}')
@@ -58,7 +58,7 @@ def test_records_and_lines_reach_the_disk_without_being_asked(tmp_path: Path) ->
 
 
 def test_finishing_writes_what_waits_and_closes_every_stream(tmp_path: Path) -> None:
-    writer = DiskWriter(tmp_path, LAYOUT, NEVER, [], Faults())
+    writer = DiskWriter(tmp_path, LAYOUT, NEVER, [], ErrorLatch())
     for step in range(5):
         writer.add("ticks", tick(step))
     assert writer.finish(soon())
@@ -75,13 +75,13 @@ def test_the_names_of_the_files_are_made_durable(tmp_path: Path, monkeypatch: py
         synced.append((folder, len(list(folder.iterdir()))))
 
     monkeypatch.setattr(writer_module, "sync_folder", sync)
-    assert DiskWriter(tmp_path, LAYOUT, NEVER, [], Faults()).finish(soon())
+    assert DiskWriter(tmp_path, LAYOUT, NEVER, [], ErrorLatch()).finish(soon())
     assert synced == [(tmp_path, len(SCHEMAS) + 1)]
 
 
 def test_a_file_that_somebody_still_writes_is_left_open(tmp_path: Path) -> None:
     kept, other = AppendFile(tmp_path / "kept"), AppendFile(tmp_path / "other")
-    writer = DiskWriter(tmp_path, LAYOUT, NEVER, [kept, other], Faults())
+    writer = DiskWriter(tmp_path, LAYOUT, NEVER, [kept, other], ErrorLatch())
     assert writer.finish(soon(), leave=[kept])
     kept.write(b"still open")
     kept.close()
@@ -93,7 +93,7 @@ def test_a_file_that_somebody_still_writes_is_left_open(tmp_path: Path) -> None:
 def test_a_table_that_fails_does_not_keep_the_others_from_being_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    faults = Faults()
+    faults = ErrorLatch()
     writer = DiskWriter(tmp_path, LAYOUT, NEVER, [], faults)
     writer.add("ticks", tick(0))
     writer.add("smoothed", tick(0))
@@ -112,7 +112,7 @@ def test_a_table_that_fails_does_not_keep_the_others_from_being_closed(
 
 
 def test_a_record_that_no_column_takes_is_a_fault(tmp_path: Path) -> None:
-    faults = Faults()
+    faults = ErrorLatch()
     writer = DiskWriter(tmp_path, LAYOUT, NEVER, [], faults)
     writer.add("ticks", tick(0, control_source=object()))
     assert writer.finish(soon())
@@ -127,7 +127,7 @@ def test_too_little_room_is_found_at_a_flush(tmp_path: Path, monkeypatch: pytest
         raise RecordingError("too little room")
 
     monkeypatch.setattr(writer_module, "require_room", full)
-    faults = Faults()
+    faults = ErrorLatch()
     writer = DiskWriter(
         tmp_path, LAYOUT, RecordingSettings(min_free_bytes=7, flush_period_s=0.01), [], faults
     )
@@ -143,7 +143,7 @@ def test_records_that_the_disk_does_not_take_are_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(writer_module, "MOST_WAITING", 1100)
-    faults = Faults()
+    faults = ErrorLatch()
     writer = DiskWriter(tmp_path, LAYOUT, NEVER, [], faults)
     real = TableWriter.flush
     monkeypatch.setattr(TableWriter, "flush", lambda self: None)

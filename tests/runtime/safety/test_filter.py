@@ -180,7 +180,7 @@ def followed(targets, dt, **options):
     previous, velocity, aim, sent, notes = np.zeros(1), np.zeros(1), None, [], []
     for target in targets:
         action = np.array([target], float)
-        verdict = safety.judge(action, RobotState(previous, velocity, previous, dt, aim=aim))
+        verdict = safety.judge(action, RobotState(previous, velocity, previous, dt, previous_target=aim))
         velocity, previous, aim = (verdict.action - previous) / dt, verdict.action, action
         sent.append(previous[0])
         notes.append(verdict.notes)
@@ -287,7 +287,7 @@ def test_an_arm_that_could_not_stop_before_the_other_is_refused_while_there_is_r
     limits = Limits(own.joint_names, own.lower, own.upper, own.velocity, grippers, np.zeros(own.dim, bool))
     judging = SafetyFilter(SafetySettings(collision="refuse"), limits, None, collisions())
     before, action = turned(0.75), turned(0.85)
-    assert collisions().approached(action, before) is None
+    assert collisions().closer_pair(action, before) is None
     quick = judging.judge(action, RobotState(before, fast, before, DT))
     assert quick.refused
     assert "right_arm/" in quick.notes[-1]
@@ -336,10 +336,10 @@ def test_a_motion_of_ours_may_come_from_outside_its_box_and_not_go_there():
 
 
 @pytest.mark.some(4)
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 @pytest.mark.parametrize("path", ["policy", "motion"])
 def test_every_robot_may_stand_at_its_poses_and_move_from_them_within_its_limits(name, path):
-    own = robots.load(name)
+    own = robots.load_robot(name)
     grippers = np.isin(np.arange(own.dim), own.gripper_dims)
     binary = np.isin(np.arange(own.dim), own.binary_dims)
     limits = Limits(own.joint_names, own.lower, own.upper, own.velocity, grippers, binary)

@@ -32,15 +32,15 @@ def test_whatever_is_wanted_what_leaves_is_finite_within_limits_and_can_be_follo
     previous, velocity = np.array(previous), np.array(velocity)
     sent = limiter(np.array(wanted), previous, velocity, elapsed, stop).action
     assert np.isfinite(sent).all()
-    assert (LIMITS.outside(sent) <= 1e-6 * LIMITS.reach).all()
+    assert (LIMITS.excess(sent) <= 1e-6 * LIMITS.radian_scale).all()
     moved = (sent - previous) / elapsed
     follows = np.array([True, True, False, not stop])
-    assert (np.abs(moved) <= LIMITS.velocity * 1.05 + 1e-4 * LIMITS.reach)[follows].all()
-    rate = 60.0 * LIMITS.reach * 1.05
+    assert (np.abs(moved) <= LIMITS.velocity * 1.05 + 1e-4 * LIMITS.radian_scale)[follows].all()
+    rate = 60.0 * LIMITS.radian_scale * 1.05
     least = np.minimum(velocity, 0.0) if stop else velocity
     most = np.maximum(velocity, 0.0) if stop else velocity
-    within = (moved >= least - rate * elapsed - 1e-4 * LIMITS.reach) & (
-        moved <= most + rate * elapsed + 1e-4 * LIMITS.reach
+    within = (moved >= least - rate * elapsed - 1e-4 * LIMITS.radian_scale) & (
+        moved <= most + rate * elapsed + 1e-4 * LIMITS.radian_scale
     )
     # Where a joint cannot stop before its limit any more, the limit comes first.
     at_limit = (sent <= LIMITS.lower + 1e-9) | (sent >= LIMITS.upper - 1e-9)
@@ -51,7 +51,7 @@ def test_whatever_is_wanted_what_leaves_is_finite_within_limits_and_can_be_follo
 @given(places, lengths)
 def test_what_may_be_sent_is_not_touched(previous, elapsed):
     previous = np.array(previous)
-    action = np.clip(previous + 0.5 * LIMITS.reach * elapsed**2, LIMITS.lower, LIMITS.upper)
+    action = np.clip(previous + 0.5 * LIMITS.radian_scale * elapsed**2, LIMITS.lower, LIMITS.upper)
     limited = limiter(action, previous, np.zeros(4), elapsed, False)
     assert limited.action is action
     assert limited.notes == ()

@@ -12,18 +12,18 @@ import robots
 from runtime.core.clock import VirtualClock
 from runtime.core.types import Float64, UInt8
 from runtime.motion.timeline import DimensionKinds, Timeline
-from runtime.policies.pictures import fitted, laid_out
+from runtime.policies.pictures import resize_image, to_layout
 from runtime.safety.filter import Limits, RobotState, SafetyFilter, SafetySettings
 from runtime.sim.bench import Bench
 from runtime.sim.pick_place import PickPlace, Skill
 from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
 from runtime.sim.script import Answer
-from runtime.sim.tabletop import Reset, Tabletop
+from runtime.sim.tabletop import ResetRequest, Tabletop
 from runtime.strategies import overlap
-from runtime.strategies.base import Arrival
+from runtime.strategies.base import ArrivedChunk
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 RATE = 30.0
 CAMERA = "cam_high"
 _GRIPPERS = np.isin(np.arange(ROBOT.dim), ROBOT.gripper_dims)
@@ -66,7 +66,7 @@ class Trial:
     def lay(self, seed: int) -> Trial:
         """Another scene, the arms back where they start; the connection stays."""
         self._number += 1
-        self.table.reset(Reset(str(self._number), seed))
+        self.table.reset(ResetRequest(str(self._number), seed))
         self.plant.q = ROBOT.poses[self.pose].copy()
         self.plant.target = self.plant.q.copy()
         self.clock.advance(5.0)
@@ -89,7 +89,7 @@ class Trial:
             if self.dark
             else np.asarray(cv2.cvtColor(shown, cv2.COLOR_BGR2RGB), np.uint8)
         )
-        return laid_out(fitted(whole, 224, 224, "pad"), "chw")
+        return to_layout(resize_image(whole, 224, 224, "pad"), "chw")
 
     def ask(self) -> Float64:
         """The rows for this moment."""
@@ -107,7 +107,7 @@ class Trial:
         step = 0
         while step < seconds * RATE:
             if step - asked >= self.delay:
-                merge(timeline, Arrival(step, asked, rows), step)
+                merge(timeline, ArrivedChunk(step, asked, rows), step)
                 asked, rows = step, self.ask()
             planned = timeline.at(step)
             if planned is not None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from runtime.sim import bench
-from runtime.sim.bench import Bench, Layout
+from runtime.sim.bench import Bench, BenchLayout
 
 BENCH = Bench()
 CAMERA = bench.overhead_camera(640, 480)
@@ -17,7 +17,7 @@ _FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), 
 _SHADES = (1.0, 0.55, 0.7, 0.75, 0.8, 0.6)  # top, bottom, sides
 
 
-def drawn(layout: Layout, z: float = 0.0, light: float = 1.0) -> np.ndarray:
+def drawn(layout: BenchLayout, z: float = 0.0, light: float = 1.0) -> np.ndarray:
     """RGB uint8 [480, 640, 3]: the plate, and the first block lying at height z."""
     shape = (CAMERA.height * _FINER, CAMERA.width * _FINER, 3)
     canvas = np.tile(np.uint8(np.multiply(BENCH.table_colour, light)), (*shape[:2], 1))
@@ -37,7 +37,7 @@ def drawn(layout: Layout, z: float = 0.0, light: float = 1.0) -> np.ndarray:
 
 
 def _block(canvas: np.ndarray, block: tuple[float, float, float], z: float, light: float) -> None:
-    pose = bench.on_table(block, BENCH)
+    pose = bench.block_pose(block, BENCH)
     half = BENCH.block_edge / 2
     signs = np.array([(x, y, up) for up in (1, -1) for x in (-1, 1) for y in (-1, 1)])
     corners = signs * half @ pose[:3, :3].T + pose[:3, 3] + (0, 0, z)

@@ -13,11 +13,11 @@ from robots.rotations import quaternion_of_matrix
 from runtime.core.types import Float64
 from runtime.kinematics.compiled import CompiledKinematics
 from runtime.sim.bench import tip_in_world
-from runtime.sim.limbs import limbs
+from runtime.sim.limbs import arm_frames
 from runtime.sim.plant import Plant
-from runtime.sim.tabletop import Reset, Tabletop
+from runtime.sim.tabletop import ResetRequest, Tabletop
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 KINEMATICS = CompiledKinematics(ROBOT)
 LEFT, RIGHT = ROBOT.arms
 READY = ROBOT.poses["ready"]
@@ -36,7 +36,7 @@ class Operator:
         self.gripper = arm.gripper_dim
         self.table = Tabletop(ROBOT, 0, blocks)
         positions = {name: [side * place[0], *place[1:]] for name, place in POSITIONS.items()}
-        self.table.reset(Reset(f"reset {seed}", seed, positions))
+        self.table.reset(ResetRequest(f"reset {seed}", seed, positions))
         self.plant = Plant(ROBOT, start=READY)
 
     @property
@@ -112,7 +112,9 @@ class Operator:
     def _solved(self, goal: Float64, start: Float64) -> Float64:
         assert self.arm.tip is not None
         index = ROBOT.arms.index(self.arm)
-        eef = np.linalg.inv(limbs(ROBOT)[self.arm.name].frame(start)) @ goal @ np.linalg.inv(self.arm.tip)
+        eef = (
+            np.linalg.inv(arm_frames(ROBOT)[self.arm.name].frame(start)) @ goal @ np.linalg.inv(self.arm.tip)
+        )
         targets = KINEMATICS.forward(start)[None]
         targets[0, index] = [*eef[:3, 3], *quaternion_of_matrix(eef[:3, :3])]
         solved = KINEMATICS.solve(targets, start)

@@ -22,17 +22,17 @@ from runtime.core.types import Float64, UInt8
 from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.sim.bench import Bench, camera_arm
-from runtime.sim.in_poses import InPoses
-from runtime.sim.lockstep import linked
+from runtime.sim.in_poses import PoseScript
+from runtime.sim.lockstep import in_process_peers
 from runtime.sim.node import parser
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from runtime.sim.pick_place import PickPlace, Skill, poses_apart
 from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
 from runtime.sim.script import Script
-from runtime.sim.surroundings import Surroundings
-from runtime.sim.tabletop import Reset, Tabletop
-from runtime.station.checks import checked_spec
+from runtime.sim.surroundings import Environment
+from runtime.sim.tabletop import ResetRequest, Tabletop
+from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 
 DEPLOYMENTS = Path(__file__).parents[3] / "deployments"
@@ -46,12 +46,12 @@ _NOISE = 0.001  # m
 @cache
 def renderer(robot: str) -> Renderer:
     """Draws the overhead camera's pictures."""
-    made = robots.load(robot)
+    made = robots.load_robot(robot)
     above = tuple(camera for camera in made.cameras if camera_arm(made, camera) is None)
     return Renderer(replace(made, cameras=above), Bench(), _WIDTH, _HEIGHT)
 
 
-class SlowEye(Surroundings):
+class SlowEye(Environment):
     """A tabletop whose overhead camera is slow."""
 
     def __init__(self, robot: Robot, table: Tabletop) -> None:
@@ -71,7 +71,7 @@ class SlowEye(Surroundings):
     def truth(self) -> dict[str, object]:
         return self.table.truth()
 
-    def reset(self, wish: Reset) -> None:
+    def reset(self, wish: ResetRequest) -> None:
         self.table.reset(wish)
 
 
@@ -108,7 +108,7 @@ def planned(name: str, data: Path, url: str | None, assignments: Sequence[str] =
     """The station of the deployment `name`; nothing is recorded."""
     given = [f'data_dir="{data}"', "recording.enabled=false", "lockstep.delay_ticks=5", *assignments]
     given += [] if url is None else [f'policy.url="{url}"']
-    return checked_spec(loader.load(DEPLOYMENTS / f"{name}.toml", given))
+    return check_deployment(loader.load(DEPLOYMENTS / f"{name}.toml", given))
 
 
 @contextmanager
@@ -123,12 +123,12 @@ def served(
     in_poses = policy.action_space == "eef"
     skill, apart = Skill(_NOISE, seed=seed), poses_apart if in_poses else None
     script = PickPlace(made.robot, HORIZON, made.rate, skill, clock=clock, apart=apart)
-    spoken = InPoses(script, made.robot, made.rate, policy.action_pose) if in_poses else script
+    spoken = PoseScript(script, made.robot, made.rate, policy.action_pose) if in_poses else script
     server = serve(made, spoken)
     url = str(server.start()["url"])
     with closing(server):
         made = planned(name, data, url, assignments)
-        with closing(Lockstep(made, clock, peers=linked(made, clock, bench, options))) as station:
+        with closing(Lockstep(made, clock, peers=in_process_peers(made, clock, bench, options))) as station:
             yield bench.table, station
 
 

@@ -12,9 +12,9 @@ import robots
 from runtime.core.errors import SetupError
 from runtime.sim import bench
 from runtime.sim.bench import Bench, BenchError
-from runtime.sim.limbs import Limb
+from runtime.sim.limbs import ArmFrames
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 READY = ROBOT.poses["ready"]
 LEFT, RIGHT = ROBOT.arms
 X_FROM, X_TO, Y_FROM, Y_TO = Bench().area
@@ -88,7 +88,7 @@ def test_in_pose_ready_fingers_point_down_open_and_leave_the_area_in_view() -> N
 
 def test_poses_on_the_table_and_their_yaw_agree() -> None:
     for yaw in (-3.0, 0.0, 0.4, 1.6):
-        pose = bench.on_table((0.1, 0.2, yaw), Bench())
+        pose = bench.block_pose((0.1, 0.2, yaw), Bench())
         assert bench.yaw_of(pose) == pytest.approx(yaw)
         assert pose[2, 3] == Bench().block_edge / 2
 
@@ -96,7 +96,7 @@ def test_poses_on_the_table_and_their_yaw_agree() -> None:
 def test_a_group_that_is_no_arm_has_no_tip() -> None:
     base = dataclasses.replace(LEFT, chain=None)
     with pytest.raises(SetupError, match="group left_arm has no end effector; allowed: an arm"):
-        Limb(ROBOT, base)
+        ArmFrames(ROBOT, base)
 
 
 @pytest.mark.parametrize(

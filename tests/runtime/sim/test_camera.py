@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from runtime.cameras import mjpeg, rtsp
-from runtime.cameras.feed import Feed
+from runtime.cameras.feed import VideoStream
 from runtime.sim.camera import main
 from runtime.sim.camera_server import FAULTS, picture
 from runtime.sim.mjpeg_server import MjpegServer
@@ -35,7 +35,7 @@ def test_the_command_serves_a_camera_until_its_lifeline_ends(kind):
     told = json.loads(child.stdout.readline())
     assert told["kind"] == kind
     module = MODULES[kind]
-    feed = Feed(module.address(module.Config(url=told["url"])), 5.0, 5.0)
+    feed = VideoStream(module.address(module.Config(url=told["url"])), 5.0, 5.0)
     assert feed.read().picture.shape == (64, 96, 3)
     feed.close()
     child.stdin.close()
@@ -46,7 +46,7 @@ def test_the_command_serves_a_camera_until_its_lifeline_ends(kind):
 def test_a_port_that_is_taken_is_said(capsys, monkeypatch):
     from runtime.sim import standin
 
-    monkeypatch.setattr(standin, "ending", lambda lifeline: None)
+    monkeypatch.setattr(standin, "stop_event", lambda lifeline: None)
     server = MjpegServer()
     port = server.start().rpartition(":")[2].partition("/")[0]
     assert main(["mjpeg", "--port", port]) == 2

@@ -9,15 +9,15 @@ import robots
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import SetupError
 from runtime.core.types import Float64
-from runtime.sim.bench import Belt, Layout, tip_in_world
-from runtime.sim.chase import LEAD, SPEED, Chase, Places
+from runtime.sim.bench import Belt, BenchLayout, tip_in_world
+from runtime.sim.chase import LEAD, SPEED, ChaseScript, PlaceMap
 from runtime.sim.pick_place import ScriptError
 from tests.runtime.sim.drawn_bench import drawn
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 READY = ROBOT.poses["ready"]
 BELT = Belt()
-PLACES = Places(ROBOT, BELT)
+PLACES = PlaceMap(ROBOT, BELT)
 RATE, HORIZON = 30.0, 50
 ASIDE = (-0.3, 0.15)
 
@@ -27,14 +27,14 @@ class Watcher:
 
     def __init__(self) -> None:
         self.clock = VirtualClock()
-        self.policy = Chase(ROBOT, HORIZON, RATE, clock=self.clock, places=PLACES)
+        self.policy = ChaseScript(ROBOT, HORIZON, RATE, clock=self.clock, places=PLACES)
         self.answer = self.policy.begin()
 
     def ask(self, q: Float64, x: float | None, after: float = 0.0) -> Float64:
         """The rows, `after` seconds later, for a block there, or for none."""
         self.clock.advance(after)
         blocks = () if x is None else ((x, BELT.y, 0.0),)
-        return self.answer(q, {"cam_high": drawn(Layout(blocks, ASIDE))}, "").astype(np.float64)
+        return self.answer(q, {"cam_high": drawn(BenchLayout(blocks, ASIDE))}, "").astype(np.float64)
 
 
 def beside(x: float) -> Float64:
@@ -43,7 +43,7 @@ def beside(x: float) -> Float64:
 
 def ridden(rows: Float64) -> Float64:
     """Where along the belt the fingertips nearest to it are in each row [m]."""
-    dx, dy, height = BELT.beside
+    dx, dy, height = BELT.fingertip_offset
     tips = np.array([[tip_in_world(ROBOT, arm, row)[:3, 3] for arm in ROBOT.arms] for row in rows])
     nearest = np.abs(tips[..., 1:] - (BELT.y + dy, height)).sum(axis=-1).argmin(axis=-1)
     return tips[np.arange(len(rows)), nearest, 0] - dx
@@ -56,7 +56,8 @@ def test_the_map_puts_fingertips_beside_the_block() -> None:
     ):
         q = PLACES.joints(np.array([x]), np.array([y]))[0]
         away = [
-            np.linalg.norm(tip_in_world(ROBOT, arm, q)[:3, 3] - (x, y, 0) - BELT.beside) for arm in ROBOT.arms
+            np.linalg.norm(tip_in_world(ROBOT, arm, q)[:3, 3] - (x, y, 0) - BELT.fingertip_offset)
+            for arm in ROBOT.arms
         ]
         assert min(away) < 1e-3
 
@@ -134,4 +135,4 @@ def test_a_belt_out_of_reach_is_refused() -> None:
     with pytest.raises(
         SetupError, match=r"no arm of agilex_piper reaches all of the belt from x -0.1 to 0.3 m, y 0.9 m"
     ):
-        Places(ROBOT, replace(BELT, y=0.9))
+        PlaceMap(ROBOT, replace(BELT, y=0.9))

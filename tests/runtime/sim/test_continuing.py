@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from robots import load
+from robots import load_robot
 from runtime.core.types import Float32
-from runtime.sim.continuing import ModelSpace, Prefix, continued
+from runtime.sim.continuing import CommittedPrefix, ModelSpace, continue_prefix
 
-ROBOT = load("agilex_piper")
+ROBOT = load_robot("agilex_piper")
 ROWS = arrays(np.float32, (12, 2), elements=st.floats(-3, 3, width=32))
 
 
@@ -21,7 +21,7 @@ def test_the_first_rows_are_the_prefix_and_the_last_are_the_plans_own(
     count: int, left: int, delay: int, end: int
 ) -> None:
     plan, before = np.ones((count, 2), np.float32), np.zeros((left, 2))
-    made = continued(plan, Prefix(before, delay, end), switched=[1])
+    made = continue_prefix(plan, CommittedPrefix(before, delay, end), switched=[1])
     kept = min(delay, left, count)
     assert made.shape == plan.shape
     np.testing.assert_array_equal(made[:kept], 0.0)
@@ -31,7 +31,7 @@ def test_the_first_rows_are_the_prefix_and_the_last_are_the_plans_own(
 
 
 def test_the_plan_takes_over_bit_by_bit() -> None:
-    made = continued(np.ones((6, 1), np.float32), Prefix(np.zeros((6, 1)), 2, 5))
+    made = continue_prefix(np.ones((6, 1), np.float32), CommittedPrefix(np.zeros((6, 1)), 2, 5))
     np.testing.assert_allclose(made[:, 0], [0, 0, 0.25, 0.5, 0.75, 1])
 
 
@@ -39,7 +39,7 @@ def test_the_plan_takes_over_bit_by_bit() -> None:
 def test_every_row_is_the_prefixs_or_the_plans_or_between_the_two(
     plan: Float32, before: Float32, delay: int, end: int
 ) -> None:
-    made = continued(plan, Prefix(before.astype(np.float64), delay, end))
+    made = continue_prefix(plan, CommittedPrefix(before.astype(np.float64), delay, end))
     assert np.all(made >= np.minimum(plan, before))
     assert np.all(made <= np.maximum(plan, before))
     np.testing.assert_array_equal(made[:delay], before[:delay])
@@ -47,11 +47,11 @@ def test_every_row_is_the_prefixs_or_the_plans_or_between_the_two(
 
 def test_without_a_prefix_the_rows_are_the_plans_own() -> None:
     plan = np.arange(12, dtype=np.float32).reshape(6, 2)
-    np.testing.assert_array_equal(continued(plan, Prefix(np.zeros((0, 2)), 0, 0)), plan)
+    np.testing.assert_array_equal(continue_prefix(plan, CommittedPrefix(np.zeros((0, 2)), 0, 0)), plan)
 
 
 def test_a_prefix_as_long_as_the_chunk_is_all_of_it() -> None:
-    made = continued(np.zeros((4, 2), np.float32), Prefix(np.ones((6, 2)), 6, 6))
+    made = continue_prefix(np.zeros((4, 2), np.float32), CommittedPrefix(np.ones((6, 2)), 6, 6))
     np.testing.assert_array_equal(made, np.ones((4, 2)))
 
 
@@ -59,7 +59,7 @@ def test_a_prefix_as_long_as_the_chunk_is_all_of_it() -> None:
 def test_joints_survive_the_way_over_the_models_own_space(values: list[float]) -> None:
     space = ModelSpace(ROBOT)
     rows = np.array([values], np.float32)
-    model = space.of(rows)
+    model = space.encode(rows)
     assert model.shape == (1, 32)
     np.testing.assert_allclose(space.joints(model), rows, atol=1e-5)
     np.testing.assert_array_equal(space.joints(rows), rows)
@@ -68,7 +68,7 @@ def test_joints_survive_the_way_over_the_models_own_space(values: list[float]) -
 def test_a_joint_without_end_has_a_place_in_the_models_space_too() -> None:
     endless = replace(ROBOT, lower=np.full(14, -np.inf), upper=np.full(14, np.inf))
     space = ModelSpace(endless)
-    np.testing.assert_allclose(space.of(np.full((1, 14), np.pi, np.float32))[0, :14], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(space.encode(np.full((1, 14), np.pi, np.float32))[0, :14], 1.0, rtol=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(3, 13), (32,), (0, 14)])

@@ -9,17 +9,17 @@ import pytest
 
 import robots
 from runtime.sim.bench import BenchError
-from runtime.sim.chase import Places
-from runtime.sim.conveyor import CONVEYOR, COURSE_S, REQUIRED, TOLERANCE_M, Conveyor, Escort
-from runtime.sim.course import course_of
+from runtime.sim.chase import PlaceMap
+from runtime.sim.conveyor import CONVEYOR, COURSE_S, REQUIRED, TOLERANCE_M, Conveyor, TrackingErrors
+from runtime.sim.course import draw_belt_motion
 from runtime.sim.plant import Plant
-from runtime.sim.tabletop import Reset
+from runtime.sim.tabletop import ResetRequest
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 READY = ROBOT.poses["ready"]
 BELT = CONVEYOR.belt
 assert BELT is not None
-PLACES = Places(ROBOT, BELT)
+PLACES = PlaceMap(ROBOT, BELT)
 TICK = 1 / 30
 
 
@@ -59,7 +59,7 @@ def test_the_belt_stands_until_fingertips_are_beside_the_block() -> None:
     before = bench.x
     for _ in range(30):
         truth = bench.tick()
-    assert bench.x == before == course_of(0, BELT, COURSE_S).x(0.0)
+    assert bench.x == before == draw_belt_motion(0, BELT, COURSE_S).x(0.0)
     assert truth["milestones"] == {"reached": False, "followed": False}
     assert truth["chase"]["seconds"] == 0.0
     bench.tick(0.0)
@@ -69,7 +69,7 @@ def test_the_belt_stands_until_fingertips_are_beside_the_block() -> None:
 
 
 def test_the_block_rides_the_course_of_its_seed_whatever_the_steps_of_time() -> None:
-    course = course_of(4, BELT, COURSE_S)
+    course = draw_belt_motion(4, BELT, COURSE_S)
     for seconds in (TICK, 0.1):
         bench = Bench(4)
         bench.tick(0.0)
@@ -140,8 +140,8 @@ def test_a_reset_lays_another_course_once() -> None:
     bench = Bench()
     for _ in range(60):
         bench.tick(0.0)
-    bench.conveyor.reset(Reset("again", 7))
-    assert bench.x == course_of(7, BELT, COURSE_S).x(0.0)
+    bench.conveyor.reset(ResetRequest("again", 7))
+    assert bench.x == draw_belt_motion(7, BELT, COURSE_S).x(0.0)
     truth = bench.tick()
     assert (truth["reset"], truth["seed"]) == ("again", 7)
     assert truth["milestones"] == {"reached": False, "followed": False}
@@ -149,7 +149,7 @@ def test_a_reset_lays_another_course_once() -> None:
     for _ in range(30):
         bench.tick(0.0)
     before = bench.x
-    bench.conveyor.reset(Reset("again", 7))
+    bench.conveyor.reset(ResetRequest("again", 7))
     assert bench.x == before
 
 
@@ -159,7 +159,7 @@ def test_positions_are_refused_and_nothing_has_changed() -> None:
         bench.tick(0.0)
     before = bench.conveyor.truth()
     with pytest.raises(BenchError, match="positions name block; allowed on a conveyor: none"):
-        bench.conveyor.reset(Reset("elsewhere", 7, {"block": [0.0, 0.3, 0.0]}))
+        bench.conveyor.reset(ResetRequest("elsewhere", 7, {"block": [0.0, 0.3, 0.0]}))
     assert bench.conveyor.truth() == before
 
 
@@ -170,12 +170,12 @@ def test_before_anything_has_moved_there_is_no_distance() -> None:
 
 
 def test_an_escort_knows_shares_means_and_quantiles() -> None:
-    escort = Escort()
-    assert (escort.share, escort.mean, escort.quantile(0.95)) == (0.0, 0.0, 0.0)
+    escort = TrackingErrors()
+    assert (escort.on_target_share, escort.mean, escort.quantile(0.95)) == (0.0, 0.0, 0.0)
     millimetres = [*range(1, 101)]
     for number in np.random.default_rng(0).permutation(millimetres).tolist():
-        escort.note(number / 1000)
-    assert escort.share == 0.2
+        escort.add(number / 1000)
+    assert escort.on_target_share == 0.2
     assert escort.mean == pytest.approx(0.0505)
     assert [escort.quantile(part) for part in (0.01, 0.5, 0.95, 1.0)] == [0.001, 0.05, 0.095, 0.1]
     assert all(one <= other for one, other in pairwise(escort.distances))

@@ -7,29 +7,29 @@ import pytest
 
 import robots
 from runtime.sim.bench import wrist_camera
-from runtime.sim.eyes import Eye, wrist_eye
-from runtime.sim.limbs import limbs
+from runtime.sim.eyes import CameraPlacement, place_wrist_camera
+from runtime.sim.limbs import arm_frames
 
-ROBOTS = robots.names()
+ROBOTS = robots.robot_names()
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_fingertips_are_in_the_picture_of_every_arms_camera(name):
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     for arm in robot.arms:
-        tip = limbs(robot)[arm.name].tip(robot.poses["ready"])
-        camera = wrist_camera(tip, 640, 480, wrist_eye(robot, arm.name))
+        tip = arm_frames(robot)[arm.name].tip(robot.poses["ready"])
+        camera = wrist_camera(tip, 640, 480, place_wrist_camera(robot, arm.name))
         u, v = camera.project(tip[:3, 3])
         assert u == pytest.approx(319.5, abs=1)
         assert 200 < v < 400
 
 
 def test_a_hand_that_hides_nothing_keeps_the_nearest_place():
-    assert wrist_eye(robots.load("agilex_piper"), "left_arm") == Eye()
+    assert place_wrist_camera(robots.load_robot("agilex_piper"), "left_arm") == CameraPlacement()
 
 
 def test_a_camera_is_not_put_inside_of_a_hand():
-    robot = robots.load("r1_lite")
-    eye = wrist_eye(robot, "left_arm")
-    assert eye.place != Eye().place
+    robot = robots.load_robot("r1_lite")
+    eye = place_wrist_camera(robot, "left_arm")
+    assert eye.place != CameraPlacement().place
     assert np.sign(eye.up[0]) == np.sign(eye.place[0])

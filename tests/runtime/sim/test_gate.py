@@ -7,11 +7,11 @@ import pytest
 
 import robots
 from runtime.core import msgpack_arrays
-from runtime.sim.drives import Switch
-from runtime.sim.gate import Gate
-from runtime.sim.tabletop import Reset
+from runtime.sim.drives import DriveSwitch
+from runtime.sim.gate import CommandGate
+from runtime.sim.tabletop import ResetRequest
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 HOME = ROBOT.poses["home"].astype(np.float32)
 
 
@@ -20,13 +20,13 @@ def command(action: Any = HOME, **fields: Any) -> bytes:
 
 
 @pytest.fixture
-def gate() -> Gate:
-    return Gate(ROBOT, deadline=0.3)
+def gate() -> CommandGate:
+    return CommandGate(ROBOT, deadline=0.3)
 
 
-def test_a_whole_target_within_limits_passes(gate: Gate) -> None:
+def test_a_whole_target_within_limits_passes(gate: CommandGate) -> None:
     target = HOME + np.where(np.asarray(ROBOT.upper) > 0.01, 0.01, -0.01).astype(np.float32)
-    accepted = gate.judge(command(target), 0.0)
+    accepted = gate.accept(command(target), 0.0)
     assert accepted is not None
     assert accepted.target is not None
     np.testing.assert_allclose(accepted.target, target, atol=1e-6)
@@ -48,16 +48,16 @@ def test_a_whole_target_within_limits_passes(gate: Gate) -> None:
     ],
 )
 def test_a_target_that_no_arm_may_be_given_is_refused_and_counted(
-    gate: Gate, action: Any, reason: str
+    gate: CommandGate, action: Any, reason: str
 ) -> None:
-    assert gate.judge(command(action), 0.0) is None
+    assert gate.accept(command(action), 0.0) is None
     assert gate.refused == {reason: 1}
-    assert gate.silent(0.0)
+    assert gate.is_silent(0.0)
 
 
-def test_limits_that_were_rounded_to_float32_are_not_violations(gate: Gate) -> None:
+def test_limits_that_were_rounded_to_float32_are_not_violations(gate: CommandGate) -> None:
     for bound in (ROBOT.lower, ROBOT.upper):
-        accepted = gate.judge(command(bound.astype(np.float32)), 0.0)
+        accepted = gate.accept(command(bound.astype(np.float32)), 0.0)
         assert accepted is not None
         assert accepted.target is not None
         assert (accepted.target >= ROBOT.lower).all()
@@ -67,122 +67,122 @@ def test_limits_that_were_rounded_to_float32_are_not_violations(gate: Gate) -> N
 @pytest.mark.parametrize(
     "payload", [b"", b"\xc1", msgpack_arrays.pack([1]), msgpack_arrays.pack({"target": 3})]
 )
-def test_garbage_is_refused_as_malformed(gate: Gate, payload: bytes) -> None:
-    assert gate.judge(payload, 0.0) is None
+def test_garbage_is_refused_as_malformed(gate: CommandGate, payload: bytes) -> None:
+    assert gate.accept(payload, 0.0) is None
     assert gate.refused == {"malformed": 1}
 
 
-def test_without_a_target_field_it_is_meant_for_the_robot(gate: Gate) -> None:
-    accepted = gate.judge(msgpack_arrays.pack({"t": 0.0, "action": HOME}), 0.0)
+def test_without_a_target_field_it_is_meant_for_the_robot(gate: CommandGate) -> None:
+    accepted = gate.accept(msgpack_arrays.pack({"t": 0.0, "action": HOME}), 0.0)
     assert accepted is not None
     assert accepted.target is not None
 
 
-def test_a_target_for_the_simulation_is_ignored_without_a_word(gate: Gate) -> None:
-    assert gate.judge(command(target="sim"), 0.0) is None
+def test_a_target_for_the_simulation_is_ignored_without_a_word(gate: CommandGate) -> None:
+    assert gate.accept(command(target="sim"), 0.0) is None
     assert gate.refused == {}
 
 
-def test_an_unknown_target_is_refused(gate: Gate) -> None:
-    assert gate.judge(command(target="fire"), 0.0) is None
+def test_an_unknown_target_is_refused(gate: CommandGate) -> None:
+    assert gate.accept(command(target="fire"), 0.0) is None
     assert gate.refused == {"unknown_target": 1}
 
 
 @pytest.mark.parametrize("word", ["collect_start", "collect_stop", "hil_start", "hil_stop"])
-def test_control_words_pass_without_counting_as_a_command(gate: Gate, word: str) -> None:
-    accepted = gate.judge(command(np.zeros(14, np.float32), target=word), 0.0)
+def test_control_words_pass_without_counting_as_a_command(gate: CommandGate, word: str) -> None:
+    accepted = gate.accept(command(np.zeros(14, np.float32), target=word), 0.0)
     assert accepted is not None
     assert accepted.control == word
     assert accepted.target is None
-    assert gate.silent(0.0)
+    assert gate.is_silent(0.0)
 
 
-def test_it_is_silent_after_the_deadline_by_our_own_clock(gate: Gate) -> None:
-    assert gate.silent(100.0)
-    gate.judge(command(t=9e9), 100.0)
-    assert not gate.silent(100.3)
-    assert gate.silent(100.31)
+def test_it_is_silent_after_the_deadline_by_our_own_clock(gate: CommandGate) -> None:
+    assert gate.is_silent(100.0)
+    gate.accept(command(t=9e9), 100.0)
+    assert not gate.is_silent(100.3)
+    assert gate.is_silent(100.31)
 
 
-def test_a_command_that_has_waited_longer_than_the_deadline_is_stale(gate: Gate) -> None:
+def test_a_command_that_has_waited_longer_than_the_deadline_is_stale(gate: CommandGate) -> None:
     """As after the node stood still: what was sent meanwhile is there at once, oldest first."""
     ahead = 5e4  # the client's clock is another machine's
     for tick in range(30):
-        assert gate.judge(command(t=ahead + tick / 10, seq=tick), tick / 10) is not None
-    queued = [gate.judge(command(t=ahead + tick / 10, seq=tick), 5.05) for tick in range(30, 51)]
+        assert gate.accept(command(t=ahead + tick / 10, seq=tick), tick / 10) is not None
+    queued = [gate.accept(command(t=ahead + tick / 10, seq=tick), 5.05) for tick in range(30, 51)]
     assert [accepted is not None for accepted in queued] == [False] * 18 + [True] * 3
     assert gate.refused == {"stale": 18}
     assert gate.ack == 50
 
 
-def test_a_queue_of_stale_commands_ends_no_silence(gate: Gate) -> None:
-    gate.judge(command(t=1.0), 1.0)
+def test_a_queue_of_stale_commands_ends_no_silence(gate: CommandGate) -> None:
+    gate.accept(command(t=1.0), 1.0)
     for tick in range(5):
-        gate.judge(command(t=1.1 + tick / 100), 4.0)
-    assert gate.silent(4.0)
+        gate.accept(command(t=1.1 + tick / 100), 4.0)
+    assert gate.is_silent(4.0)
 
 
 @pytest.mark.parametrize("stamps", [[0.0] * 40, [None] * 40, [float("nan")] * 40, list(range(40, 0, -1))])
 def test_a_client_without_a_clock_that_goes_on_is_judged_by_arrival_alone(
-    gate: Gate, stamps: list[Any]
+    gate: CommandGate, stamps: list[Any]
 ) -> None:
     for tick, stamp in enumerate(stamps):
-        assert gate.judge(command(t=stamp), tick / 2) is not None
+        assert gate.accept(command(t=stamp), tick / 2) is not None
     assert gate.refused == {}
 
 
-def test_a_client_whose_clock_jumps_is_understood_at_once(gate: Gate) -> None:
+def test_a_client_whose_clock_jumps_is_understood_at_once(gate: CommandGate) -> None:
     clock = [tick / 30 for tick in range(20)]
     clock += [9e5 + one for one in clock] + [one - 400 for one in clock]
     for tick, stamp in enumerate(clock):
-        assert gate.judge(command(t=stamp), tick / 30) is not None
+        assert gate.accept(command(t=stamp), tick / 30) is not None
     assert gate.refused == {}
 
 
-def test_what_was_obeyed_last_is_acknowledged_by_its_number(gate: Gate) -> None:
+def test_what_was_obeyed_last_is_acknowledged_by_its_number(gate: CommandGate) -> None:
     assert gate.ack is None
-    gate.judge(command(master="a", seq=7), 0.0)
+    gate.accept(command(master="a", seq=7), 0.0)
     assert gate.ack == 7
-    gate.judge(command(HOME[:3], master="a", seq=8), 0.1)
-    gate.judge(command(master="b", seq=90), 0.2)
+    gate.accept(command(HOME[:3], master="a", seq=8), 0.1)
+    gate.accept(command(master="b", seq=90), 0.2)
     assert gate.ack == 7
-    gate.judge(command(target="collect_start", master="a", seq=9), 0.3)
+    gate.accept(command(target="collect_start", master="a", seq=9), 0.3)
     assert gate.ack == 9
-    gate.judge(command(master="b", seq="x"), 2.0)
+    gate.accept(command(master="b", seq="x"), 2.0)
     assert (gate.master, gate.ack) == ("b", None)
-    gate.judge(command(), 4.0)  # an older client does not number
+    gate.accept(command(), 4.0)  # an older client does not number
     assert (gate.master, gate.ack) == ("anonymous", None)
 
 
-def test_the_first_master_rules_until_it_is_silent_for_a_second(gate: Gate) -> None:
-    assert gate.judge(command(master="a"), 0.0) is not None
-    assert gate.judge(command(master="b"), 0.5) is None
+def test_the_first_master_rules_until_it_is_silent_for_a_second(gate: CommandGate) -> None:
+    assert gate.accept(command(master="a"), 0.0) is not None
+    assert gate.accept(command(master="b"), 0.5) is None
     assert gate.refused == {"other_master": 1}
-    assert gate.judge(command(master="a"), 0.9) is not None
-    assert gate.judge(command(master="b"), 1.8) is None
-    assert gate.judge(command(master="b"), 1.91) is not None
+    assert gate.accept(command(master="a"), 0.9) is not None
+    assert gate.accept(command(master="b"), 1.8) is None
+    assert gate.accept(command(master="b"), 1.91) is not None
     assert gate.master == "b"
-    assert gate.judge(command(master="a"), 2.0) is None
+    assert gate.accept(command(master="a"), 2.0) is None
     assert gate.refused == {"other_master": 3}
 
 
-def test_refused_attempts_of_another_do_not_prolong_nor_end_the_reign(gate: Gate) -> None:
-    gate.judge(command(master="a"), 0.0)
+def test_refused_attempts_of_another_do_not_prolong_nor_end_the_reign(gate: CommandGate) -> None:
+    gate.accept(command(master="a"), 0.0)
     for tenth in range(1, 11):
-        assert gate.judge(command(master="b"), tenth / 10) is None
-    assert gate.judge(command(master="b"), 1.01) is not None
+        assert gate.accept(command(master="b"), tenth / 10) is None
+    assert gate.accept(command(master="b"), 1.01) is not None
 
 
-def test_a_client_without_a_name_is_a_master_like_any_other(gate: Gate) -> None:
-    assert gate.judge(command(), 0.0) is not None
+def test_a_client_without_a_name_is_a_master_like_any_other(gate: CommandGate) -> None:
+    assert gate.accept(command(), 0.0) is not None
     assert gate.master == "anonymous"
-    assert gate.judge(command(master="b"), 0.1) is None
-    assert gate.judge(command(), 0.2) is not None
+    assert gate.accept(command(master="b"), 0.1) is None
+    assert gate.accept(command(), 0.2) is not None
 
 
-def test_control_words_of_another_client_are_refused(gate: Gate) -> None:
-    gate.judge(command(master="a"), 0.0)
-    assert gate.judge(command(target="collect_start", master="b"), 0.1) is None
+def test_control_words_of_another_client_are_refused(gate: CommandGate) -> None:
+    gate.accept(command(master="a"), 0.0)
+    assert gate.accept(command(target="collect_start", master="b"), 0.1) is None
     assert gate.refused == {"other_master": 1}
 
 
@@ -190,23 +190,27 @@ WISH = {"target": "scene_reset", "id": "one", "seed": 7}
 
 
 def test_a_wish_to_lay_the_bench_passes_where_there_is_one() -> None:
-    gate = Gate(ROBOT, deadline=0.3, bench=True)
+    gate = CommandGate(ROBOT, deadline=0.3, bench=True)
     positions = {"block": [0.1, 0.2, 30.0], "plate": [0.1, 0.37]}
     for arrival, wish, expected in (
-        (0.0, WISH, Reset("one", 7, None)),
-        (2.0, WISH | {"positions": None, "master": "first", "t": 1.0, "seq": 3}, Reset("one", 7, None)),
-        (4.0, WISH | {"positions": positions}, Reset("one", 7, positions)),
+        (0.0, WISH, ResetRequest("one", 7, None)),
+        (
+            2.0,
+            WISH | {"positions": None, "master": "first", "t": 1.0, "seq": 3},
+            ResetRequest("one", 7, None),
+        ),
+        (4.0, WISH | {"positions": positions}, ResetRequest("one", 7, positions)),
     ):
-        accepted = gate.judge(msgpack_arrays.pack(wish), arrival)
+        accepted = gate.accept(msgpack_arrays.pack(wish), arrival)
         assert accepted is not None
         assert accepted.reset == expected
         assert accepted.target is accepted.control is None
     assert gate.refused == {}
-    assert gate.silent(0.0)
+    assert gate.is_silent(0.0)
 
 
-def test_a_node_without_a_bench_refuses_the_wish(gate: Gate) -> None:
-    assert gate.judge(msgpack_arrays.pack(WISH), 0.0) is None
+def test_a_node_without_a_bench_refuses_the_wish(gate: CommandGate) -> None:
+    assert gate.accept(msgpack_arrays.pack(WISH), 0.0) is None
     assert gate.refused == {"no_bench": 1}
 
 
@@ -224,23 +228,23 @@ def test_a_node_without_a_bench_refuses_the_wish(gate: Gate) -> None:
     ],
 )
 def test_a_wish_of_the_wrong_shape_is_refused(wrong: dict[str, Any]) -> None:
-    gate = Gate(ROBOT, deadline=0.3, bench=True)
-    assert gate.judge(msgpack_arrays.pack(WISH | wrong), 0.0) is None
+    gate = CommandGate(ROBOT, deadline=0.3, bench=True)
+    assert gate.accept(msgpack_arrays.pack(WISH | wrong), 0.0) is None
     assert gate.refused == {"malformed": 1}
 
 
 def test_the_bench_is_not_laid_for_a_second_client_while_the_first_commands() -> None:
-    gate = Gate(ROBOT, deadline=0.3, bench=True)
-    gate.judge(command(master="first"), 0.0)
-    assert gate.judge(msgpack_arrays.pack(WISH | {"master": "second"}), 0.5) is None
+    gate = CommandGate(ROBOT, deadline=0.3, bench=True)
+    gate.accept(command(master="first"), 0.0)
+    assert gate.accept(msgpack_arrays.pack(WISH | {"master": "second"}), 0.5) is None
     assert gate.refused == {"other_master": 1}
 
 
-def test_the_drives_are_switched_by_anybody_who_does_not_become_the_master_by_it(gate: Gate) -> None:
-    gate.judge(command(master="station"), 0.0)
-    accepted = gate.judge(command(target="drives_fault", fault="hot", master="hand"), 0.1)
+def test_the_drives_are_switched_by_anybody_who_does_not_become_the_master_by_it(gate: CommandGate) -> None:
+    gate.accept(command(master="station"), 0.0)
+    accepted = gate.accept(command(target="drives_fault", fault="hot", master="hand"), 0.1)
     assert accepted is not None
-    assert accepted.switch == Switch(False, "hot")
+    assert accepted.switch == DriveSwitch(False, "hot")
     assert (gate.master, gate.refused) == ("station", {})
-    assert gate.judge(command(target="drives_fault", fault=7), 0.2) is None
+    assert gate.accept(command(target="drives_fault", fault=7), 0.2) is None
     assert gate.refused == {"malformed": 1}

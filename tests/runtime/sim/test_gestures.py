@@ -16,9 +16,9 @@ from runtime.sim.plant import Plant
 RATE = 30.0
 
 
-@given(st.sampled_from(robots.names()), st.integers(0, 1000))
+@given(st.sampled_from(robots.robot_names()), st.integers(0, 1000))
 def test_a_chunk_starts_where_the_robot_is_and_is_slow_and_within_limits(name: str, seed: int) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     start = np.random.default_rng(seed).uniform(robot.lower, robot.upper)
     rows = Gesture(robot).chunk(start, 50, RATE).astype(np.float64)
     steps = np.diff(np.vstack([start, rows]), axis=0)
@@ -32,16 +32,16 @@ def test_a_chunk_starts_where_the_robot_is_and_is_slow_and_within_limits(name: s
 
 
 def test_the_same_joints_give_the_same_chunk() -> None:
-    robot = robots.load("agilex_piper")
+    robot = robots.load_robot("agilex_piper")
     start = 0.3 * robot.lower + 0.7 * robot.upper
     np.testing.assert_array_equal(
         Gesture(robot).chunk(start, 20, RATE), Gesture(robot).chunk(start, 20, RATE)
     )
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_a_robot_that_follows_it_goes_round_for_ever(name: str) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     gesture, plant = Gesture(robot), Plant(robot)
     phases, joints = [], []
     for _ in range(90):
@@ -61,12 +61,12 @@ def test_a_robot_that_follows_it_goes_round_for_ever(name: str) -> None:
 
 def test_what_is_no_arm_stays_where_it_is(tmp_path: Path) -> None:
     folder = tmp_path / "with_head"
-    shutil.copytree(robots.load("agilex_piper").folder, folder)
+    shutil.copytree(robots.load_robot("agilex_piper").folder, folder)
     file = folder / "robot.toml"
     head = '[[groups]]\nname = "head"\njoints = ["pan"]\nurdf_joints = ["joint7"]\n\n[poses.home]\n'
     text = file.read_text().replace("[poses.home]\n", head)
     file.write_text(re.sub(r"(right_arm = .*\n)", r"\1head = [0.01]\n", text))
-    robot = robots.load(folder)
+    robot = robots.load_robot(folder)
     start = 0.5 * (robot.lower + robot.upper)
     rows = Gesture(robot).chunk(start, 30, RATE)
     part = robot.group("head").slice
@@ -76,6 +76,6 @@ def test_what_is_no_arm_stays_where_it_is(tmp_path: Path) -> None:
 
 @given(st.floats(-3.0, 3.0))
 def test_the_phase_can_be_read_off_the_joints(phase: float) -> None:
-    robot = robots.load("agilex_piper")
+    robot = robots.load_robot("agilex_piper")
     gesture = Gesture(robot)
-    assert gesture.phase_of(gesture.at(phase, robot.poses["home"])) == pytest.approx(phase, abs=1e-6)
+    assert gesture.phase_of(gesture.joints_at(phase, robot.poses["home"])) == pytest.approx(phase, abs=1e-6)

@@ -94,7 +94,7 @@ def test_a_trial_through_gr00t_puts_the_block_on_the_plate(tmp_path: Path, versi
 
 def test_the_deployment_of_the_document_is_answered_by_the_stand_in_that_it_names() -> None:
     resolved = load(ROOT / "deployments" / "gr00t.toml")
-    settings, robot = resolved.deployment.policy, robots.load(resolved.deployment.robot)
+    settings, robot = resolved.deployment.policy, robots.load_robot(resolved.deployment.robot)
     server = Gr00tServer(robot, Gr00tBehaviour("n1.7"))
     with contextlib.closing(server):
         here = settings.model_copy(update={"url": server.start()["url"]})
@@ -118,7 +118,7 @@ def test_the_server_of_the_document_is_one(free_port: int) -> None:
                 "video",
                 "action",
             }
-            robot = robots.load("ur5e")
+            robot = robots.load_robot("ur5e")
             settings = gr00t.Config(
                 url=url,
                 video={"ego_view": "cam_high"},

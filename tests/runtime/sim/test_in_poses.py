@@ -8,8 +8,8 @@ import pytest
 import robots
 from runtime.core.errors import SetupError
 from runtime.core.pose_format import PoseFormat
-from runtime.sim.in_poses import InPoses, pose_format
-from runtime.sim.script import Waving
+from runtime.sim.in_poses import PoseScript, pose_format
+from runtime.sim.script import WavingScript
 from runtime.spaces.pose_rows import PoseRows
 
 FORMATS = [
@@ -19,12 +19,12 @@ FORMATS = [
 ]
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 @pytest.mark.parametrize("pose", FORMATS, ids=str)
 def test_its_rows_are_the_poses_of_the_joint_rows(name, pose):
-    robot = robots.load(name)
-    waving, q = Waving(robot, 12, 30.0), robot.poses["ready"]
-    rows = InPoses(waving, robot, 30.0, pose).begin()(q, {}, "")
+    robot = robots.load_robot(name)
+    waving, q = WavingScript(robot, 12, 30.0), robot.poses["ready"]
+    rows = PoseScript(waving, robot, 30.0, pose).begin()(q, {}, "")
     vectors, appended = PoseRows(pose, robot).decode(rows.astype(np.float64))
     joints = waving.begin()(q, {}, "").astype(np.float64)
     assert rows.shape == (12, PoseRows(pose, robot).width)
@@ -39,9 +39,9 @@ def test_its_rows_are_the_poses_of_the_joint_rows(name, pose):
 
 
 def test_groups_that_follow_the_poses_come_as_joints():
-    robot = robots.load("agibot_g2")
+    robot = robots.load_robot("agibot_g2")
     q = robot.poses["ready"]
-    rows = InPoses(Waving(robot, 5, 30.0), robot, 30.0, PoseFormat(groups=["body", "head"])).begin()(
+    rows = PoseScript(WavingScript(robot, 5, 30.0), robot, 30.0, PoseFormat(groups=["body", "head"])).begin()(
         q, {}, ""
     )
     expected = np.concatenate([q[robot.group("body").slice], q[robot.group("head").slice]])
@@ -49,8 +49,8 @@ def test_groups_that_follow_the_poses_come_as_joints():
 
 
 def test_it_says_how_its_rows_are_written():
-    robot = robots.load("ur5e")
-    metadata = InPoses(Waving(robot, 5, 25.0), robot, 25.0, PoseFormat(orientation="xyzw")).metadata
+    robot = robots.load_robot("ur5e")
+    metadata = PoseScript(WavingScript(robot, 5, 25.0), robot, 25.0, PoseFormat(orientation="xyzw")).metadata
     assert (metadata["action_space"], metadata["action_dim"], metadata["action_rate"]) == ("eef", 8, 25.0)
     assert metadata["action_pose"]["orientation"] == "xyzw"
     assert metadata["action_horizon"] == 5
@@ -78,6 +78,6 @@ def test_a_format_that_is_none_is_refused(given, said):
 
 
 def test_a_frame_that_the_robot_has_not_is_refused():
-    robot = robots.load("ur5e")
+    robot = robots.load_robot("ur5e")
     with pytest.raises(SetupError, match="nowhere"):
-        InPoses(Waving(robot, 5, 25.0), robot, 25.0, PoseFormat(frame="nowhere"))
+        PoseScript(WavingScript(robot, 5, 25.0), robot, 25.0, PoseFormat(frame="nowhere"))

@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 
 import robots
 from runtime.sim.bench import Bench, BenchError
-from runtime.sim.layout import APART_M, NOISE_M, NOISE_RAD, layout_of
+from runtime.sim.layout import APART_M, NOISE_M, NOISE_RAD, draw_layout
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 X_FROM, X_TO, Y_FROM, Y_TO = Bench().area
 SEEDS = st.integers(0, 2**63 - 1)
 
 
 @given(SEEDS, st.integers(1, 4))
 def test_every_layout_lies_in_the_area_apart_and_on_one_side(seed: int, blocks: int) -> None:
-    layout = layout_of(seed, None, blocks)
+    layout = draw_layout(seed, None, blocks)
     assert len(layout.blocks) == blocks
     for x, y, _ in [*layout.blocks, (*layout.plate, 0.0)]:
         assert X_FROM <= x <= X_TO
@@ -34,8 +34,8 @@ def test_every_layout_lies_in_the_area_apart_and_on_one_side(seed: int, blocks: 
 @given(SEEDS)
 def test_a_layout_is_always_the_same_for_a_seed_and_near_what_was_asked_for(seed: int) -> None:
     positions = {"block": [0.1, 0.2, 30.0], "plate": [0.15, 0.36]}
-    layout = layout_of(seed, positions)
-    assert layout == layout_of(seed, positions)
+    layout = draw_layout(seed, positions)
+    assert layout == draw_layout(seed, positions)
     x, y, yaw = layout.blocks[0]
     assert np.abs(np.subtract((x, y, *layout.plate), (0.1, 0.2, 0.15, 0.36))).max() <= NOISE_M
     assert abs(yaw - math.radians(30)) <= NOISE_RAD
@@ -43,7 +43,7 @@ def test_a_layout_is_always_the_same_for_a_seed_and_near_what_was_asked_for(seed
 
 def test_layouts_differ_by_seed_with_and_without_positions() -> None:
     for positions in (None, {"block": [0.1, 0.2, 0.0], "plate": [0.15, 0.36]}, {"plate": [0.1, 0.3]}):
-        assert len({layout_of(seed, positions) for seed in range(20)}) == 20
+        assert len({draw_layout(seed, positions) for seed in range(20)}) == 20
 
 
 @pytest.mark.parametrize(
@@ -61,10 +61,10 @@ def test_layouts_differ_by_seed_with_and_without_positions() -> None:
 )
 def test_positions_that_cannot_be_are_refused_with_a_sentence(positions: dict, says: str) -> None:
     with pytest.raises(BenchError, match=says):
-        layout_of(0, positions)
+        draw_layout(0, positions)
 
 
 @pytest.mark.parametrize(("seed", "blocks"), [(0, 0), (-1, 1), (0, 60)])
 def test_blocks_that_do_not_fit_are_refused(seed: int, blocks: int) -> None:
     with pytest.raises(BenchError, match="block"):
-        layout_of(seed, None, blocks)
+        draw_layout(seed, None, blocks)

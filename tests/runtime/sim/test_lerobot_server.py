@@ -29,7 +29,7 @@ from runtime.sim import lerobot_wire as wire  # noqa: E402
 from runtime.sim.lerobot_server import LerobotBehaviour, LerobotServer  # noqa: E402
 
 VECTORS = Path(__file__).parents[1] / "vectors"
-ROBOT = robots.load("ur5e")
+ROBOT = robots.load_robot("ur5e")
 
 
 class Client:
@@ -89,9 +89,9 @@ def test_recorded_messages_of_the_real_client_are_understood_and_the_answer_is_n
 
 
 def test_a_pickle_that_names_something_else_is_not_read() -> None:
-    for data in (wire.command("true"), b"\x80\x04cos\nsystem\n."):
+    for data in (wire.command_pickle("true"), b"\x80\x04cos\nsystem\n."):
         with pytest.raises(ModuleNotFoundError, match="No module named"):
-            wire.read(data)
+            wire.unpickle(data)
 
 
 def test_its_pickles_name_what_those_of_the_real_server_name() -> None:

@@ -7,11 +7,11 @@ import robots
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import SetupError
 from runtime.core.types import Float64, RobotCommand
-from runtime.sim.link import Link
+from runtime.sim.link import InProcessNode
 from runtime.sim.node import Node, parser
 from runtime.transports.node_messages import MessageRefused
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 HOME = ROBOT.poses["home"]
 AWAY = np.clip(HOME + 0.2, ROBOT.lower, ROBOT.upper)
 TICK = 1 / 30
@@ -24,7 +24,7 @@ class Bench:
         self.clock = VirtualClock()
         line = ["--robot", "agilex_piper", "--width", "96", "--height", "60", *options]
         self.node = Node(ROBOT, parser().parse_args(line), self.clock)
-        self.link = Link(self.node, ROBOT, self.clock)
+        self.link = InProcessNode(self.node, ROBOT, self.clock)
         self.link.connect()
 
     def send(self, target: Float64, step: int = 0) -> None:
@@ -75,7 +75,7 @@ def test_the_nodes_own_gate_judges_commands() -> None:
 def test_a_word_lays_the_bench_anew_and_the_truth_says_so() -> None:
     bench = Bench("--bench", "conveyor", "--start-pose", "ready")
     assert bench.look().truth["reset"] == ""
-    bench.link.tell("scene_reset", {"id": "first", "seed": 3})
+    bench.link.send_control_word("scene_reset", {"id": "first", "seed": 3})
     truth = bench.look().truth
     assert (truth["reset"], truth["seed"], truth["success"]) == ("first", 3, False)
     assert truth["milestones"] == {"reached": False, "followed": False}

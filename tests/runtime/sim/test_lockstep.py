@@ -23,10 +23,10 @@ from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.server import ServedLockstep
 from runtime.recording.reader import open_episode
 from runtime.sim import lockstep, serve
-from runtime.sim.lockstep import Rested, linked
+from runtime.sim.lockstep import SuccessDetector, in_process_peers
 from runtime.sim.node import parser
 from runtime.sim.tabletop import Tabletop
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from tests.runtime.lockstep_station import column
 from tests.runtime.sim.tabletop_station import DEPLOYMENTS, SlowEye
 
@@ -66,13 +66,13 @@ class Operator:
         self._until(SessionState.READY)
         self._ended.append((session.reason, set(self.station.coordinator.inference.metrics.delays)))
         while self._dawdles and runs.last_episode.get("uuid") != self._given[-1]:
-            self.station.turn()
+            self.station.poll()
 
     def courses(self) -> list[Course]:
         """Of all trials, once all recordings are closed."""
         runs, found = self.station.coordinator.runs, []
         while runs.last_episode["uuid"] != self._given[-1]:
-            self.station.turn()
+            self.station.poll()
         for uuid_, (reason, delays) in zip(self._given, self._ended, strict=True):
             episode = open_episode(self.station.spec.deployment.episodes_dir / uuid_)
             truth = next(event["data"] for event in episode.events if event["kind"] == "truth")
@@ -83,7 +83,7 @@ class Operator:
 
     def _give(self, kind: str, **arguments: Any) -> Ack:
         for _ in range(1 + self._dawdles):  # nobody decides by what is not published yet
-            self.station.turn()
+            self.station.poll()
         main = self.station.coordinator
         epoch = 0 if kind == "lease_claim" else main.lease.epoch
         ack = main.handle(
@@ -105,7 +105,7 @@ class Operator:
         for _ in range(TURNS):
             if self.station.coordinator.session.state in states:
                 return
-            self.station.turn()
+            self.station.poll()
         raise AssertionError(f"never {states}")
 
 
@@ -126,10 +126,10 @@ def courses(
         server.reply = replying
     urls = [str(server.start()["url"]) for server in servers]
     given = [f'data_dir="{data}"', f'policy.url="{urls[0]}"', "recording.export=false", "lease.ttl_s=600"]
-    made = checked_spec(loader.load(DEPLOYMENTS / "tabletop.toml", given))
+    made = check_deployment(loader.load(DEPLOYMENTS / "tabletop.toml", given))
     around = SlowEye(made.robot, Tabletop(made.robot, 1))
     options = parser().parse_args(["--robot", made.robot.name, "--bench", "tabletop", "--seed", "1"])
-    over, peers = Rested(around.truth, clock), linked(made, clock, around, options)
+    over, peers = SuccessDetector(around.truth, clock), in_process_peers(made, clock, around, options)
     with closing(ServedLockstep(made, clock, over, peers=peers)) as station:
         operator = Operator(station, dawdles)
         for policy, seed, seconds in trials:
@@ -161,7 +161,7 @@ def test_the_same_plan_gives_the_same_course_however_busy_the_machine(tmp_path: 
 
 def test_a_run_is_over_once_success_has_lasted(tmp_path: Path) -> None:
     clock, truth = VirtualClock(), {"success": False}
-    over = Rested(lambda: truth, clock)
+    over = SuccessDetector(lambda: truth, clock)
 
     def after(seconds: float, running: bool = True) -> str:
         clock.advance(seconds)

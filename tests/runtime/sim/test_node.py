@@ -21,7 +21,7 @@ from runtime.core.errors import CodecError, SetupError
 from runtime.core.types import Float64, Observation, RobotCommand
 from runtime.sim import node as module
 from runtime.sim.bench import overhead_camera
-from runtime.sim.layout import layout_of
+from runtime.sim.layout import draw_layout
 from runtime.sim.node import Node, parser
 from runtime.sim.pictures import frame_number
 from runtime.transports import zmq as link
@@ -31,7 +31,7 @@ from runtime.transports.node_source import NodeSource
 from runtime.transports.zmq import Config
 from tests.processes import PATIENCE_S
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 HOME = ROBOT.poses["home"]
 KEYS = [camera.key for camera in ROBOT.cameras]
 FREE = ["--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0"]
@@ -150,9 +150,9 @@ def test_poses_are_those_of_the_joints(bench: Bench) -> None:
 
 
 @pytest.mark.some(1)
-@pytest.mark.parametrize("name", [name for name in robots.names() if name != "agilex_piper"])
+@pytest.mark.parametrize("name", [name for name in robots.robot_names() if name != "agilex_piper"])
 def test_any_robot_goes_where_it_is_told_and_measures_what_its_chains_say(name: str) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     clock = VirtualClock()
     line = [
         "--robot",
@@ -386,7 +386,7 @@ def test_without_a_bench_there_is_no_truth_and_nothing_to_lay(bench: Bench) -> N
 def test_a_tabletop_says_how_it_really_is(tabletop: Bench) -> None:
     said = tabletop.tick()
     np.testing.assert_allclose(joints(said), ROBOT.poses["ready"], atol=1e-6)
-    layout = layout_of(5)
+    layout = draw_layout(5)
     truth = said["truth"]
     assert truth["reset"] == ""
     assert truth["seed"] == 5
@@ -402,7 +402,7 @@ def test_a_scene_reset_lays_the_bench_once_and_the_pictures_show_it(tabletop: Be
     for _ in range(3):
         tabletop.send(target="scene_reset", id="one", seed=3, positions=POSITIONS)
     said = tabletop.tick()
-    layout = layout_of(3, POSITIONS)
+    layout = draw_layout(3, POSITIONS)
     assert said["truth"]["reset"] == "one"
     assert said["truth"]["seed"] == 3
     assert said["truth"]["blocks"][0][:2] == pytest.approx(layout.blocks[0][:2])
@@ -450,9 +450,9 @@ def test_the_node_with_a_bench_is_one_that_the_link_understands(tabletop: Bench)
     assert frame.truth["success"] is False
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_every_robot_can_be_simulated(name: str) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     options = parser().parse_args(["--robot", name, *SMALL])
     with contextlib.closing(Node(robot, options, VirtualClock())) as node:
         node.open()

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.sim.bench import Layout
+from runtime.sim.bench import BenchLayout
 from runtime.sim.pick_place import ScriptError, Skill
 from tests.runtime.sim.bench_trial import CAMERA, ROBOT, Trial
 
@@ -88,7 +88,7 @@ def test_without_a_block_it_does_not_move(monkeypatch):
     from tests.runtime.sim.drawn_bench import drawn
 
     trial = Trial(GOOD).lay(0)
-    monkeypatch.setattr(trial, "picture", lambda: drawn(Layout((), (0.1, 0.3))))
+    monkeypatch.setattr(trial, "picture", lambda: drawn(BenchLayout((), (0.1, 0.3))))
     assert moved(trial.ask(), trial.plant.q) < 1e-6
 
 
@@ -180,12 +180,14 @@ def test_a_grasp_that_is_always_short_never_grasps():
 
 def first_that(slips):
     """The first seed whose first episode slips in this way."""
-    return next(seed for seed in range(50) if slips(Trial(Skill(0.0, 1.0, seed)).policy.luck().slip))
+    return next(
+        seed for seed in range(50) if slips(Trial(Skill(0.0, 1.0, seed)).policy.next_episode_noise().slip)
+    )
 
 
 def test_slips_come_as_often_as_they_should():
     policy = Trial(Skill(0.0, 0.25, 3)).policy
-    slips = [policy.luck().slip for _ in range(400)]
+    slips = [policy.next_episode_noise().slip for _ in range(400)]
     share = sum(slip.lets_go or slip.short > 0 for slip in slips) / len(slips)
     assert share == pytest.approx(0.25, abs=0.06)
     assert any(slip.lets_go for slip in slips)
@@ -193,8 +195,8 @@ def test_slips_come_as_often_as_they_should():
 
 
 def test_noise_is_as_large_as_it_should_be_and_new_in_each_attempt():
-    luck = Trial(Skill(noise=0.014)).policy.luck()
-    places = np.array([luck.perceived((0.1, 0.3, 0.2)) for _ in range(600)])
+    luck = Trial(Skill(noise=0.014)).policy.next_episode_noise()
+    places = np.array([luck.perceive((0.1, 0.3, 0.2)) for _ in range(600)])
     np.testing.assert_allclose(places.mean(axis=0), (0.1, 0.3, 0.2), atol=0.05)
     np.testing.assert_allclose(places.std(axis=0), (0.014, 0.014, 0.35), rtol=0.12)
 

@@ -11,7 +11,7 @@ from runtime.core.errors import SetupError
 from runtime.sim.bench import Bench, tip_in_world
 from runtime.sim.postures import CLEAR, TILTS, Postures, closed, gripper_dim, jaws, opened
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 LEFT, RIGHT = ROBOT.arms
 READY, HOME = ROBOT.poses["ready"], ROBOT.poses["home"]
 POSTURES = Postures(ROBOT, Bench())
@@ -83,9 +83,9 @@ def mute(arm):
     return replace(arm, gripper=replace(jaws(arm), unit="percent", apart=None))
 
 
-@pytest.mark.parametrize("name", robots.names())
+@pytest.mark.parametrize("name", robots.robot_names())
 def test_every_arm_of_every_robot_goes_straight_down_on_what_is_near_it(name):
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     postures, home = Postures(robot, Bench()), robot.poses["home"]
     assert postures.arms == robot.arms
     for arm in robot.arms:

@@ -33,7 +33,7 @@ def told(node: StandIn) -> dict[str, Any]:
 def test_a_topic_that_is_none_of_the_robots_is_refused() -> None:
     options = parser().parse_args(["--robot", "agilex_piper", "--silence", "/nothing"])
     with pytest.raises(SetupError, match="--silence /nothing is no topic of agilex_piper; it has"):
-        Ros1Node(robots.load("agilex_piper"), options, MonotonicClock())
+        Ros1Node(robots.load_robot("agilex_piper"), options, MonotonicClock())
 
 
 def test_a_robot_that_is_none_is_an_error_in_words(capsys: pytest.CaptureFixture[str]) -> None:

@@ -31,7 +31,7 @@ def told(node: StandIn) -> dict[str, Any]:
 
 
 def test_a_robot_without_topics_is_given_some() -> None:
-    pictures, groups = topics(robots.load("ur5e"), 2)
+    pictures, groups = topics(robots.load_robot("ur5e"), 2)
     assert pictures == {
         "cam_wrist": "/wrist_image/image_raw/compressed",
         "cam_high": "/exterior_image/image_raw/compressed",
@@ -44,7 +44,7 @@ def test_a_robot_without_topics_is_given_some() -> None:
 def test_a_topic_that_is_none_of_the_robots_is_refused() -> None:
     options = parser().parse_args(["--robot", "ur5e", "--silence", "/nothing"])
     with pytest.raises(SetupError, match="--silence /nothing is no topic of ur5e; it has"):
-        Ros2Node(robots.load("ur5e"), options, MonotonicClock())
+        Ros2Node(robots.load_robot("ur5e"), options, MonotonicClock())
 
 
 def test_a_robot_that_is_none_is_an_error_in_words(capsys: pytest.CaptureFixture[str]) -> None:
@@ -96,7 +96,7 @@ def test_all_its_numbers_are_the_robots(start: Start) -> None:
     from runtime.transports import ros2
     from tests.processes import eventually
 
-    robot = robots.load("r1_lite")
+    robot = robots.load_robot("r1_lite")
     with free_domain() as domain:
         start(
             "runtime.sim.ros2_node", "--robot", "r1_lite", "--start-pose", "ready", "--domain", str(domain),

@@ -10,18 +10,18 @@ import robots
 from robots.clearance import Clearance
 from runtime.sim import bench
 from runtime.sim.bench import Bench
-from runtime.sim.layout import layout_of
+from runtime.sim.layout import draw_layout
 from runtime.sim.postures import CLEAR, gripper_dim
-from runtime.sim.routes import Planner, Slip
+from runtime.sim.routes import PlannedFailure, RoutePlanner
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 LEFT, RIGHT = ROBOT.arms
 READY, HOME = ROBOT.poses["ready"], ROBOT.poses["home"]
 RATE = 30.0
-PLANNER = Planner(ROBOT, RATE, Bench())
+PLANNER = RoutePlanner(ROBOT, RATE, Bench())
 BLOCK, PLATE = (-0.1, 0.26, 0.4), (-0.05, 0.38)
 ANGLES = np.setdiff1d(np.arange(ROBOT.dim), ROBOT.gripper_dims)
-SURE = Slip()
+SURE = PlannedFailure()
 
 
 def planned(q=READY, block=BLOCK, plate=PLATE, slip=SURE):
@@ -55,7 +55,7 @@ def test_the_legs_follow_each_other_without_a_jump_of_the_arm():
 @pytest.mark.parametrize("q", [READY, HOME], ids=["ready", "home"])
 @pytest.mark.parametrize("seed", range(20))
 def test_every_layout_is_reached_slowly_and_above_the_table(seed, q):
-    layout = layout_of(seed)
+    layout = draw_layout(seed)
     route = planned(q, layout.blocks[0], layout.plate)
     speeds = np.abs(np.diff(route.rows, axis=0)) * RATE
     assert speeds[:, ANGLES].max() < 1.2
@@ -121,30 +121,32 @@ def test_the_other_arm_takes_what_the_nearer_one_cannot_bring_home():
 
 
 @pytest.mark.some(1)
-@pytest.mark.parametrize("name", [name for name in robots.names() if len(robots.load(name).arms) > 1])
+@pytest.mark.parametrize(
+    "name", [name for name in robots.robot_names() if len(robots.load_robot(name).arms) > 1]
+)
 def test_arms_leave_each_other_room_wherever_block_and_plate_are(name):
-    robot = robots.load(name)
-    planner, clearance = Planner(robot, RATE, Bench()), Clearance(robot)
+    robot = robots.load_robot(name)
+    planner, clearance = RoutePlanner(robot, RATE, Bench()), Clearance(robot)
     arms = [f"{arm.name}/" for arm in robot.arms]
     between = [all(any(part.startswith(arm) for part in pair) for arm in arms) for pair in clearance.pairs]
     for pose, seed in itertools.product(("ready", "home"), (0, 4, 6, 14)):
-        layout = layout_of(seed)
+        layout = draw_layout(seed)
         route = planner.pick_and_place(robot.poses[pose], layout.blocks[0], layout.plate, SURE)
         assert clearance.distances(route.rows[::5])[:, between].min() > 0.025, (pose, seed)
 
 
 def test_an_arm_that_would_run_into_the_other_leaves_it_to_that_one():
-    layout = layout_of(4)  # the left arm is nearer to the block, but the plate is far over on the right
+    layout = draw_layout(4)  # the left arm is nearer to the block, but the plate is far over on the right
     route = planned(block=layout.blocks[0], plate=layout.plate)
     assert route.arm is RIGHT
     assert route.legs[0].name == "reach"
 
 
 def test_an_arm_that_is_in_the_way_of_the_only_one_that_can_makes_way_first():
-    robot = robots.load("arx_r5")
-    layout = layout_of(0)
+    robot = robots.load_robot("arx_r5")
+    layout = draw_layout(0)
     home, ready = robot.poses["home"], robot.poses["ready"]
-    route = Planner(robot, RATE, Bench()).pick_and_place(home, layout.blocks[0], layout.plate, SURE)
+    route = RoutePlanner(robot, RATE, Bench()).pick_and_place(home, layout.blocks[0], layout.plate, SURE)
     left, right = robot.arms
     assert route.arm is left
     first = route.legs[0]
@@ -168,13 +170,13 @@ def test_what_makes_way_rises_from_the_table_first():
 
 
 def test_a_grasp_can_be_short_of_the_block():
-    tip = bench.tip_in_world(ROBOT, LEFT, leg(planned(slip=Slip(short=0.05)), "descend").end)
+    tip = bench.tip_in_world(ROBOT, LEFT, leg(planned(slip=PlannedFailure(short=0.05)), "descend").end)
     assert math.dist(tip[:2, 3], BLOCK[:2]) == pytest.approx(0.05, abs=0.002)
     assert math.dist(tip[:2, 3], LEFT.mount[:2]) < math.dist(BLOCK[:2], LEFT.mount[:2])
 
 
 def test_the_block_can_be_let_go_of_on_the_way():
-    route = planned(slip=Slip(lets_go=True))
+    route = planned(slip=PlannedFailure(lets_go=True))
     assert [leg.name for leg in route.legs[-3:]] == ["carry", "open", "retreat"]
     assert math.dist(bench.tip_in_world(ROBOT, LEFT, leg(route, "carry").end)[:2, 3], PLATE) > 0.03
 
@@ -196,13 +198,13 @@ def test_a_route_from_the_table_rises_first():
 
 
 @pytest.mark.some(1)
-@pytest.mark.parametrize("name", [name for name in robots.names() if name != ROBOT.name])
+@pytest.mark.parametrize("name", [name for name in robots.robot_names() if name != ROBOT.name])
 def test_every_robot_reaches_every_layout_slowly_and_above_the_table(name):
-    robot = robots.load(name)
-    planner, ready = Planner(robot, RATE, Bench()), robot.poses["ready"]
+    robot = robots.load_robot(name)
+    planner, ready = RoutePlanner(robot, RATE, Bench()), robot.poses["ready"]
     moving = np.setdiff1d(np.arange(robot.dim), robot.gripper_dims)
     for seed in range(25):
-        layout = layout_of(seed)
+        layout = draw_layout(seed)
         route = planner.pick_and_place(ready, layout.blocks[0], layout.plate, SURE)
         assert route is not None, seed
         assert (np.abs(np.diff(route.rows, axis=0))[:, moving].max() * RATE) < 1.5

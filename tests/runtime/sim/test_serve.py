@@ -17,17 +17,17 @@ from websockets.sync.client import ClientConnection, connect
 import robots
 from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock
-from runtime.core.errors import ContradictionError, PolicyError, PolicyGone
+from runtime.core.errors import ContradictionError, PolicyDisconnected, PolicyError
 from runtime.core.types import Observation
 from runtime.policies import openpi
-from runtime.policies.pictures import fitted, laid_out
-from runtime.sim.bench import Layout
+from runtime.policies.pictures import resize_image, to_layout
+from runtime.sim.bench import BenchLayout
 from runtime.sim.gestures import Gesture
-from runtime.sim.layout import layout_of
+from runtime.sim.layout import draw_layout
 from tests.processes import PATIENCE_S
 from tests.runtime.sim.drawn_bench import drawn
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 HOME = ROBOT.poses["home"]
 
 
@@ -106,7 +106,7 @@ def test_a_server_that_dies_during_an_inference_is_gone_for_the_client(serve: An
     with contextlib.closing(openpi.build(config, ROBOT, MonotonicClock(), 30.0)) as policy:
         policy.connect()
         assert policy.infer(shown).actions.shape == (50, 14)
-        with pytest.raises(PolicyGone, match="closed the connection"):
+        with pytest.raises(PolicyDisconnected, match="closed the connection"):
             policy.infer(shown)
         assert standin.process.wait(PATIENCE_S) == 1
         with pytest.raises(PolicyError, match="no policy server listens"):
@@ -164,8 +164,8 @@ def test_the_pick_and_place_policy_says_what_it_is_and_moves_only_for_a_block_th
         metadata = receive(connection)
         connection.send(request(images={"cam_high": np.zeros((3, 224, 224), np.uint8)}))
         dark = receive(connection)["actions"]
-        seen = fitted(drawn(layout_of(0)), 224, 224, "pad")
-        connection.send(request(images={"cam_high": laid_out(seen, "chw")}))
+        seen = resize_image(drawn(draw_layout(0)), 224, 224, "pad")
+        connection.send(request(images={"cam_high": to_layout(seen, "chw")}))
         moving = receive(connection)["actions"]
     assert metadata["name"] == "checkpoint A"
     assert "scripted pick-and-place" in metadata["description"]
@@ -182,8 +182,8 @@ def test_the_chase_says_what_it_is_and_moves_only_for_a_block_that_it_sees(serve
         metadata = receive(connection)
         connection.send(request(images={"cam_high": np.zeros((3, 224, 224), np.uint8)}))
         dark = receive(connection)["actions"]
-        seen = fitted(drawn(Layout(((0.1, 0.34, 0.0),), (-0.3, 0.15))), 224, 224, "pad")
-        connection.send(request(images={"cam_high": laid_out(seen, "chw")}))
+        seen = resize_image(drawn(BenchLayout(((0.1, 0.34, 0.0),), (-0.3, 0.15))), 224, 224, "pad")
+        connection.send(request(images={"cam_high": to_layout(seen, "chw")}))
         moving = receive(connection)["actions"]
     assert metadata["name"] == "chase"
     assert "not a learned policy" in metadata["description"]
@@ -240,7 +240,7 @@ def test_a_client_that_has_it_otherwise_is_told_so(serve: Any) -> None:
 
 def test_a_robot_may_have_its_optional_groups(start: Any) -> None:
     groups = ["left_arm", "right_arm", "torso"]
-    robot = robots.load("r1_lite", groups)
+    robot = robots.load_robot("r1_lite", groups)
     arguments = ("openpi", "--robot", "r1_lite", "--groups", ",".join(groups), "--port", "0")
     with conversation(start("runtime.sim.serve", *arguments).ready["url"]) as connection:
         receive(connection)

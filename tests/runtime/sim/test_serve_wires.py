@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from runtime.core.clock import MonotonicClock
-from runtime.core.errors import PolicyError, PolicyGone
+from runtime.core.errors import PolicyDisconnected, PolicyError
 from runtime.core.plugins import variants
 from tests.processes import PATIENCE_S
 from tests.runtime.policies.peers import FRANKA, seen
@@ -61,7 +61,7 @@ def test_a_server_that_dies_is_gone_for_its_client(serve: Any) -> None:
     standin = serve("roboarena", "--fault", "die:1")
     with contextlib.closing(policy_of("roboarena", standin.ready["url"], **ARENA)) as policy:
         policy.infer(seen(FRANKA))
-        with pytest.raises(PolicyGone, match="closed the connection"):
+        with pytest.raises(PolicyDisconnected, match="closed the connection"):
             policy.infer(seen(FRANKA))
         assert standin.process.wait(PATIENCE_S) == 1
         with pytest.raises(PolicyError, match="no policy server listens"):

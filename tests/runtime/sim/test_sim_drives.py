@@ -5,7 +5,7 @@ import zmq
 
 from runtime.core import msgpack_arrays
 from runtime.sim import drives
-from runtime.sim.drives import Drives, Switch
+from runtime.sim.drives import Drives, DriveSwitch
 from runtime.transports.node_messages import DRIVE_FAULTS_LIMIT
 from tests.processes import PATIENCE_MS
 
@@ -13,34 +13,34 @@ GOOD = {"enabled": True, "faults": []}
 
 
 def test_drives_are_on_unless_there_is_a_fault():
-    assert Drives().said() == GOOD
-    assert Drives(False).said() == {"enabled": False, "faults": []}
-    assert Drives(True, ["hot"]).said() == {"enabled": False, "faults": ["hot"]}
+    assert Drives().status() == GOOD
+    assert Drives(False).status() == {"enabled": False, "faults": []}
+    assert Drives(True, ["hot"]).status() == {"enabled": False, "faults": ["hot"]}
 
 
 def test_a_fault_switches_them_off_and_switching_on_clears_it():
     switched = Drives()
-    switched.obey(Switch(False, "hot"))
-    switched.obey(Switch(False))
-    assert switched.said() == {"enabled": False, "faults": ["hot"]}
-    switched.obey(Switch(True))
-    assert switched.said() == GOOD
+    switched.apply(DriveSwitch(False, "hot"))
+    switched.apply(DriveSwitch(False))
+    assert switched.status() == {"enabled": False, "faults": ["hot"]}
+    switched.apply(DriveSwitch(True))
+    assert switched.status() == GOOD
 
 
 def test_of_endless_faults_the_newest_are_kept():
     switched = Drives()
     for number in range(DRIVE_FAULTS_LIMIT + 5):
-        switched.obey(Switch(False, f"fault {number}"))
-    assert switched.said()["faults"][-1] == f"fault {DRIVE_FAULTS_LIMIT + 4}"
-    assert len(switched.said()["faults"]) == DRIVE_FAULTS_LIMIT
+        switched.apply(DriveSwitch(False, f"fault {number}"))
+    assert switched.status()["faults"][-1] == f"fault {DRIVE_FAULTS_LIMIT + 4}"
+    assert len(switched.status()["faults"]) == DRIVE_FAULTS_LIMIT
 
 
 @pytest.mark.parametrize(
     ("word", "fields", "switch"),
     [
-        ("drives_enable", {}, Switch(True)),
-        ("drives_disable", {}, Switch(False)),
-        ("drives_fault", {"fault": "hot"}, Switch(False, "hot")),
+        ("drives_enable", {}, DriveSwitch(True)),
+        ("drives_disable", {}, DriveSwitch(False)),
+        ("drives_fault", {"fault": "hot"}, DriveSwitch(False, "hot")),
         ("drives_fault", {}, None),
         ("drives_fault", {"fault": ""}, None),
         ("drives_fault", {"fault": 7}, None),
@@ -48,7 +48,7 @@ def test_of_endless_faults_the_newest_are_kept():
     ],
 )
 def test_words_are_read(word, fields, switch):
-    assert drives.read(word, fields) == switch
+    assert drives.parse_word(word, fields) == switch
 
 
 def test_a_word_is_said_once_the_node_listens():

@@ -10,7 +10,7 @@ from PIL import Image
 import robots
 from runtime.sim.pictures import Scene, frame_number
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 HOME = ROBOT.poses["home"]
 SCENE = Scene(ROBOT, 480, 640)
 

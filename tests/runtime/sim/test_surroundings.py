@@ -10,10 +10,10 @@ from runtime.sim import node
 from runtime.sim.conveyor import Conveyor
 from runtime.sim.plant import Plant
 from runtime.sim.render import Renderer
-from runtime.sim.surroundings import Workbench
-from runtime.sim.tabletop import Reset, Tabletop
+from runtime.sim.surroundings import BenchEnvironment
+from runtime.sim.tabletop import ResetRequest, Tabletop
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 OPTIONS = node.parser().parse_args(["--robot", "agilex_piper", "--width", "64", "--height", "48"])
 
 
@@ -21,14 +21,14 @@ OPTIONS = node.parser().parse_args(["--robot", "agilex_piper", "--width", "64", 
 @pytest.mark.parametrize("kind", [Tabletop, Conveyor])
 def test_pictures_are_those_of_the_moment(kind: type[Tabletop]) -> None:
     bench = kind(ROBOT, 0)
-    around, renderer = Workbench(ROBOT, OPTIONS, bench), Renderer(ROBOT, bench.bench, 64, 48)
+    around, renderer = BenchEnvironment(ROBOT, OPTIONS, bench), Renderer(ROBOT, bench.bench, 64, 48)
     plant = Plant(ROBOT)
     drawn = []
     for step in range(90):
         if step == 5:
             plant.target = ROBOT.poses["ready"]
         if step == 60:
-            around.reset(Reset("another", 7))
+            around.reset(ResetRequest("another", 7))
         around.move(plant, 1 / 30)
         drawn.append(around.pictures(step, step / 30, plant.q))
         for key, picture in renderer.draw(plant.q, bench.state()).items():

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.sim.bench import BenchError
-from runtime.sim.tabletop import Reset, Tabletop
+from runtime.sim.tabletop import ResetRequest, Tabletop
 from tests.examples import some
 from tests.runtime.sim.operator_hands import LEFT, OPEN, POSITIONS, RATE, READY, RIGHT, ROBOT, SHUT, Operator
 
@@ -193,9 +193,9 @@ def test_a_reset_lays_the_bench_by_its_seed_and_forgets_what_was_reached():
     hands = Operator(seed=1)
     first = hands.truth
     hands.closes_on_block()
-    hands.table.reset(Reset("again", 1, POSITIONS))
+    hands.table.reset(ResetRequest("again", 1, POSITIONS))
     assert hands.truth == first | {"reset": "again"}
-    hands.table.reset(Reset("another", 2, POSITIONS))
+    hands.table.reset(ResetRequest("another", 2, POSITIONS))
     assert hands.truth["blocks"] != first["blocks"]
     assert hands.truth["seed"] == 2
     np.testing.assert_allclose(hands.truth["blocks"][0][:2], POSITIONS["block"][:2], atol=0.00501)
@@ -205,7 +205,7 @@ def test_a_repeated_reset_changes_nothing():
     hands = Operator(seed=1)
     hands.closes_on_block()
     before = hands.truth
-    hands.table.reset(Reset("reset 1", 99))
+    hands.table.reset(ResetRequest("reset 1", 99))
     assert hands.truth == before
 
 
@@ -213,7 +213,7 @@ def test_a_reset_that_cannot_be_leaves_everything_as_it_is():
     hands = Operator(seed=1)
     before = hands.truth
     with pytest.raises(BenchError, match="apart"):
-        hands.table.reset(Reset("bad", 1, {"block": [0.0, 0.3, 0.0], "plate": [0.0, 0.35]}))
+        hands.table.reset(ResetRequest("bad", 1, {"block": [0.0, 0.3, 0.0], "plate": [0.0, 0.35]}))
     assert hands.truth == before
 
 

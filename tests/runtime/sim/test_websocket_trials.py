@@ -11,29 +11,31 @@ import robots
 from runtime.ipc.session_state import SessionState
 from runtime.sim.faults import Fault
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.roboarena_server import Arena, RoboarenaServer
+from runtime.sim.roboarena_server import RoboarenaBehaviour, RoboarenaServer
 from runtime.sim.script import Script
-from runtime.sim.starvla_server import Star, StarvlaServer
+from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
 from runtime.station.spec import StationSpec
 from tests.runtime.sim.tabletop_station import HORIZON, pick_and_place, served
 
 ARENA = ['policy.kind="roboarena"', 'policy.cameras={cam_high="first", cam_wrist="wrist"}']
 STARVLA = ['policy.kind="starvla"', 'policy.cameras=["cam_wrist", "cam_high"]']
 SIZE = (240, 320)
-ARM = robots.load("ur5e")
+ARM = robots.load_robot("ur5e")
 LIMITS = f"{{low={list(map(float, ARM.lower))}, high={list(map(float, ARM.upper))}}}"
 
 
 def arena_server(**arena: Any) -> Any:
     def made(spec: StationSpec, script: Script) -> RoboarenaServer:
-        return RoboarenaServer(spec.robot, Arena(HORIZON, spec.rate, resolution=SIZE, **arena), 0, script)
+        return RoboarenaServer(
+            spec.robot, RoboarenaBehaviour(HORIZON, spec.rate, resolution=SIZE, **arena), 0, script
+        )
 
     return made
 
 
 def starvla_server(old: bool) -> Any:
     def made(spec: StationSpec, script: Script) -> StarvlaServer:
-        star = Star(HORIZON, spec.rate, size=SIZE, views=("cam_wrist", "cam_high"), old=old)
+        star = StarvlaBehaviour(HORIZON, spec.rate, size=SIZE, views=("cam_wrist", "cam_high"), old=old)
         return StarvlaServer(spec.robot, star, 0, script)
 
     return made

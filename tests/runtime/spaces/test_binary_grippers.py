@@ -15,13 +15,13 @@ from runtime.ipc.shared_state import EStop
 from runtime.motion.timeline import DimensionKinds
 from runtime.policies.base import PolicyInfo
 from runtime.safety.limits import Limits
-from runtime.spaces.binary_grippers import DWELL_S, Dwell, Switch, switches
+from runtime.spaces.binary_grippers import MIN_SWITCH_INTERVAL_S, BinaryGripper, Dwell, binary_grippers_of
 from tests.examples import some
 from tests.runtime.lockstep_station import Station, Stubs, stubbed
 from tests.runtime.tick_bench import PERIOD, WITH_GRIPPER, Bench
 
-PERCENT = Switch(6, 100.0, 0.0, 80.0, 5.0)  # an R1 Lite's
-ANGLE = Switch(7, -0.785, 0.0, -0.4, 0.04)  # open is the smaller number, as with a G2
+PERCENT = BinaryGripper(6, 100.0, 0.0, 80.0, 5.0)  # an R1 Lite's
+ANGLE = BinaryGripper(7, -0.785, 0.0, -0.4, 0.04)  # open is the smaller number, as with a G2
 KINDS = ("sync", "async", "ensemble", "naive", "rtc")
 
 
@@ -40,9 +40,9 @@ KINDS = ("sync", "async", "ensemble", "naive", "rtc")
     ],
 )
 def test_a_number_is_open_or_closed_and_near_the_threshold_what_it_was(
-    switch: Switch, before: float, wanted: list[float], meant: list[float]
+    switch: BinaryGripper, before: float, wanted: list[float], meant: list[float]
 ) -> None:
-    assert switch.snapped(np.array(wanted, np.float64), before).tolist() == meant
+    assert switch.snap_sequence(np.array(wanted, np.float64), before).tolist() == meant
 
 
 numbers = st.lists(st.floats(-50, 150), min_size=1, max_size=30)
@@ -53,33 +53,35 @@ def test_it_is_the_same_number_by_number_and_in_either_direction(
     wanted: list[float], before: float, part: int, mirrored: bool
 ) -> None:
     rows = np.array(wanted)
-    whole = PERCENT.snapped(rows, before)
+    whole = PERCENT.snap_sequence(rows, before)
     state, expected = before >= 80, []
     for number in wanted:
         state = number >= 82.5 if abs(number - 80) >= 2.5 else state
         expected.append(100.0 if state else 0.0)
     assert whole.tolist() == expected
-    first = PERCENT.snapped(rows[:part], before)
-    rest = PERCENT.snapped(rows[part:], first[-1] if len(first) else before)
+    first = PERCENT.snap_sequence(rows[:part], before)
+    rest = PERCENT.snap_sequence(rows[part:], first[-1] if len(first) else before)
     assert [*first, *rest] == whole.tolist()
     if mirrored:
-        other = Switch(0, 0.0, 100.0, 20.0, 5.0).snapped(100.0 - rows, 100.0 - before)
+        other = BinaryGripper(0, 0.0, 100.0, 20.0, 5.0).snap_sequence(100.0 - rows, 100.0 - before)
         assert (100.0 - other).tolist() == whole.tolist() or abs(before - 80) < 1e-9
 
 
 def test_every_binary_gripper_of_a_robot_is_one() -> None:
-    robot = robots.load("r1_lite")
-    assert [(one.dim, one.open, one.close, one.threshold, one.hysteresis) for one in switches(robot)] == [
+    robot = robots.load_robot("r1_lite")
+    assert [
+        (one.dim, one.open, one.close, one.threshold, one.hysteresis) for one in binary_grippers_of(robot)
+    ] == [
         (6, 100.0, 0.0, 80.0, 5.0),
         (13, 100.0, 0.0, 80.0, 5.0),
     ]
-    assert switches(robots.load("agilex_piper")) == ()
+    assert binary_grippers_of(robots.load_robot("agilex_piper")) == ()
 
 
 def test_the_hysteresis_is_the_deployments_where_it_says_so(tmp_path: Path) -> None:
     table = {"left_arm": {"binary": True, "threshold": 0.05, "hysteresis": 0.5}}
-    (only,) = switches(stubbed(tmp_path, grippers=table).spec.robot)
-    assert only.snapped(np.array([0.06, 0.074, 0.076, 0.03, 0.02]), 0.0).tolist() == [0, 0, 0.1, 0.1, 0]
+    (only,) = binary_grippers_of(stubbed(tmp_path, grippers=table).spec.robot)
+    assert only.snap_sequence(np.array([0.06, 0.074, 0.076, 0.03, 0.02]), 0.0).tolist() == [0, 0, 0.1, 0.1, 0]
 
 
 # --- how often it switches ---------------------------------------------------------------------------------------
@@ -100,14 +102,14 @@ def test_a_gripper_that_has_just_switched_is_kept_and_a_continuous_one_is_not() 
     for limits, kept in ((BINARY, True), (WITH_GRIPPER, False)):
         dwell = Dwell(limits)
         assert dwell.apply(opened, closed, 10.0) == (opened, ())
-        dwell.sent(closed, opened, 10.0)
-        action, notes = dwell.apply(closed, opened, 10.0 + DWELL_S / 2)
+        dwell.record_command(closed, opened, 10.0)
+        action, notes = dwell.apply(closed, opened, 10.0 + MIN_SWITCH_INTERVAL_S / 2)
         assert action.tolist() == ([0.0, 0.0, 0.1] if kept else [0.0, 0.0, 0.0])
         assert notes == (("gripper kept at 0.1: it switches once per 0.2 s at most",) if kept else ())
-        assert dwell.apply(closed, opened, 10.0 + DWELL_S)[1] == ()
+        assert dwell.apply(closed, opened, 10.0 + MIN_SWITCH_INTERVAL_S)[1] == ()
 
 
-HALF = Switch(2, 0.1, 0.0, 0.05, 0.005)
+HALF = BinaryGripper(2, 0.1, 0.0, 0.05, 0.005)
 
 
 def switched_at(sent: np.ndarray) -> np.ndarray:
@@ -145,7 +147,7 @@ def test_what_is_sent_switches_in_one_tick_and_rests_whatever_is_asked_for(
     bench.run(20)
     told = bench.sent[:, 2]
     assert set(np.round(told, 6)) <= {0.0, 0.1}
-    assert (np.diff(switched_at(told)) >= round(DWELL_S / PERIOD)).all()
+    assert (np.diff(switched_at(told)) >= round(MIN_SWITCH_INTERVAL_S / PERIOD)).all()
 
 
 def test_a_switch_that_came_too_soon_is_made_when_the_time_is_over_and_noted() -> None:
@@ -243,7 +245,7 @@ class Rtc:
 
 
 def r1_lite(tmp_path: Path, kind: str, told: list[float], **more: Any) -> tuple[Stubs, np.ndarray]:
-    home = robots.load("r1_lite").poses["home"].copy()
+    home = robots.load_robot("r1_lite").poses["home"].copy()
     home[[6, 13]] = 0.0
 
     def rows(seen: Any, number: int) -> np.ndarray:

@@ -9,18 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robots import Robot, load
+from robots import Robot, load_robot
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.pose_format import PoseFormat
 from runtime.core.types import ActionChunk, Observation
 from runtime.kinematics.base import IkFlag
 from runtime.kinematics.compiled import CompiledKinematics
-from runtime.spaces.conversion import ActionSpaces, CommandRows, Onset
+from runtime.spaces.conversion import ActionSpaces, ChunkStart, CommandRows
 from runtime.spaces.pose_rows import PoseRows
 from tests.examples import some
 from tests.runtime.odd_robot import odd_robot
 
-ROBOT = load("agilex_piper")
+ROBOT = load_robot("agilex_piper")
 SPACES = ActionSpaces(ROBOT, CompiledKinematics(ROBOT), 30.0)
 START = np.array(
     [0.1, 1.2, -1.0, 0.3, 0.4, 0.2, 0.03, -0.2, 0.9, -0.8, 0.1, -0.4, 0.5, 0.08], dtype=np.float32
@@ -45,8 +45,8 @@ def test_joint_rows_pass_as_they_are_in_float64() -> None:
     rows = path(5)
     made = commanded(ActionChunk(rows))
     commands = made.rows
-    assert made.solved is None
-    assert made.source.tolist() == [0, 1, 2, 3, 4]
+    assert made.ik_result is None
+    assert made.source_rows.tolist() == [0, 1, 2, 3, 4]
     assert commands.dtype == np.float64
     np.testing.assert_array_equal(commands.astype(np.float32), rows)
     commands[0] = 0.0
@@ -56,8 +56,8 @@ def test_joint_rows_pass_as_they_are_in_float64() -> None:
 def test_eef_rows_become_the_joints_that_they_were_made_of() -> None:
     rows = path(20)
     made = commanded(ActionChunk(SPACES.eef_of(rows), space="eef"))
-    assert made.solved is not None
-    assert made.solved.reached.all()
+    assert made.ik_result is not None
+    assert made.ik_result.reached.all()
     assert made.rows.dtype == np.float64
     np.testing.assert_allclose(made.rows, rows, atol=1e-4)
 
@@ -78,8 +78,8 @@ def test_quaternions_that_are_not_quite_unit_or_of_the_other_sign_give_the_same_
     sloppy[::2, 11:15] *= -1.0
     expected = commanded(ActionChunk(eef, space="eef")).rows
     made = commanded(ActionChunk(sloppy, space="eef"))
-    assert made.solved is not None
-    assert made.solved.reached.all()
+    assert made.ik_result is not None
+    assert made.ik_result.reached.all()
     np.testing.assert_allclose(made.rows, expected, atol=1e-5)
 
 
@@ -89,7 +89,7 @@ def test_velocity_limits_hold_from_one_control_period_to_the_next_whatever_the_c
     eef = SPACES.eef_of(np.stack([START, there]))
     slow = commanded(ActionChunk(eef, space="eef", rate=2.0))
     fast = commanded(ActionChunk(eef, space="eef"))
-    assert slow.source.tolist() == [0] * 15 + [1]
+    assert slow.source_rows.tolist() == [0] * 15 + [1]
     assert slow.rows[15, 0] - slow.rows[0, 0] == pytest.approx(1.0, abs=1e-3)
     for made in (slow, fast):
         assert np.all(np.abs(np.diff(made.rows, axis=0)) <= ROBOT.velocity / 30 + 1e-9)
@@ -98,7 +98,7 @@ def test_velocity_limits_hold_from_one_control_period_to_the_next_whatever_the_c
 def test_a_pose_that_cannot_be_reached_is_reported_arm_by_arm() -> None:
     eef = SPACES.eef_of(path(4))
     eef[2:, 8] += 2.0
-    result = commanded(ActionChunk(eef, space="eef")).solved
+    result = commanded(ActionChunk(eef, space="eef")).ik_result
     assert result is not None
     np.testing.assert_array_equal(result.reached, [[True, True], [True, True], [True, False], [True, False]])
     assert (result.position_error[2:, 1] > 1.0).all()
@@ -226,8 +226,8 @@ def test_relative_poses_come_back_to_the_absolute_ones_they_were_made_of(
     rows = path(count, step)
     offsets = relative_poses(SPACES.eef_of(rows), SPACES.eef_of(START), mode, frame)
     made = commanded(ActionChunk(offsets, space="eef", mode=mode, frame=frame))  # type: ignore[arg-type]
-    assert made.solved is not None
-    assert made.solved.reached.all()
+    assert made.ik_result is not None
+    assert made.ik_result.reached.all()
     np.testing.assert_allclose(made.rows, rows, atol=1e-3)
 
 
@@ -261,9 +261,9 @@ def test_an_observation_without_a_pose_is_no_ground_for_a_relative_chunk() -> No
 def test_poses_of_another_rate_stay_on_the_straight_way_between_rows(count: int, rate: float) -> None:
     ends = SPACES.eef_of(path(count)).astype(np.float64)
     made = commanded(ActionChunk(ends.astype(np.float32), space="eef", rate=rate))
-    assert made.solved is not None
-    assert made.solved.reached.all()
-    assert len(made.rows) == len(made.source) == int((count - 1) * 30.0 / rate + 1e-9) + 1
+    assert made.ik_result is not None
+    assert made.ik_result.reached.all()
+    assert len(made.rows) == len(made.source_rows) == int((count - 1) * 30.0 / rate + 1e-9) + 1
     between = SPACES.eef_of(made.rows)[:, :3]
     meant = np.arange(len(made.rows)) * rate / 30.0
     for axis in range(3):
@@ -276,7 +276,7 @@ def test_a_delta_is_summed_at_the_policys_rate_before_it_is_resampled() -> None:
     steps[:, 0] = 0.1
     made = commanded(ActionChunk(steps, mode="delta", rate=15.0))
     np.testing.assert_allclose(made.rows[:, 0] - START[0], [0.1, 0.15, 0.2, 0.25, 0.3], atol=1e-6)
-    assert made.source.tolist() == [0, 0, 1, 1, 2]
+    assert made.source_rows.tolist() == [0, 0, 1, 1, 2]
 
 
 # Grippers that know two values, joints without end
@@ -302,7 +302,7 @@ def test_binary_grippers_stay_binary_at_every_rate(values: list[float], space: s
     rows[:, 6] = values
     given_ = rows if space == "joint" else spaces.eef_of(rows)
     made = spaces.to_command(ActionChunk(given_, space=space, rate=12.0), seen())  # type: ignore[arg-type]
-    np.testing.assert_array_equal(made.rows[:, 6].astype(np.float32), rows[made.source, 6])
+    np.testing.assert_array_equal(made.rows[:, 6].astype(np.float32), rows[made.source_rows, 6])
 
 
 @given(st.floats(-20, 20), st.integers(-3, 3), st.integers(1, 8))
@@ -344,8 +344,8 @@ def test_rows_in_any_format_become_the_joints_that_they_were_made_of(pose: PoseF
     rows = path(20)
     actions = written(SPACES, ROBOT, pose, rows, START[None]).astype(np.float32)
     made = commanded(ActionChunk(actions, space="eef", pose=pose))
-    assert made.solved is not None
-    assert made.solved.reached.all()
+    assert made.ik_result is not None
+    assert made.ik_result.reached.all()
     np.testing.assert_allclose(made.rows, rows, atol=1e-3)
 
 
@@ -370,8 +370,8 @@ def test_offsets_in_any_format_lie_along_the_declared_frame_or_the_tool(
     rows = path(8)
     actions = offsets(rows, mode, frame, pose).astype(np.float32)
     made = commanded(ActionChunk(actions, space="eef", mode=mode, frame=frame, pose=pose))  # type: ignore[arg-type]
-    assert made.solved is not None
-    assert made.solved.reached.all()
+    assert made.ik_result is not None
+    assert made.ik_result.reached.all()
     np.testing.assert_allclose(made.rows, rows, atol=2e-3)
 
 
@@ -381,7 +381,7 @@ def test_rows_without_grippers_leave_them_as_they_are_commanded() -> None:
     chunk = ActionChunk(actions, space="eef", pose=pose)
     np.testing.assert_array_equal(commanded(chunk).rows[:, [6, 13]], np.tile(START[[6, 13]], (4, 1)))
     told = START.astype(np.float64) + 0.01
-    made = SPACES.to_command(chunk, seen(), Onset(told, told)).rows
+    made = SPACES.to_command(chunk, seen(), ChunkStart(told, told)).rows
     np.testing.assert_array_equal(made[:, [6, 13]], np.tile(told[[6, 13]], (4, 1)))
 
 
@@ -422,28 +422,28 @@ def leap(rows: int, by: float = 0.6) -> ActionChunk:
 def test_from_where_it_takes_over_no_joint_is_faster_than_it_may_be() -> None:
     told = START.astype(np.float64).copy()
     told[0] += 0.1
-    made = SPACES.to_command(leap(20), seen(), Onset(told, told, 4))
+    made = SPACES.to_command(leap(20), seen(), ChunkStart(told, told, 4))
     step = ROBOT.velocity[0] / 30
     np.testing.assert_allclose(made.rows[:4, 0], START[0] + 0.6, atol=1e-3)  # stale: nobody executes them
     assert made.rows[4, 0] == pytest.approx(told[0] + step, abs=1e-9)
     assert np.all(np.abs(np.diff(made.rows[4:], axis=0)) <= ROBOT.velocity / 30 + 1e-9)
     assert made.rows[-1, 0] == pytest.approx(START[0] + 0.6, abs=1e-3)
-    assert made.solved is not None
-    assert made.solved.flags[4, 0] & IkFlag.AT_VELOCITY
-    assert made.solved.flags[4, 0] & IkFlag.OVER_TOLERANCE
+    assert made.ik_result is not None
+    assert made.ik_result.flags[4, 0] & IkFlag.AT_VELOCITY
+    assert made.ik_result.flags[4, 0] & IkFlag.OVER_TOLERANCE
 
 
 def test_where_the_policy_means_to_begin_is_not_hidden_by_how_fast_the_robot_is() -> None:
     made = commanded(leap(5))
     assert made.rows[0, 0] == pytest.approx(START[0] + ROBOT.velocity[0] / 30, abs=1e-6)
-    assert made.meant[0] == pytest.approx(START[0] + 0.6, abs=1e-3)
-    stale = SPACES.to_command(leap(5), seen(), Onset(START.astype(float), START.astype(float), 2))
-    assert stale.meant[0] == pytest.approx(START[0] + 0.6, abs=1e-3)
-    np.testing.assert_array_equal(commanded(ActionChunk(path(3))).meant, path(3)[0].astype(float))
+    assert made.intended_start[0] == pytest.approx(START[0] + 0.6, abs=1e-3)
+    stale = SPACES.to_command(leap(5), seen(), ChunkStart(START.astype(float), START.astype(float), 2))
+    assert stale.intended_start[0] == pytest.approx(START[0] + 0.6, abs=1e-3)
+    np.testing.assert_array_equal(commanded(ActionChunk(path(3))).intended_start, path(3)[0].astype(float))
 
 
 def test_a_chunk_whose_rows_are_all_stale_is_solved_all_the_same() -> None:
-    made = SPACES.to_command(leap(5), seen(), Onset(START.astype(float), START.astype(float), 50))
+    made = SPACES.to_command(leap(5), seen(), ChunkStart(START.astype(float), START.astype(float), 50))
     assert made.rows.shape == (5, 14)
 
 
@@ -475,7 +475,7 @@ def test_what_rows_say_nothing_of_is_held_where_it_is_commanded(odd: tuple[Robot
     home = robot.poses["home"]
     told = home + 0.01
     rows = np.tile(spaces.eef_of(home), (3, 1))
-    made = spaces.to_command(ActionChunk(rows, space="eef"), seen(home), Onset(told, told)).rows
+    made = spaces.to_command(ActionChunk(rows, space="eef"), seen(home), ChunkStart(told, told)).rows
     np.testing.assert_array_equal(made[:, [0, 1, 15, 16]], np.tile(told[[0, 1, 15, 16]], (3, 1)))
 
 
@@ -503,7 +503,7 @@ def test_joints_that_follow_the_poses_are_commanded_with_them(
     assert made.rows[:, 16].tolist() == [1, 1, 1, 1, 0, 0, 0]
 
 
-TORSO = load("r1_lite", ["left_arm", "right_arm", "torso"])
+TORSO = load_robot("r1_lite", ["left_arm", "right_arm", "torso"])
 CARRIED = ActionSpaces(TORSO, CompiledKinematics(TORSO), 30.0)
 STANDS = TORSO.poses["ready"] if "ready" in TORSO.poses else TORSO.poses["home"]
 
@@ -520,8 +520,8 @@ def test_arms_reach_their_poses_while_rows_move_the_torso_that_carries_them(
         rows[:, TORSO.group("torso").slice] += 0.01 * np.arange(6)[:, None]
     actions = written(CARRIED, TORSO, pose, rows, rows)
     made = CARRIED.to_command(ActionChunk(actions.astype(np.float32), space="eef", pose=pose), seen(STANDS))
-    assert made.solved is not None
-    assert made.solved.reached.all()
+    assert made.ik_result is not None
+    assert made.ik_result.reached.all()
     np.testing.assert_allclose(CARRIED.vectors(made.rows)[..., :3], CARRIED.vectors(rows)[..., :3], atol=1e-3)
     np.testing.assert_allclose(
         made.rows[:, TORSO.group("torso").slice], rows[:, TORSO.group("torso").slice], atol=1e-5
@@ -533,12 +533,12 @@ def test_arms_reach_their_poses_while_rows_move_the_torso_that_carries_them(
 
 def test_how_far_measured_poses_are_from_those_of_the_joints_is_said_of_the_worst_arm() -> None:
     measured = SPACES.eef_of(START)
-    assert SPACES.disagreement(measured, START) == ""
+    assert SPACES.pose_mismatch(measured, START) == ""
     measured[3:7] *= -1.0
-    assert SPACES.disagreement(measured, START) == ""
+    assert SPACES.pose_mismatch(measured, START) == ""
     turn = Rotation.from_quat(measured[11:15], scalar_first=True) * Rotation.from_rotvec([0, 0, 0.5])
     measured[11:15] = turn.as_quat(scalar_first=True)
-    said = SPACES.disagreement(measured, START)
+    said = SPACES.pose_mismatch(measured, START)
     assert "right_arm 0 mm and 29 degrees from where its joints have gripper_base in base_link" in said
     with pytest.raises(PolicyError, match="the robot measured no orientation for left_arm"):
-        SPACES.disagreement(np.zeros(16), START)
+        SPACES.pose_mismatch(np.zeros(16), START)

@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robots import Body, Robot, load
+from robots import Body, Robot, load_robot
 from robots.rotations import transform_of
 from runtime.core.errors import ConfigurationError
 from runtime.spaces.frames import Frame
 from tests.examples import some
 from tests.runtime.odd_robot import odd_robot
 
-TORSO = load("r1_lite", ["left_arm", "right_arm", "torso"])
-BODY = load("agibot_g2")
-TWO_BASES = load("agilex_piper")
+TORSO = load_robot("r1_lite", ["left_arm", "right_arm", "torso"])
+BODY = load_robot("agibot_g2")
+TWO_BASES = load_robot("agilex_piper")
 FRAMES = [(TORSO, "torso_link3"), (BODY, "base_link"), (BODY, "body_link2"), (TWO_BASES, "world")]
 
 

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from runtime.spaces.orientations import (
     EulerAngles,
     Orientation,
-    QuaternionNumbers,
+    QuaternionOrientation,
     RotationVector,
-    SixNumbers,
+    SixD,
     continuous_signs,
 )
 from tests.examples import some
@@ -26,10 +26,10 @@ QUARTER = np.pi / 2
 EXACT = 1e-9
 
 codecs = st.one_of(
-    st.sampled_from([True, False]).map(QuaternionNumbers),
+    st.sampled_from([True, False]).map(QuaternionOrientation),
     st.builds(EulerAngles, st.sampled_from(ORDERS), st.booleans()),
     st.booleans().map(RotationVector),
-    st.booleans().map(SixNumbers),
+    st.booleans().map(SixD),
 )
 # Ordinary angles, and those at which formats break: none, tiny, a quarter, half a turn, a hair beside them.
 awkward = st.sampled_from([0.0, QUARTER, -QUARTER, np.pi, -np.pi])
@@ -125,8 +125,8 @@ def test_tiny_angles_keep_all_their_digits(angle: float, axis: int) -> None:
 @given(st.one_of(turns, vectors))
 def test_six_numbers_are_columns_or_rows_of_the_matrix(turn: Rotation) -> None:
     matrix = turn.as_matrix()
-    columns = SixNumbers(True).encode(wxyz([turn]))[0, 0]
-    rows = SixNumbers(False).encode(wxyz([turn]))[0, 0]
+    columns = SixD(True).encode(wxyz([turn]))[0, 0]
+    rows = SixD(False).encode(wxyz([turn]))[0, 0]
     np.testing.assert_allclose(columns, np.concatenate([matrix[:, 0], matrix[:, 1]]), atol=1e-12)
     np.testing.assert_allclose(rows, np.concatenate([matrix[0], matrix[1]]), atol=1e-12)
 
@@ -135,7 +135,7 @@ def test_six_numbers_that_a_network_predicted_are_straightened_as_by_gram_and_sc
     turn = Rotation.from_euler("xyz", [0.3, -0.4, 1.1])
     first, second = turn.as_matrix()[:, 0], turn.as_matrix()[:, 1]
     sloppy = np.concatenate([1.4 * first, 0.7 * second + 0.3 * first])
-    back, determined = SixNumbers(True).decode(sloppy[None, None])
+    back, determined = SixD(True).decode(sloppy[None, None])
     assert determined.all()
     assert apart(back, turn.as_quat(scalar_first=True)) < EXACT
 
@@ -143,11 +143,11 @@ def test_six_numbers_that_a_network_predicted_are_straightened_as_by_gram_and_sc
 @pytest.mark.parametrize(
     ("codec", "numbers"),
     [
-        (QuaternionNumbers(True), [0.0, 0.0, 0.0, 0.0]),
-        (QuaternionNumbers(False), [1e-4, 0.0, 0.0, 0.0]),
-        (SixNumbers(True), [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]),
-        (SixNumbers(True), [1.0, 0.0, 0.0, -2.0, 0.0, 0.0]),
-        (SixNumbers(False), [1.0, 2.0, 3.0, 2.0, 4.0, 6.0]),
+        (QuaternionOrientation(True), [0.0, 0.0, 0.0, 0.0]),
+        (QuaternionOrientation(False), [1e-4, 0.0, 0.0, 0.0]),
+        (SixD(True), [0.0, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        (SixD(True), [1.0, 0.0, 0.0, -2.0, 0.0, 0.0]),
+        (SixD(False), [1.0, 2.0, 3.0, 2.0, 4.0, 6.0]),
     ],
 )
 def test_numbers_that_determine_no_orientation_are_pointed_out(
@@ -161,7 +161,7 @@ def test_numbers_that_determine_no_orientation_are_pointed_out(
 
 @pytest.mark.parametrize("scalar_first", [True, False])
 def test_the_scalar_is_where_it_is_said_to_be(scalar_first: bool) -> None:
-    found = QuaternionNumbers(scalar_first).encode(np.array([[[0.5, 0.1, 0.7, -0.5]]]))
+    found = QuaternionOrientation(scalar_first).encode(np.array([[[0.5, 0.1, 0.7, -0.5]]]))
     expected = [0.5, 0.1, 0.7, -0.5] if scalar_first else [0.1, 0.7, -0.5, 0.5]
     np.testing.assert_array_equal(found[0, 0], expected)
 
@@ -181,9 +181,9 @@ def path(count: int, seed: int, span: float = 4.0) -> np.ndarray:
 @given(st.booleans(), st.integers(0, 1000))
 def test_quaternions_keep_their_sign_from_row_to_row(scalar_first: bool, seed: int) -> None:
     way = path(200, seed)
-    rows = QuaternionNumbers(scalar_first).encode(way)
+    rows = QuaternionOrientation(scalar_first).encode(way)
     assert ((rows[1:] * rows[:-1]).sum(axis=-1) > 0.9).all()
-    later = QuaternionNumbers(scalar_first).encode(way[50:], rows[49])
+    later = QuaternionOrientation(scalar_first).encode(way[50:], rows[49])
     np.testing.assert_array_equal(later, rows[50:])
 
 

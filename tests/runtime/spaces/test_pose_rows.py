@@ -10,18 +10,18 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from robots import Robot, load
+from robots import Robot, load_robot
 from runtime.config.loader import load as load_deployment
 from runtime.core.errors import ConfigurationError, PolicyError
-from runtime.core.pose_format import CANONICAL, PoseFormat, refuse_format
+from runtime.core.pose_format import CANONICAL, PoseFormat, reject_pose_format
 from runtime.spaces.pose_rows import PoseRows
 from tests.examples import some
 from tests.runtime.odd_robot import odd_robot
 from tests.runtime.spaces.test_frames import joints, some_vectors
 from tests.runtime.spaces.test_orientations import ORDERS
 
-PIPER = load("agilex_piper")
-BODY = load("agibot_g2")
+PIPER = load_robot("agilex_piper")
+BODY = load_robot("agibot_g2")
 
 formats = st.one_of(
     st.builds(PoseFormat, orientation=st.sampled_from(["wxyz", "xyzw"]), gripper=st.booleans()),
@@ -201,8 +201,8 @@ def test_a_format_reads_itself_back_from_what_it_resolved_to() -> None:
 
 
 def test_a_format_for_a_space_of_joints_is_refused_with_what_was_given():
-    refuse_format(PoseFormat(), "policy.action_pose")
+    reject_pose_format(PoseFormat(), "policy.action_pose")
     with pytest.raises(
         ConfigurationError, match=r"policy\.action_pose = \{'gripper': False\}.*no format, or.*\"eef\""
     ):
-        refuse_format(PoseFormat(gripper=False), "policy.action_pose")
+        reject_pose_format(PoseFormat(gripper=False), "policy.action_pose")

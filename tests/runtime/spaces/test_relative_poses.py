@@ -8,8 +8,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from runtime.core.types import ActionMode, RelativeFrame
-from runtime.spaces.pose_rows import continuous
-from runtime.spaces.relative_poses import absolute
+from runtime.spaces.pose_rows import continuous_quaternions
+from runtime.spaces.relative_poses import to_absolute
 from tests.examples import some
 
 
@@ -33,7 +33,7 @@ def test_offsets_lie_along_the_base_or_along_the_tool(
     mode: ActionMode, frame: RelativeFrame, expected: list[list[float]]
 ) -> None:
     start, offsets = quarter_turned(2)
-    made = absolute(offsets, start, mode, frame)
+    made = to_absolute(offsets, start, mode, frame)
     np.testing.assert_allclose(made[:, 0, :2], expected, atol=1e-12)
     np.testing.assert_array_equal(made[:, 0, 7], [0.05, 0.05])
 
@@ -42,7 +42,7 @@ def test_offsets_lie_along_the_base_or_along_the_tool(
 def test_a_turn_is_about_the_axes_of_its_frame(frame: RelativeFrame, side: float) -> None:
     start, offsets = quarter_turned(1)
     offsets[0, 0, 3:7] = [np.cos(0.1), np.sin(0.1), 0, 0]
-    made = absolute(offsets, start, "relative", frame)[0, 0, 3:7]
+    made = to_absolute(offsets, start, "relative", frame)[0, 0, 3:7]
     expected = np.sqrt(0.5) * np.array([np.cos(0.1), np.sin(0.1), side * np.sin(0.1), np.cos(0.1)])
     np.testing.assert_allclose(made, expected, atol=1e-12)
 
@@ -58,8 +58,10 @@ def test_absolute_poses_are_unit_and_continuous(
     quaternions: np.ndarray, mode: ActionMode, frame: RelativeFrame
 ) -> None:
     vectors = np.zeros((30, 2, 8))
-    vectors[..., 3:7] = continuous(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))
-    made = absolute(vectors, vectors[0], mode, frame)[..., 3:7]
+    vectors[..., 3:7] = continuous_quaternions(
+        quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    )
+    made = to_absolute(vectors, vectors[0], mode, frame)[..., 3:7]
     np.testing.assert_allclose(np.linalg.norm(made, axis=-1), 1.0, atol=1e-12)
     assert ((made[1:] * made[:-1]).sum(axis=-1) >= -1e-12).all()
     assert (made[0, :, 0] >= 0).all()
@@ -73,7 +75,7 @@ def test_steps_amount_to_what_they_are_one_after_the_other(
     vectors = np.random.default_rng(count).uniform(-1, 1, (count, 2, 8))
     vectors[..., 3:7] = quaternions[:count] / np.linalg.norm(quaternions[:count], axis=-1, keepdims=True)
     start = np.array([[0.1, 0.2, 0.3, 0.5, 0.5, -0.5, 0.5, 0.0], [0, 0, 0, 0, 1.0, 0, 0, 0.0]])
-    made = absolute(vectors, start, "delta", frame)
+    made = to_absolute(vectors, start, "delta", frame)
     for arm in (0, 1):
         position, turn = start[arm, :3], Rotation.from_quat(start[arm, 3:7], scalar_first=True)
         for row, step in zip(made[:, arm], vectors[:, arm], strict=True):

@@ -18,7 +18,7 @@ from runtime.ipc.bus import Endpoints, Key
 from runtime.ipc.messages import Command, encode
 from runtime.ipc.shared_state import EStop
 from runtime.processes.coordinator.process import CommandService
-from runtime.processes.guard.process import Desk
+from runtime.processes.guard.process import EStopServer
 from tests.processes import PATIENCE_MS
 from tests.runtime.lockstep_station import Station, stubbed
 
@@ -59,7 +59,9 @@ class Bench:
         self.station = Station(stubbed(folder))
         self.folder = self.station.spec.deployment.station_dir
         self.coordinator = CommandService(self.station.coordinator, self.context)
-        self.guard = Desk(self.station.guard, self.station.coordinator.shared, self.context, self.folder)
+        self.guard = EStopServer(
+            self.station.guard, self.station.coordinator.shared, self.context, self.folder
+        )
         Key(self.folder).secret()
         read = Endpoints(self.folder).read
         self.places = {

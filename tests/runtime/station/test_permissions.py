@@ -4,9 +4,9 @@ import os
 
 import pytest
 
-from runtime.config.loader import resolve
+from runtime.config.loader import resolve_deployment
 from runtime.core.errors import RuntimeFault
-from runtime.core.machine_names import Names, named
+from runtime.core.machine_names import HostReference, find_host_references
 from runtime.core.plugins import variants
 from runtime.core.settings import Settings
 from runtime.ipc.messages import Command
@@ -27,7 +27,7 @@ def own(tmp_path):
             "policy": {"kind": "openpi"},
             **tables,
         }
-        return resolve(tree, {}, "test")
+        return resolve_deployment(tree, {}, "test")
 
     return own
 
@@ -181,10 +181,10 @@ def test_every_key_that_sounds_like_a_file_or_a_variable_is_marked_as_one(kind):
 def test_values_that_name_something_are_found_in_tables_within_tables(own):
     table = {"host": "h", "identity_file": "/k", "known_hosts_file": "/w"}
     policy = own(policy={"kind": "openpi", "api_key_env": "OURS", "tunnel": table}).deployment.policy
-    assert set(named(policy)) == {
-        ("api_key_env", Names.VARIABLE, "OURS"),
-        ("tunnel.identity_file", Names.FILE, "/k"),
-        ("tunnel.known_hosts_file", Names.WRITTEN, "/w"),
+    assert set(find_host_references(policy)) == {
+        ("api_key_env", HostReference.VARIABLE, "OURS"),
+        ("tunnel.identity_file", HostReference.FILE, "/k"),
+        ("tunnel.known_hosts_file", HostReference.WRITTEN, "/w"),
     }
 
 

@@ -38,7 +38,7 @@ def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Station
 
 def command(station: Station, policy: dict[str, Any], role: str, vouched: tuple[str, ...] = ()) -> Command:
     main = station.coordinator
-    held = main.lease.current(main.people.now())
+    held = main.lease.current(main.client_clock.now())
     assert held is not None
     given = {"holder": held.holder, "epoch": held.epoch, "boot": main.boot, "sequence": main.session.sequence}
     return Command(str(uuid4()), "setup", {"policy": policy}, **given, role=role, vouched=list(vouched))

@@ -12,10 +12,10 @@ import pytest
 from runtime import __main__ as command_line
 from runtime.config import loader
 from runtime.core.errors import ConfigurationError
-from runtime.recording.files import document
+from runtime.recording.files import to_json
 from runtime.recording.reader import open_episode
 from runtime.station import rerun
-from runtime.station.rerun import find
+from runtime.station.rerun import find_episode
 from runtime.station.run import Provenance
 from tests.runtime.lockstep_station import stubbed
 
@@ -30,7 +30,7 @@ def kept(data: Path, run: str = ONE, mode: str = "continuous", **changes: Any) -
     manifest |= {"uuid": run, "git": CLEAN} | changes
     folder = data / "episodes" / run
     folder.mkdir(parents=True)
-    (folder / "manifest.json").write_bytes(document(manifest, "the manifest", indent=1))
+    (folder / "manifest.json").write_bytes(to_json(manifest, "the manifest", indent=1))
     return manifest
 
 
@@ -54,7 +54,7 @@ def _committed(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_how_its_uuid_begins_is_enough(tmp_path: Path, given: str) -> None:
     kept(tmp_path, ONE)
     kept(tmp_path, OTHER)
-    assert find(given, tmp_path) == tmp_path / "episodes" / ONE
+    assert find_episode(given, tmp_path) == tmp_path / "episodes" / ONE
 
 
 @pytest.mark.parametrize(
@@ -71,12 +71,12 @@ def test_what_is_no_one_run_is_a_sentence(tmp_path: Path, given: str, sentence: 
     kept(tmp_path, ONE)
     kept(tmp_path, OTHER)
     with pytest.raises(ConfigurationError, match=sentence):
-        find(given, tmp_path)
+        find_episode(given, tmp_path)
 
 
 def test_a_data_folder_without_episodes_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=rf"there are no episodes in {tmp_path}; .* --data-dir"):
-        find(ONE, tmp_path)
+        find_episode(ONE, tmp_path)
 
 
 # --- what it was made with ---------------------------------------------------------------------------------
@@ -98,7 +98,7 @@ def test_nothing_differs_where_nothing_was_changed(tmp_path: Path) -> None:
 def test_each_thing_that_differs_is_told_in_a_line(tmp_path: Path) -> None:
     manifest = kept(tmp_path, git={"commit": "a" * 40, "dirty": True})
     manifest["versions"] |= {"numpy": "1.0", "torch": "2.0"}
-    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(document(manifest, "the manifest"))
+    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(to_json(manifest, "the manifest"))
     found = rerun.rerun(ONE, tmp_path, ["strategy.k_max=3"])
     assert "numpy 1.0 then, " in line(found.lines, "versions")
     assert "torch 2.0 then, none now" in line(found.lines, "versions")
@@ -139,10 +139,10 @@ def test_settings_that_there_were_not_yet_have_their_defaults(tmp_path: Path) ->
     manifest = kept(tmp_path)
     old = {name: value for name, value in manifest["configuration"].items() if name != "faults"}
     old["run"] = {"duration_s": None}
-    changed = manifest | {"configuration": old, "configuration_hash": loader.digest_of(old)}
+    changed = manifest | {"configuration": old, "configuration_hash": loader.config_digest(old)}
     for key in ("versions", "git"):
         del changed[key]
-    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(document(changed, "the manifest"))
+    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(to_json(changed, "the manifest"))
     found = rerun.rerun(ONE, tmp_path)
     assert found.resolved.digest == manifest["configuration_hash"]
     assert "faults.policy_error (none) -> " in line(found.lines, "hash")
@@ -153,8 +153,8 @@ def test_the_ports_of_a_bus_of_before_say_nothing_of_what_was_done(tmp_path: Pat
     manifest = kept(tmp_path)
     old = dict(manifest["configuration"])
     old["bus"] = old["bus"] | {"host": "127.0.0.1", "command_port": 5, "estop_port": 0}
-    changed = manifest | {"configuration": old, "configuration_hash": loader.digest_of(old)}
-    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(document(changed, "the manifest"))
+    changed = manifest | {"configuration": old, "configuration_hash": loader.config_digest(old)}
+    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(to_json(changed, "the manifest"))
     assert rerun.rerun(ONE, tmp_path).resolved.digest == manifest["configuration_hash"]
 
 
@@ -164,7 +164,7 @@ def test_the_ports_of_a_bus_of_before_say_nothing_of_what_was_done(tmp_path: Pat
 def test_a_manifest_that_was_altered_is_refused(tmp_path: Path) -> None:
     manifest = kept(tmp_path)
     manifest["configuration"]["strategy"]["blend_window"] = 99
-    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(document(manifest, "the manifest"))
+    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(to_json(manifest, "the manifest"))
     with pytest.raises(ConfigurationError, match=r"configuration has the hash .* was altered since"):
         rerun.rerun(ONE, tmp_path)
 
@@ -196,8 +196,8 @@ def test_a_manifest_that_is_torn_or_absent_is_named(tmp_path: Path) -> None:
 def test_a_setting_that_is_none_any_more_is_named_with_its_run(tmp_path: Path) -> None:
     manifest = kept(tmp_path)
     manifest["configuration"]["control"]["magic"] = 7
-    manifest["configuration_hash"] = loader.digest_of(manifest["configuration"])
-    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(document(manifest, "the manifest"))
+    manifest["configuration_hash"] = loader.config_digest(manifest["configuration"])
+    (tmp_path / "episodes" / ONE / "manifest.json").write_bytes(to_json(manifest, "the manifest"))
     with pytest.raises(ConfigurationError, match=rf"configuration of run {ONE}.*(?s:.)*magic"):
         rerun.rerun(ONE, tmp_path)
 
@@ -254,6 +254,6 @@ def test_a_run_in_lockstep_is_exported_and_one_of_mode_sim_is_in_no_dataset(
     assert not (tmp_path / "set").exists()
     episode = open_episode(tmp_path / "episodes" / path.stem)
     told = json.loads(pq.read_schema(path).metadata[b"eva.manifest"])
-    assert told == json.loads(document(episode.manifest, "it"))
+    assert told == json.loads(to_json(episode.manifest, "it"))
     assert rerun.rerun(path.stem, tmp_path).resolved.digest == made.spec.resolved.digest
     assert "sim" in set(episode.ticks["control_source"].to_pylist())

@@ -1,7 +1,7 @@
 import json
 
 from runtime.core.git_revision import revision
-from runtime.recording.files import document
+from runtime.recording.files import to_json
 from runtime.station.run import Provenance, Run, installed_versions
 from tests.runtime.lockstep_station import stubbed
 
@@ -28,4 +28,4 @@ def test_a_manifest_says_what_the_run_was_made_with(tmp_path):
     assert manifest["checkpoint"] == {"id": 7, "name": "good"}
     assert manifest["versions"] == installed_versions()
     assert manifest["git"] == dict(revision())
-    assert json.loads(document(manifest, "the manifest"))["git"] == dict(revision())
+    assert json.loads(to_json(manifest, "the manifest"))["git"] == dict(revision())

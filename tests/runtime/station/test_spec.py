@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runtime.config.loader import changed, load
+from runtime.config.loader import apply_changes, load
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.pose_format import PoseFormat
 from runtime.ipc.bells import Bell
@@ -17,7 +17,7 @@ from runtime.motion.timeline import DimensionKinds
 from runtime.processes import child
 from runtime.processes.control.process import make_publisher
 from runtime.spaces.end_effectors import EndEffectors
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from runtime.station.spec import CAPABILITIES
 from runtime.transports import zmq
 from runtime.transports.base import Capabilities
@@ -41,21 +41,21 @@ def pipe():
 
 def test_a_lifeline_is_cut_when_its_other_end_is_gone(pipe):
     lifeline = Lifeline(pipe["reading"])
-    assert not lifeline.cut
+    assert not lifeline.is_cut
     os.close(pipe.pop("writing"))
-    assert lifeline.cut
+    assert lifeline.is_cut
     assert lifeline.cut
 
 
 def test_words_on_a_lifeline_do_not_cut_it(pipe):
     lifeline = Lifeline(pipe["reading"])
     os.write(pipe["writing"], b"hello\n")
-    assert not lifeline.cut
-    assert not lifeline.cut
+    assert not lifeline.is_cut
+    assert not lifeline.is_cut
 
 
 def test_the_limits_and_the_page_are_the_robots(resolved):
-    made = checked_spec(resolved)
+    made = check_deployment(resolved)
     limits, robot = made.limits, made.robot
     assert limits.names == robot.joint_names
     np.testing.assert_array_equal(limits.upper, robot.upper)
@@ -67,17 +67,17 @@ def test_the_limits_and_the_page_are_the_robots(resolved):
 
 def test_disabled_cameras_are_not_in_the_page(tmp_path):
     resolved = load(DEPLOYMENTS / "demo.toml", ['transport.disabled_cameras=["cam_high"]'])
-    assert checked_spec(resolved).layout.cameras == ("cam_left_wrist", "cam_right_wrist")
+    assert check_deployment(resolved).layout.cameras == ("cam_left_wrist", "cam_right_wrist")
 
 
 def test_a_transport_that_says_nothing_of_cameras_has_all_of_them():
     resolved = load(DEPLOYMENTS / "replay_dataset.toml", ["transport.path=x", "policy.path=x"])
-    made = checked_spec(resolved)
+    made = check_deployment(resolved)
     assert made.cameras == tuple(camera.key for camera in made.robot.cameras)
 
 
 def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path, monkeypatch):
-    made = checked_spec(resolved)
+    made = check_deployment(resolved)
     poses = (PoseFormat(orientation="euler", degrees=True),)
     told = replace(made.capabilities, spaces=frozenset({"joint", "eef"}), poses=poses)
     shared, descriptor = SharedState.create(made.layout)
@@ -98,9 +98,9 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
         "b",
     ]
     monkeypatch.setattr("sys.argv", arguments)
-    monkeypatch.setattr(child.log, "start", lambda process: None)
+    monkeypatch.setattr(child.log, "configure_logging", lambda process: None)
     monkeypatch.setattr(zmq, "capabilities", lambda config: pytest.fail("asked once more"))
-    member = child.join("control", pictures=False)
+    member = child.join_station("control", pictures=False)
     assert member.spec.capabilities == told
     assert member.spec.resolved.digest == resolved.digest
     assert member.shared.last_beat("coordinator") == 12.5
@@ -109,7 +109,7 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
 
 
 def test_angles_without_limits_wrap_and_grippers_that_know_two_places_switch(resolved):
-    made = checked_spec(resolved)
+    made = check_deployment(resolved)
     assert made.dims == DimensionKinds()
     lower, upper = made.robot.lower.copy(), made.robot.upper.copy()
     lower[[2, 9]], upper[[2, 4]] = -np.inf, np.inf
@@ -122,13 +122,13 @@ def test_angles_without_limits_wrap_and_grippers_that_know_two_places_switch(res
 
 
 def publishing(resolved, **publication):
-    return changed(resolved, {"publication": publication}, "test")
+    return apply_changes(resolved, {"publication": publication}, "test")
 
 
 def test_poses_are_published_only_over_a_transport_that_has_such_a_command(resolved):
     said = "publication.space = 'eef' with transport 'zmq', which has no such command; allowed: joint$"
     with pytest.raises(SetupError, match=said):
-        checked_spec(publishing(resolved, space="eef"))
+        check_deployment(publishing(resolved, space="eef"))
 
 
 @pytest.fixture
@@ -139,7 +139,7 @@ def taking_poses(monkeypatch):
 
 
 def test_poses_are_published_as_the_transport_takes_them(resolved, taking_poses):
-    made = checked_spec(publishing(resolved, space="eef", pose={"orientation": "xyzw"}))
+    made = check_deployment(publishing(resolved, space="eef", pose={"orientation": "xyzw"}))
     home = made.robot.poses["home"]
     row = make_publisher(made)(home)
     expected = EndEffectors(made.robot, ChainForward(made.robot)).eef_of(home)
@@ -149,17 +149,17 @@ def test_poses_are_published_as_the_transport_takes_them(resolved, taking_poses)
     with pytest.raises(
         SetupError, match=r"publication.pose = 6d of columns with transport 'zmq'; allowed: xyzw$"
     ):
-        checked_spec(publishing(resolved, space="eef", pose={"orientation": "6d"}))
+        check_deployment(publishing(resolved, space="eef", pose={"orientation": "6d"}))
 
 
 def test_a_format_of_published_poses_that_does_not_fit_the_robot_is_refused(resolved, taking_poses):
     with pytest.raises(ConfigurationError, match=r"publication\.pose\.frame = 'moon' is no frame"):
-        checked_spec(publishing(resolved, space="eef", pose={"orientation": "xyzw", "frame": "moon"}))
+        check_deployment(publishing(resolved, space="eef", pose={"orientation": "xyzw", "frame": "moon"}))
 
 
 def test_joints_alone_are_published_where_nothing_is_said(resolved):
-    assert make_publisher(checked_spec(resolved)) is None
+    assert make_publisher(check_deployment(resolved)) is None
     with pytest.raises(
         ConfigurationError, match=r"publication\.pose = \{'orientation': 'xyzw'\}, but the space"
     ):
-        checked_spec(publishing(resolved, pose={"orientation": "xyzw"}))
+        check_deployment(publishing(resolved, pose={"orientation": "xyzw"}))

@@ -3,7 +3,7 @@ import pytest
 
 from runtime.motion.timeline import DimensionKinds, Timeline
 from runtime.strategies import overlap
-from runtime.strategies.base import Arrival
+from runtime.strategies.base import ArrivedChunk
 
 
 def merger(**parameters):
@@ -13,8 +13,8 @@ def merger(**parameters):
 def after_two(old=0.0, new=1.0, **parameters):
     """A plan of 50 rows `old`, into which one of 50 rows `new` comes at step 4."""
     timeline, merge = Timeline(1), merger(**parameters)
-    merge(timeline, Arrival(1, 0, np.full((50, 1), old)), 0)
-    return timeline, merge(timeline, Arrival(2, 4, np.full((50, 1), new)), 4)
+    merge(timeline, ArrivedChunk(1, 0, np.full((50, 1), old)), 0)
+    return timeline, merge(timeline, ArrivedChunk(2, 4, np.full((50, 1), new)), 4)
 
 
 def test_each_step_names_the_chunks_it_was_made_from():
@@ -49,5 +49,5 @@ def test_the_shape_says_how_the_old_plan_gives_way(shape, halfway):
 
 def test_a_chunk_that_waited_begins_at_the_first_free_step():
     timeline = Timeline(1)
-    merger()(timeline, Arrival(1, 0, np.arange(9.0)[:, None], waited=True), 30)
+    merger()(timeline, ArrivedChunk(1, 0, np.arange(9.0)[:, None], requested_while_stopped=True), 30)
     assert timeline.at(30).action[0] == 0

@@ -3,13 +3,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.strategies.base import Arrival
+from runtime.strategies.base import ArrivedChunk
 from runtime.strategies.placing import place
 
 
 def chunk(observed, count, waited=False):
     """Every row is the number of the step it is meant for."""
-    return Arrival(1, observed, np.arange(observed, observed + count, dtype=float)[:, None], waited)
+    return ArrivedChunk(1, observed, np.arange(observed, observed + count, dtype=float)[:, None], waited)
 
 
 def test_stale_rows_are_dropped_and_the_rest_keeps_its_steps():

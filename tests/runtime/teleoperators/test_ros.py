@@ -18,7 +18,7 @@ from runtime.transports.ros.messages import JointState
 from runtime.transports.ros.middleware import Match
 from tests.runtime.transports.ros.hand import Hand
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 LEFT, RIGHT = (ROBOT.groups[index] for index in (0, 1))
 BOTH = {LEFT.name: {"topic": "/leader/left"}, RIGHT.name: {"topic": "/leader/right"}}
 
@@ -39,8 +39,8 @@ class Bench:
 
     @property
     def newest(self) -> LeaderPose:
-        assert self.leader.newest is not None
-        return self.leader.newest
+        assert self.leader.latest_pose is not None
+        return self.leader.latest_pose
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 def test_a_pose_is_there_when_every_arm_has_said_something_and_as_old_as_the_oldest(bench: Bench) -> None:
     bench.say("/leader/left", range(7))
-    assert bench.leader.newest is None
+    assert bench.leader.latest_pose is None
     bench.clock.advance(0.02)
     bench.say("/leader/right", range(7, 14), RIGHT.joints)
     assert bench.newest.joints.tolist() == list(range(14))
@@ -87,13 +87,13 @@ def test_an_arm_that_falls_silent_or_repeats_itself_makes_the_leader_silent_and_
     bench: Bench,
 ) -> None:
     bench.hand.found = {"/leader/left": Match(1), "/leader/right": Match(0)}
-    assert bench.leader.refused == "/leader/left says nothing new; nobody publishes /leader/right"
+    assert bench.leader.problem == "/leader/left says nothing new; nobody publishes /leader/right"
     for stamp in (5, 5, 5):
         bench.say("/leader/right", np.zeros(7), RIGHT.joints, stamp=stamp)
         bench.say("/leader/left", np.zeros(7))
         bench.clock.advance(0.1)
     assert bench.newest.arrived == 10.0
-    assert bench.leader.refused == "nobody publishes /leader/right"
+    assert bench.leader.problem == "nobody publishes /leader/right"
 
 
 @pytest.mark.parametrize(
@@ -109,17 +109,17 @@ def test_what_cannot_be_used_is_said_and_moves_nothing(
 ) -> None:
     bench.say("/leader/right", np.zeros(7), RIGHT.joints)
     bench.say("/leader/left", position, names)
-    assert bench.leader.newest is None
-    assert why in bench.leader.refused
-    assert "/leader/left" in bench.leader.refused
+    assert bench.leader.latest_pose is None
+    assert why in bench.leader.problem
+    assert "/leader/left" in bench.leader.problem
     bench.say("/leader/left", np.zeros(7))
-    assert bench.leader.newest is not None
+    assert bench.leader.latest_pose is not None
     assert "positions" not in bench.leader.refused
 
 
 def test_bytes_that_are_no_message_are_said(bench: Bench) -> None:
     bench.hand.deliver["/leader/left"](b"\x00\x01\x00\x00nonsense")
-    assert bench.leader.refused.startswith("/leader/left: ")
+    assert bench.leader.problem.startswith("/leader/left: ")
 
 
 def test_it_begins_anew_and_ends(bench: Bench) -> None:
@@ -127,9 +127,9 @@ def test_it_begins_anew_and_ends(bench: Bench) -> None:
     bench.say("/leader/right", np.zeros(7), RIGHT.joints)
     bench.leader.connect()
     assert bench.hand.closed
-    assert bench.leader.newest is None
+    assert bench.leader.latest_pose is None
     bench.say("/leader/left", np.ones(7))
-    assert bench.leader.newest is None
+    assert bench.leader.latest_pose is None
     bench.leader.close()
     bench.leader.close()
 

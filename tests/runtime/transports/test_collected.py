@@ -20,7 +20,7 @@ from runtime.core.clock import MonotonicClock
 from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from runtime.transports import ros1, ros2
 from runtime.transports.ros import cdr, packed
 from runtime.transports.ros.messages import JointState, Wire
@@ -95,7 +95,7 @@ def demonstration(
         "safety": {"joint_age_s": PATIENCE_S, "picture_age_s": PATIENCE_S},
         "control": {"heartbeat_timeout_s": 10.0, "coordinator_timeout_s": 10.0},
     }
-    station = lockstep.Lockstep(checked_spec(loader.resolve(tree, {}, "test")))
+    station = lockstep.Lockstep(check_deployment(loader.resolve_deployment(tree, {}, "test")))
     session = station.coordinator.session
     try:
         station.connect()
@@ -150,7 +150,7 @@ class Waving:
     """Leader arms that publish on ROS topics, in any order of joints and under a name more than are wanted."""
 
     def __init__(self, robot: str, open_middleware: Callable[[], Middleware], wire: Wire) -> None:
-        described = robots.load(robot)
+        described = robots.load_robot(robot)
         self._home = described.poses["home"]
         self._groups = [group for group in described.groups if group.chain is not None]
         self.topics = {group.name: f"/leader/{group.name}" for group in self._groups}

@@ -213,7 +213,7 @@ def test_the_recorded_task_is_the_prompt(stage: Stage) -> None:
 
 def test_it_moves_nothing_ends_and_measures_what_is_mapped() -> None:
     plain = dataset.capabilities(Config(path="x"))
-    assert (plain.moves_robot, plain.ends, plain.measures_eef) == (False, True, False)
+    assert (plain.moves_robot, plain.is_finite, plain.measures_eef) == (False, True, False)
     assert dataset.capabilities(Config(path="x", mapping=MAPPING)).measures_eef
 
 

@@ -16,7 +16,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.station import spec as station_spec
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from tests.runtime.datasets.foreign import Plan, column, shown, write
 from tests.runtime.datasets.small import seen
 
@@ -48,7 +48,7 @@ def trial(tmp_path: Path, **tables: Any) -> station_spec.StationSpec:
         "recording": {"min_free_bytes": 0},
         **tables,
     }
-    return checked_spec(loader.resolve(tree, {}, "test"))
+    return check_deployment(loader.resolve_deployment(tree, {}, "test"))
 
 
 def stacked(table: Any, name: str) -> np.ndarray:
@@ -58,9 +58,9 @@ def stacked(table: Any, name: str) -> np.ndarray:
 def played(episode: Episode) -> dict[str, list[int]]:
     numbers = {}
     for camera, path in episode.videos.items():
-        from runtime.datasets.pictures import Pictures
+        from runtime.datasets.pictures import VideoFrames
 
-        with Pictures(path) as pictures:
+        with VideoFrames(path) as pictures:
             numbers[camera] = [seen(pictures[k]) for k in range(episode.frames)]
     return numbers
 

@@ -25,7 +25,7 @@ from runtime.transports.ros.topics import GroupTopics, Topics
 from tests.processes import PATIENCE_S, eventually
 from tests.runtime.ros_master import RosMaster, needs_ros1
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 HEAD, LEFT = "/camera_f/color/image_raw", "/puppet/joint_left"
 READY = ROBOT.poses["ready"].astype(np.float32)
 
@@ -84,7 +84,7 @@ def said(source: RosSource, *words: str) -> str:
 
     def found() -> str:
         source.receive(0.05)
-        return next((e.text for e in source.news() if all(word in e.text for word in words)), "")
+        return next((e.text for e in source.pop_events() if all(word in e.text for word in words)), "")
 
     return eventually(found, f"news with {words}")
 
@@ -125,7 +125,7 @@ def test_observations_come_and_commands_arrive(ros_master: RosMaster, node: Node
 def test_a_robot_without_topics_of_its_own_has_compressed_pictures_and_those_of_the_deployment(
     ros_master: RosMaster, node: Node
 ) -> None:
-    robot = robots.load("ur5e")
+    robot = robots.load_robot("ur5e")
     node(robot="ur5e")
     topics = Topics(
         cameras={"exterior_image": "/exterior_image/image_raw/compressed"},
@@ -142,7 +142,7 @@ def test_a_robot_without_topics_of_its_own_has_compressed_pictures_and_those_of_
 def test_grippers_with_topics_of_their_own_are_split_off_and_put_together(
     ros_master: RosMaster, node: Node
 ) -> None:
-    robot = robots.load("r1_lite")  # a robot of ROS 2, whose drivers have grippers apart
+    robot = robots.load_robot("r1_lite")  # a robot of ROS 2, whose drivers have grippers apart
     assert robot.ros is not None
     groups = {
         name: GroupTopics(
@@ -178,7 +178,7 @@ def test_a_group_and_a_camera_that_a_deployment_leaves_out_have_no_topics(
     ros_master: RosMaster, node: Node
 ) -> None:
     node("--groups", "left_arm")
-    robot = robots.load("agilex_piper", ["left_arm"])
+    robot = robots.load_robot("agilex_piper", ["left_arm"])
     with listening(ros_master, robot, disabled_cameras=["cam_high"]) as source:
         first = seen(source)
     assert first.qpos.shape == (7,)
@@ -216,7 +216,7 @@ def test_a_topic_that_falls_silent_is_named_and_nothing_is_delivered(
     node("--silence", HEAD, "--silence-from", "200")
     with listening(ros_master) as source:
         seen(source)
-        source.news()  # of the time before all were there
+        source.pop_events()  # of the time before all were there
         assert f"waiting for cam_high ({HEAD}): nothing for " in said(source, "cam_high")
         # A busy machine may have been silent before, and goes on after that; the topic does not.
         eventually(
@@ -273,7 +273,7 @@ def test_nobody_at_the_topics_is_said(ros_master: RosMaster, caplog: pytest.LogC
     sink.connect()
     with contextlib.closing(sink):
         unheard = dict.fromkeys(("/puppet/master_joint_left", "/puppet/master_joint_right"), "")
-        eventually(lambda: sink.unheard() == unheard, "nobody who listens")
+        eventually(lambda: sink.missing_subscribers() == unheard, "nobody who listens")
 
 
 @needs_ros1
@@ -352,4 +352,4 @@ def test_a_robot_of_the_other_generation_needs_topics_of_the_deployments() -> No
     with pytest.raises(
         ConfigurationError, match=r"no topic of camera \w+ .* is known; needed: transport\.topics"
     ):
-        ros1.cameras(ros1.Config(), robots.load("r1_lite"))
+        ros1.cameras(ros1.Config(), robots.load_robot("r1_lite"))

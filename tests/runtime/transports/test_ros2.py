@@ -25,7 +25,7 @@ from runtime.transports.ros.source import RosSource
 from runtime.transports.ros.topics import GroupTopics, Topics
 from tests.processes import PATIENCE_S, eventually
 
-ROBOT = robots.load("r1_lite")
+ROBOT = robots.load_robot("r1_lite")
 HEAD = "/hdas/camera_head/right_raw/image_raw_color/compressed"
 LEFT = "/hdas/feedback_arm_left"
 
@@ -95,7 +95,7 @@ def said(source: RosSource, *words: str) -> str:
 
     def found() -> str:
         assert source.receive(0.05) is None
-        return next((e.text for e in source.news() if all(word in e.text for word in words)), "")
+        return next((e.text for e in source.pop_events() if all(word in e.text for word in words)), "")
 
     return eventually(found, f"news with {words}")
 
@@ -120,7 +120,7 @@ def test_observations_come_and_commands_arrive(domain: int, node: Node) -> None:
                 return newest is not None and bool(np.allclose(newest.qpos, goal, atol=0.01))
 
             eventually(arrived, "the goal")
-            assert sink.unheard() == {}
+            assert sink.missing_subscribers() == {}
     assert json.loads(_end(process).splitlines()[-1])["refused"] == 0
 
 
@@ -145,7 +145,7 @@ def test_a_topic_that_falls_silent_is_named_and_nothing_is_delivered(domain: int
 
         def stalled() -> str:
             source.receive(0.05)
-            return next((e.text for e in source.news() if "cam_high" in e.text), "")
+            return next((e.text for e in source.pop_events() if "cam_high" in e.text), "")
 
         sentence = eventually(stalled, "the silence of cam_high")
         assert sentence.startswith(f"waiting for cam_high ({HEAD}): nothing for ")

@@ -22,7 +22,7 @@ from runtime.transports.node_source import NodeSource
 from runtime.transports.zmq import Config
 from tests.processes import PATIENCE_S, eventually
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 CAMERAS = tuple(camera.key for camera in ROBOT.cameras)
 
 
@@ -165,7 +165,7 @@ def test_a_disabled_camera_must_exist() -> None:
 
 def test_it_moves_a_robot() -> None:
     assert link.capabilities(Config()).moves_robot
-    assert not link.capabilities(Config()).ends
+    assert not link.capabilities(Config()).is_finite
 
 
 # Observations
@@ -257,7 +257,7 @@ def test_the_newest_counts_by_arrival_when_a_node_restarts_with_a_smaller_clock(
                 if observation.qpos[0] == 2:
                     break
             assert source.faults()["clock_backwards"] == 1
-            assert source.why("clock_backwards").startswith("the node's clock went back")
+            assert source.describe_fault("clock_backwards").startswith("the node's clock went back")
             assert abs(observation.captured["joints"] - observation.arrived) < 5
             observation = until_heard(second, source, lambda: frame(time.monotonic() % 100, 3))
     assert observation.qpos[0] in (2, 3)
@@ -281,7 +281,7 @@ def test_stamps_that_run_backwards_are_named_and_never_recorded_as_time(node: No
         wait_for(told)
     assert times == sorted(times)
     assert len(times) <= 20
-    assert source.why("not_newer").startswith("its stamps run backwards")
+    assert source.describe_fault("not_newer").startswith("its stamps run backwards")
 
 
 @pytest.mark.parametrize(
@@ -298,7 +298,7 @@ def test_a_jump_of_the_nodes_clock_is_named_and_ages_nothing(node: Node, jump: f
                 assert observation is not None
                 assert 0 <= observation.arrived - observation.captured["joints"] < 0.25
         assert source.faults() == {name: 1}
-        assert "the node's clock" in source.why(name)
+        assert "the node's clock" in source.describe_fault(name)
 
 
 def test_why_no_frame_comes_is_said_once_for_each_reason(node: Node) -> None:
@@ -306,7 +306,7 @@ def test_why_no_frame_comes_is_said_once_for_each_reason(node: Node) -> None:
         told: list[str] = []
 
         def news() -> bool:
-            told.extend(event.text for event in source.news())
+            told.extend(event.text for event in source.pop_events())
             return bool(told)
 
         wait_for(news)
@@ -315,7 +315,7 @@ def test_why_no_frame_comes_is_said_once_for_each_reason(node: Node) -> None:
             "publishes where transport.sub_endpoint says",
             told.pop(),
         )
-        assert source.news() == []
+        assert source.pop_events() == []
         until_heard(node, source, lambda: frame(time.monotonic()))
         wait_for(news)
         assert "s: it has stopped, or the way to it is cut" in told.pop()
@@ -465,8 +465,8 @@ def test_what_the_node_says_of_itself_is_passed_on(node: Node) -> None:
         assert (source.status.master, source.status.ack) == ("abc", 17)
         assert source.status.hil_error == "no leader"
         assert source.faults() == {"node_refused.limits": 4}
-        assert source.why("node_refused.limits") == "commands were beyond the node's own limits"
-        assert source.why("node_refused.of_its_own") == ""
+        assert source.describe_fault("node_refused.limits") == "commands were beyond the node's own limits"
+        assert source.describe_fault("node_refused.of_its_own") == ""
 
 
 def test_two_readers_do_not_steal_each_others_frames(node: Node) -> None:
@@ -624,7 +624,7 @@ def test_words_of_the_protocol_have_the_form_of_a_command_that_moves_nothing(nod
     stands = np.linspace(0, 0.1, 14).astype(np.float32)
     with commanding(node) as sink:
         send_until_heard(node, sink, RobotCommand(stands, 1, 1.0))
-        sink.tell(word, {"mode": "relative"})
+        sink.send_control_word(word, {"mode": "relative"})
         heard = node.hear()
         while heard is not None and heard["target"] == "real":
             heard = node.hear()
@@ -635,7 +635,7 @@ def test_words_of_the_protocol_have_the_form_of_a_command_that_moves_nothing(nod
 
 
 def test_a_link_that_is_cut_without_a_word_is_noticed(node: Node) -> None:
-    with contextlib.closing(node_link.opened(zmq.SUB, node.obs, {})) as socket:
+    with contextlib.closing(node_link.open_socket(zmq.SUB, node.obs, {})) as socket:
         assert socket.getsockopt(zmq.TCP_KEEPALIVE) == 1
         options = (zmq.TCP_KEEPALIVE_IDLE, zmq.TCP_KEEPALIVE_INTVL, zmq.TCP_KEEPALIVE_CNT)
         first, each, count = (int(socket.getsockopt(option)) for option in options)
@@ -789,7 +789,7 @@ def test_a_control_word_says_who_sends_it_and_stands_where_a_command_says_its_ta
         data = {"id": "r-1", "seed": 3, "positions": {"block": [0.1, 0.3, 45.0]}}
         heard = None
         while heard is None:  # until the link is up
-            sink.tell("scene_reset", data)
+            sink.send_control_word("scene_reset", data)
             heard = node.hear(0.1)
         assert {key: heard[key] for key in data} == data
         assert (heard["target"], heard["master"]) == ("scene_reset", sink.master)
@@ -809,10 +809,10 @@ def test_a_control_word_says_who_sends_it_and_stands_where_a_command_says_its_ta
 )
 def test_a_control_word_cannot_be_taken_for_a_command(node: Node, word: str, data: dict[str, Any]) -> None:
     with commanding(node) as sink, pytest.raises(TransportError, match="would be taken for a command"):
-        sink.tell(word, data)
+        sink.send_control_word(word, data)
 
 
 def test_a_control_word_over_no_link_is_a_fault() -> None:
     sink = link.sink(Config(), ROBOT, VirtualClock())
     with pytest.raises(TransportError, match="is not connected"):
-        sink.tell("scene_reset", {"id": "r"})
+        sink.send_control_word("scene_reset", {"id": "r"})

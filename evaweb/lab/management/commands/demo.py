@@ -264,8 +264,8 @@ def _check(options: Mapping[str, Any]) -> None:
 
 def _deployment(robot: str) -> Path:
     """The tabletop's deployment for that robot, else the one for any; CommandError lists the robots."""
-    if robot not in robots.names():
-        raise CommandError(f"--robot {robot}: allowed: {', '.join(robots.names())}")
+    if robot not in robots.robot_names():
+        raise CommandError(f"--robot {robot}: allowed: {', '.join(robots.robot_names())}")
     own = _DEPLOYMENTS / f"tabletop_{robot}.toml"
     return own if own.is_file() else _DEPLOYMENTS / "tabletop.toml"
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _ROUND = 0.02  # [rad] by which the model's own rows, mixed as numbers, may miss an angle or a turn
 
 
-class Parts(NamedTuple):
+class MixtureParts(NamedTuple):
     """Parts of N rows: numbers [P, N, W], weights [P, N] that sum to 1, and the newest of each [N, W]."""
 
     rows: Float64
@@ -43,11 +43,11 @@ class Mixture:
         self._robot = robot
         self._layout: PoseRows | None = None  # a policy speaks one format
 
-    def joints(self, parts: Parts) -> Float64:
+    def joints(self, parts: MixtureParts) -> Float64:
         """Joint rows [N, D], angles without limits on the newest one's branch."""
         return _mixed(parts, self._dims.switched, self._dims.wrapping)
 
-    def numbers(self, parts: Parts, like: ActionChunk) -> Float64:
+    def numbers(self, parts: MixtureParts, like: ActionChunk) -> Float64:
         """Rows [N, W] of which nobody but the model knows what they mean, in the order of the actions of `like`."""
         return _mixed(parts, self._switched(like), ())
 
@@ -77,7 +77,7 @@ class Mixture:
             layout, at = self._layout_of(like), qpos[None]
             seen = self._end_effectors.eef_of(qpos) if observation.eef is None else observation.eef
             vectors = np.asarray(seen, np.float64).reshape(1, -1, EEF_WIDTH)
-            start = layout.frame.express(layout.upright(vectors), at)[0]
+            start = layout.frame.express(layout.normalize_quaternions(vectors), at)[0]
             poses = layout.frame.express(self._end_effectors.vectors(joints), at)
             poses = relative(poses, start, like.mode, like.frame)
             made = layout.written(poses, moved[:, layout.dims], newest)
@@ -85,7 +85,7 @@ class Mixture:
         made[:, switched] = newest[:, switched]
         return made
 
-    def agree(self, straight: Float64, meant: Float64, like: ActionChunk) -> bool:
+    def mixes_linearly(self, straight: Float64, meant: Float64, like: ActionChunk) -> bool:
         """True if rows mixed as numbers are what is meant: they are not where an angle goes round."""
         if like.space == "joint":
             return bool(np.abs(straight - meant).max(initial=0.0) <= _ROUND)
@@ -119,7 +119,7 @@ class Mixture:
         return self._robot
 
 
-def _mixed(parts: Parts, switched: Sequence[int], wrapping: Sequence[int]) -> Float64:
+def _mixed(parts: MixtureParts, switched: Sequence[int], wrapping: Sequence[int]) -> Float64:
     """Written so that equal rows stay equal to the last bit."""
     apart = difference(parts.rows, parts.newest, wrapping)
     made: Float64 = parts.newest + (parts.weights[..., None] * apart).sum(axis=0)

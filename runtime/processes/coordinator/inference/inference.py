@@ -23,7 +23,7 @@ from runtime.processes.coordinator.inference.policy_observation import StaleObse
 from runtime.processes.coordinator.inference.requests import PolicyRequests, PolicyResponse
 from runtime.processes.coordinator.inference.retry import Retry
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
-from runtime.processes.coordinator.inference.worker import telling
+from runtime.processes.coordinator.inference.worker import as_policy_errors
 from runtime.strategies.base import Progress, Query, StrategyParameters
 
 _NOT_ANSWERED_YET = Pattern(
@@ -36,7 +36,7 @@ ON_DEMAND: tuple[Mode, ...] = ("step", "preview")  # modes that ask when a perso
 
 
 @dataclass(frozen=True, slots=True)
-class Patience:
+class FaultTimeouts:
     """Times that a run goes on without what it needs [s]."""
 
     stale: float  # without a fresh observation, until waiting for one is an error
@@ -66,7 +66,7 @@ class PendingChunk:
 
 
 @dataclass(frozen=True, slots=True)
-class ShownChunk:
+class DisplayedChunk:
     """The newest chunk, for pages: `state` is "proposed", "merged" or "dropped"; targets as in ChunkMerged."""
 
     number: int
@@ -89,19 +89,19 @@ class Inference:
         shared: SharedState,
         orders: ControlQueue,
         clock: Clock,
-        patience: Patience,
+        patience: FaultTimeouts,
         commitment: RtcPrefix,
     ) -> None:
         self.requests = requests
         self.runner = requests.runner
         self.metrics = PolicyMetrics()
         self.proposal: PendingChunk | None = None  # shown, and neither committed nor cancelled
-        self.shown: ShownChunk | None = None
-        self._planned: ShownChunk | None = None  # the newest that control has merged
+        self.shown: DisplayedChunk | None = None
+        self._planned: DisplayedChunk | None = None  # the newest that control has merged
         self.rtc_warning = ""
         self._given: Conditioning | None = None  # with the newest request
         self._strategy = strategy
-        self._page = shared
+        self._shared_state = shared
         self._orders = orders
         self._clock = clock
         self._patience = patience
@@ -121,7 +121,7 @@ class Inference:
         return self.requests.policy
 
     @property
-    def notes(self) -> list[Event]:
+    def pending_notes(self) -> list[Event]:
         """For the coordinator to collect."""
         return self.requests.notes
 
@@ -129,7 +129,7 @@ class Inference:
         """Figures of the answers of late, and whether the policy is lost."""
         return {
             "answers": self.metrics.answers,
-            **self.metrics.newest(),
+            **self.metrics.recent(),
             "lost": self.retry.lost_for > 0,
             "retry_in_s": self.retry.due_in,
             "rtc": self.rtc,
@@ -141,12 +141,12 @@ class Inference:
         return self.requests.policy_observation.simulated
 
     @property
-    def asked(self) -> bool:
+    def is_pending(self) -> bool:
         """True if the policy is being asked, or its answer has not reached the timeline."""
         return self._wanted or self._flight is not None or bool(self._unmerged)
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """Why there may be no chunk: what the policy last failed of, or for how long it owes an answer; else ""."""
         if self.retry.failure or self._flight is None:
             return self.retry.failure
@@ -167,24 +167,24 @@ class Inference:
     @property
     def continues(self) -> bool:
         """True if requests carry what the robot is committed to (RTC)."""
-        return self._strategy.query.continues
+        return self._strategy.query.uses_rtc
 
-    def exchange(self, policy: Policy, task: str) -> None:
+    def set_policy(self, policy: Policy, task: str) -> None:
         """Ask `policy`, with the instruction `task`, from now on; figures are counted anew."""
         self.pause()
-        self.requests.exchange(policy, task)
-        self.metrics.forget()
-        self.retry.forget()
+        self.requests.set_policy(policy, task)
+        self.metrics.reset()
+        self.retry.reset()
 
     def tune(self, strategy: Strategy, task: str) -> None:
         """Go on with another strategy, other parameters, another instruction; a request in flight stays."""
         self._strategy = strategy
-        self.requests.instruct(task)
+        self.requests.set_task(task)
         self.rtc_warning = ""
 
-    def show_simulated(self, simulated: bool) -> None:
+    def use_simulated(self, simulated: bool) -> None:
         """Show the policy the joints of the simulated robot, or those of the real one."""
-        self.requests.policy_observation.show_simulated(simulated)
+        self.requests.policy_observation.use_simulated(simulated)
 
     # --- a run ---------------------------------------------------------------------------------------------
 
@@ -192,13 +192,13 @@ class Inference:
         """Ask from now on, for this run; `fresh` lets the policy forget the episode before."""
         self._run, self._mode = run, mode
         if fresh:
-            self.requests.forget()
-            self.metrics.forget()
+            self.requests.reset_episode()
+            self.metrics.reset()
             self.shown = self._planned = None
         else:
             self.requests.resume()
         self._commitment.clear()
-        self.retry.forget()
+        self.retry.reset()
         self._stale_since = None
         self._wanted, self.proposal = False, None
         self._unmerged.clear()
@@ -225,7 +225,7 @@ class Inference:
     def cancel(self) -> None:
         """Forget the chunk that is asked for, or shown, or under way to control, and what has failed meanwhile."""
         self._flight, self._stale_since = None, None
-        self.retry.forget()
+        self.retry.reset()
         self._wanted, self.proposal, self.shown, self._planned = False, None, None, None
         self._unmerged.clear()
         self._commitment.clear()
@@ -239,17 +239,17 @@ class Inference:
 
     # --- what control says -----------------------------------------------------------------------------------
 
-    def merged(self, merged: ChunkMerged) -> None:
+    def on_merged(self, merged: ChunkMerged) -> None:
         """Control has put a chunk on the timeline, or dropped it."""
         made = self._unmerged.pop(merged.chunk_id, None)
         if merged.run != self._run:
             return
-        self.metrics.merged(merged)
-        self._commitment.merged(merged)
+        self.metrics.add_merge(merged)
+        self._commitment.on_merged(merged)
         if made is not None:
             state = "dropped" if merged.dropped else "merged"
             step = made.answered.observation.step
-            self.shown = ShownChunk(
+            self.shown = DisplayedChunk(
                 merged.chunk_id,
                 merged.run,
                 state,
@@ -262,7 +262,7 @@ class Inference:
             if not merged.dropped:
                 self._planned = self.shown
 
-    def raw(self, step: int) -> Float64 | None:
+    def raw_action(self, step: int) -> Float64 | None:
         """Action for `step` [D] in the newest chunk that control has merged; None where it has none."""
         if self._planned is None:
             return None
@@ -271,39 +271,41 @@ class Inference:
 
     # --- asking and answering --------------------------------------------------------------------------------
 
-    def pump(self) -> PolicyAnswer | None:
+    def poll(self) -> PolicyAnswer | None:
         """Collect an answer, or ask; returns the answer, for the record. Raises PolicyError, and no other error."""
-        with telling(_ANSWER_UNUSABLE):
+        with as_policy_errors(_ANSWER_UNUSABLE):
             return self._pump() if self._run else None
 
     def _pump(self) -> PolicyAnswer | None:
-        self.requests.glance()
+        self.requests.push_observation()
         if self._flight is not None:
             if not self.runner.ready(self._flight):
                 return None
             flight, self._flight = self._flight, None
-            return self._take(flight.result())
+            return self._on_response(flight.result())
         # A late answer of an earlier run may keep the policy busy: a request would grow old in the queue.
-        if not self.runner.busy and self._wants() and self._try_to_ask():
+        if not self.runner.busy and self._should_request() and self._try_to_ask():
             return self._pump()
         return None
 
-    def retries(self, error: RuntimeFault) -> bool:
+    def should_retry(self, error: RuntimeFault) -> bool:
         """Count a failure; True if the policy will be tried again, False where patience is at its end."""
         if isinstance(error, PolicyLostError):
             self.metrics.count_lost()
-        if not self.retry.failed(error):
+        if not self.retry.record_failure(error):
             return False
         self._orders.bear(self._run, self._clock.now() + self._patience.lost - self.retry.lost_for)
         return True
 
-    def _wants(self) -> bool:
+    def _should_request(self) -> bool:
         if self.retry.due_in:
             return False
-        return self._wanted if self._mode in ON_DEMAND else self._strategy.query.wants(self._progress())
+        return (
+            self._wanted if self._mode in ON_DEMAND else self._strategy.query.should_request(self._progress())
+        )
 
     def _progress(self) -> Progress:
-        remaining = int(self._page.control.read()["remaining"])
+        remaining = int(self._shared_state.control.read()["remaining"])
         return Progress(remaining, bool(self._unmerged), self._clock.now() - self._asked_at)
 
     def _try_to_ask(self) -> bool:
@@ -313,10 +315,10 @@ class Inference:
         answer there is nothing to judge, so a gap that lasts is an error here too.
         """
         now = self._clock.now()
-        waited = self._mode in ON_DEMAND or self._strategy.query.waits
+        waited = self._mode in ON_DEMAND or self._strategy.query.requests_while_stopped
         try:
             committed = self._committed if self.continues else None
-            flight = self.requests.ask(waited, committed, self._strategy.parameters.k_max, executed=True)
+            flight = self.requests.send(waited, committed, self._strategy.parameters.k_max, executed=True)
         except StaleObservationError:
             if self._stale_since is None:
                 self._stale_since = now
@@ -342,45 +344,49 @@ class Inference:
         self.rtc_warning, self._given = warning, found
         return found
 
-    def _take(self, answered: PolicyResponse) -> PolicyAnswer:
+    def _on_response(self, answered: PolicyResponse) -> PolicyAnswer:
         step, chunk = answered.observation.step, answered.chunk
-        self.requests.note(answered)
-        made = PendingChunk(self._orders.next_chunk(), answered.made.rows, answered)
+        self.requests.log_ik_problems(answered)
+        made = PendingChunk(self._orders.next_chunk(), answered.commands.rows, answered)
         self._wanted = False
-        self.metrics.answered(answered.seconds, answered.age, answered.ik)
-        self._commitment.answered(made.number, chunk, step, answered.waited, self._generation, made.rows)
+        self.metrics.add_response(answered.seconds, answered.age, answered.ik)
+        self._commitment.add_chunk(
+            made.number, chunk, step, answered.requested_while_stopped, self._generation, made.rows
+        )
         if self._mode == "preview":
             self.proposal = made
             nowhere = np.full(len(made.rows), -1, np.int64)
             ik = answered.ik
-            self.shown = ShownChunk(made.number, self._run, "proposed", step, nowhere, made.rows, ik=ik)
+            self.shown = DisplayedChunk(made.number, self._run, "proposed", step, nowhere, made.rows, ik=ik)
         else:
             self._post(made)
         recorded = self._record(made)
-        self.retry.recovered()  # not before: one whose answers cannot be used is not back
+        self.retry.record_success()  # not before: one whose answers cannot be used is not back
         return recorded
 
     def _record(self, made: PendingChunk) -> PolicyAnswer:
-        answered, solved = made.answered, made.answered.made.solved
+        answered, solved = made.answered, made.answered.commands.ik_result
         return PolicyAnswer(
             made.number,
             self._run,
             answered.observation.step,
             answered.chunk.actions,
             answered.chunk.space,
-            answered.made.source,
+            answered.commands.source_rows,
             answered.seconds * 1000.0,
             position_error=None if solved is None else solved.position_error,
             rotation_error=None if solved is None else solved.rotation_error,
             ik_flags=None if solved is None else solved.flags,
-            eef=answered.eef if self.policy.sees_poses else "",
+            eef=answered.eef if self.policy.uses_poses else "",
         )
 
     def _post(self, made: PendingChunk) -> None:
         answered, step = made.answered, made.answered.observation.step
-        first = answered.made.first
-        self._orders.post(PostedChunk(made.number, self._run, step, made.rows, answered.waited, first))
+        first = answered.commands.first
+        self._orders.send_chunk(
+            PostedChunk(made.number, self._run, step, made.rows, answered.requested_while_stopped, first)
+        )
         self._unmerged[made.number] = made
 
     def _note(self, kind: str, text: str) -> None:
-        self.notes.append(Event(kind, text, self._clock.now()))
+        self.pending_notes.append(Event(kind, text, self._clock.now()))

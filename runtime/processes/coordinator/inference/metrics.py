@@ -37,9 +37,9 @@ class PolicyMetrics:
     """Counts from the beginning of a run; memory is bounded, counts are not."""
 
     def __init__(self) -> None:
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew."""
         self.ik: dict[str, Any] = {}  # of the newest answer
         self.poses: dict[
@@ -50,7 +50,9 @@ class PolicyMetrics:
         self.ages: deque[float] = deque(maxlen=_KEPT)  # of what the policy was shown when it was asked [s]
         self.delays: deque[int] = deque(maxlen=_KEPT)  # control steps, measured
 
-    def answered(self, seconds: float, age: float | None = None, ik: Mapping[str, Any] | None = None) -> None:
+    def add_response(
+        self, seconds: float, age: float | None = None, ik: Mapping[str, Any] | None = None
+    ) -> None:
         """An answer came after so long [s]; what was shown was so old when the policy was asked [s].
 
         `ik` says how its poses were met (asking.figures), {} for joints.
@@ -72,13 +74,13 @@ class PolicyMetrics:
         """The policy was lost."""
         self.lost += 1
 
-    def merged(self, merged: ChunkMerged) -> None:
+    def add_merge(self, merged: ChunkMerged) -> None:
         """Control has placed it, or dropped it."""
         self.delays.append(merged.delay)
         self.mistimed += merged.mistimed > 0
         self.dropped += bool(merged.dropped)
 
-    def newest(self) -> dict[str, Any]:
+    def recent(self) -> dict[str, Any]:
         """The last answers, for a page: latencies [ms], delays [steps]; their spread is that of a few hundred."""
         latencies, delays = _last(self.latencies, _JUDGED), _last(self.delays, _JUDGED)
         return {

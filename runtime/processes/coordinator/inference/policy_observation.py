@@ -24,16 +24,16 @@ class StaleObservationError(PolicyError):
     """The newest observation is too old to ask a policy about."""
 
 
-class Eyes(Protocol):
+class ObservationProvider(Protocol):
     """Source of a policy's observations; `simulated`: the joints of the simulated robot."""
 
     @property
     def simulated(self) -> bool: ...
 
-    def show_simulated(self, simulated: bool) -> None:
+    def use_simulated(self, simulated: bool) -> None:
         """Show the joints of the simulated robot in place of the real one's, or the latter again."""
 
-    def now(self, prompt: str, pictures: bool = True) -> Observation:
+    def latest(self, prompt: str, pictures: bool = True) -> Observation:
         """The newest observation, without `pictures` of joints alone; PolicyError where there is none, or it is old."""
 
     def commanded(self) -> tuple[int, Float64] | None:
@@ -41,7 +41,7 @@ class Eyes(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class SightSettings:
+class StalenessLimits:
     """Bounds on what may be shown: ages in seconds, the control rate in Hz."""
 
     control_rate: float
@@ -52,20 +52,20 @@ class SightSettings:
 class PolicyObservation:
     """Reads the shared state."""
 
-    def __init__(self, shared: SharedState, clock: Clock, settings: SightSettings) -> None:
-        self._page = shared
+    def __init__(self, shared: SharedState, clock: Clock, settings: StalenessLimits) -> None:
+        self._shared_state = shared
         self._clock = clock
         self._settings = settings
         self.simulated = False
 
-    def show_simulated(self, simulated: bool) -> None:
+    def use_simulated(self, simulated: bool) -> None:
         """Show the joints of the simulated robot in place of the real one's, or the latter again."""
         self.simulated = simulated
 
-    def now(self, prompt: str, pictures: bool = True) -> Observation:
+    def latest(self, prompt: str, pictures: bool = True) -> Observation:
         """The newest observation, without `pictures` of joints alone; PolicyError where there is none, or it is old."""
-        cameras = self._page.layout.cameras if pictures else ()
-        seen = self._page.read_observation(cameras)
+        cameras = self._shared_state.layout.cameras if pictures else ()
+        seen = self._shared_state.read_observation(cameras)
         if seen is None:
             raise PolicyError(_NONE_YET)
         now, bounds = self._clock.now(), self._settings
@@ -87,7 +87,7 @@ class PolicyObservation:
 
     def commanded(self) -> tuple[int, Float64] | None:
         """The newest control step and what the robot that chunks are for was told then [D]; None before that."""
-        status = self._page.control.read()
+        status = self._shared_state.control.read()
         simulated = np.array(status["simulated"], np.float64)
         if int(status["step"]) >= 0 and np.isfinite(simulated).all() and bytes(status["behaviour"]):
             return int(status["step"]), simulated
@@ -100,7 +100,7 @@ class PolicyObservation:
 
         While control stalls that is more than one step on: steps follow the clock, missed ticks are skipped.
         """
-        status = self._page.control.read()
+        status = self._shared_state.control.read()
         step, planned = int(status["step"]), float(status["planned"])
         if seen.sequence == int(status["sequence"]):
             return step
@@ -109,7 +109,7 @@ class PolicyObservation:
 
     def _of_the_simulated_robot(self, shown: Observation) -> Observation:
         """Its joints; what only a real robot measures is left out. Before its first tick it stands where that does."""
-        joints = np.array(self._page.control.read()["simulated"], np.float32)
+        joints = np.array(self._shared_state.control.read()["simulated"], np.float32)
         if not np.isfinite(joints).all():
             return shown
         return replace(shown, qpos=joints, qvel=None, effort=None, eef=None)

@@ -18,9 +18,9 @@ from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.ipc.messages import Event
 from runtime.kinematics.base import IkFlag, IkResult
 from runtime.policies.base import Policy
-from runtime.processes.coordinator.inference.policy_observation import Eyes
+from runtime.processes.coordinator.inference.policy_observation import ObservationProvider
 from runtime.processes.coordinator.inference.worker import Runner
-from runtime.spaces.conversion import ActionSpaces, CommandRows, Onset
+from runtime.spaces.conversion import ActionSpaces, ChunkStart, CommandRows
 
 log = logging.getLogger(__name__)
 _EEF_DISAGREES = Pattern(
@@ -75,8 +75,8 @@ class PolicyResponse:
     chunk: ActionChunk
     seconds: float
     observation: Observation
-    made: CommandRows
-    waited: bool = False
+    commands: CommandRows
+    requested_while_stopped: bool = False
     age: float | None = None  # of the oldest stream of the observation when the policy was asked [s]
     eef: Literal["measured", "fk"] = "fk"
     ik: Mapping[str, Any] = field(
@@ -96,7 +96,7 @@ class PolicyRequests:
         policy: Policy,
         task: str,
         spaces: ActionSpaces,
-        policy_observation: Eyes,
+        policy_observation: ObservationProvider,
         runner: Runner,
         clock: Clock,
         bound: MissBound | None = None,
@@ -114,7 +114,7 @@ class PolicyRequests:
         self._glance_at = float("-inf")
         self.notes: list[Event] = []  # for the coordinator to collect
 
-    def exchange(self, policy: Policy, task: str) -> None:
+    def set_policy(self, policy: Policy, task: str) -> None:
         """Ask `policy`, with the instruction `task`, from now on.
 
         Another policy takes the place of the former one, which is closed first. Calls are made one after the
@@ -125,11 +125,11 @@ class PolicyRequests:
             self.policy, self._fresh, self._held = policy, True, False
         self.task = task
 
-    def instruct(self, task: str) -> None:
+    def set_task(self, task: str) -> None:
         """Ask with another instruction from now on."""
         self.task = task
 
-    def forget(self) -> None:
+    def reset_episode(self) -> None:
         """Let the policy forget the episode before its next inference."""
         self._fresh = True
 
@@ -137,7 +137,7 @@ class PolicyRequests:
         """Let the policy know before its next inference that the robot was held meanwhile."""
         self._held = True
 
-    def rest(self) -> None:
+    def end_episode(self) -> None:
         """The rollout is over: the policy ends what its server keeps of it, and nobody waits for that.
 
         Where it cannot, the log says so: a policy that owes it does it before it is asked again, or says why not.
@@ -146,29 +146,29 @@ class PolicyRequests:
 
         def end() -> None:
             try:
-                policy.rest()
+                policy.end_episode()
             except RuntimeFault as error:
                 log.warning("the policy's server may still keep the rollout that is over: %s", error)
 
         self.runner.submit(end)
 
-    def glance(self) -> None:
+    def push_observation(self) -> None:
         """Show the policy what is seen now, where it wants that and it is time; a gap in what is seen is left one."""
-        every, now = self.policy.glances_s, self._clock.now()
+        every, now = self.policy.observe_period_s, self._clock.now()
         if every is None or now < self._glance_at - _EARLY_S:
             return
         due = self._glance_at + every
         self._glance_at = due if due > now else now + every
         try:
-            self.policy.glance(self.observe())
+            self.policy.observe(self.observe())
         except PolicyError:  # what is missing or old is said of the next request
             return
 
     def observe(self) -> Observation:
         """The observation to show the policy now; PolicyError where there is none, or it is old."""
-        return self.policy_observation.now(self.task, self.policy.sees_pictures)
+        return self.policy_observation.latest(self.task, self.policy.uses_images)
 
-    def ask(
+    def send(
         self,
         waited: bool = False,
         committed: Committed | None = None,
@@ -201,16 +201,16 @@ class PolicyRequests:
                 self._fresh, self._held = self._fresh or fresh, self._held or held
                 raise
             seconds = self._clock.now() - begun
-            onset = self._onset(shown, waited, waited or fresh, k_max)
+            onset = self._chunk_start(shown, waited, waited or fresh, k_max)
             made = self._spaces.to_command(chunk, shown, onset)
             source: Literal["measured", "fk"] = "measured" if measured else "fk"
-            ik = {} if made.solved is None else figures(made.solved)
-            made, refused = self._within(made, onset.row, fresh or held) if executed else (made, "")
+            ik = {} if made.ik_result is None else ik_figures(made.ik_result)
+            made, refused = self._within(made, onset.first_row, fresh or held) if executed else (made, "")
             return PolicyResponse(chunk, seconds, shown, made, waited, age, source, ik, refused)
 
         return self.runner.submit(infer)
 
-    def _onset(self, shown: Observation, waited: bool, rests: bool, k_max: int | None) -> Onset:
+    def _chunk_start(self, shown: Observation, waited: bool, rests: bool, k_max: int | None) -> ChunkStart:
         """Onset of the answer, as far as it is known now: at what control was told to do last.
 
         Its first row that can still be executed follows the newest control step. A robot that rests starts from
@@ -219,11 +219,11 @@ class PolicyRequests:
         qpos = np.asarray(shown.qpos, dtype=np.float64)
         told = self.policy_observation.commanded()
         if told is None:
-            return Onset(qpos, qpos)
+            return ChunkStart(qpos, qpos)
         step, commanded = told
         passed = 0 if waited else max(0, step + 1 - shown.step)
         row = passed if k_max is None else min(passed, k_max)
-        return Onset(commanded, qpos if rests else commanded, row)
+        return ChunkStart(commanded, qpos if rests else commanded, row)
 
     def _within(self, made: CommandRows, first: int, begins: bool) -> tuple[CommandRows, str]:
         """The rows before the first pose from row `first` on that is refused, and why no more; PolicyError for none.
@@ -232,7 +232,7 @@ class PolicyRequests:
         lag behind a pose by less are those of joint rows that the limits of safety hold back. Where a run `begins` so,
         control says it, by that one row.
         """
-        solved, bound = made.solved, self._bound
+        solved, bound = made.ik_result, self._bound
         if solved is None or bound is None:
             return made, ""
         first = min(first, len(made.rows) - 1)
@@ -247,7 +247,7 @@ class PolicyRequests:
         met = IkResult(
             solved.q[:kept], solved.position_error[:kept], solved.rotation_error[:kept], solved.flags[:kept]
         )
-        cut = replace(made, rows=made.rows[:kept], source=made.source[:kept], solved=met)
+        cut = replace(made, rows=made.rows[:kept], source_rows=made.source_rows[:kept], ik_result=met)
         return cut, _ROWS_REFUSED(wrong=wrong, kept=kept - first)
 
     def _refused(self, made: CommandRows, row: int, bound: MissBound) -> tuple[str, bool]:
@@ -257,7 +257,7 @@ class PolicyRequests:
         if over.any():
             arm = int(over.argmax())
             return _OUT_OF_REACH(
-                row=made.source[row],
+                row=made.source_rows[row],
                 arm=self._spaces.arm_names[arm],
                 mm=1000.0 * free.position_error[0, arm],
                 deg=np.degrees(free.rotation_error[0, arm]),
@@ -265,10 +265,10 @@ class PolicyRequests:
                 allowed_deg=np.degrees(bound.rotation),
             ), False
         if distance > bound.jump:
-            return _TOO_FAR(row=made.source[row], distance=distance, allowed=bound.jump), True
+            return _TOO_FAR(row=made.source_rows[row], distance=distance, allowed=bound.jump), True
         return "", True
 
-    def compare(self, answered: PolicyResponse) -> None:
+    def check_measured_poses(self, answered: PolicyResponse) -> None:
         """Hold the poses that the robot measures against those of its joints: they may be of another frame.
 
         Raises SetupError where the policy depends on them; else it is only said.
@@ -276,13 +276,13 @@ class PolicyRequests:
         shown = answered.observation
         if answered.eef != "measured" or shown.eef is None:
             return
-        wrong = self._spaces.disagreement(shown.eef, shown.qpos)
-        if wrong and self.policy.sees_poses:
+        wrong = self._spaces.pose_mismatch(shown.eef, shown.qpos)
+        if wrong and self.policy.uses_poses:
             raise SetupError(_EEF_DISAGREES(wrong=wrong))
         if wrong:
             self.notes.append(Event("eef_disagrees", wrong, self._clock.now(), shown.step))
 
-    def note(self, answered: PolicyResponse) -> None:
+    def log_ik_problems(self, answered: PolicyResponse) -> None:
         """Say what could not be done of an answer."""
         ik = answered.ik
         if answered.refused:
@@ -303,7 +303,7 @@ class PolicyRequests:
             self.notes.append(Event("ik_unreached", text, self._clock.now(), step, ik))
 
 
-def figures(solved: IkResult) -> dict[str, Any]:
+def ik_figures(solved: IkResult) -> dict[str, Any]:
     """Rows of which any arm is flagged, by flag, and the worst errors [mm, degrees]."""
 
     def flagged(flag: IkFlag) -> int:

@@ -28,17 +28,17 @@ class Retry:
     @property
     def lost_for(self) -> float:
         """Time for which the policy has not answered [s], 0 where it does."""
-        return self._back_off.lasts(self._clock.now())
+        return self._back_off.failing_for(self._clock.now())
 
     @property
     def due_in(self) -> float:
         """When it is tried again [s]."""
-        return self._back_off.waiting(self._clock.now())
+        return self._back_off.remaining_delay(self._clock.now())
 
-    def failed(self, error: RuntimeFault) -> bool:
+    def record_failure(self, error: RuntimeFault) -> bool:
         """Count a failure; True if the policy will be tried again, False where patience is at its end."""
         first, self.failure = self._back_off.since is None, str(error)
-        self._back_off.failed(self._clock.now())
+        self._back_off.record_failure(self._clock.now())
         if self.lost_for > self._patience:
             return False
         if first:
@@ -46,13 +46,13 @@ class Retry:
             self._say(kind, _LOST(error=error, seconds=self._patience))
         return True
 
-    def recovered(self) -> None:
+    def record_success(self) -> None:
         """It answers."""
         if self._back_off.since is not None:
             self._say("policy_back", _ANSWERS_AGAIN(seconds=self.lost_for))
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Nothing has failed."""
-        self._back_off.forget()
+        self._back_off.reset()
         self.failure = ""

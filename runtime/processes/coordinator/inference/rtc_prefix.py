@@ -12,7 +12,7 @@ from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import ActionChunk, Conditioning, Float32, Float64, Observation
 from runtime.ipc.messages import ChunkMerged
 from runtime.motion.timeline import HELD
-from runtime.processes.coordinator.inference.chunk_mixture import Mixture, Parts
+from runtime.processes.coordinator.inference.chunk_mixture import Mixture, MixtureParts
 
 _MODEL_ROWS_RELATIVE = fixed(
     "rtc.model_rows_relative",
@@ -32,7 +32,7 @@ Shares = dict[int, float]  # by chunk: its weight in a step; they sum to 1
 
 
 @dataclass(frozen=True, slots=True)
-class _Answer:
+class _PendingChunk:
     """A chunk that is on its way to the timeline."""
 
     chunk: ActionChunk
@@ -43,7 +43,7 @@ class _Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class _Commitment:
+class _CommittedChunk:
     """A chunk on the timeline: `rows` as the server gave them, row 0 for control step `anchor`.
 
     From control step `first` on it is the plan, but for the steps in `shares`, which others have a part in; None
@@ -57,7 +57,7 @@ class _Commitment:
     anchor: int
     first: int
     end: int  # the step after the last that is planned
-    shares: Mapping[int, Shares] | None
+    contributions: Mapping[int, Shares] | None
     pace: float  # rows per control step
     delay: int  # control steps from its observation to its arrival
 
@@ -87,8 +87,8 @@ class RtcPrefix:
         self.generation = 0  # what a request is asked in, see `answered`
         self.warning = ""  # of the newest `conditioning`, "" where it fits
         self.predicted_delay = 0  # rows, of the newest `conditioning`
-        self._on_the_way: dict[int, _Answer] = {}
-        self._merged: dict[int, _Commitment] = {}  # by chunk, the newest last
+        self._on_the_way: dict[int, _PendingChunk] = {}
+        self._merged: dict[int, _CommittedChunk] = {}  # by chunk, the newest last
 
     def clear(self) -> None:
         """The robot is committed to nothing, and no answer that is still out will change that."""
@@ -98,7 +98,7 @@ class RtcPrefix:
         self._on_the_way.clear()
         self._merged.clear()
 
-    def answered(
+    def add_chunk(
         self,
         chunk_id: int,
         chunk: ActionChunk,
@@ -118,9 +118,9 @@ class RtcPrefix:
             rows = chunk.actions.astype(np.float64) if commands is None else commands
             pace = (chunk.rate or self._control_rate) / self._control_rate
             made = len(rows) if commands is None else _made_of(len(commands), pace)
-            self._on_the_way[chunk_id] = _Answer(chunk, observation_step, waited, rows, made)
+            self._on_the_way[chunk_id] = _PendingChunk(chunk, observation_step, waited, rows, made)
 
-    def merged(self, merged: ChunkMerged) -> None:
+    def on_merged(self, merged: ChunkMerged) -> None:
         """Control has put a chunk on the timeline, or dropped it: what was dropped commits nobody."""
         answer = self._on_the_way.pop(merged.chunk_id, None)
         if answer is None or merged.dropped or merged.chunk_id < max(self._merged, default=-1):
@@ -131,7 +131,7 @@ class RtcPrefix:
         over = [number for number, held in self._merged.items() if held.end < answer.observation_step]
         for number in over:  # no later request is about a step that it has made
             del self._merged[number]
-        self._merged[merged.chunk_id] = _Commitment(
+        self._merged[merged.chunk_id] = _CommittedChunk(
             chunk=chunk,
             rows=rows,
             commands=answer.commands,
@@ -139,7 +139,7 @@ class RtcPrefix:
             anchor=merged.arrival_step if answer.waited else answer.observation_step + merged.mistimed,
             first=merged.arrival_step,
             end=int(merged.targets.max(initial=merged.arrival_step - 1)) + 1,
-            shares=_shares(merged),
+            contributions=_shares(merged),
             pace=pace,
             delay=merged.delay,
         )
@@ -191,17 +191,17 @@ class RtcPrefix:
         return Conditioning(previous, consumed, min(self.predicted_delay, len(steps)), last)
 
     def _planned(
-        self, held: _Commitment, steps: Float64, passed: int, observation: Observation | None
+        self, held: _CommittedChunk, steps: Float64, passed: int, observation: Observation | None
     ) -> Float32 | None:
         """The rows of `held`, those for control `steps` as they are planned; None where that is not known.
 
         `passed` is the row nearest to the first of these. Rows that are not absolute do not mix: the joints do that
         they became, and are said as such rows again.
         """
-        made = [self._makers(at) for at in steps.tolist()]
+        made = [self._contributions_at(at) for at in steps.tolist()]
         if held.chunk.mode != "absolute":
             return self._from_here(held, steps, made, passed, observation)
-        known = [shares for shares in made if shares is not None and self._alike(held, shares)]
+        known = [shares for shares in made if shares is not None and self._same_kind(held, shares)]
         if len(known) < len(made):
             return None
         whole = _held_on(held.rows, held.usable)  # without those that were refused
@@ -219,7 +219,7 @@ class RtcPrefix:
 
     def _from_here(
         self,
-        held: _Commitment,
+        held: _CommittedChunk,
         steps: Float64,
         made: Sequence[Shares | None],
         passed: int,
@@ -239,12 +239,12 @@ class RtcPrefix:
         rows[places] = self._mixture.relative(joints, newest, held.chunk, observation)
         return _held_on(rows, int(places[-1]) + 1)
 
-    def _alike(self, held: _Commitment, shares: Shares) -> bool:
+    def _same_kind(self, held: _CommittedChunk, shares: Shares) -> bool:
         """True if all these are chunks in the numbers of `held`."""
         others = [self._merged.get(number) for number in shares]
         return all(other is not None and other.kind == held.kind for other in others)
 
-    def _makers(self, at: float) -> Shares | None:
+    def _contributions_at(self, at: float) -> Shares | None:
         """Shares of chunks in control step `at`, between steps in both; None where they are not known."""
         before = math.floor(at + _HAIR)
         part = at - before
@@ -261,9 +261,9 @@ class RtcPrefix:
     def _makers_of(self, step: int) -> Shares | None:
         number = max((number for number, held in self._merged.items() if held.first <= step), default=HELD)
         held = self._merged.get(number)
-        if held is None or held.shares is None or step >= held.end:
+        if held is None or held.contributions is None or step >= held.end:
             return None
-        return held.shares.get(step, {number: 1.0})
+        return held.contributions.get(step, {number: 1.0})
 
     def _mixed(self, steps: Float64, made: Sequence[Shares]) -> Float64 | None:
         """Rows for these control steps, of what makes each; None where the model's own rows cannot be mixed."""
@@ -276,13 +276,16 @@ class RtcPrefix:
             meant = mixture.poses(mixture.joints(commands), actions.newest, like)
         if like.model_actions is None:
             return meant
-        if not mixture.agree(mixture.numbers(actions, like), meant, like):
+        if not mixture.mixes_linearly(mixture.numbers(actions, like), meant, like):
             return None
         return mixture.numbers(self._parts(steps, made, lambda held: (held.rows, held.pace)), like)
 
     def _parts(
-        self, steps: Float64, made: Sequence[Shares], table: Callable[[_Commitment], tuple[Numbers, float]]
-    ) -> Parts:
+        self,
+        steps: Float64,
+        made: Sequence[Shares],
+        table: Callable[[_CommittedChunk], tuple[Numbers, float]],
+    ) -> MixtureParts:
         """Parts of the rows for these steps, out of a `table` of each chunk and its rows per step."""
         numbers: list[Numbers] = []
         weights: list[Float64] = []
@@ -298,7 +301,7 @@ class RtcPrefix:
             numbers += [rows[below], rows[np.minimum(below + 1, len(rows) - 1)]]
             weights += [share * (1.0 - part), share * part]
         every = np.array(numbers, np.float64)
-        return Parts(every, np.array(weights), every[newest, np.arange(len(steps))])
+        return MixtureParts(every, np.array(weights), every[newest, np.arange(len(steps))])
 
     def _judge(self, delay: float, left: int) -> None:
         """RTC needs steps to go on with until the answer arrives."""
@@ -327,9 +330,9 @@ def _expected(delays: Sequence[int], quantile: float) -> float:
 
 def _shares(merged: ChunkMerged) -> dict[int, Shares] | None:
     """By step, of the steps that are not the chunk's alone; None where they were not told."""
-    if merged.shares is None:
+    if merged.contributions is None:
         return None
     shares: dict[int, Shares] = {}
-    for step, chunk, weight in merged.shares.tolist():
+    for step, chunk, weight in merged.contributions.tolist():
         shares.setdefault(int(step), {})[int(chunk)] = weight
     return shares

@@ -32,7 +32,7 @@ class Runner(ABC):
     def ready(self, future: Future[Result]) -> bool: ...
 
     @abstractmethod
-    def aside(self, call: Callable[[], Result]) -> Future[Result]:
+    def run_in_background(self, call: Callable[[], Result]) -> Future[Result]:
         """Start `call`, which has nothing to do with the policy, behind no other."""
 
     @property
@@ -48,7 +48,7 @@ class Runner(ABC):
 
 
 @contextmanager
-def telling(what: str) -> Iterator[None]:
+def as_policy_errors(what: str) -> Iterator[None]:
     """Tell every error within as a PolicyError, its traceback in the log: no answer ends the coordinator."""
     try:
         yield
@@ -59,9 +59,9 @@ def telling(what: str) -> Iterator[None]:
         raise PolicyError(f"{what}: {type(error).__name__}: {error}") from error
 
 
-def _told(call: Callable[[], Result]) -> Callable[[], Result]:
+def _call_logged(call: Callable[[], Result]) -> Callable[[], Result]:
     def told() -> Result:
-        with telling(_CODE_FAILED):
+        with as_policy_errors(_CODE_FAILED):
             return call()
 
     return told
@@ -82,11 +82,11 @@ class ThreadRunner(Runner):
         self._newest: Future[Any] | None = None
 
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
-        future = self._pool.submit(_told(call))
+        future = self._pool.submit(_call_logged(call))
         self._newest = future
         return future
 
-    def aside(self, call: Callable[[], Result]) -> Future[Result]:
+    def run_in_background(self, call: Callable[[], Result]) -> Future[Result]:
         future: Future[Result] = Future()
         # A daemon: what is only being prepared keeps no process from ending.
         threading.Thread(target=_settle, args=(future, call), name="aside", daemon=True).start()
@@ -124,12 +124,12 @@ class DeclaredRunner(Runner):
         self._waiting.append((future, call))
         return future
 
-    def aside(self, call: Callable[[], Result]) -> Future[Result]:
+    def run_in_background(self, call: Callable[[], Result]) -> Future[Result]:
         future: Future[Result] = Future()
         _settle(future, call)
         return future
 
-    def begin(self) -> bool:
+    def start_waiting(self) -> bool:
         """Begin all calls that wait; whether one is being made now."""
         while self._waiting:
             self._thread.submit(partial(self._make, *self._waiting.popleft()))
@@ -151,7 +151,7 @@ class DeclaredRunner(Runner):
 
     def _make(self, future: Future[Any], call: Callable[[], Any]) -> None:
         def handed_over() -> Any:
-            result, self._late[future] = self._declared(_told(call)())
+            result, self._late[future] = self._declared(_call_logged(call)())
             return result
 
         _settle(future, handed_over)
@@ -168,13 +168,13 @@ class LockstepRunner(Runner):
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
         future: Future[Result] = Future()
         try:
-            future.set_result(_told(call)())
+            future.set_result(_call_logged(call)())
         except RuntimeFault as error:
             future.set_exception(error)
         self._due[future] = self._now + self._delay
         return future
 
-    def aside(self, call: Callable[[], Result]) -> Future[Result]:
+    def run_in_background(self, call: Callable[[], Result]) -> Future[Result]:
         future: Future[Result] = Future()
         _settle(future, call)
         return future

@@ -12,7 +12,7 @@ from runtime.core.errors import RuntimeFault
 from runtime.core.sentences import Pattern
 from runtime.core.types import Float64
 from runtime.ipc.command_arguments import GripperRequest
-from runtime.spaces.binary_grippers import open_or_closed, switches
+from runtime.spaces.binary_grippers import binary_grippers_of, snap_grippers
 from runtime.station.spec import StationSpec
 
 _NO_SUCH_ARM = Pattern("grippers.no_such_arm", "gripper: arm = {arm!r}; {robot} has grippers on {names}")
@@ -21,7 +21,7 @@ _REACHED = 1e-3  # of its travel: a gripper that is so near to its lock is there
 
 
 @dataclass(frozen=True, slots=True)
-class Grip:
+class GripperPlan:
     """Result of a request: locks float64 [D] (NaN: free), and the goal of a motion, None for none.
 
     A goal float64 [D] is NaN for all that stays where it is.
@@ -38,16 +38,16 @@ class Grippers:
         self._groups = [group for group in spec.robot.groups if group.gripper is not None]
         self._robot = spec.robot.name
         self._limits = spec.limits
-        self._switches = switches(spec.robot)
+        self._switches = binary_grippers_of(spec.robot)
         self.locks: Float64 = np.full(spec.robot.dim, np.nan)
 
-    def asked(self, request: GripperRequest, commanded: Float64, free: bool) -> Grip:
+    def plan_request(self, request: GripperRequest, commanded: Float64, free: bool) -> GripperPlan:
         """`free`: nothing else moves the arms, so that a gripper can be moved; else opening and closing lock it there.
 
         `commanded` [D] is where the robot was told to be. Raises RuntimeFault where it has no such gripper.
         """
         chosen = self._chosen(request.arm)
-        commanded = open_or_closed(self._switches, commanded, commanded)
+        commanded = snap_grippers(self._switches, commanded, commanded)
         locks, goal = self.locks.copy(), np.full(len(commanded), np.nan)
         for group in chosen:
             dim, gripper = group.gripper_dim, group.gripper
@@ -62,15 +62,15 @@ class Grippers:
                 if not free or not np.isnan(locks[dim]):
                     locks[dim] = goal[dim]
         moves = free and request.action in ("open", "close")
-        return Grip(locks, goal if moves else None)
+        return GripperPlan(locks, goal if moves else None)
 
     def lock(self, locks: Float64) -> None:
         """Locks [D] are in force, NaN where a gripper is free."""
         self.locks = locks
 
-    def standing(self, commanded: Float64) -> Float64:
+    def settled_locks(self, commanded: Float64) -> Float64:
         """The locks float64 [D], those that a gripper is still on its way to moved to where it was told to be."""
-        commanded = open_or_closed(self._switches, commanded, commanded)
+        commanded = snap_grippers(self._switches, commanded, commanded)
         travel = self._limits.upper - self._limits.lower
         away = np.abs(self.locks - commanded) > _REACHED * travel  # NaN, what is free, is not
         return np.where(away, commanded, self.locks)
@@ -84,7 +84,7 @@ class Grippers:
             raise RuntimeFault(_NO_SUCH_ARM(arm=name, robot=self._robot, names=names))
         return chosen
 
-    def told(self, commanded: Float64) -> dict[str, Any]:
+    def status(self, commanded: Float64) -> dict[str, Any]:
         """For a snapshot: where each one was told to be [D], and whether it is locked."""
         return {
             group.name: {

@@ -15,7 +15,7 @@ from runtime.ipc.command_arguments import AimRequest, GripperRequest, MoveReques
 from runtime.ipc.shared_state import SharedState
 from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.processes.coordinator.manual.grippers import Grippers
-from runtime.processes.coordinator.manual.targets import Targets, told
+from runtime.processes.coordinator.manual.targets import Targets, aim_to_dict
 from runtime.processes.coordinator.runs import Runs
 from runtime.processes.coordinator.setup.sequence import first_action
 from runtime.station.spec import StationSpec
@@ -31,7 +31,7 @@ class ManualControl:
         self, spec: StationSpec, shared: SharedState, orders: ControlQueue, runs: Runs, targets: Targets
     ) -> None:
         self._plan = spec
-        self._page = shared
+        self._shared_state = shared
         self._orders = orders
         self._runs = runs
         self._targets = targets
@@ -50,7 +50,7 @@ class ManualControl:
             kind = self._plan.deployment.transport.kind
             raise RuntimeFault(_MOVES_NO_ROBOT(what=what, transport=kind))
 
-    def waits(self, arguments: Mapping[str, Any]) -> bool:
+    def is_loading(self, arguments: Mapping[str, Any]) -> bool:
         """True if such an aim needs what is still being loaded; loading begins with the first aim."""
         ready = self._targets.prepare()
         return not ready and arguments.get("jog") is not None
@@ -60,26 +60,26 @@ class ManualControl:
         start = self.commanded()
         aim = self._targets.aim(read("aim", AimRequest, arguments), start)
         away = first_action(aim.joints, start, self._plan)["distance"]
-        return told(aim, self._plan, away, self._targets.duration(start, aim.joints))
+        return aim_to_dict(aim, self._plan, away, self._targets.duration(start, aim.joints))
 
     def move(self, asked: MoveRequest) -> dict[str, Any]:
         """Go there on a limited path, within the open run."""
         start = self.commanded()
-        goal = self._targets.goal(asked, start)
+        goal = self._targets.motion_goal(asked, start)
         self._runs.move(goal, asked.speed)
         return {"duration_s": self._targets.duration(start, goal, asked.speed)}
 
-    def checked(self, what: str, goal: Float64) -> Float64:
+    def check_motion(self, what: str, goal: Float64) -> Float64:
         """`goal` [D], a policy's action, where a motion there is allowed all the way; grippers within their travel."""
         self.require_robot(what)
         limits = self._plan.limits
         goal = np.where(limits.grippers, np.clip(goal, limits.lower, limits.upper), goal)
-        return self._targets.checked(what, goal, self.commanded())
+        return self._targets.check_motion(what, goal, self.commanded())
 
-    def grip(self, asked: GripperRequest, free: bool) -> dict[str, Any]:
+    def move_gripper(self, asked: GripperRequest, free: bool) -> dict[str, Any]:
         """Open, close, lock or give back; `free`: no policy moves the arms just now."""
         self.require_robot("gripper")
-        grip = self.grippers.asked(asked, self.commanded(), free)
+        grip = self.grippers.plan_request(asked, self.commanded(), free)
         self.lock(grip.locks)
         if grip.goal is not None:
             self._runs.move(grip.goal, 1.0)
@@ -87,11 +87,11 @@ class ManualControl:
 
     def status(self) -> dict[str, Any]:
         """How each gripper is commanded and locked."""
-        return {"grippers": self.grippers.told(self.commanded())}
+        return {"grippers": self.grippers.status(self.commanded())}
 
-    def stand(self) -> None:
+    def stop_grippers(self) -> None:
         """Whatever is stopped stops grippers too: one on its way to its lock is locked where it is."""
-        locks = self.grippers.standing(self.commanded())
+        locks = self.grippers.settled_locks(self.commanded())
         if not np.array_equal(locks, self.grippers.locks, equal_nan=True):
             try:
                 self.lock(locks)
@@ -104,11 +104,11 @@ class ManualControl:
 
     def lock(self, locks: Float64) -> None:
         """Lock grippers at these values [D], NaN for the rest."""
-        self._orders.lock(locks)
+        self._orders.lock_grippers(locks)
         self.grippers.lock(locks)
 
     def commanded(self) -> Float64:
         """Commanded position of the robot [D], or the measured one as long as nothing was commanded."""
-        status = self._page.control.read()
-        known = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
+        status = self._shared_state.control.read()
+        known = status["commanded"] if status["engaged"] else self._shared_state.observation.read()["qpos"]
         return np.array(known, np.float64)

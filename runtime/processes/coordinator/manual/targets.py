@@ -69,29 +69,29 @@ class Targets:
 
     def aim(self, asked: AimRequest, commanded: Float64) -> TargetPreview:
         """Preview of a target; RuntimeFault for a pose, arm or number of joints that the robot has not."""
-        start = self._wanted("aim", asked.joints, asked.pose, commanded)
+        start = self._requested_joints("aim", asked.joints, asked.pose, commanded)
         if asked.jog is None:
             return self._clipped(start)
         return self._jogged(asked.jog, start)
 
-    def goal(self, asked: MoveRequest, commanded: Float64) -> Float64:
+    def motion_goal(self, asked: MoveRequest, commanded: Float64) -> Float64:
         """The end of a motion from `commanded`, checked all the way: RuntimeFault says what is wrong with it."""
         if asked.joints is None and asked.pose is None:
             raise RuntimeFault(_NO_TARGET(robot=self._plan.robot.name, poses=self._poses()))
-        goal = self._wanted("move", asked.joints, asked.pose, commanded)
+        goal = self._requested_joints("move", asked.joints, asked.pose, commanded)
         for dim in self._plan.limits.speeds:
             if goal[dim]:
                 name = self._plan.limits.names[dim]
                 raise RuntimeFault(_SPEED_AT_END(name=name, value=goal[dim]))
-        return self.checked("move", goal, commanded)
+        return self.check_motion("move", goal, commanded)
 
-    def checked(self, what: str, goal: Float64, commanded: Float64) -> Float64:
+    def check_motion(self, what: str, goal: Float64, commanded: Float64) -> Float64:
         """`goal` [D], where limits, workspace boxes and links allow the way there; RuntimeFault for `what` else.
 
         Motions of ours end at rest: what is a speed is 0 there.
         """
         limits = self._plan.limits
-        goal = limits.standing(goal)
+        goal = limits.with_zero_speeds(goal)
         beyond = np.flatnonzero((goal < limits.lower - _TOLERANCE) | (goal > limits.upper + _TOLERANCE))
         if len(beyond):
             worst = int(beyond[0])
@@ -111,9 +111,9 @@ class Targets:
         """Duration of a motion of ours [s]."""
         safety, limits = self._plan.deployment.safety, self._plan.limits
         velocity = limits.velocity * safety.motion_velocity_scale * speed
-        return Trajectory(start, goal, velocity, safety.motion_acceleration * limits.reach).duration
+        return Trajectory(start, goal, velocity, safety.motion_acceleration * limits.radian_scale).duration
 
-    def _wanted(
+    def _requested_joints(
         self, what: str, joints: Sequence[float | None] | None, pose: str | None, commanded: Float64
     ) -> Float64:
         robot = self._plan.robot
@@ -148,7 +148,7 @@ class Targets:
             raise RuntimeFault(_NO_SUCH_ARM(arm=jog.arm, robot=self._plan.robot.name, arms=", ".join(arms)))
         index = arms.index(jog.arm)
         poses = self._kinematics.forward(start)
-        poses[index] = _stepped(poses[index], jog)
+        poses[index] = _apply_jog(poses[index], jog)
         solved = self._kinematics.solve(poses[None], start)
         aimed = self._clipped(solved.q[0])
         return TargetPreview(
@@ -161,7 +161,7 @@ class Targets:
         )
 
 
-def _stepped(pose: Float64, jog: Jog) -> Float64:
+def _apply_jog(pose: Float64, jog: Jog) -> Float64:
     """The pose [7] (x, y, z, qw, qx, qy, qz) after the step."""
     turn, shift = matrix_of_rpy(*jog.rotation), np.array(jog.translation, np.float64)
     here = matrix_of_quaternion(pose[3:])
@@ -170,7 +170,7 @@ def _stepped(pose: Float64, jog: Jog) -> Float64:
     return np.concatenate([pose[:3] + way, quaternion_of_matrix(there)])
 
 
-def told(aim: TargetPreview, spec: StationSpec, distance: float, duration: float) -> dict[str, Any]:
+def aim_to_dict(aim: TargetPreview, spec: StationSpec, distance: float, duration: float) -> dict[str, Any]:
     """The aim as an answer to a client: joints, poses, errors in mm and degrees."""
     return {
         "joints": aim.joints.tolist(),

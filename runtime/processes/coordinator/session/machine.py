@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from runtime.core.errors import RuntimeFault
 from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.command_arguments import ARGUMENTS, read
-from runtime.ipc.identity import at_the_panel, named
+from runtime.ipc.identity import at_the_panel, display_name
 from runtime.ipc.messages import Ack, AckStatus, Command
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
@@ -23,7 +23,7 @@ from runtime.processes.coordinator.session.transitions import (
     REASONS,
     STOPPING,
     SessionEvent,
-    Told,
+    TransitionResult,
 )
 
 if TYPE_CHECKING:
@@ -76,21 +76,21 @@ class SessionMachine:
         self._unattended = False  # a run goes on though its holder is lost
         self._answers: dict[str, Ack] = {}
 
-    def remember(self, answers: dict[str, Ack]) -> None:
+    def restore_answers(self, answers: dict[str, Ack]) -> None:
         """Answers given before a restart: the same uuid gets the same answer, and no epoch comes again."""
         self._answers = answers | self._answers
         epochs = [ack.data.get("epoch") for ack in answers.values()]
-        self._lease.never_below(max((e for e in epochs if isinstance(e, int)), default=0))
+        self._lease.raise_epoch_floor(max((e for e in epochs if isinstance(e, int)), default=0))
 
     def status(self) -> dict[str, Any]:
         """State, why it is that, and the commands that it allows."""
         return {
             "sequence": self.sequence,
             "state": str(self.state),
-            "state_is": self.told(),
+            "state_is": self.state_meaning(),
             "reason": self.reason,
             "allowed": self.allowed(),
-            "guarded": self.guarded(),
+            "guarded": self.blocked_commands(),
         }
 
     def allowed(self) -> list[str]:
@@ -105,7 +105,7 @@ class SessionMachine:
             commands.extend(CANCELLING)
         return [*commands, "estop"]
 
-    def guarded(self) -> dict[str, str]:
+    def blocked_commands(self) -> dict[str, str]:
         """The commands of this state that would be refused just now, each with the reason."""
         situation = self._effects.situation
         reasons = {
@@ -145,12 +145,12 @@ class SessionMachine:
         first = self._answers.get(command.uuid)
         return first if first is not None and first.kind in ("", command.kind) else None
 
-    def told(self) -> dict[str, Any]:
+    def state_meaning(self) -> dict[str, Any]:
         """What the state means as a snapshot has it; it is not connected while observations are missing."""
         row = self.state.meaning
-        return replace(row, connected=row.connected and self._connected).told()
+        return replace(row, connected=row.connected and self._connected).to_dict()
 
-    def observe(self, happening: SessionEvent, reason: str = "") -> bool:
+    def handle_event(self, happening: SessionEvent, reason: str = "") -> bool:
         """Tell the session what happened; True where the state changed.
 
         A RuntimeFault of an effect passes through, with the state as it was: nobody is there to be refused.
@@ -225,7 +225,7 @@ class SessionMachine:
             return _NOT_ALLOWED_NOW(command=kind, why=why, allowed=possible)
         return _NOT_ALLOWED(command=kind, state=self.state, reason=self.reason, allowed=possible)
 
-    def _carry_out(self, command: Command) -> Told | None:
+    def _carry_out(self, command: Command) -> TransitionResult | None:
         """Do it; raises RuntimeFault where something in it, or who is to do it, refuses."""
         if command.kind in LEASE_COMMANDS:
             self._lease_command(command)
@@ -237,7 +237,7 @@ class SessionMachine:
             rule = CANCEL
         takes = ARGUMENTS[command.kind]
         asked = read(command.kind, takes, command.args) if takes else None
-        self._effects.attribute(command.user or command.holder, command.uuid)
+        self._effects.set_requester(command.user or command.holder, command.uuid)
         told = rule.effect(self._effects, asked)
         after = rule.next(self.state, asked)
         if after:
@@ -251,12 +251,12 @@ class SessionMachine:
         act = {
             "lease_claim": self._lease.claim,
             "lease_renew": self._lease.renew,
-            "lease_give_up": self._lease.give_up,
+            "lease_give_up": self._lease.release,
         }[command.kind]
         if command.kind == "lease_renew" and command.args.get("hidden") is True and self.state.meaning.moving:
             self._lease.hide(command.holder, command.epoch, now)
             raise RuntimeFault(_HOLDER_HIDDEN)
-        refusal = act(command.holder, command.epoch, now, named(command))
+        refusal = act(command.holder, command.epoch, now, display_name(command))
         after = self._lease.current(now)
         if (before and before.epoch) != (after and after.epoch):
             self.sequence += 1
@@ -269,7 +269,9 @@ class SessionMachine:
         self.state, self.reason, self._unattended = state, reason, False
         self.sequence += 1
 
-    def _ack(self, command: Command, status: AckStatus, reason: str, told: Told | None = None) -> Ack:
+    def _ack(
+        self, command: Command, status: AckStatus, reason: str, told: TransitionResult | None = None
+    ) -> Ack:
         held = self._lease.current(self._now())
         lease = {"epoch": held.epoch, "holder": held.holder} if held else {}
         data = {**(told or {}), **lease}

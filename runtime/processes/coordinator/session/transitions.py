@@ -75,7 +75,7 @@ _SETTING_UP = fixed("session.setting_up", "setting up")
 _APPROACHING_FIRST = fixed("session.approaching_first", "going to the policy's first action")
 DISCARDED = fixed("session.discarded", "discarded by the operator")
 
-Told = Mapping[str, Any]  # for the data of an answer
+TransitionResult = Mapping[str, Any]  # for the data of an answer
 
 
 class SessionEvent(StrEnum):
@@ -103,8 +103,8 @@ class GuardFacts:
 
     mode: Mode | None = None  # of the open run
     trial: bool = False  # the open run is one of a trial: nobody may change what is measured
-    proposed: bool = False  # a chunk is shown and waits to be committed
-    asked: bool = False  # the policy is being asked, or its answer has not reached control
+    has_proposal: bool = False  # a chunk is shown and waits to be committed
+    is_requesting: bool = False  # the policy is being asked, or its answer has not reached control
     executing: bool = False  # steps are planned
     first_action: bool = False  # the last set-up knows the policy's first action
     opening: bool = False  # the open run has not begun: its recording is being opened
@@ -112,7 +112,7 @@ class GuardFacts:
     collection: bool = False  # the deployment says how to collect
     collecting: bool = False  # it is set up to collect
     armed: bool = False  # a person has switched on that a collected episode may begin
-    unled: str = ""  # why the leader cannot be followed just now
+    leader_problem: str = ""  # why the leader cannot be followed just now
     doubt: str = ""  # why nothing may begin to move: joints are read where they cannot be, or are not held
 
 
@@ -138,7 +138,7 @@ class Rule:
 
     allowed: tuple[SessionState, ...]
     after: SessionState | Mapping[SessionState, SessionState] | None
-    effect: Callable[[SessionActions, Any], Told | None]
+    effect: Callable[[SessionActions, Any], TransitionResult | None]
     guard: Guard = _always
     stays: Callable[[Any], bool] = lambda asked: False  # by what it took, whether the state is left as it is
 
@@ -168,7 +168,7 @@ def _may_arm(state: SessionState, situation: GuardFacts) -> str:
         return _NO_COLLECTION
     if not situation.collecting:
         return _SET_UP_WITH_POLICY
-    return _ARMED_ALREADY if situation.armed else situation.unled
+    return _ARMED_ALREADY if situation.armed else situation.leader_problem
 
 
 def _may_disarm(state: SessionState, situation: GuardFacts) -> str:
@@ -177,14 +177,14 @@ def _may_disarm(state: SessionState, situation: GuardFacts) -> str:
     return "" if situation.armed else _NOT_ARMED_AT_ALL
 
 
-def _untried(state: SessionState, situation: GuardFacts) -> str:
+def _approach_problem(state: SessionState, situation: GuardFacts) -> str:
     return _TRIAL_OPEN if situation.trial else ""
 
 
 def _may_grip(state: SessionState, situation: GuardFacts) -> str:
     if state is SessionState.RUNNING and situation.opening:
         return _OPENING
-    return _untried(state, situation)
+    return _approach_problem(state, situation)
 
 
 def _may_step(state: SessionState, situation: GuardFacts) -> str:
@@ -192,9 +192,9 @@ def _may_step(state: SessionState, situation: GuardFacts) -> str:
         return _MODE_WITHOUT_STEP(mode=situation.mode)
     if situation.opening:  # what is asked for now would be forgotten when it begins
         return _OPENING
-    if situation.proposed:
+    if situation.has_proposal:
         return _CHUNK_SHOWN
-    if situation.asked:
+    if situation.is_requesting:
         return _POLICY_ASKED
     return _CHUNK_EXECUTING if situation.executing else ""
 
@@ -204,7 +204,7 @@ def _may_commit(state: SessionState, situation: GuardFacts) -> str:
         return _MODE_WITHOUT_COMMIT(mode=situation.mode)
     if situation.approaching:  # control would not take the chunk, and it would be gone
         return _APPROACHING
-    return "" if situation.proposed else _NO_CHUNK_SHOWN
+    return "" if situation.has_proposal else _NO_CHUNK_SHOWN
 
 
 def _may_cancel(state: SessionState, situation: GuardFacts) -> str:
@@ -224,7 +224,7 @@ def _may_approach(state: SessionState, situation: GuardFacts) -> str:
         return "" if situation.first_action else _FIRST_ACTION_UNKNOWN
     if situation.mode != "preview":
         return _MODE_WITHOUT_APPROACH(mode=situation.mode)
-    return "" if situation.proposed else _NO_CHUNK_SHOWN
+    return "" if situation.has_proposal else _NO_CHUNK_SHOWN
 
 
 S = SessionState
@@ -235,20 +235,28 @@ COMMANDS: dict[str, Rule] = {
     "halt": Rule((S.RUNNING, S.HOLDING), S.HOLDING, lambda do, _: do.hold(_HALTED)),
     "resume": Rule((S.HOLDING,), S.RUNNING, lambda do, _: do.resume_run(), guard=_placed(_may_resume)),
     "home": Rule((S.READY,), S.SETTING_UP, lambda do, _: do.go_home(), guard=_placed()),
-    "release": Rule((S.FAULTED,), None, lambda do, _: do.shared.ask_release()),
+    "release": Rule((S.FAULTED,), None, lambda do, _: do.shared.request_release()),
     "record_start": Rule((S.IDLE, S.READY), None, lambda do, _: do.start_recording()),
     "record_stop": Rule(
-        (S.DISCONNECTED, S.IDLE, S.SETTING_UP, S.READY, S.HOLDING), None, lambda do, _: do.runs.stop_alone()
+        (S.DISCONNECTED, S.IDLE, S.SETTING_UP, S.READY, S.HOLDING),
+        None,
+        lambda do, _: do.runs.stop_standalone_recording(),
     ),
     "tune": Rule(
-        (S.IDLE, S.READY, S.RUNNING, S.HOLDING), None, lambda do, asked: do.tune(asked), guard=_untried
+        (S.IDLE, S.READY, S.RUNNING, S.HOLDING),
+        None,
+        lambda do, asked: do.tune(asked),
+        guard=_approach_problem,
     ),
     "step": Rule((S.RUNNING,), None, lambda do, _: do.inference.step(), guard=_placed(_may_step)),
     "commit": Rule((S.RUNNING,), None, lambda do, _: do.inference.commit(), guard=_placed(_may_commit)),
     "cancel": Rule((S.RUNNING,), None, lambda do, _: do.cancel(), guard=_may_cancel),
     "move": Rule((S.RUNNING,), None, lambda do, asked: do.manual.move(asked), guard=_placed(_may_move)),
     "gripper": Rule(
-        (S.READY, S.RUNNING, S.HOLDING), None, lambda do, asked: do.grip(asked), guard=_placed(_may_grip)
+        (S.READY, S.RUNNING, S.HOLDING),
+        None,
+        lambda do, asked: do.move_gripper(asked),
+        guard=_placed(_may_grip),
     ),
     "approach": Rule(
         (S.READY, S.RUNNING),

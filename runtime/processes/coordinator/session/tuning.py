@@ -26,7 +26,7 @@ def strategy_of(spec: StationSpec) -> Strategy:
     return Strategy(variants("runtime.strategies")[settings.kind].query(settings), settings)
 
 
-def tuned(spec: StationSpec, asked: TuneRequest, info: PolicyInfo | None) -> StationSpec:
+def apply_tuning(spec: StationSpec, asked: TuneRequest, info: PolicyInfo | None) -> StationSpec:
     """`plan` with what is asked; another kind keeps the parameters. RuntimeFault names what is wrong.
 
     `info` is what the connected policy says of itself, None where none is.
@@ -36,7 +36,9 @@ def tuned(spec: StationSpec, asked: TuneRequest, info: PolicyInfo | None) -> Sta
     now = spec.deployment
     strategy = {**now.strategy.model_dump(), **(asked.strategy or {})}
     task = now.task if asked.task is None else asked.task
-    made = replace(spec, resolved=loader.changed(spec.resolved, {"strategy": strategy, "task": task}, "tune"))
-    if info is not None and info.supports_rtc is False and strategy_of(made).query.continues:
+    made = replace(
+        spec, resolved=loader.apply_changes(spec.resolved, {"strategy": strategy, "task": task}, "tune")
+    )
+    if info is not None and info.supports_rtc is False and strategy_of(made).query.uses_rtc:
         raise RuntimeFault(_POLICY_WITHOUT_RTC(policy=info.name))
     return made

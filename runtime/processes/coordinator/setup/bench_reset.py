@@ -46,7 +46,7 @@ class BenchReset:
         self._reception = reception  # what it last reported
         self._refused = ""
 
-    def of(self, bench: BenchRequest | None) -> dict[str, Any] | None:
+    def from_request(self, bench: BenchRequest | None) -> dict[str, Any] | None:
         """Reset that the node is to be told; SetupError where it has no bench, or has done that already."""
         if bench is None:
             return None
@@ -64,12 +64,12 @@ class BenchReset:
         self._asked_at = float("-inf")
         self._refused_before = self._refused_by_node()
 
-    def heard(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Control's events: the one that says that it could not pass the word on."""
         if event.kind == "word_refused":
             self._refused = event.text
 
-    def done(self) -> bool:
+    def is_done(self) -> bool:
         """True if the policy is shown the new bench from now on; SetupError where it will not be."""
         if self._reception().truth.get("reset") == self._reset["id"]:
             return True
@@ -80,7 +80,7 @@ class BenchReset:
             raise SetupError(_NOT_RESET(seconds=_RESET_S, why=self._why_not()))
         if now - self._asked_at >= _REPEAT_S:
             self._asked_at = now
-            self._orders.ask_node("scene_reset", self._reset)
+            self._orders.send_node_request("scene_reset", self._reset)
         return False
 
     def _why_not(self) -> str:

@@ -34,7 +34,7 @@ class SetupMotion:
     def __init__(self, spec: StationSpec, orders: ControlQueue, shared: SharedState, clock: Clock) -> None:
         self._plan = spec
         self._orders = orders
-        self._page = shared
+        self._shared_state = shared
         self._clock = clock
         self._ways = PathCheck(spec)
 
@@ -44,26 +44,26 @@ class SetupMotion:
         self._goal, self._where = goal, where
         self._allowed = self._motion_time() + _SETTLE_S
         self._since = self._clock.now()
-        self._order = self._orders.give("motion", goal=np.array(goal, np.float64))
+        self._order = self._orders.send_order("motion", goal=np.array(goal, np.float64))
 
     def require_progress(self) -> None:
         """SetupError where control should have been there by now."""
         if self._clock.now() - self._since > self._allowed:
             raise SetupError(_NOT_COME(where=self._where, seconds=self._allowed))
 
-    def done(self, event: Event) -> bool:
+    def is_sent(self, event: Event) -> bool:
         """True if `event` says that control has sent the end of this motion: then the arm is waited for."""
         over = event.kind == "motion_done" and event.data.get("order") == self._order
         if over:
             self._since = self._clock.now()
         return over
 
-    def arrived(self) -> bool:
+    def has_arrived(self) -> bool:
         """True if the arm is there; SetupError, naming the joint, where it does not come."""
-        measured = np.array(self._page.observation.read()["qpos"], np.float64)
+        measured = np.array(self._shared_state.observation.read()["qpos"], np.float64)
         limits = self._plan.limits
         away = np.abs(difference(measured, self._goal, self._plan.dims.wrapping))
-        error = np.where(limits.places, away, 0.0)
+        error = np.where(limits.position_mask, away, 0.0)
         worst = int(error.argmax())
         if error[worst] <= _ARRIVED_RAD:
             return True
@@ -77,11 +77,11 @@ class SetupMotion:
         """Duration of the motion from where control will start it [s]."""
         safety, limits = self._plan.deployment.safety, self._plan.limits
         velocity = limits.velocity * safety.motion_velocity_scale
-        acceleration = safety.motion_acceleration * limits.reach
+        acceleration = safety.motion_acceleration * limits.radian_scale
         return Trajectory(self._start(), self._goal, velocity, acceleration).duration
 
     def _start(self) -> Float64:
         """Position from which control will start [D]."""
-        status = self._page.control.read()
-        start = status["commanded"] if status["engaged"] else self._page.observation.read()["qpos"]
+        status = self._shared_state.control.read()
+        start = status["commanded"] if status["engaged"] else self._shared_state.observation.read()["qpos"]
         return np.array(start, np.float64)

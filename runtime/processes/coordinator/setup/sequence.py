@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.cameras.complaints import complaints
+from runtime.cameras.complaints import describe_camera_problems
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.plugins import variants
@@ -22,10 +22,10 @@ from runtime.motion import resampling
 from runtime.motion.timeline import difference
 from runtime.policies.base import PolicyInfo
 from runtime.processes.coordinator.control_queue import ControlQueue
-from runtime.processes.coordinator.health_monitor import SIBLINGS
+from runtime.processes.coordinator.health_monitor import SIBLING_PROCESSES
 from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.inference.requests import PolicyResponse
-from runtime.processes.coordinator.inference.worker import telling
+from runtime.processes.coordinator.inference.worker import as_policy_errors
 from runtime.processes.coordinator.setup.bench_reset import BenchReset
 from runtime.processes.coordinator.setup.motion import SetupMotion
 from runtime.station.spec import StationSpec
@@ -118,7 +118,7 @@ class SetUp:
         self._plan = spec
         self._inference = inference
         self._orders = orders
-        self._page = shared
+        self._shared_state = shared
         self._clock = clock
         self._reception = reception  # what it last reported
         self._compile = compile_  # begins that, None where there is nothing to compile
@@ -151,7 +151,7 @@ class SetUp:
         first = self.first_action
         return {
             "stage": self.stage.sentence,
-            "stages": [self._stage_status(stage, now) for stage in self._course],
+            "stages": [self._stage_status(stage, now) for stage in self._stages],
             "setup_took": dict(self.took),
             "first_action": {} if first is None else self.distance_of(first),
             "validated": self.validated,
@@ -159,10 +159,12 @@ class SetUp:
 
     def distance_of(self, action: Float64) -> dict[str, Any]:
         """Distance of an action [D] from where the robot is now, as by `first_action`."""
-        return first_action(action, np.array(self._page.observation.read()["qpos"], np.float64), self._plan)
+        return first_action(
+            action, np.array(self._shared_state.observation.read()["qpos"], np.float64), self._plan
+        )
 
     @property
-    def _course(self) -> tuple[Stage, ...]:
+    def _stages(self) -> tuple[Stage, ...]:
         """Stages of the newest set-up in their order: of a motion alone those that were entered."""
         whole = Stage.CONNECT in self.stages or not self.stages
         if not whole or Stage.COMPILE not in self.stages:
@@ -201,18 +203,18 @@ class SetUp:
         """Only go to the pose; RuntimeFault, and nothing has changed, where the way there is not free."""
         pose = self._plan.deployment.setup.pose
         where = _THE_POSE(pose=pose)
-        self._only_go(self._plan.robot.poses[pose], where, Stage.HOME)
+        self._begin_motion_only(self._plan.robot.poses[pose], where, Stage.HOME)
 
     def begin_approach(self, first_action: Float64) -> None:
         """Only go to the policy's first action [D], as it is allowed; RuntimeFault where the way there is not free."""
-        self.expect(first_action)
-        self._only_go(first_action, _THE_FIRST_ACTION, Stage.APPROACH)
+        self.set_first_action(first_action)
+        self._begin_motion_only(first_action, _THE_FIRST_ACTION, Stage.APPROACH)
 
-    def expect(self, first_action: Float64 | None) -> None:
+    def set_first_action(self, first_action: Float64 | None) -> None:
         """The first action [D] of what drives the robot is this one from now on; None where it is not known."""
         self.first_action = first_action
 
-    def _only_go(self, goal: Float64, where: str, stage: Stage) -> None:
+    def _begin_motion_only(self, goal: Float64, where: str, stage: Stage) -> None:
         self._going.start(goal, where)
         self._motion_only = f"at {where}"
         self._start()
@@ -232,18 +234,18 @@ class SetUp:
             self._inference.policy.close()
         self.stage = Stage.IDLE
 
-    def heard(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Control's events: the one that says that the motion is done."""
-        if self.stage in (Stage.HOME, Stage.APPROACH) and self._going.done(event):
+        if self.stage in (Stage.HOME, Stage.APPROACH) and self._going.is_sent(event):
             self._enter(Stage.SETTLE)
-        self.bench.heard(event)
+        self.bench.on_event(event)
 
-    def pump(self) -> bool:
+    def poll(self) -> bool:
         """Advance; True when done. Raises RuntimeFault where it cannot go on."""
         if self.stage is Stage.CONNECT:
             ready = self._inference.runner.ready(self._connection)
-            if ready and self._rested("connect_s", self._least.connect_s):
-                with telling(_POLICY_UNUSABLE):
+            if ready and self._stage_lasted("connect_s", self._least.connect_s):
+                with as_policy_errors(_POLICY_UNUSABLE):
                     self.info = self._connection.result()
                     check_info(self.info, self._plan, self._inference.continues)
                 self._compiling = self._compile()
@@ -261,7 +263,7 @@ class SetUp:
         elif self.stage is Stage.SETTLE:
             return self._settle()
         elif self.stage is Stage.RESET:
-            return self.bench.done() and self._start_warm_up()
+            return self.bench.is_done() and self._start_warm_up()
         elif self.stage is Stage.WARM_UP:
             return self._warm_up()
         return False
@@ -272,22 +274,22 @@ class SetUp:
         self.stages[stage] = self._since
 
     def _check_joints(self) -> None:
-        doubt = self._page.doubt if self._plan.capabilities.moves_robot else ""
+        doubt = self._shared_state.joint_problem if self._plan.capabilities.moves_robot else ""
         if not doubt:
             return
-        if self._page.control.read()["believed"] and not self._met:
+        if self._shared_state.control.read()["believed"] and not self._met:
             self._met = True
-            self._orders.give("meet")
+            self._orders.send_order("meet")
         raise SetupError(doubt)
 
-    def _name_zeros(self) -> None:
+    def _report_zero_joints(self) -> None:
         """From the first samples on a dead encoder looks like a joint that stands at 0: the operator knows."""
         limits = self._plan.limits
-        joints = self._page.observation.read()["qpos"]
-        zero = [limits.names[i] for i in np.flatnonzero(limits.places & (joints == 0.0))]
+        joints = self._shared_state.observation.read()["qpos"]
+        zero = [limits.names[i] for i in np.flatnonzero(limits.position_mask & (joints == 0.0))]
         if zero and self._plan.capabilities.moves_robot:
             text = _ZERO_JOINTS(joints=", ".join(zero))
-            self._inference.notes.append(Event("zero_joints", text, self._clock.now()))
+            self._inference.pending_notes.append(Event("zero_joints", text, self._clock.now()))
 
     def _check_drives(self) -> None:
         drives = self._reception().drives
@@ -296,7 +298,7 @@ class SetUp:
             raise DrivesDisabledError(_DRIVES_DISABLED(faults=faults))
 
     def _check_cameras(self) -> None:
-        found = complaints(self._reception().cameras)
+        found = describe_camera_problems(self._reception().cameras)
         if found:
             raise SetupError(series(found))
 
@@ -316,7 +318,7 @@ class SetUp:
                 return False
             missing = _NO_DRIVES if isinstance(error, DrivesDisabledError) else _NO_OBSERVATION
             raise SetupError(missing(seconds=settings.observation_timeout_s, why=str(error))) from None
-        self._name_zeros()
+        self._report_zero_joints()
         if settings.home and self._plan.capabilities.moves_robot:
             self._go_home()
             return False
@@ -325,8 +327,8 @@ class SetUp:
     def _require_family(self) -> None:
         """An order to a control that is still starting would be lost, and without a guard it only holds."""
         within = self._plan.deployment.heartbeat_timeout_s
-        for process in SIBLINGS:
-            if not self._page.alive(process, self._clock.now(), within(process)):
+        for process in SIBLING_PROCESSES:
+            if not self._shared_state.alive(process, self._clock.now(), within(process)):
                 raise SetupError(_SILENT(process=process))
 
     def _go_home(self) -> None:
@@ -335,7 +337,7 @@ class SetUp:
         self._enter(Stage.HOME)
 
     def _settle(self) -> bool:
-        if not self._going.arrived():
+        if not self._going.has_arrived():
             return False
         if self._motion_only:
             self.stage = Stage.IDLE
@@ -352,7 +354,7 @@ class SetUp:
 
     def _start_warm_up(self) -> bool:
         """Ask the policy; True where there is nobody to ask, and all is done."""
-        if not self._inference.policy.answers:
+        if not self._inference.policy.is_queried:
             self.validated = _DRIVES_ROBOT(who=self.info.name if self.info else "the node")
             self.stage = Stage.IDLE
             return True
@@ -364,7 +366,7 @@ class SetUp:
     def _warm_up(self) -> bool:
         if self._left and not self._answered():
             return False
-        if self._left or not self._rested("warm_up_s", self._least.warm_up_s):
+        if self._left or not self._stage_lasted("warm_up_s", self._least.warm_up_s):
             return False
         self.stage = Stage.IDLE
         return True
@@ -372,27 +374,27 @@ class SetUp:
     def _answered(self) -> bool:
         """Ask once more, and look at what came; whether something did."""
         if self._asked is None:
-            self._asked = self._inference.requests.ask()
+            self._asked = self._inference.requests.send()
             return False
         if not self._inference.runner.ready(self._asked):
             return False
         asked, self._asked = self._asked, None
-        with telling(_ANSWER_UNUSABLE):
+        with as_policy_errors(_ANSWER_UNUSABLE):
             self._validate(asked.result())
         self._left -= 1
         return True
 
-    def _rested(self, name: str, least: float) -> bool:
+    def _stage_lasted(self, name: str, least: float) -> bool:
         """The policy is done with this stage: whether that lasted long enough to tell nothing of who it is."""
         waited = self._waited()
         self.took.setdefault(name, waited)
         return waited >= least
 
     def _validate(self, answered: PolicyResponse) -> None:
-        self._inference.requests.note(answered)
+        self._inference.requests.log_ik_problems(answered)
         if self._left == self._plan.deployment.setup.warmup_chunks:
-            self._inference.requests.compare(answered)
-        self.first_action = answered.made.meant
+            self._inference.requests.check_measured_poses(answered)
+        self.first_action = answered.commands.intended_start
         first = first_action(self.first_action, np.asarray(answered.observation.qpos, np.float64), self._plan)
         self.validated = (_VALIDATED_FAR if first["far"] else _VALIDATED)(
             rows=len(answered.chunk.actions),
@@ -415,7 +417,7 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
     wanted, uses = strategy.execution_horizon, variants("runtime.strategies")[strategy.kind].USES
     if wanted is None or info.horizon is None or "execution_horizon" not in uses:
         return
-    steps = resampling.length(info.horizon, info.rate or spec.rate, spec.rate)
+    steps = resampling.resampled_length(info.horizon, info.rate or spec.rate, spec.rate)
     if wanted > steps:
         raise SetupError(_HORIZON_TOO_LONG(wanted=wanted, policy=info.name, rows=info.horizon, steps=steps))
 
@@ -423,7 +425,7 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
 def first_action(action: Float64, joints: Float64, spec: StationSpec) -> dict[str, Any]:
     """Distance of an action [D] from `joints` [D]: {"distance" rad, "joint", "far"}; of joints alone."""
     limits = spec.limits
-    away = np.where(limits.places, np.abs(difference(action, joints, spec.dims.wrapping)), 0.0)
+    away = np.where(limits.position_mask, np.abs(difference(action, joints, spec.dims.wrapping)), 0.0)
     worst = int(away.argmax())
     far = bool(away[worst] > spec.deployment.safety.first_action_far)
     return {"distance": float(away[worst]), "joint": limits.names[worst], "far": far}

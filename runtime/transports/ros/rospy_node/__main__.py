@@ -34,7 +34,7 @@ BUFFER_OF_NUMBERS = 1 << 18
 LOGGING = "version: 1\ndisable_existing_loggers: false\n"
 
 
-class Unanswered(Exception):
+class NoXmlRpcAnswer(Exception):
     """Somebody did not answer as the ROS master and nodes do."""
 
 
@@ -47,19 +47,21 @@ class _Bounded(xmlrpc.client.Transport):
         return connection
 
 
-def ask(address: str, method: str, *arguments: Any, default: Any = None) -> Any:
+def call_xmlrpc(address: str, method: str, *arguments: Any, default: Any = None) -> Any:
     """Answer of the master or a node; `default`, where there is one, for what it does not know."""
     try:
         with xmlrpc.client.ServerProxy(address, transport=_Bounded()) as proxy:
             code, said, value = getattr(proxy, method)("/eva_web", *arguments)
     except OSError as error:
-        raise Unanswered(error.strerror or str(error) or type(error).__name__) from error
+        raise NoXmlRpcAnswer(error.strerror or str(error) or type(error).__name__) from error
     except Exception as error:
-        raise Unanswered(f"what answers there is none: {type(error).__name__}: {str(error)[:200]}") from error
+        raise NoXmlRpcAnswer(
+            f"what answers there is none: {type(error).__name__}: {str(error)[:200]}"
+        ) from error
     if code == 1:
         return value
     if default is None:
-        raise Unanswered(said)
+        raise NoXmlRpcAnswer(said)
     return default
 
 
@@ -88,7 +90,7 @@ class Parent:
                 os._exit(0)
 
 
-class Sayings(logging.Handler):
+class WarningForwarder(logging.Handler):
     """Warnings of rospy, for the parent's log, once each."""
 
     def __init__(self, parent: Parent) -> None:
@@ -162,7 +164,7 @@ def raw(kind: str) -> Any:
     return type(name, (rospy.AnyMsg,), fields)
 
 
-class Watch:
+class PeerMonitor:
     """Tells the parent who is at the other side of each topic; ends the process when the master is another."""
 
     def __init__(self, parent: Parent, topics: Topics, master: str, address: str) -> None:
@@ -170,7 +172,7 @@ class Watch:
 
         self._parent, self._topics, self._master, self._address = parent, topics, master, address
         self._name = rospy.get_name()
-        self._uri = ask(master, "lookupNode", self._name)
+        self._uri = call_xmlrpc(master, "lookupNode", self._name)
         self._identity = self._who()
         self._trouble = ""
         self._refused: dict[int, str] = {}
@@ -182,7 +184,7 @@ class Watch:
             now = time.monotonic()
             if now >= look_at:
                 look_at = now + MASTER_S
-                self._look()
+                self._poll()
             if now >= why_at:
                 why_at = now + WHY_S
                 self._explain()
@@ -190,12 +192,15 @@ class Watch:
             time.sleep(LOOK_S)
 
     def _who(self) -> list[Any]:
-        return [ask(self._master, "getParam", "/run_id", default=""), ask(self._master, "getPid")]
+        return [
+            call_xmlrpc(self._master, "getParam", "/run_id", default=""),
+            call_xmlrpc(self._master, "getPid"),
+        ]
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         try:
-            who, uri = self._who(), ask(self._master, "lookupNode", self._name, default="")
-        except Unanswered as error:
+            who, uri = self._who(), call_xmlrpc(self._master, "lookupNode", self._name, default="")
+        except NoXmlRpcAnswer as error:
             self._trouble = f"the ROS master at {self._master} does not answer: {error}"
             return
         self._trouble = ""
@@ -211,8 +216,8 @@ class Watch:
         self._refused = {}
         if not lonely or self._trouble:
             return
-        with contextlib.suppress(Unanswered):  # the next look says it
-            publishers, subscribers, _ = ask(self._master, "getSystemState")
+        with contextlib.suppress(NoXmlRpcAnswer):  # the next look says it
+            publishers, subscribers, _ = call_xmlrpc(self._master, "getSystemState")
             for index in lonely:
                 spoken = self._topics.publishes(index)
                 name = self._topics.open[index][0]
@@ -228,12 +233,12 @@ class Watch:
         name, made, _ = self._topics.open[index]
         verb = "subscribes to" if spoken else "publishes"
         try:
-            uri = ask(self._master, "lookupNode", node)
-        except Unanswered as error:
+            uri = call_xmlrpc(self._master, "lookupNode", node)
+        except NoXmlRpcAnswer as error:
             return f"the master says that {node} {verb} {name}, and not where that is: {error}"
         try:
-            said = ask(uri, "getSubscriptions" if spoken else "getPublications")
-        except Unanswered as error:
+            said = call_xmlrpc(uri, "getSubscriptions" if spoken else "getPublications")
+        except NoXmlRpcAnswer as error:
             return (
                 f"{node}, which {verb} {name}, is not to be reached at {uri}: {error}; does it still run, and is its "
                 "ROS_IP or ROS_HOSTNAME an address that is known here?"
@@ -261,7 +266,7 @@ class Watch:
             self._parent.word(**status)
 
 
-def obey(parent: Parent, topics: Topics, life: float) -> None:
+def run_commands(parent: Parent, topics: Topics, life: float) -> None:
     """Do what the parent says until it has ended; a command that is older than `life` seconds is left undone."""
     while True:
         packet = parent.commands.recv(LARGEST_COMMAND)
@@ -282,12 +287,12 @@ def obey(parent: Parent, topics: Topics, life: float) -> None:
             topics.publish(index, packet[COMMAND.size :])
 
 
-def begin(options: dict[str, Any], parent: Parent) -> None:
+def start_node(options: dict[str, Any], parent: Parent) -> None:
     """Become a node; ends the process with a word where that cannot be."""
     master = options["master"]
     try:
-        ask(master, "getPid")  # init_node would wait for a master for ever
-    except Unanswered as error:
+        call_xmlrpc(master, "getPid")  # init_node would wait for a master for ever
+    except NoXmlRpcAnswer as error:
         parent.word(failed=str(error))
         sys.exit(1)
     import rospy
@@ -301,10 +306,10 @@ def begin(options: dict[str, Any], parent: Parent) -> None:
             options["name"], argv=[], disable_signals=True, disable_rostime=True, disable_rosout=True
         )
     for name in ("rospy", "rosout"):
-        logging.getLogger(name).addHandler(Sayings(parent))
+        logging.getLogger(name).addHandler(WarningForwarder(parent))
 
 
-def leave() -> None:
+def shut_down() -> None:
     """Take leave of the master, and end whether or not it answers."""
     import rospy
 
@@ -324,17 +329,17 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # the parent's end is this one's, and nothing before
         signal.signal(number, signal.SIG_IGN)
     parent = Parent(socket.socket(fileno=options["telling"]), socket.socket(fileno=options["commands"]))
-    begin(options, parent)
+    start_node(options, parent)
     topics = Topics(parent)
     try:
-        watch = Watch(parent, topics, options["master"], options["address"])
-    except Unanswered as error:
+        watch = PeerMonitor(parent, topics, options["master"], options["address"])
+    except NoXmlRpcAnswer as error:
         parent.word(failed=str(error))
         os._exit(1)
     parent.word(ready=True)
     threading.Thread(target=watch.run, name="watch", daemon=True).start()
-    obey(parent, topics, options["life"])
-    leave()
+    run_commands(parent, topics, options["life"])
+    shut_down()
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import zmq
 
-from runtime.clients.channel.names import Names
+from runtime.clients.channel.names import HolderNames
 from runtime.clients.channel.server import ChannelServer
 from runtime.clients.client import StationClient
 from runtime.ipc.bus import CommandServer, Endpoints
@@ -42,7 +42,7 @@ class Bench:
         Endpoints(self.folder).write("guard", {"estop": self._guard.endpoint})
         self._open: list[Script] = []
         self.door = ChannelServer(
-            *(self.context, 0, Names("lab", scripts), self.silence_s),
+            *(self.context, 0, HolderNames("lab", scripts), self.silence_s),
             lambda name: _Patient(self, name),
             lambda: self.now,
         )

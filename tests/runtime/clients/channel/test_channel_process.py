@@ -21,7 +21,7 @@ DEMO = Path(__file__).parents[4] / "deployments" / "demo.toml"
 
 
 def test_a_station_that_is_not_known_here_is_a_sentence(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(channel.log, "start", lambda process: None)
+    monkeypatch.setattr(channel.log, "configure_logging", lambda process: None)
     assert channel.main(["nowhere", "--data-dir", str(tmp_path)]) == 2
     assert "station 'nowhere' is not known here" in capsys.readouterr().err
 

@@ -5,7 +5,7 @@ from queue import Queue
 import pytest
 
 from runtime.clients.channel import lane as module
-from runtime.clients.channel.lane import Job, Lane
+from runtime.clients.channel.lane import Job, RequestWorker
 from runtime.clients.channel.message import Message
 from tests.processes import PATIENCE_S, joined
 
@@ -31,14 +31,14 @@ class Clerk:
 class World:
     def __init__(self, keep=lambda: None):
         self.clerk, self.replies, self.stops = Clerk(), Queue(), 0
-        self.lane = Lane(
+        self.lane = RequestWorker(
             "test", self.clerk, lambda to, answer: self.replies.put(answer), lambda: self.stops, keep
         )
 
     def put(self, name, form="cmd", came=None, stops=0, of=b"x"):
         message = Message(form, name, {"cmd": f"web:{name}"})
         came = time.monotonic() if came is None else came
-        return self.lane.put(Job([of, b""], "me", message, came, stops))
+        return self.lane.submit(Job([of, b""], "me", message, came, stops))
 
     def reply(self):
         return self.replies.get(timeout=PATIENCE_S)

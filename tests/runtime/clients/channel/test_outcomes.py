@@ -1,6 +1,6 @@
 import pytest
 
-from runtime.clients.channel.outcomes import KEPT, Outcome, Outcomes, lasts
+from runtime.clients.channel.outcomes import KEPT, Outcome, Outcomes, is_long_running
 from tests.runtime.terminal_station import event, status
 
 
@@ -21,12 +21,12 @@ def none_since(number):
     "kind", ["setup", "run", "resume", "home", "approach", "step", "commit", "move", "gripper"]
 )
 def test_these_go_on_after_they_were_accepted(kind):
-    assert lasts(kind)
+    assert is_long_running(kind)
 
 
 @pytest.mark.parametrize("kind", ["stop", "halt", "tune", "release", "record_start", "record_stop"])
 def test_these_are_done_at_once(kind):
-    assert not lasts(kind)
+    assert not is_long_running(kind)
 
 
 @pytest.mark.parametrize(
@@ -102,16 +102,16 @@ def test_after_a_restart_of_the_station_it_is_not_known():
 
 def test_the_first_outcome_of_an_id_stays_unless_it_is_unknown():
     outcomes = Outcomes()
-    outcomes.keep(Outcome("a", "run", "run", "unknown"))
-    outcomes.keep(Outcome("a", "run", "run", "accepted"))
-    outcomes.keep(Outcome("a", "run", "run", "refused"))
+    outcomes.add(Outcome("a", "run", "run", "unknown"))
+    outcomes.add(Outcome("a", "run", "run", "accepted"))
+    outcomes.add(Outcome("a", "run", "run", "refused"))
     assert outcomes.get("a").result == "accepted"
-    assert [outcome.id for outcome in outcomes.open] == ["a"]
+    assert [outcome.id for outcome in outcomes.pending] == ["a"]
 
 
 def test_only_the_newest_are_remembered():
     outcomes = Outcomes()
     for number in range(KEPT + 5):
-        outcomes.keep(Outcome(str(number), "stop", "stop", "done"))
+        outcomes.add(Outcome(str(number), "stop", "stop", "done"))
     assert outcomes.get("4") is None
     assert outcomes.get("5") is not None

@@ -1,7 +1,7 @@
 import pytest
 
 from runtime.clients.channel import scripts as module
-from runtime.clients.channel.scripts import Lives, Scripts
+from runtime.clients.channel.scripts import ScriptActivity, Scripts
 from runtime.clients.client import Refused
 from runtime.core.errors import TransportError
 
@@ -30,7 +30,7 @@ class Client:
 class World:
     def __init__(self):
         self.now, self.made = 0.0, {}
-        self.lives = Lives(lambda: self.now)
+        self.lives = ScriptActivity(lambda: self.now)
         self.scripts = Scripts(self._open, self.lives, 10.0)
 
     def _open(self, holder):
@@ -38,9 +38,9 @@ class World:
         return self.made[holder]
 
     def holding(self, holder):
-        script = self.scripts.of(holder)
+        script = self.scripts.get_or_create(holder)
         script.holds = True
-        self.lives.heard(holder)
+        self.lives.record(holder)
         return script
 
 

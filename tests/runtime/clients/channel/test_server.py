@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from runtime.clients.channel.names import Names
+from runtime.clients.channel.names import HolderNames
 from runtime.clients.client import Refused, StationClient
 from runtime.ipc.session_state import SessionState
 from tests import presses
@@ -448,9 +448,9 @@ def noisy(tmp_path_factory):
 
 
 def test_the_names_of_holders_cannot_be_those_of_others():
-    names = Names("lab", "apart")
+    names = HolderNames("lab", "apart")
     assert names.holder(b"a", "") == "channel:lab#1"
     assert names.holder(b"b", "") == "channel:lab#2"
     assert names.holder(b"a", "") == "channel:lab#1"
     assert names.holder(b"a", "night") == names.holder(b"b", "night") == "channel:lab/night"
-    assert Names("lab", "together").holder(b"a", "") == "channel:lab"
+    assert HolderNames("lab", "together").holder(b"a", "") == "channel:lab"

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from runtime.clients.channel.selection import Selection
+from runtime.clients.channel.selection import ScriptSelection
 from runtime.clients.channel.status import status as older
 from runtime.clients.channel.strict import dumps
 from tests.runtime.terminal_station import status
@@ -74,7 +74,7 @@ def snapshot(state="ready", **changes):
 
 
 def told(state="ready", selection=None, newest="", **changes):
-    return older(snapshot(state, **changes), selection or Selection(), newest)
+    return older(snapshot(state, **changes), selection or ScriptSelection(), newest)
 
 
 def test_every_key_of_the_older_channel_is_there_and_is_json():
@@ -108,7 +108,7 @@ def test_who_waits_for_idle_waits_until_nothing_goes_on(state, word, set_up):
 
 
 def test_what_was_selected_is_shown_before_it_is_used():
-    selection = Selection(task="pour", mode="preview", collect_task="wipe", target=[1.0, 2.0, 3.0])
+    selection = ScriptSelection(task="pour", mode="preview", collect_task="wipe", target=[1.0, 2.0, 3.0])
     content = told(selection=selection)
     assert (content["selected_task"], content["selected_collect_task"]) == ("pour", "wipe")
     assert (content["cli_mode"], content["manual_qpos"]) == ("step", [1.0, 2.0, 3.0])
@@ -118,7 +118,7 @@ def test_what_was_selected_is_shown_before_it_is_used():
 
 def test_an_open_run_shows_its_own_mode_and_its_time_in_milliseconds():
     run = {"number": 3, "elapsed": 2.5}
-    content = told("running", Selection(mode="sim"), run=run, mode="manual")
+    content = told("running", ScriptSelection(mode="sim"), run=run, mode="manual")
     assert (content["cli_mode"], content["run_elapsed_ms"]) == ("manual", 2500.0)
     assert content["manual_publish_active"] is True
     assert content["collect"] is None

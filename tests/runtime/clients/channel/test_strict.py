@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.clients.channel.strict import dumps, plain
+from runtime.clients.channel.strict import dumps, to_builtin
 
 
 def test_what_is_no_number_in_json_is_null():
@@ -15,7 +15,7 @@ def test_what_is_no_number_in_json_is_null():
 
 
 def test_what_json_has_stays_as_it_is_and_what_is_foreign_is_its_text():
-    assert plain({"a": True, "b": None, "c": (1, "x"), 3: np.int64(4), "p": Path("/x")}) == {
+    assert to_builtin({"a": True, "b": None, "c": (1, "x"), 3: np.int64(4), "p": Path("/x")}) == {
         "a": True,
         "b": None,
         "c": [1, "x"],

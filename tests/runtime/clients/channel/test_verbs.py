@@ -3,9 +3,9 @@ import json
 import pytest
 
 from runtime.clients.channel.message import read
-from runtime.clients.channel.selection import Selection
-from runtime.clients.channel.verb_commands import NotOurs, Scene
-from runtime.clients.channel.verbs import VERBS, deed, stops
+from runtime.clients.channel.selection import ScriptSelection
+from runtime.clients.channel.verb_commands import UnsupportedVerb, VerbContext
+from runtime.clients.channel.verbs import VERBS, commands_for_verb, stops
 from tests.runtime.terminal_station import status
 from tests.sources import ROOT
 
@@ -50,22 +50,25 @@ COMMANDED = [1.0, 2.0, 3.0, 4.0]
 def scene(verb, state="ready", selection=None, facts=FACTS, grippers=GRIPPERS, episode=None, **more):
     message = read([json.dumps({"cmd": f"web:{verb}"} | more).encode()])
     shown = status(state, facts=facts, grippers=grippers, episode=episode or {})
-    return Scene(message, shown, selection or Selection(), lambda: list(COMMANDED))
+    return VerbContext(message, shown, selection or ScriptSelection(), lambda: list(COMMANDED))
 
 
 def steps(verb, state="ready", selection=None, **more):
-    return [(kind, dict(arguments)) for kind, arguments in deed(scene(verb, state, selection, **more)).steps]
+    return [
+        (kind, dict(arguments))
+        for kind, arguments in commands_for_verb(scene(verb, state, selection, **more)).steps
+    ]
 
 
 def refusal(verb, state="ready", **more):
-    with pytest.raises(NotOurs) as raised:
-        deed(scene(verb, state, **more))
+    with pytest.raises(UnsupportedVerb) as raised:
+        commands_for_verb(scene(verb, state, **more))
     return str(raised.value)
 
 
 def test_every_verb_of_the_older_channel_is_known():
     assert set(THEIRS) | {"estop"} == set(VERBS)
-    assert all(verb.ours for verb in VERBS.values())
+    assert all(verb.description for verb in VERBS.values())
 
 
 CHOSEN = {"task": "pour", "strategy": {"kind": "sync"}, "mode": "preview", "target": COMMANDED}
@@ -124,11 +127,11 @@ CHOSEN = {"task": "pour", "strategy": {"kind": "sync"}, "mode": "preview", "targ
     ],
 )
 def test_a_verb_comes_to_these_commands_of_ours(verb, state, given):
-    assert steps(verb, state, Selection(**CHOSEN)) == given
+    assert steps(verb, state, ScriptSelection(**CHOSEN)) == given
 
 
 def test_what_was_selected_for_collecting_is_tuned_first():
-    assert steps("collect_start", selection=Selection(collect_task="wipe")) == [
+    assert steps("collect_start", selection=ScriptSelection(collect_task="wipe")) == [
         ("tune", {"task": "wipe"}),
         ("record_start", {}),
     ]
@@ -147,18 +150,18 @@ def test_what_was_selected_for_collecting_is_tuned_first():
     ],
 )
 def test_what_is_selected_is_remembered(verb, chosen):
-    assert dict(deed(scene(verb)).chosen) == chosen
+    assert dict(commands_for_verb(scene(verb)).chosen) == chosen
 
 
 def test_a_task_in_the_message_goes_before_one_behind_the_colon():
-    assert dict(deed(scene("select_task:a", task="b")).chosen) == {"task": "b"}
+    assert dict(commands_for_verb(scene("select_task:a", task="b")).chosen) == {"task": "b"}
 
 
 def test_strategies_add_up():
-    selection = Selection(task="pour")
+    selection = ScriptSelection(task="pour")
     selection.choose(strategy={"kind": "sync"})
     selection.choose(strategy={"k_max": 4})
-    assert selection == Selection(task="pour", strategy={"kind": "sync", "k_max": 4})
+    assert selection == ScriptSelection(task="pour", strategy={"kind": "sync", "k_max": 4})
 
 
 @pytest.mark.parametrize(
@@ -170,7 +173,7 @@ def test_strategies_add_up():
     ],
 )
 def test_armed_counts_for_the_tab_collect_alone(verb, armed, told):
-    assert deed(scene(verb, armed=armed)).told == told
+    assert commands_for_verb(scene(verb, armed=armed)).told == told
 
 
 @pytest.mark.parametrize(
@@ -225,8 +228,8 @@ def test_armed_counts_for_the_tab_collect_alone(verb, armed, told):
 )
 def test_what_means_nothing_here_is_refused_with_what_does(verb, state, why):
     if verb == "connect":
-        with pytest.raises(NotOurs, match=why):
-            deed(scene(verb, state))
+        with pytest.raises(UnsupportedVerb, match=why):
+            commands_for_verb(scene(verb, state))
         return
     assert why in refusal(verb, state)
 
@@ -243,7 +246,7 @@ def test_a_robot_of_one_arm_has_it_on_both_sides():
 
 
 def test_what_was_recorded_is_told_when_it_is_to_be_saved():
-    made = deed(scene("rollout_save", episode={"path": "/data/one", "uuid": "u"}))
+    made = commands_for_verb(scene("rollout_save", episode={"path": "/data/one", "uuid": "u"}))
     assert made.told == {"episode": {"path": "/data/one", "uuid": "u"}}
 
 
@@ -267,19 +270,19 @@ def test_stops_are_told_from_the_rest_before_anything_waits(verb, argument, told
 
 def test_the_document_says_of_every_verb_what_it_comes_to():
     document = (ROOT / "docs/control-channel.md").read_text("utf-8").splitlines()
-    rows = [f"| `web:{verb}` | {what.ours} |" for verb, what in VERBS.items()]
+    rows = [f"| `web:{verb}` | {what.description} |" for verb, what in VERBS.items()]
     assert [line for line in document if line.startswith("| `web:")] == rows
 
 
 def test_where_a_person_is_to_drive_collecting_is_a_run():
     def steps(verb, episode=None, **selected):
-        made = scene(verb, "running" if episode else "ready", Selection(**selected))
+        made = scene(verb, "running" if episode else "ready", ScriptSelection(**selected))
         made.status["collect"] = {"set_up": True, "armed": True, "episode": episode}
-        return [(kind, dict(arguments)) for kind, arguments in deed(made).steps]
+        return [(kind, dict(arguments)) for kind, arguments in commands_for_verb(made).steps]
 
     assert steps("collect_start", collect_task="wipe") == [("run", {"mode": "collect", "task": "wipe"})]
     assert steps("collect_start") == [("run", {"mode": "collect"})]
     assert steps("collect_stop", "e") == [("stop", {})]
     assert steps("collect_cancel", "e") == [("discard", {})]
-    with pytest.raises(NotOurs, match="web:collect_stop"):
+    with pytest.raises(UnsupportedVerb, match="web:collect_stop"):
         steps("collect_cancel")

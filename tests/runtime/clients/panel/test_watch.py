@@ -6,7 +6,7 @@ import pytest
 
 from runtime.clients.panel.watch import shown
 from runtime.core.sentences import Pattern, fixed, within
-from runtime.ipc.session_state import with_meaning
+from runtime.ipc.session_state import complete_state_meaning
 
 _BECAUSE = Pattern("inbox.of_this_test", "{why}: {trouble}")
 _HELD = Pattern("safety.of_this_test", "refused: {why}")
@@ -15,7 +15,7 @@ _SILENT = Pattern("policy.of_this_test", "the policy at {url} is silent")
 
 def said(reason, **more):
     snapshot = {"state": "running", "reason": reason, "allowed": ["stop", "halt", "estop"], **more}
-    return shown(with_meaning(snapshot | {"sentences": within(snapshot)}))
+    return shown(complete_state_meaning(snapshot | {"sentences": within(snapshot)}))
 
 
 def test_it_says_what_goes_on_and_who_commands():

@@ -12,7 +12,7 @@ NAMES = ["a", "b", "grip"]
 
 
 def wanted(*words):
-    return aims.wanted(Script(), parse(["bench-1", *words]))
+    return aims.aim_arguments(Script(), parse(["bench-1", *words]))
 
 
 @pytest.mark.parametrize(
@@ -47,15 +47,15 @@ def test_a_joint_that_the_robot_has_not_is_named_with_those_that_it_has():
 
 def test_a_target_is_told_joint_by_joint():
     aim = AIM | {"joints": [0.1001, 0.2, 0.05]}
-    assert aims.lines(aim, AIM["joints"], NAMES, 0.5) == [
+    assert aims.aim_lines(aim, AIM["joints"], NAMES, 0.5) == [
         "  b                        -0.2000 -> +0.2000",
         "  at most 0.200 rad, in up to 3.0 s",
     ]
-    assert aims.lines(AIM, AIM["joints"], NAMES, 1.0)[0] == "  no joint would move"
+    assert aims.aim_lines(AIM, AIM["joints"], NAMES, 1.0)[0] == "  no joint would move"
 
 
 def test_what_is_not_as_asked_is_told():
     aim = AIM | {"clipped": ["b"], "reached": False, "position_error_mm": 12.3, "rotation_error_deg": 4.56}
-    assert aims.shortcoming(AIM) == ""
-    assert aims.shortcoming(aim) == "stopped by the limits of b; 12.3 mm and 4.6 degrees away from the pose"
-    assert aims.lines(aim, AIM["joints"], NAMES, 1.0)[-1].startswith("  NOT AS ASKED: stopped by")
+    assert aims.aim_problem(AIM) == ""
+    assert aims.aim_problem(aim) == "stopped by the limits of b; 12.3 mm and 4.6 degrees away from the pose"
+    assert aims.aim_lines(aim, AIM["joints"], NAMES, 1.0)[-1].startswith("  NOT AS ASKED: stopped by")

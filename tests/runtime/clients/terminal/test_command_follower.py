@@ -5,7 +5,7 @@ import pytest
 
 from runtime.clients.client import Refused
 from runtime.clients.terminal import command_follower
-from runtime.clients.terminal.command_follower import attend
+from runtime.clients.terminal.command_follower import follow_command
 from runtime.clients.terminal.keys import Keys, NoKeys
 from tests.runtime.terminal_station import Script, status
 
@@ -48,14 +48,14 @@ def at_the_terminal(monkeypatch):
 )
 def test_it_stays_until_the_end_and_keeps_the_lease(kind, while_, end):
     script = Script([status(while_), status(while_), status(end)])
-    assert attend(script, kind, {"task": "fold"}, print)["state"] == end
+    assert follow_command(script, kind, {"task": "fold"}, print)["state"] == end
     assert script.given == [(kind, {"task": "fold"}), "renew", "renew"]
 
 
 def test_ctrl_c_stops_what_was_begun():
     before = signal.getsignal(signal.SIGINT)
     script = Script([status("running"), KeyboardInterrupt(), status("ready")])
-    assert attend(script, "run", {}, print)["state"] == "ready"
+    assert follow_command(script, "run", {}, print)["state"] == "ready"
     assert script.given == ["run", "renew", "stop"]
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -72,7 +72,7 @@ def test_a_signal_stops_it_wherever_it_comes():
     script.command = lambda kind: (
         script.given.append(kind) or (kind == "stop" and script.statuses.__setitem__(0, status("ready")))
     )
-    assert attend(script, "run", {}, print)["state"] == "ready"
+    assert follow_command(script, "run", {}, print)["state"] == "ready"
     assert script.given == ["run", "renew", "stop"]
 
 
@@ -86,7 +86,7 @@ def test_ctrl_c_before_the_answer_stops_too():
             raise refusal
 
     script.command = interrupted_once
-    attend(script, "run", {}, print)
+    follow_command(script, "run", {}, print)
     assert script.given == ["run", "stop"]
 
 
@@ -98,7 +98,7 @@ def keyed(mode, phase="waiting", **changes):
 def test_a_person_at_the_terminal_has_keys(at_the_terminal, capsys, mode):
     person = at_the_terminal["keys"] = Person("\nc?xq")
     script = Script([*[keyed(mode)] * 6, status("ready")])
-    attend(script, "run", {}, print)
+    follow_command(script, "run", {}, print)
     assert [given for given in script.given if given != "renew"] == [
         "run",
         "step",
@@ -116,7 +116,7 @@ def test_a_person_at_the_terminal_has_keys(at_the_terminal, capsys, mode):
 def test_what_needs_no_person_takes_no_keys(at_the_terminal, kind, mode, state):
     at_the_terminal["keys"] = Person("qqq")
     script = Script([status(state, mode=mode), status("ready")])
-    attend(script, kind, {}, print)
+    follow_command(script, kind, {}, print)
     assert script.given == [kind, "renew"]
 
 
@@ -131,7 +131,7 @@ def test_a_key_that_is_refused_is_told_and_the_run_goes_on(at_the_terminal, caps
             raise Refused("commit is for preview")
 
     script.command = refuse
-    assert attend(script, "run", {}, print)["state"] == "ready"
+    assert follow_command(script, "run", {}, print)["state"] == "ready"
     assert capsys.readouterr().err == "refused: commit is for preview\n"
 
 
@@ -146,7 +146,7 @@ def test_with_keys_a_line_comes_when_something_else_goes_on_and_says_the_keys(at
             status("ready"),
         ]
     )
-    attend(script, "run", {}, print)
+    follow_command(script, "run", {}, print)
     told = capsys.readouterr().out.splitlines()
     assert [row.split("  ")[0] for row in told if row.startswith("RUNNING")] == [
         "RUNNING (preview, waiting): set up",
@@ -161,5 +161,5 @@ def test_the_terminal_is_left_also_when_the_station_is_gone(at_the_terminal):
     person = at_the_terminal["keys"] = Person("")
     script = Script([keyed("step"), ConnectionError("gone")])
     with contextlib.suppress(ConnectionError):
-        attend(script, "run", {}, print)
+        follow_command(script, "run", {}, print)
     assert person.left

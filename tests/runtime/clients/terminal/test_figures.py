@@ -23,34 +23,36 @@ def test_the_line_of_a_run_says_how_it_is_going():
         policy=ANSWERED,
         link={"rates": {"joints": 60.0, "cam_high": 30.1, "cam_low": 14.6}},
     )
-    assert figures.line(running) == (
+    assert figures.status_line(running) == (
         "RUNNING (step, executing)  12.3 s  370 rows  policy 82 ms, delay 2  tick p99 0.50 ms, 2 missed  "
         "cameras 15 Hz"
     )
-    assert "SETTING_UP (warming up): set up" in figures.line(status("setting_up", stage="warming up"))
-    assert figures.line(status("holding", reason="halted")).startswith("HOLDING (continuous): halted  ")
+    assert "SETTING_UP (warming up): set up" in figures.status_line(status("setting_up", stage="warming up"))
+    assert figures.status_line(status("holding", reason="halted")).startswith(
+        "HOLDING (continuous): halted  "
+    )
 
 
 def test_a_delay_that_is_not_known_yet_is_a_dash():
-    assert "policy 82 ms, delay -" in figures.line(status(policy=ANSWERED | {"delay_p50": math.nan}))
+    assert "policy 82 ms, delay -" in figures.status_line(status(policy=ANSWERED | {"delay_p50": math.nan}))
 
 
 def test_a_lost_policy_is_said():
     lost = status("running", phase="executing", policy=ANSWERED | {"lost": True, "retry_in_s": 1.5})
-    assert "policy lost" in figures.line(lost)
-    assert "LOST, asked again in 1.5 s" in "\n".join(figures.report(lost, "me"))
+    assert "policy lost" in figures.status_line(lost)
+    assert "LOST, asked again in 1.5 s" in "\n".join(figures.status_report(lost, "me"))
 
 
 def test_a_lease_is_named_where_somebody_else_holds_it():
     theirs = status(lease={"holder": "anna", "expires_in": 3.0})
-    assert figures.line(theirs, "me").endswith("  lease: anna")
-    assert "lease" not in figures.line(theirs)
-    assert "lease" not in figures.line(theirs, "anna")
+    assert figures.status_line(theirs, "me").endswith("  lease: anna")
+    assert "lease" not in figures.status_line(theirs)
+    assert "lease" not in figures.status_line(theirs, "anna")
 
 
 def test_a_report_says_how_everything_is():
     first = {"distance": 0.42, "joint": "b", "far": True}
-    told = figures.report(
+    told = figures.status_report(
         status(policy=ANSWERED, first_action=first, drives={"enabled": False, "faults": ["hot"]}), "me"
     )
     assert told == [
@@ -70,18 +72,18 @@ def test_a_report_says_how_everything_is():
 
 
 def test_a_report_of_a_simulation_says_what_the_policy_sees_and_of_a_preview_what_is_shown():
-    told = "\n".join(figures.report(status("running", mode="sim", phase="executing"), "me"))
+    told = "\n".join(figures.status_report(status("running", mode="sim", phase="executing"), "me"))
     assert "mode      sim, the policy sees the simulated state, executing" in told
     proposal = {"chunk": 3, "rows": 50, "distance": 0.1, "joint": "a", "far": False, "age_s": 2.0}
     told = "\n".join(
-        figures.report(status("running", mode="preview", phase="proposed", proposal=proposal), "me")
+        figures.status_report(status("running", mode="preview", phase="proposed", proposal=proposal), "me")
     )
     assert "chunk     the chunk that is shown is 0.100 rad away (a)" in told
 
 
 def test_drives_of_a_node_that_does_not_say_are_not_called_enabled():
-    assert figures.drives({}) == "not reported by the node"
-    assert figures.drives({"enabled": True, "faults": []}) == "enabled"
+    assert figures.drive_line({}) == "not reported by the node"
+    assert figures.drive_line({"enabled": True, "faults": []}) == "enabled"
 
 
 def test_a_lease_of_ones_own_and_a_warning_of_the_policy_are_said():
@@ -89,11 +91,11 @@ def test_a_lease_of_ones_own_and_a_warning_of_the_policy_are_said():
         lease={"holder": "me", "expires_in": 4.2},
         policy=ANSWERED | {"rtc": {"warning": "the predicted delay does not fit"}},
     )
-    told = "\n".join(figures.report(mine, "me"))
+    told = "\n".join(figures.status_report(mine, "me"))
     assert "lease     yours, for 4.2 s unless it is renewed" in told
     assert "; the predicted delay does not fit" in told
 
 
 def test_parameters_that_mean_nothing_to_the_strategy_are_shown_only_when_asked_for():
-    assert figures.tuning(status()) == ["async", "k_max none", "blend_window 8"]
-    assert figures.tuning(status(), everything=True)[-1] == "ensemble_m 0.01 (nothing to async)"
+    assert figures.tuning_lines(status()) == ["async", "k_max none", "blend_window 8"]
+    assert figures.tuning_lines(status(), everything=True)[-1] == "ensemble_m 0.01 (nothing to async)"

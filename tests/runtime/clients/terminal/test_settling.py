@@ -1,7 +1,7 @@
 import pytest
 
 from runtime.clients.terminal import settling
-from runtime.clients.terminal.settling import settle
+from runtime.clients.terminal.settling import wait_until_settled
 from tests.runtime.terminal_station import Script, event, status
 
 
@@ -17,7 +17,11 @@ def running(phase, step, state="running", behaviour="follow", **changes):
 
 def settled(*statuses, events=()):
     script, told = Script(statuses, events=events), []
-    return settle(script, {"state": statuses[0]["state"], "newest_event": 0}, told.append), told, script
+    return (
+        wait_until_settled(script, {"state": statuses[0]["state"], "newest_event": 0}, told.append),
+        told,
+        script,
+    )
 
 
 def test_it_is_over_when_the_run_has_waited_for_a_few_ticks():

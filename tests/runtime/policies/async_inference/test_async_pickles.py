@@ -18,8 +18,8 @@ from runtime.policies.async_inference.pickles import (
     MODULES,
     RemotePolicyConfig,
     TimedObservation,
-    read_actions,
-    written,
+    dump,
+    load_actions,
 )
 
 VECTORS = Path(__file__).parents[2] / "vectors"
@@ -43,25 +43,25 @@ def text(word: str) -> bytes:
 def test_an_observation_has_the_bytes_of_the_real_client() -> None:
     picture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
     values = {"shoulder.pos": 0.5, "gripper.pos": 1.0, "cam": picture, "task": "pick"}
-    made = written(TimedObservation(1700000000.25, 7, values, must_go=True), HELPERS)
+    made = dump(TimedObservation(1700000000.25, 7, values, must_go=True), HELPERS)
     assert made == vector("lerobot_timed_observation")
 
 
 def test_instructions_have_the_bytes_of_the_real_client() -> None:
     names = ["shoulder.pos", "gripper.pos"]
     features = {"observation.state": {"dtype": "float32", "shape": (2,), "names": names}}
-    made = written(RemotePolicyConfig("act", "user/ckpt", features, 10), HELPERS)
+    made = dump(RemotePolicyConfig("act", "user/ckpt", features, 10), HELPERS)
     assert made == vector("lerobot_remote_policy_config")
 
 
 def test_the_earlier_version_has_its_classes_elsewhere() -> None:
-    made = written(RemotePolicyConfig("act", "a", {}, 1), MODULES["0.3"])
+    made = dump(RemotePolicyConfig("act", "a", {}, 1), MODULES["0.3"])
     assert b"lerobot.scripts.server.helpers" in made
 
 
 @pytest.mark.parametrize("name", REPLIES[:2])
 def test_recorded_actions_are_read_each_from_its_own_place(name: str) -> None:
-    actions = read_actions(vector(name), LIMIT)
+    actions = load_actions(vector(name), LIMIT)
     assert [one.timestep for one in actions] == [7, 8, 9][: len(actions)]
     rows = np.arange(6, dtype=np.float32).reshape(3, 2) / 4
     np.testing.assert_array_equal([one.action for one in actions], rows[: len(actions)])
@@ -69,7 +69,7 @@ def test_recorded_actions_are_read_each_from_its_own_place(name: str) -> None:
 
 
 def test_the_answer_of_the_real_server_is_read() -> None:
-    actions = read_actions(vector("lerobot_real_server_reply"), LIMIT)
+    actions = load_actions(vector("lerobot_real_server_reply"), LIMIT)
     assert [one.timestep for one in actions] == list(range(7, 17))
     times = np.array([one.timestamp for one in actions])
     np.testing.assert_allclose(np.diff(times), 0.1, atol=1e-6)
@@ -120,7 +120,7 @@ def hostile() -> list[tuple[bytes, str]]:
 @pytest.mark.parametrize(("data", "says"), hostile(), ids=range(len(hostile())))
 def test_whatever_could_act_is_refused_by_name(data: bytes, says: str) -> None:
     with pytest.raises(CodecError, match=says):
-        read_actions(data, LIMIT)
+        load_actions(data, LIMIT)
 
 
 def test_pickled_instances_of_any_class_run_nothing() -> None:
@@ -130,25 +130,25 @@ def test_pickled_instances_of_any_class_run_nothing() -> None:
 
     for protocol in (2, 3, 4, 5):
         with pytest.raises(CodecError, match=r"names .*_Fail is refused"):
-            read_actions(pickle.dumps([Bomb()], protocol), LIMIT)
+            load_actions(pickle.dumps([Bomb()], protocol), LIMIT)
 
 
 def test_what_is_too_long_is_refused_unread() -> None:
     with pytest.raises(CodecError, match="exceed the limit of 3"):
-        read_actions(b"1234", 3)
+        load_actions(b"1234", 3)
 
 
 def test_a_message_leaves_nothing_behind_for_the_next() -> None:
     harm = b"\x80\x04" + named("torch._utils", "_rebuild_tensor_v2") + b"N}" + text("make") + b"Ns\x86b."
     with pytest.raises(CodecError):
-        read_actions(harm, LIMIT)
-    assert len(read_actions(vector("lerobot_timed_actions_views"), LIMIT)) == 3
+        load_actions(harm, LIMIT)
+    assert len(load_actions(vector("lerobot_timed_actions_views"), LIMIT)) == 3
 
 
 @given(st.binary(max_size=200))
 def test_random_bytes_are_an_error(data: bytes) -> None:
     with contextlib.suppress(CodecError):
-        assert read_actions(b"\x80\x04" + data, LIMIT) == []
+        assert load_actions(b"\x80\x04" + data, LIMIT) == []
 
 
 @given(st.data(), st.sampled_from(REPLIES))
@@ -159,12 +159,12 @@ def test_cut_and_bent_answers_are_actions_or_an_error(data: Any, name: str) -> N
         if payload:
             payload[place] = data.draw(st.integers(0, 255))
     with contextlib.suppress(CodecError):
-        assert len(read_actions(bytes(payload), LIMIT)) <= 10
+        assert len(load_actions(bytes(payload), LIMIT)) <= 10
 
 
 def test_the_recorded_names_are_all_that_is_allowed() -> None:
     with pytest.raises(CodecError) as refused:
-        read_actions(b"\x80\x04" + named("os", "system") + b".", LIMIT)
+        load_actions(b"\x80\x04" + named("os", "system") + b".", LIMIT)
     allowed = str(refused.value).partition("allowed: ")[2].split(", ")
     assert json.dumps(sorted(allowed)) == json.dumps(
         [

@@ -11,7 +11,7 @@ from runtime.core.types import Observation
 from runtime.policies.async_inference.pickles import TimedAction
 from runtime.policies.async_inference.request import AsyncRequest, RequestSettings
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 SETTINGS: dict[str, Any] = {"policy_type": "act", "checkpoint": "user/ckpt", "images": {"top": "cam_high"}}
 
 
@@ -27,12 +27,12 @@ def sent(made: AsyncRequest) -> Any:
     wire = pytest.importorskip("runtime.sim.lerobot_wire", reason="the extra lerobot-grpc is not installed")
     pictures = {camera.key: np.full((4, 6, 3), 7, np.uint8) for camera in ROBOT.cameras}
     qpos = np.arange(14, dtype=np.float32) / 4
-    return wire.read(made.of(Observation(1, 0.0, {}, qpos, pictures, prompt="pick"), 5))
+    return wire.read(made.build(Observation(1, 0.0, {}, qpos, pictures, prompt="pick"), 5))
 
 
 def told(made: AsyncRequest) -> Any:
     wire = pytest.importorskip("runtime.sim.lerobot_wire", reason="the extra lerobot-grpc is not installed")
-    return wire.read(made.instructions())
+    return wire.read(made.setup_message())
 
 
 def test_an_observation_has_motors_pictures_and_task_and_must_go() -> None:

@@ -14,10 +14,10 @@ import robots
 from runtime.core.errors import ConfigurationError, ContradictionError, PolicyError
 from runtime.core.pose_format import PoseFormat
 from runtime.core.types import Float32, Observation
-from runtime.policies.groot.modality import Modalities, Modality, Written
+from runtime.policies.groot.modality import ActionFormat, Modalities, Modality
 from runtime.policies.groot.request import Gr00tRequest, RequestSettings
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 LEFT, RIGHT = list(range(7)), list(range(7, 14))
 SETTINGS: dict[str, Any] = {
     "video": {"ego_view": "cam_high"},
@@ -39,7 +39,7 @@ def wanted(**changes: Any) -> Modalities:
 
 def request(agreed: Modalities | None = None, **settings: Any) -> Gr00tRequest:
     made = Gr00tRequest(RequestSettings(**{**SETTINGS, **settings}), ROBOT, 30.0)
-    made.agree(agreed or wanted())
+    made.configure(agreed or wanted())
     return made
 
 
@@ -52,7 +52,7 @@ def observation(step: int = 0) -> Observation:
 
 
 def shown(made: Gr00tRequest, step: int = 0) -> dict[str, Any]:
-    return made.of(made.moment(observation(step)), "pick")
+    return made.build(made.model_input(observation(step)), "pick")
 
 
 def answer(height: int = 2) -> dict[str, Float32]:
@@ -107,7 +107,7 @@ def test_grippers_are_counted_as_the_model_does() -> None:
     grippers = list(ROBOT.gripper_dims)
     qpos = np.zeros(14, np.float32)
     qpos[grippers] = [group.gripper.open for group in ROBOT.groups if group.gripper is not None]
-    state = made.moment(replace(observation(), qpos=qpos)).state
+    state = made.model_input(replace(observation(), qpos=qpos)).state
     np.testing.assert_array_equal(state, np.zeros(14))
     rows = made.rows([{key: np.zeros_like(part) for key, part in answer().items()}, {}])
     np.testing.assert_array_equal(rows[0], qpos)
@@ -209,13 +209,17 @@ EEF = {"action_space": "eef", "actions": {"eef": [*range(3), *range(3, 9)], "oth
 @pytest.mark.parametrize(
     ("written", "settings", "says"),
     [
-        (Written("RELATIVE", "XYZ_ROT6D"), {}, "'left' as XYZ_ROT6D; policy.action_space = 'joint'.*'6d'"),
-        (Written("RELATIVE", "XYZ_ROTVEC"), {}, "allowed: .eef. and 'rotation_vector'"),
-        (Written("DELTA", "DEFAULT"), {}, "answers with changes for the action 'left'"),
+        (
+            ActionFormat("RELATIVE", "XYZ_ROT6D"),
+            {},
+            "'left' as XYZ_ROT6D; policy.action_space = 'joint'.*'6d'",
+        ),
+        (ActionFormat("RELATIVE", "XYZ_ROTVEC"), {}, "allowed: .eef. and 'rotation_vector'"),
+        (ActionFormat("DELTA", "DEFAULT"), {}, "answers with changes for the action 'left'"),
     ],
 )
 def test_rows_of_poses_or_changes_are_not_taken_for_joints_or_targets(
-    written: Written, settings: dict[str, Any], says: str
+    written: ActionFormat, settings: dict[str, Any], says: str
 ) -> None:
     action = Modality(("left", "right"), (0,), {"left": written})
     with pytest.raises(ContradictionError, match=says):
@@ -223,10 +227,12 @@ def test_rows_of_poses_or_changes_are_not_taken_for_joints_or_targets(
 
 
 def test_what_is_written_as_declared_is_no_contradiction() -> None:
-    fine = {"left": Written("RELATIVE", "DEFAULT"), "right": Written("DELTA", "DEFAULT")}
+    fine = {"left": ActionFormat("RELATIVE", "DEFAULT"), "right": ActionFormat("DELTA", "DEFAULT")}
     request(wanted(action=Modality(("left", "right"), (0,), fine)), action_mode="delta")
-    poses = {"eef": Written("RELATIVE", "XYZ_ROT6D"), "other": Written("ABSOLUTE", "XYZ_ROT6D")}
-    action = Modality(("eef", "other", "joints"), (0,), {**poses, "joints": Written("DELTA", "XYZ_ROTVEC")})
+    poses = {"eef": ActionFormat("RELATIVE", "XYZ_ROT6D"), "other": ActionFormat("ABSOLUTE", "XYZ_ROT6D")}
+    action = Modality(
+        ("eef", "other", "joints"), (0,), {**poses, "joints": ActionFormat("DELTA", "XYZ_ROTVEC")}
+    )
     pose = PoseFormat(orientation="6d")
     request(wanted(action=action), action_pose=pose, ignored_actions=["joints"], **EEF)
     with pytest.raises(ContradictionError, match="orientation = 'wxyz'"):
@@ -266,7 +272,7 @@ def test_history_repeats_the_newest_or_takes_what_was_shown_nearest() -> None:
     assert newest(shown(nearest, 4)) == [0, 0, 40]
     assert newest(shown(nearest, 9)) == [0, 40, 90]
     assert newest(shown(nearest, 13)) == [40, 90, 130]
-    nearest.forget()
+    nearest.reset()
     assert newest(shown(nearest, 17)) == [170, 170, 170]
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from runtime.core.errors import PolicyError
 from runtime.policies.groot import arrays
-from runtime.policies.groot.modality import Modality, Written, modalities
+from runtime.policies.groot.modality import ActionFormat, Modality, parse_modalities
 
 N16 = bytes.fromhex(
     "82a5766964656f82b85f5f4d6f64616c697479436f6e6669675f636c6173735f5fc3a761735f6a736f6e85ad64656c74615f696e6469636573"
@@ -32,26 +32,26 @@ def given_as(keys: Any, steps: Any) -> dict[str, object]:
 
 
 def test_the_answers_of_n16_and_n17_are_read() -> None:
-    found = modalities(arrays.unpack(N16, 1000))
+    found = parse_modalities(arrays.unpack(N16, 1000))
     assert found.video == Modality(("ego_view",), (0,))
     assert found.state == Modality(("single_arm",), (0,))
     assert found.action == Modality()
-    assert not found.early
+    assert not found.is_n15
     assert not found.reads_mnp
-    newest = modalities(arrays.unpack(N17, 1000))
+    newest = parse_modalities(arrays.unpack(N17, 1000))
     assert newest.video == Modality(("ego_view",), (0,))
     assert newest.reads_mnp
 
 
 def test_text_under_the_mark_of_n17_is_not_n15() -> None:
     fields = '{"delta_indices": [0], "modality_keys": ["ego_view"]}'
-    assert not modalities({"video": {"__ModalityConfig__": True, "as_json": fields}}).early
+    assert not parse_modalities({"video": {"__ModalityConfig__": True, "as_json": fields}}).is_n15
 
 
 def test_a_configuration_without_a_mark_says_nothing_of_arrays() -> None:
     fields = {"modality_keys": ["ego_view"], "delta_indices": [0]}
     for configuration in ({"as_json": fields}, fields):
-        found = modalities({"video": configuration})
+        found = parse_modalities({"video": configuration})
         assert (found.video, found.reads_mnp) == (Modality(("ego_view",), (0,)), None)
 
 
@@ -63,17 +63,17 @@ def test_starvla_says_keys_and_numbers_in_flat_lists() -> None:
         "action_key_dims": {"action.arm": 7},
         "unnorm_key": "bench",
     }
-    found = modalities(reply)
+    found = parse_modalities(reply)
     assert (found.state.keys, found.state.widths) == (("arm",), {"arm": 7})
     assert (found.action.keys, found.action.widths) == (("arm",), {"arm": 7})
     assert found.video.keys is found.language.keys is None
-    assert found.plain() == reply
-    assert not found.early
+    assert found.to_dict() == reply
+    assert not found.is_n15
     assert not found.reads_mnp
 
 
 def test_starvlas_server_of_egovla_says_no_numbers_and_a_horizon() -> None:
-    found = modalities(
+    found = parse_modalities(
         {"video_keys": ["ego_view"], "state_keys": [], "action_keys": ["arm"], "action_horizon": 30}
     )
     assert found.video.keys == ("ego_view",)
@@ -83,10 +83,10 @@ def test_starvlas_server_of_egovla_says_no_numbers_and_a_horizon() -> None:
 
 def test_n15_writes_json_as_text_and_keys_with_their_prefix() -> None:
     text = '{"delta_indices": [-1, 0], "modality_keys": ["video.ego_view"]}'
-    found = modalities({"video": {MARK: True, "as_json": text}})
-    assert found.early
+    found = parse_modalities({"video": {MARK: True, "as_json": text}})
+    assert found.is_n15
     assert found.video == Modality(("ego_view",), (-1, 0))
-    assert found.plain()["video"] == {"keys": ["ego_view"], "steps": [-1, 0]}
+    assert found.to_dict()["video"] == {"keys": ["ego_view"], "steps": [-1, 0]}
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_n15_writes_json_as_text_and_keys_with_their_prefix() -> None:
 )
 def test_what_is_no_modality_configuration_is_named(reply: object, says: str) -> None:
     with pytest.raises(PolicyError, match=says):
-        modalities(reply)
+        parse_modalities(reply)
 
 
 def test_how_actions_are_written_is_read_where_there_is_one_word_for_each() -> None:
@@ -120,11 +120,14 @@ def test_how_actions_are_written_is_read_where_there_is_one_word_for_each() -> N
         {"rep": "absolute", "format": "DEFAULT"},
     ]
     fields = {"modality_keys": ["eef", "gripper"], "delta_indices": [0], "action_configs": configs}
-    found = modalities({"action": {MARK: True, "as_json": fields}}).action.written
-    assert found == {"eef": Written("RELATIVE", "XYZ_ROT6D"), "gripper": Written("ABSOLUTE", "DEFAULT")}
+    found = parse_modalities({"action": {MARK: True, "as_json": fields}}).action.written
+    assert found == {
+        "eef": ActionFormat("RELATIVE", "XYZ_ROT6D"),
+        "gripper": ActionFormat("ABSOLUTE", "DEFAULT"),
+    }
     for strange in (configs[:1], None, 3, [1, 2]):
         given = {MARK: True, "as_json": {**fields, "action_configs": strange}}
-        assert modalities({"action": given}).action.written == {}
+        assert parse_modalities({"action": given}).action.written == {}
 
 
 JSON = st.recursive(
@@ -142,4 +145,4 @@ JSON = st.recursive(
 @given(JSON)
 def test_anything_else_is_an_error_and_no_crash(reply: object) -> None:
     with contextlib.suppress(PolicyError):
-        modalities(reply)
+        parse_modalities(reply)

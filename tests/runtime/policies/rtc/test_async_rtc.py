@@ -20,17 +20,17 @@ def committed(count: int = 50, consumed: int = 10, delay: int = 3, horizon: int 
 
 def connected(**said: Any) -> AsyncRtc:
     dialect = AsyncRtc("linear", 5.0)
-    assert dialect.supported({"async_rtc": SAID | said})
+    assert dialect.check_supported({"async_rtc": SAID | said})
     return dialect
 
 
 def rtc_of(conditioning: Conditioning, **said: Any) -> dict[str, Any]:
-    return dict(connected(**said).request({}, conditioning)["rtc"])
+    return dict(connected(**said).wrap({}, conditioning)["rtc"])
 
 
 def test_an_envelope_has_a_number_of_its_own_and_raw_pictures() -> None:
     dialect = connected()
-    first, second = (dialect.request({"state": 1}, None) for _ in range(2))
+    first, second = (dialect.wrap({"state": 1}, None) for _ in range(2))
     assert first == {
         **HEAD,
         "request_id": 0,
@@ -43,7 +43,7 @@ def test_an_envelope_has_a_number_of_its_own_and_raw_pictures() -> None:
 
 def test_all_five_fields_are_sent_with_what_is_left() -> None:
     sent = rtc_of(committed())
-    np.testing.assert_array_equal(sent.pop("prev_chunk_left_over"), committed().left_over)
+    np.testing.assert_array_equal(sent.pop("prev_chunk_left_over"), committed().remaining_rows)
     assert sent == {
         "inference_delay": 3,
         "execution_horizon": 50,
@@ -82,11 +82,11 @@ def test_delay_and_horizon_stay_in_what_the_server_takes(
 )
 def test_metadata_of_another_server_say_what_was_found(metadata: dict[str, Any], says: str) -> None:
     with pytest.raises(PolicyError, match=says):
-        AsyncRtc("exp", 10.0).supported(metadata)
+        AsyncRtc("exp", 10.0).check_supported(metadata)
 
 
 def test_a_server_of_a_model_without_rtc_says_so() -> None:
-    assert AsyncRtc("exp", 10.0).supported({"async_rtc": SAID | {"rtc_supported": False}}) is False
+    assert AsyncRtc("exp", 10.0).check_supported({"async_rtc": SAID | {"rtc_supported": False}}) is False
 
 
 @pytest.mark.parametrize(
@@ -104,12 +104,12 @@ def test_a_server_of_a_model_without_rtc_says_so() -> None:
 )
 def test_a_reply_that_is_none_is_named(reply: dict[str, Any], says: str) -> None:
     dialect = connected()
-    dialect.request({}, None)
+    dialect.wrap({}, None)
     with pytest.raises(PolicyError, match=says):
-        dialect.result(reply)
+        dialect.unwrap(reply)
 
 
 def test_the_result_is_what_is_in_the_envelope() -> None:
     dialect = connected()
-    dialect.request({}, None)
-    assert dialect.result({**HEAD, "request_id": 0, "result": {"actions": 1}}) == {"actions": 1}
+    dialect.wrap({}, None)
+    assert dialect.unwrap({**HEAD, "request_id": 0, "result": {"actions": 1}}) == {"actions": 1}

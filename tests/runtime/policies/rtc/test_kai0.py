@@ -25,12 +25,12 @@ def test_the_request_of_its_own_client_is_reproduced_byte_for_byte() -> None:
     observation = {key: message[key] for key in ("state", "images", "prompt")}
     rows = np.array(message["prev_action_chunk"], np.float32)[:, :2]
     weight = message["max_guidance_weight"]
-    request = Kai0("whole", weight).request(observation, Conditioning(rows, 1, 3, 8))
+    request = Kai0("whole", weight).wrap(observation, Conditioning(rows, 1, 3, 8))
     assert msgpack_arrays.pack(request) == recorded
 
 
 def test_the_first_request_lacks_only_the_chunk() -> None:
-    assert Kai0("aligned", 0.5).request({"state": 1}, None) == {
+    assert Kai0("aligned", 0.5).wrap({"state": 1}, None) == {
         "state": 1,
         "inference_delay": 0,
         "execute_horizon": 1,
@@ -42,9 +42,9 @@ def test_the_first_request_lacks_only_the_chunk() -> None:
 
 def test_row_n_is_for_the_step_that_row_n_of_the_answer_is_for() -> None:
     conditioning = committed(consumed=10)
-    rows = np.array(Kai0("aligned", 0.5).request({}, conditioning)["prev_action_chunk"])
+    rows = np.array(Kai0("aligned", 0.5).wrap({}, conditioning)["prev_action_chunk"])
     assert rows.shape == (50, 32)
-    np.testing.assert_array_equal(rows[:40, :2], conditioning.left_over)
+    np.testing.assert_array_equal(rows[:40, :2], conditioning.remaining_rows)
     assert (rows[40:, :2] == conditioning.previous[-1]).all()
     assert not rows[:, 2:].any()
 
@@ -60,13 +60,13 @@ def test_row_n_is_for_the_step_that_row_n_of_the_answer_is_for() -> None:
 def test_what_only_repeats_the_last_row_is_not_followed(
     conditioning: Conditioning, delay: int, end: int
 ) -> None:
-    request = Kai0("aligned", 0.5).request({}, conditioning)
+    request = Kai0("aligned", 0.5).wrap({}, conditioning)
     assert (request["inference_delay"], request["execute_horizon"]) == (delay, end)
 
 
 def test_wide_rows_are_cropped_to_the_models() -> None:
     rows = np.ones((4, 40), np.float32)
-    sent = Kai0("whole", 0.5).request({}, Conditioning(rows, 0, 0, 4))["prev_action_chunk"]
+    sent = Kai0("whole", 0.5).wrap({}, Conditioning(rows, 0, 0, 4))["prev_action_chunk"]
     assert {len(row) for row in sent} == {32}
 
 
@@ -77,13 +77,13 @@ def test_wide_rows_are_cropped_to_the_models() -> None:
 def test_most_servers_do_not_say_and_the_bundled_one_does(
     metadata: dict[str, Any], expected: bool | None
 ) -> None:
-    assert Kai0("aligned", 0.5).supported(metadata) is expected
+    assert Kai0("aligned", 0.5).check_supported(metadata) is expected
 
 
 def test_a_server_that_wants_envelopes_is_refused() -> None:
     with pytest.raises(PolicyError, match=r"policy\.rtc is 'kai0', allowed with this server: 'async_rtc'"):
-        Kai0("aligned", 0.5).supported({"async_rtc": {}})
+        Kai0("aligned", 0.5).check_supported({"async_rtc": {}})
 
 
 def test_the_reply_is_the_result() -> None:
-    assert Kai0("aligned", 0.5).result({"actions": 1}) == {"actions": 1}
+    assert Kai0("aligned", 0.5).unwrap({"actions": 1}) == {"actions": 1}

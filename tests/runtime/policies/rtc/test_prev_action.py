@@ -18,8 +18,8 @@ def committed(count: int, consumed: int) -> Conditioning:
 @given(st.integers(1, 60).flatmap(lambda count: st.tuples(st.just(count), st.integers(0, count - 1))))
 def test_what_is_left_is_padded_with_its_last_row_to_the_length_of_the_chunk(shape: tuple[int, int]) -> None:
     conditioning = committed(*shape)
-    request = PrevAction().request({"state": 1}, conditioning)
-    sent, left = request["prev_action"], conditioning.left_over
+    request = PrevAction().wrap({"state": 1}, conditioning)
+    sent, left = request["prev_action"], conditioning.remaining_rows
     assert sent.dtype == np.float32
     assert sent.shape == conditioning.previous.shape
     np.testing.assert_array_equal(sent[: len(left)], left)
@@ -29,7 +29,7 @@ def test_what_is_left_is_padded_with_its_last_row_to_the_length_of_the_chunk(sha
 
 
 def test_the_first_request_has_neither_key() -> None:
-    assert PrevAction().request({"state": 1}, None) == {"state": 1}
+    assert PrevAction().wrap({"state": 1}, None) == {"state": 1}
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_the_first_request_has_neither_key() -> None:
 def test_most_servers_do_not_say_and_the_bundled_one_does(
     metadata: dict[str, object], expected: bool | None
 ) -> None:
-    assert PrevAction().supported(metadata) is expected
+    assert PrevAction().check_supported(metadata) is expected
 
 
 @pytest.mark.parametrize(
@@ -52,4 +52,4 @@ def test_most_servers_do_not_say_and_the_bundled_one_does(
 )
 def test_a_server_of_another_dialect_is_named(metadata: dict[str, object], says: str) -> None:
     with pytest.raises(PolicyError, match=says):
-        PrevAction().supported(metadata)
+        PrevAction().check_supported(metadata)

@@ -24,7 +24,7 @@ from runtime.sim.faults import NONE, Fault
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
 from tests.processes import PATIENCE_S
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 DIALECTS = ["prev_action", "openpi_rtc", "kai0", "async_rtc"]
 HOME = ROBOT.poses["home"].astype(np.float32)
 
@@ -48,7 +48,7 @@ def talking(
 
 def placed(number: int, step: int, delay: int, count: int) -> ChunkMerged:
     return ChunkMerged(
-        number, 1, step + delay, delay, step + np.arange(count), 0, "", shares=np.zeros((0, 3))
+        number, 1, step + delay, delay, step + np.arange(count), 0, "", contributions=np.zeros((0, 3))
     )
 
 
@@ -70,8 +70,8 @@ def test_every_chunk_begins_with_what_the_robot_executes_until_it_arrives(dialec
             assert chunk.model_actions is None or chunk.model_actions.shape == (40, 32)
             for ahead in range(delay if number > 1 else 0):
                 np.testing.assert_allclose(chunk.actions[ahead], executed[step + ahead], atol=1e-5)
-            held.answered(number, chunk, step)
-            held.merged(placed(number, step, delay, 40))
+            held.add_chunk(number, chunk, step)
+            held.on_merged(placed(number, step, delay, 40))
             executed.update({step + ahead: row for ahead, row in enumerate(chunk.actions) if ahead >= delay})
             step += max(1, delay)
 
@@ -188,8 +188,8 @@ def test_a_reset_with_a_reply_in_flight_leaves_nothing_to_continue() -> None:
         held.clear()
         policy.reset()
         generation, chunk = flight.result(PATIENCE_S)
-        held.answered(2, chunk, 10, generation=generation)
-        held.merged(placed(2, 10, 9, 40))
+        held.add_chunk(2, chunk, 10, generation=generation)
+        held.on_merged(placed(2, 10, 9, 40))
         conditioning = held.conditioning(20, [9], 0.9, None)
         assert conditioning is None
-        assert "prev_action" not in policy._dialect.request(policy.request(seen(20)), conditioning)
+        assert "prev_action" not in policy._dialect.wrap(policy.request(seen(20)), conditioning)

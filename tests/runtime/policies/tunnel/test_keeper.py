@@ -7,7 +7,7 @@ from collections import deque
 
 import pytest
 
-from runtime.policies.tunnel.keeper import Keeper
+from runtime.policies.tunnel.keeper import TunnelKeeper
 from tests.processes import PATIENCE_S
 
 
@@ -34,7 +34,7 @@ class FakeSsh:
 class World:
     def __init__(self) -> None:
         self.now, self.started, self.fault = 100.0, [], None
-        self.keeper = Keeper("gpu", self._start, 10.0, lambda: self.now)  # type: ignore[arg-type]
+        self.keeper = TunnelKeeper("gpu", self._start, 10.0, lambda: self.now)  # type: ignore[arg-type]
 
     started: list[FakeSsh]
     fault: OSError | None
@@ -55,7 +55,7 @@ class World:
 
     def look(self, seconds: float = 0.0) -> None:
         self.now += seconds
-        self.keeper.look()
+        self.keeper.poll()
 
     def come_up(self) -> None:
         count = len(self.started)
@@ -84,17 +84,17 @@ def test_it_is_up_when_its_own_ssh_listens_and_no_sooner(world: World) -> None:
     assert (world.status.up, world.status.port, world.status.failures) == (True, 40001, 0)
     world.look(1000.0)
     assert len(world.started) == 1
-    assert world.keeper.lasts(world.status) == pytest.approx(1000.0)
+    assert world.keeper.duration(world.status) == pytest.approx(1000.0)
 
 
 def test_a_near_end_is_its_own_only_as_long_as_its_ssh_listens_there(world: World) -> None:
-    assert not world.keeper.holds(0)
+    assert not world.keeper.owns_port(0)
     world.come_up()
-    assert world.keeper.holds(40001)
-    assert not world.keeper.holds(40002)
+    assert world.keeper.owns_port(40001)
+    assert not world.keeper.owns_port(40002)
     world.ssh.up = False  # it has ended, and nobody has looked yet
     assert world.status.up
-    assert not world.keeper.holds(40001)
+    assert not world.keeper.owns_port(40001)
 
 
 def test_an_ssh_that_ends_is_down_since_then_with_what_it_said(world: World) -> None:
@@ -106,7 +106,7 @@ def test_an_ssh_that_ends_is_down_since_then_with_what_it_said(world: World) -> 
     assert status.why == "Connection to gpu closed by remote host."
     assert world.ssh.ended
     world.look(3.0)
-    assert world.keeper.lasts(status) == pytest.approx(3.0)
+    assert world.keeper.duration(status) == pytest.approx(3.0)
 
 
 def test_it_is_down_since_the_first_of_several_failures(world: World) -> None:
@@ -205,17 +205,17 @@ def threads() -> int:
 
 def test_closed_it_ends_its_ssh_and_its_thread_and_says_so_at_once(world: World) -> None:
     before = threads()
-    world.keeper.begin()
-    world.keeper.wait(lambda _: bool(world.started), PATIENCE_S)
+    world.keeper.start()
+    world.keeper.wait_for(lambda _: bool(world.started), PATIENCE_S)
     world.keeper.close()
     assert (world.status.closed, world.status.why) == (True, "it was closed from our side")
-    world.keeper.wait(lambda _: threads() == before, PATIENCE_S)
+    world.keeper.wait_for(lambda _: threads() == before, PATIENCE_S)
     assert all(ssh.ended for ssh in world.started)
 
 
 def test_a_fault_of_our_own_is_told_to_whoever_waits(world: World) -> None:
     world.fault = ValueError("a bug")  # type: ignore[assignment]
-    world.keeper.begin()
-    status = world.keeper.wait(lambda now: now.closed, PATIENCE_S)
+    world.keeper.start()
+    status = world.keeper.wait_for(lambda now: now.closed, PATIENCE_S)
     assert status.closed
     assert status.why == "it is not kept any more (ValueError: a bug)"

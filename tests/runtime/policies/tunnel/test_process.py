@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from runtime.policies.tunnel import process
-from runtime.policies.tunnel.listening import listens
+from runtime.policies.tunnel.listening import is_listening
 from runtime.policies.tunnel.process import Ssh, free_port
 from tests.processes import PATIENCE_S, alive, eventually
 
@@ -39,20 +39,20 @@ def begin() -> Iterator[Begin]:
 
     yield start
     for ssh in running:
-        ssh.end()
+        ssh.terminate()
 
 
 def ended(ssh: Ssh) -> int:
-    eventually(lambda: ssh.look() is not None, "its end")
-    code = ssh.look()
+    eventually(lambda: ssh.poll() is not None, "its end")
+    code = ssh.poll()
     assert code is not None
     return code
 
 
 def test_it_listens_when_its_own_process_does(begin: Begin) -> None:
     ssh = begin(LISTEN)
-    eventually(ssh.listens, "its near end")
-    assert ssh.look() is None
+    eventually(ssh.is_listening, "its near end")
+    assert ssh.poll() is None
 
 
 ECHO = """
@@ -70,38 +70,38 @@ print("ended" if not sys.stdin.readline() else "told more", file=sys.stderr, flu
 def test_where_a_session_is_wanted_it_counts_only_once_the_far_end_has_said_the_word_again() -> None:
     port = free_port()
     ssh = Ssh([sys.executable, "-c", ECHO.replace("{port}", str(port))], port, echoes=True)
-    eventually(lambda: ssh.look() is None and "listening" in ssh.said, "its near end")
-    assert listens(ssh.pid, port)
-    assert not ssh.listens()
-    eventually(lambda: ssh.look() is None and ssh.listens(), "the far end's word")
+    eventually(lambda: ssh.poll() is None and "listening" in ssh.said, "its near end")
+    assert is_listening(ssh.pid, port)
+    assert not ssh.is_listening()
+    eventually(lambda: ssh.poll() is None and ssh.is_listening(), "the far end's word")
     assert sorted(ssh.said) == ["a greeting", "listening"]  # a nologin's sentence, too, is on the output
-    ssh.end()
+    ssh.terminate()
 
 
 def test_a_session_ends_with_its_input() -> None:
     ssh = Ssh([sys.executable, "-c", ECHO.replace("{port}", "0")], 1, echoes=True)
-    eventually(lambda: ssh.look() is None and "listening" in ssh.said, "its near end")
+    eventually(lambda: ssh.poll() is None and "listening" in ssh.said, "its near end")
     assert ssh._process.stdin is not None
     ssh._process.stdin.close()
     assert ended(ssh) == 0
     assert ssh.said[-1] == "ended"
-    ssh.end()
+    ssh.terminate()
 
 
 def test_somebody_else_on_its_port_is_not_taken_for_it(begin: Begin) -> None:
     ssh = begin("import time; print('x', file=__import__('sys').stderr, flush=True); time.sleep(60)")
     with socket.create_server(("127.0.0.1", ssh.port)):
-        assert listens(os.getpid(), ssh.port)
-        eventually(lambda: ssh.look() is None and bool(ssh.said), "its first word")
-        assert not ssh.listens()
+        assert is_listening(os.getpid(), ssh.port)
+        eventually(lambda: ssh.poll() is None and bool(ssh.said), "its first word")
+        assert not ssh.is_listening()
 
 
 def test_a_socket_that_is_bound_to_another_address_or_does_not_listen_is_none() -> None:
     with socket.socket() as bound, socket.create_server(("0.0.0.0", 0)) as everywhere:
         bound.bind(("127.0.0.1", 0))
-        assert not listens(os.getpid(), bound.getsockname()[1])
-        assert not listens(os.getpid(), everywhere.getsockname()[1])
-    assert not listens(2**22 + 1, 80)
+        assert not is_listening(os.getpid(), bound.getsockname()[1])
+        assert not is_listening(os.getpid(), everywhere.getsockname()[1])
+    assert not is_listening(2**22 + 1, 80)
 
 
 def test_what_it_says_is_kept_line_by_line_and_what_the_far_end_refuses_apart(begin: Begin) -> None:
@@ -142,10 +142,10 @@ def test_its_end_is_that_of_what_it_started(begin: Begin) -> None:
         "jump = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
         "print(jump.pid, file=sys.stderr, flush=True); time.sleep(60)"
     )
-    eventually(lambda: ssh.look() is None and bool(ssh.said), "its first word")
+    eventually(lambda: ssh.poll() is None and bool(ssh.said), "its first word")
     started = int(ssh.said[-1])
     assert alive(started)
-    ssh.end()
+    ssh.terminate()
     eventually(lambda: not alive(started), "its end")
     assert not alive(ssh.pid)
 
@@ -156,17 +156,17 @@ def test_one_that_does_not_want_to_end_is_made_to(begin: Begin, monkeypatch: pyt
         "import signal, sys, time\n"
         "signal.signal(signal.SIGTERM, signal.SIG_IGN); print('deaf', file=sys.stderr, flush=True); time.sleep(60)"
     )
-    eventually(lambda: ssh.look() is None and bool(ssh.said), "its first word")
-    ssh.end()
+    eventually(lambda: ssh.poll() is None and bool(ssh.said), "its first word")
+    ssh.terminate()
     assert not alive(ssh.pid)
-    ssh.end()  # safe to call twice
+    ssh.terminate()  # safe to call twice
 
 
 def test_a_program_that_is_not_there_ends_with_a_sentence() -> None:
     ssh = Ssh(["/nowhere/ssh"], 1)
     assert ended(ssh) == 1
     assert list(ssh.said) == ["/nowhere/ssh cannot be started: No such file or directory"]
-    ssh.end()
+    ssh.terminate()
 
 
 def test_it_ends_with_the_thread_that_started_it() -> None:
@@ -175,7 +175,7 @@ def test_it_ends_with_the_thread_that_started_it() -> None:
 
     def start() -> None:
         made.append(Ssh([sys.executable, "-c", LISTEN.replace("{port}", str(free_port()))], 1))
-        eventually(lambda: made[0].look() is None and bool(made[0].said), "its first word")
+        eventually(lambda: made[0].poll() is None and bool(made[0].said), "its first word")
         go_on.wait(PATIENCE_S)
 
     thread = threading.Thread(target=start)
@@ -184,8 +184,8 @@ def test_it_ends_with_the_thread_that_started_it() -> None:
     assert alive(made[0].pid)
     go_on.set()
     thread.join()
-    eventually(lambda: made[0].look() == -signal.SIGTERM, "its end")
-    made[0].end()
+    eventually(lambda: made[0].poll() == -signal.SIGTERM, "its end")
+    made[0].terminate()
 
 
 STATION = """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runtime.policies.tunnel.sentences import is_taken, why
+from runtime.policies.tunnel.sentences import explain_exit, port_was_taken
 
 # Of OpenSSH 9.2.
 DENIED = [
@@ -54,7 +54,7 @@ TAKEN = [
     ],
 )
 def test_the_last_that_was_said_comes_with_what_to_do(said: list[str], sentence: str, advice: str) -> None:
-    told = why(said, 255)
+    told = explain_exit(said, 255)
     assert sentence in told
     assert advice in told
     if said:
@@ -62,18 +62,18 @@ def test_the_last_that_was_said_comes_with_what_to_do(said: list[str], sentence:
 
 
 def test_what_ended_at_the_far_end_is_told_from_what_ssh_could_not() -> None:
-    told = why(["This account is currently not available."], 1)
+    told = explain_exit(["This account is currently not available."], 1)
     assert told.startswith("This account is currently not available.: what is run there")
     assert "policy.tunnel.session = false" in told
-    assert why([], -15) == "ssh ended with -15 and said nothing"
-    assert "policy.tunnel.session" in why([], 0)
+    assert explain_exit([], -15) == "ssh ended with -15 and said nothing"
+    assert "policy.tunnel.session" in explain_exit([], 0)
 
 
 def test_a_changed_key_is_never_advised_to_be_accepted() -> None:
-    assert "accept-new" not in why(CHANGED, 255)
+    assert "accept-new" not in explain_exit(CHANGED, 255)
 
 
 def test_a_port_that_is_taken_is_told_from_all_else() -> None:
-    assert is_taken(TAKEN)
-    assert is_taken(TAKEN[1:])
-    assert not any(is_taken(said) for said in (DENIED, UNKNOWN, CHANGED, []))
+    assert port_was_taken(TAKEN)
+    assert port_was_taken(TAKEN[1:])
+    assert not any(port_was_taken(said) for said in (DENIED, UNKNOWN, CHANGED, []))

@@ -15,7 +15,7 @@ from runtime.policies.openpi import OpenpiPolicy
 from runtime.policies.tunnel import policy as tunnelled
 from runtime.policies.tunnel.policy import TunnelledPolicy
 from runtime.processes.coordinator.builders import make_policy
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from tests.runtime.policies.peers import PIPER, seen
 
 CAMERAS = {camera.key: camera.key for camera in PIPER.cameras}
@@ -41,14 +41,14 @@ def ssh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def made(**policy: Any) -> Policy:
     tree = {"station": "bench", "robot": "agilex_piper", "transport": {"kind": "zmq"}, "policy": policy}
-    return make_policy(checked_spec(loader.resolve(tree, {}, "a test")), MonotonicClock())
+    return make_policy(check_deployment(loader.resolve_deployment(tree, {}, "a test")), MonotonicClock())
 
 
 def test_only_those_that_say_so_have_one() -> None:
     assert isinstance(made(kind="openpi"), OpenpiPolicy)
     policy = made(kind="openpi", observation_space="eef", observation_eef="fk", tunnel={"host": "gpu"})
     assert isinstance(policy, TunnelledPolicy)
-    assert (policy.sees_poses, policy.observation_eef) == (True, "fk")
+    assert (policy.uses_poses, policy.observation_eef) == (True, "fk")
     policy.close()
 
 
@@ -66,10 +66,10 @@ def test_a_checkpoint_lays_its_tunnel_on_top_of_the_deployments_or_takes_it_away
         "transport": {"kind": "zmq"},
         "policy": {"kind": "openpi", "tunnel": {"host": "gpu", "user": "lab"}},
     }
-    resolved = loader.resolve(tree, {}, "a test")
+    resolved = loader.resolve_deployment(tree, {}, "a test")
 
     def changed(tunnel: object) -> Any:
-        other = loader.changed(resolved, {"policy": {"tunnel": tunnel}}, "setup")
+        other = loader.apply_changes(resolved, {"policy": {"tunnel": tunnel}}, "setup")
         return other.deployment.policy.tunnel  # type: ignore[attr-defined]
 
     assert changed({"host": "gpu-2"}).where == "lab@gpu-2"

@@ -31,8 +31,8 @@ from runtime.processes.coordinator.builders import make_policy
 from runtime.sim.faults import Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.starvla_server import Star, StarvlaServer
-from runtime.station.checks import checked_spec
+from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
+from runtime.station.checks import check_deployment
 from tests.processes import PATIENCE_S, alive, eventually, joined
 from tests.runtime.policies.peers import PIPER, seen
 from tests.runtime.policies.tls import encrypted, self_signed
@@ -57,7 +57,7 @@ def through(tunnel: dict[str, Any], robot: str = "agilex_piper", **policy: Any) 
             **policy,
         },
     }
-    made = make_policy(checked_spec(loader.resolve(tree, {}, "a test")), MonotonicClock())
+    made = make_policy(check_deployment(loader.resolve_deployment(tree, {}, "a test")), MonotonicClock())
     assert isinstance(made, TunnelledPolicy)
     return made
 
@@ -128,7 +128,7 @@ PROTOCOLS: dict[str, tuple[Callable[[], Any], Callable[[str], dict[str, Any]]]] 
     "gr00t": (lambda: Gr00tServer(PIPER, Gr00tBehaviour("n1.7", False, 8, 30.0)), gr00t),
     "lerobot": (lerobot_server, lerobot),
     "starvla": (
-        lambda: StarvlaServer(PIPER, Star(size=(24, 32))),
+        lambda: StarvlaServer(PIPER, StarvlaBehaviour(size=(24, 32))),
         lambda url: {"kind": "starvla", "url": url, "cameras": list(CAMERAS)},
     ),
 }

@@ -42,7 +42,7 @@ def test_only_slow_has_patience_with_starvation(answer, patience):
 def test_elapsed_time_is_capped_and_the_first_tick_counts_as_one_period():
     simulated = SimulatedActuator(np.zeros(2), settings(), lambda: 0.0)
     assert simulated.elapsed(50.0) == PERIOD
-    simulated.ticked(50.0)
+    simulated.end_tick(50.0)
     assert simulated.elapsed(50.0 + PERIOD) == pytest.approx(PERIOD)
     assert simulated.elapsed(50.0 + 0.1 * PERIOD) == pytest.approx(0.5 * PERIOD)
     assert simulated.elapsed(60.0) == pytest.approx(1.5 * PERIOD)

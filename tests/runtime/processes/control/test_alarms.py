@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from runtime.motion.timeline import DimensionKinds
-from runtime.processes.control.alarms import Displacement, silent_sibling
+from runtime.processes.control.alarms import DisplacementMonitor, stale_heartbeat
 from runtime.processes.control.led import PART
-from runtime.processes.control.plausibility import Plausibility
+from runtime.processes.control.plausibility import JointPlausibility
 from tests.runtime.processes.control.test_actuator import robot, seen, settings
 from tests.runtime.tick_bench import PERIOD, Bench
 
@@ -14,16 +14,16 @@ def test_a_sibling_that_is_silent_is_named_with_how_long():
     shared.beat("coordinator", 100.0)
     shared.beat("guard", 100.0)
     allowed = {"guard": 1.0, "coordinator": 3.0}.__getitem__
-    assert silent_sibling(shared, 100.9, allowed) == ""
-    assert silent_sibling(shared, 101.5, allowed) == "no sign of life from guard for 1.5 s"
+    assert stale_heartbeat(shared, 100.9, allowed) == ""
+    assert stale_heartbeat(shared, 101.5, allowed) == "no sign of life from guard for 1.5 s"
     shared.beat("guard", 104.0)
-    assert silent_sibling(shared, 103.0, allowed) == ""
-    assert silent_sibling(shared, 104.0, allowed) == "no sign of life from coordinator for 4.0 s"
+    assert stale_heartbeat(shared, 103.0, allowed) == ""
+    assert stale_heartbeat(shared, 104.0, allowed) == "no sign of life from coordinator for 4.0 s"
 
 
 def test_a_sibling_that_never_gave_a_sign_is_named_so():
     assert (
-        silent_sibling(Bench().shared, 100.0, lambda process: 1.0)
+        stale_heartbeat(Bench().shared, 100.0, lambda process: 1.0)
         == "no sign of life from coordinator since it was restarted"
     )
 
@@ -34,8 +34,8 @@ class Held:
     def __init__(self):
         self.actuator = robot(Bench())
         self.actuator.engage(np.zeros(2))
-        self.judge = Plausibility(settings().limits, DimensionKinds())
-        self.displacement = Displacement(settings(), self.judge)
+        self.judge = JointPlausibility(settings().limits, DimensionKinds())
+        self.displacement = DisplacementMonitor(settings(), self.judge)
         self.now = 100.0
 
     def see(self, *joints, held=True):

@@ -10,7 +10,7 @@ from tests.examples import some
 from tests.runtime.tick_bench import PERIOD, WITH_GRIPPER, Bench
 
 TOP = WITH_GRIPPER.velocity
-RATE = 60.0 * WITH_GRIPPER.reach
+RATE = 60.0 * WITH_GRIPPER.radian_scale
 NAN = float("nan")
 
 numbers = st.floats(-2.5, 2.5)

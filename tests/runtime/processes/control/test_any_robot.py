@@ -22,7 +22,7 @@ from runtime.safety.filter import Limits, SafetySettings
 from runtime.spaces.conversion import ActionSpaces
 from tests.runtime.tick_bench import PERIOD, Bench, following
 
-EVERY = pytest.mark.parametrize("name", robots.names())
+EVERY = pytest.mark.parametrize("name", robots.robot_names())
 
 
 def limits_of(robot: Robot) -> Limits:
@@ -52,7 +52,7 @@ def standing_at(robot: Robot, pose: Float64) -> Bench:
 @pytest.mark.some(4)
 @EVERY
 def test_control_goes_from_pose_to_pose_and_arrives(name: str) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     bench = standing_at(robot, robot.poses["ready"])
     bench.say("motion", goal=robot.poses["home"])
     bench.run(600)
@@ -67,7 +67,7 @@ def test_control_goes_from_pose_to_pose_and_arrives(name: str) -> None:
 def test_control_executes_a_policy_s_chunk_of_every_group_and_switches_binary_grippers_at_once(
     name: str,
 ) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     ready = robot.poses["ready"]
     rows = np.tile(ready, (40, 1))
     rows += 0.005 * np.sin(np.arange(40) / 8)[:, None] * ~limits_of(robot).grippers
@@ -88,10 +88,10 @@ def test_control_executes_a_policy_s_chunk_of_every_group_and_switches_binary_gr
 
 @EVERY
 def test_grippers_open_close_and_lock_in_their_own_units_and_nothing_else_does(name: str) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     grippers, here = Grippers(plan_of(robot)), robot.poses["ready"].astype(float)
     having = [group for group in robot.groups if group.gripper is not None]
-    shut = grippers.asked(GripperRequest(action="close"), here, free=False)
+    shut = grippers.plan_request(GripperRequest(action="close"), here, free=False)
     assert np.isfinite(shut.locks).tolist() == np.isin(np.arange(robot.dim), robot.gripper_dims).tolist()
     for group in having:
         assert shut.locks[group.gripper_dim] == group.gripper.close  # type: ignore[union-attr]
@@ -105,7 +105,7 @@ def test_grippers_open_close_and_lock_in_their_own_units_and_nothing_else_does(n
     assert np.allclose(bench.sent[-1][others], here[others], atol=1e-6)
     names = ", ".join(group.name for group in having)
     with pytest.raises(RuntimeFault, match=f"gripper: arm = 'tail'; {name} has grippers on {names}"):
-        grippers.asked(GripperRequest(arm="tail", action="open"), here, free=True)
+        grippers.plan_request(GripperRequest(arm="tail", action="open"), here, free=True)
 
 
 class Standing(Kinematics):
@@ -124,15 +124,15 @@ class Standing(Kinematics):
 @pytest.mark.some(4)
 @EVERY
 def test_poses_are_gone_to_by_name_and_an_arm_that_there_is_not_is_refused(name: str) -> None:
-    robot = robots.load(name)
+    robot = robots.load_robot(name)
     kinematics = Standing(robot)
     targets = Targets(plan_of(robot), ActionSpaces(robot, kinematics, 30.0), kinematics)
     home, ready = robot.poses["home"], robot.poses["ready"]
     aim = targets.aim(AimRequest(pose="ready"), home)
     assert np.array_equal(aim.joints, ready)
     assert aim.poses.shape == (8 * len(robot.arms),)
-    assert np.array_equal(targets.goal(MoveRequest(pose="home"), ready), home)
-    assert np.array_equal(targets.goal(MoveRequest(pose="ready"), home), ready)
+    assert np.array_equal(targets.motion_goal(MoveRequest(pose="home"), ready), home)
+    assert np.array_equal(targets.motion_goal(MoveRequest(pose="ready"), home), ready)
     with pytest.raises(RuntimeFault, match=f"{name} has {', '.join(arm.name for arm in robot.arms)}"):
         targets.aim(AimRequest(jog=Jog(arm="tail")), home)
 

@@ -4,7 +4,7 @@ import pytest
 from runtime.core.errors import ConfigurationError
 from runtime.ipc.messages import ChunkMerged, Event
 from runtime.motion.timeline import HELD, DimensionKinds
-from runtime.processes.control.chunk_execution import strategy
+from runtime.processes.control.chunk_execution import build_strategy
 from tests.runtime.tick_bench import Bench, following, wave
 
 
@@ -21,7 +21,7 @@ def speeds(bench):
 
 @pytest.mark.parametrize("kind", ["sync", "async", "ensemble", "naive", "rtc"])
 def test_every_kind_of_strategy_is_made_from_its_section(kind):
-    assert strategy({"kind": kind}, DimensionKinds()).kind == kind
+    assert build_strategy({"kind": kind}, DimensionKinds()).kind == kind
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ def test_every_kind_of_strategy_is_made_from_its_section(kind):
 )
 def test_what_is_no_strategy_is_refused_by_its_key(section, said):
     with pytest.raises(ConfigurationError, match=said):
-        strategy(section, DimensionKinds())
+        build_strategy(section, DimensionKinds())
 
 
 # --- chunks -------------------------------------------------------------------------------------------------

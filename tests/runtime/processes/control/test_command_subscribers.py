@@ -31,7 +31,7 @@ class Mouth(Sink):
     def send(self, command: RobotCommand) -> None:
         raise AssertionError("nobody sends here")
 
-    def unheard(self) -> dict[str, str]:
+    def missing_subscribers(self) -> dict[str, str]:
         self.asked += 1
         if self.error:
             raise TransportError(self.error)
@@ -57,7 +57,7 @@ class Desk:
         self.said.clear()
         for _ in range(round(seconds * 10)):
             self.now += 0.1
-            self._hearing.look(self.now)
+            self._hearing.poll(self.now)
         return list(self.said)
 
 
@@ -101,7 +101,7 @@ def test_it_is_in_the_status_before_anything_is_set_up_and_leaves_it(
 ) -> None:
     station = Station(stubbed(tmp_path))
     found = {"/left": ""}
-    monkeypatch.setattr(station.robot, "unheard", lambda: dict(found), raising=False)
+    monkeypatch.setattr(station.robot, "missing_subscribers", lambda: dict(found), raising=False)
     station.go(90)
     assert station.state is SessionState.IDLE
     assert station.coordinator.snapshot()["link"]["unheard"] == {"/left": ""}

@@ -50,7 +50,7 @@ def looped(shared: SharedState, clock: VirtualClock, times: int, rate: float = 1
     ticks: Any = Ticks(shared)
     loop = Loop(ticks, shared, clock, rate, "FIFO 20")
     for _ in range(times):
-        loop.once()
+        loop.tick_once()
     return ticks
 
 
@@ -98,16 +98,16 @@ class Beats:
 
     def __init__(self, shared: SharedState) -> None:
         self.status = np.zeros((), shared.layout.control_dtype())
-        self._page = shared
+        self._shared_state = shared
         self.seen: list[float] = []
 
     def __call__(self, step: int, planned: float, woke: float) -> None:
-        self.seen.append(self._page.last_beat("control"))
+        self.seen.append(self._shared_state.last_beat("control"))
 
 
 def test_control_is_alive_in_the_page_before_its_tick_begins(shared: SharedState) -> None:
     beats: Any = Beats(shared)
-    Loop(beats, shared, LateClock(0.002), 10.0, "ordinary").once()
+    Loop(beats, shared, LateClock(0.002), 10.0, "ordinary").tick_once()
     assert beats.seen == pytest.approx([100.102])
 
 

@@ -177,7 +177,7 @@ def test_a_held_arm_whose_encoder_slips_is_led_by_no_more_than_is_needed_to_see_
     bench.break_encoder()
     bench.go(14.0)
     assert np.ptp(bench.moves[30:]) <= MOST_LED
-    assert bench.shared.doubt or bench.said("implausible")
+    assert bench.shared.joint_problem or bench.said("implausible")
 
 
 def smoothly(share):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from runtime.ipc.observation_reader import LatestObservation
 from runtime.motion.timeline import DimensionKinds
-from runtime.processes.control.plausibility import Plausibility, Unquestioned
+from runtime.processes.control.plausibility import JointPlausibility, TrustingPlausibility
 from runtime.safety.limits import Limits
 from tests.runtime.tick_bench import PERIOD
 
@@ -25,7 +25,7 @@ NAN = float("nan")
 
 class Watcher:
     def __init__(self, limits=LIMITS, dims=None):
-        self.judge = Plausibility(limits, dims or DimensionKinds())
+        self.judge = JointPlausibility(limits, dims or DimensionKinds())
         self.now, self.sequence, self.captured = 100.0, 0, 0.0
 
     def see(self, joints, commanded=None, stamp=True):
@@ -44,7 +44,7 @@ class Watcher:
         )
         return self.judge.judge(
             seen, self.now, None if commanded is None else np.array(commanded, float)
-        ).doubt
+        ).implausible_reason
 
     def stand(self, ticks=5, joints=STANDS):
         return [self.see(joints) for _ in range(ticks)]
@@ -231,7 +231,7 @@ def test_an_encoder_that_was_noisy_leaps_as_far_as_the_joint_can_and_is_stuck_th
     doubts = []
     for tick in range(100):
         doubts.append(watcher.see([0.6, -0.4 + 1e-5 * (tick % 3), 0.05]))
-        assert not watcher.judge.apart(STANDS, 0.1)
+        assert not watcher.judge.is_displaced(STANDS, 0.1)
     assert doubts[:2] == ["", ""]
     assert set(doubts[2:]) == {"hip jumped to 0.600 rad and reads exactly that: is it stuck?"}
     assert watcher.see(STANDS) == ""
@@ -250,7 +250,7 @@ def test_a_noisy_joint_that_is_fast_and_comes_to_rest_is_believed():
     way = 0.8 - 0.2 * np.arange(5)
     for hip in (0.8, 0.80001, 0.8, 0.80001, 0.8, *way, 0.00001, 0.0, 0.00001):
         assert watcher.see([hip, -0.4, 0.05]) == "" or hip > 0.7
-    assert watcher.judge.settled
+    assert watcher.judge.is_settled
 
 
 @pytest.mark.some(4)
@@ -399,8 +399,8 @@ def test_an_endless_joint_that_is_counted_in_another_turn_has_not_moved():
 
 
 def test_what_moves_no_robot_is_believed_at_once():
-    judge = Unquestioned(LIMITS, DimensionKinds())
+    judge = TrustingPlausibility(LIMITS, DimensionKinds())
     seen = LatestObservation(1, STANDS.astype(np.float32), STANDS, 99.0, (), True)
     assert judge.judge(seen, 99.0, None) is seen
-    assert judge.apart(np.zeros(3), 0.5)
-    assert not judge.apart(STANDS, 0.5)
+    assert judge.is_displaced(np.zeros(3), 0.5)
+    assert not judge.is_displaced(STANDS, 0.5)

@@ -44,9 +44,9 @@ def bench() -> Bench:
 
 
 def test_a_base_s_numbers_are_speeds_and_an_arm_s_are_not() -> None:
-    robot = robots.load("r1_lite", ["left_arm", "torso", "base"])
+    robot = robots.load_robot("r1_lite", ["left_arm", "torso", "base"])
     assert [robot.joint_names[dim] for dim in robot.speed_dims] == ["base.vx", "base.vy", "base.wz"]
-    assert all(robots.load(name).speed_dims == () for name in robots.names())
+    assert all(robots.load_robot(name).speed_dims == () for name in robots.robot_names())
 
 
 def test_braking_brings_a_speed_to_zero_at_its_own_rate_and_no_joint_elsewhere() -> None:
@@ -142,7 +142,7 @@ def test_a_speed_is_no_gripper_to_be_locked(bench: Bench) -> None:
 
 
 def test_a_person_cannot_have_a_base_driven_by_a_motion_and_an_approach_leaves_it_standing() -> None:
-    robot = robots.load("r1_lite", ["left_arm", "base"])
+    robot = robots.load_robot("r1_lite", ["left_arm", "base"])
     none = np.zeros(robot.dim, bool)
     grippers = np.isin(np.arange(robot.dim), robot.gripper_dims)
     limits = Limits(
@@ -157,8 +157,8 @@ def test_a_person_cannot_have_a_base_driven_by_a_motion_and_an_approach_leaves_i
     with pytest.raises(
         RuntimeFault, match=r"move: base.vx = 0.2000 is a speed; allowed at the end of a motion: 0"
     ):
-        targets.goal(MoveRequest(joints=driving.tolist()), robot.poses["home"])
-    assert np.array_equal(targets.checked("approach", driving, robot.poses["home"]), robot.poses["home"])
+        targets.motion_goal(MoveRequest(joints=driving.tolist()), robot.poses["home"])
+    assert np.array_equal(targets.check_motion("approach", driving, robot.poses["home"]), robot.poses["home"])
 
 
 class StandingArms(Kinematics):
@@ -176,7 +176,7 @@ class StandingArms(Kinematics):
 
 
 def test_a_policy_in_poses_leaves_the_base_standing_and_one_in_steps_names_its_speed() -> None:
-    robot = robots.load("r1_lite", ["left_arm", "base"])
+    robot = robots.load_robot("r1_lite", ["left_arm", "base"])
     spaces = ActionSpaces(robot, StandingArms(robot), 30.0)
     qpos = robot.poses["ready"].copy()
     qpos[list(robot.speed_dims)] = 0.3

@@ -11,8 +11,8 @@ from hypothesis.stateful import initialize, rule
 
 from runtime.config import loader
 from runtime.ipc.session_state import SessionState
-from runtime.recording.labels import newest
-from runtime.station.checks import checked_spec
+from runtime.recording.labels import latest_label
+from runtime.station.checks import check_deployment
 from tests.runtime.collect_station import CollectStation, CollectStubs
 from tests.runtime.lockstep_station import stubbed
 from tests.runtime.processes.coordinator.session import test_session_machine
@@ -34,10 +34,10 @@ class Collects(test_session_machine.Machine):
             "source": "relay",
             "mode": mode,
             "leader": {"kind": "zmq"},
-            "cameras": [camera.key for camera in checked_spec(made).robot.cameras[:1]],
+            "cameras": [camera.key for camera in check_deployment(made).robot.cameras[:1]],
         }
-        resolved = loader.changed(made, {"collection": leads}, "test")
-        collects = CollectStubs(checked_spec(resolved), rows=self.rows)
+        resolved = loader.apply_changes(made, {"collection": leads}, "test")
+        collects = CollectStubs(check_deployment(resolved), rows=self.rows)
         self.opened: dict[str, bool] = {}  # the episodes, and whether each was discarded
         self.watch(CollectStation(collects))
 
@@ -106,7 +106,7 @@ class Collects(test_session_machine.Machine):
         return super().asked() or (leads and main.session.state is SessionState.RUNNING)
 
     def label_of(self, episode: str) -> Any:
-        label = newest(Path(self.folder.name), episode)
+        label = latest_label(Path(self.folder.name), episode)
         return label is not None and label.discarded
 
     def teardown(self) -> None:

@@ -28,8 +28,8 @@ def read(shared):
 
 def test_orders_are_numbered_and_arrive_in_order(shared):
     orders = ControlQueue(shared)
-    assert orders.give("hold", run=3, reason="halted") == 1
-    assert orders.give("motion", goal=np.array([0.5, 1.0])) == 2
+    assert orders.send_order("hold", run=3, reason="halted") == 1
+    assert orders.send_order("motion", goal=np.array([0.5, 1.0])) == 2
     first, second = read(shared)
     assert first == Order(1, "hold", 3, None, "halted")
     assert (second.number, second.kind, second.goal.tolist()) == (2, "motion", [0.5, 1.0])
@@ -37,38 +37,38 @@ def test_orders_are_numbered_and_arrive_in_order(shared):
 
 def test_an_order_is_obeyed_once_control_says_so(shared):
     orders = ControlQueue(shared)
-    number = orders.give("hold")
-    assert not orders.obeyed(number)
+    number = orders.send_order("hold")
+    assert not orders.is_obeyed(number)
     obey(shared, number)
-    assert orders.obeyed(number)
+    assert orders.is_obeyed(number)
 
 
 def test_a_restarted_main_counts_on_from_what_control_has_obeyed(shared):
     obey(shared, 41)
     orders = ControlQueue(shared)
-    assert not orders.obeyed(orders.give("follow", run=1))
+    assert not orders.is_obeyed(orders.send_order("follow", run=1))
     assert read(shared)[0].number == 42
 
 
 def test_chunks_keep_their_numbers_and_their_place_among_the_orders(shared):
     orders = ControlQueue(shared)
-    orders.give("follow", run=1)
-    orders.post(PostedChunk(orders.next_chunk(), 1, 10, np.zeros((3, 2))))
-    orders.give("hold", run=1)
+    orders.send_order("follow", run=1)
+    orders.send_chunk(PostedChunk(orders.next_chunk(), 1, 10, np.zeros((3, 2))))
+    orders.send_order("hold", run=1)
     assert [type(message) for message in read(shared)] == [Order, PostedChunk, Order]
     assert orders.next_chunk() == 2
 
 
 def test_a_word_for_the_node_goes_the_way_of_the_orders(shared):
     orders = ControlQueue(shared)
-    orders.give("hold")
-    orders.ask_node("scene_reset", {"id": "r", "seed": 3})
+    orders.send_order("hold")
+    orders.send_node_request("scene_reset", {"id": "r", "seed": 3})
     assert read(shared)[1] == NodeRequest("scene_reset", {"id": "r", "seed": 3})
 
 
 def test_a_control_that_does_not_read_is_a_fault_and_not_silence(shared):
     orders = ControlQueue(shared)
     large = PostedChunk(1, 1, 10, np.zeros((40_000, 2)))
-    orders.post(large)
+    orders.send_chunk(large)
     with pytest.raises(RuntimeFault, match="control does not read its orders: the ring is full"):
-        orders.post(large)
+        orders.send_chunk(large)

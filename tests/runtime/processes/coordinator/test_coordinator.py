@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from runtime.core.errors import SetupError
-from runtime.ipc.messages import UNHEARD, Command, EpisodeOpened, Event, encode
+from runtime.ipc.messages import NO_SUBSCRIBER, Command, EpisodeOpened, Event, encode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop, RecorderStage
 from tests.processes import PATIENCE_S
@@ -38,9 +38,9 @@ def test_a_process_that_hangs_in_a_run_holds_it_and_is_named(tmp_path: Path, pro
 
 def hanging(station: Station, seconds: float) -> None:
     """Let everything go on but media, which reads nothing meanwhile."""
-    digest, station.media.digest = station.media.digest, lambda: None
+    digest, station.media.poll = station.media.poll, lambda: None
     without(station, "media", seconds)
-    station.media.digest = digest
+    station.media.poll = digest
 
 
 def test_a_recorder_that_hangs_in_a_run_is_told_once_and_loses_nothing_of_it(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_a_run_of_which_no_answer_can_be_used_is_ended_by_the_rule_of_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, state: SessionState
 ) -> None:
     station = Station(stubbed(tmp_path, faults={"policy_error": answer, "starvation": "slow"})).ready()
-    monkeypatch.setattr(station.coordinator.inference.requests, "note", lambda answered: [][0])
+    monkeypatch.setattr(station.coordinator.inference.requests, "log_ik_problems", lambda answered: [][0])
     station.command("run")
     station.reach(state, PATIENCE_S)
     assert "the policy's answer cannot be used: IndexError" in station.reason
@@ -273,7 +273,7 @@ def test_a_query_with_nonsense_is_refused_and_nothing_ends(tmp_path: Path) -> No
 def test_a_media_that_does_not_read_costs_the_record_and_not_the_station(tmp_path: Path) -> None:
     station = Station(stubbed(tmp_path)).running(10)
     station.shared.rings["minutes"].push = lambda payload: False
-    station.media.digest = lambda: None
+    station.media.poll = lambda: None
     station.go(20)
     assert station.state in (SessionState.RUNNING, SessionState.HOLDING)
     assert np.isfinite(station.robot.sent).all()
@@ -287,11 +287,11 @@ def test_events_from_before_main_was_there_are_kept_and_nothing_that_was_told_is
     rings, told = station.shared.rings, {"unheard": {"left_arm": "nobody listens"}}
     rings["media_events"].push(encode(Event("source_frozen_cam_high", "the same picture", 0.1)))
     rings["media_events"].push(encode(EpisodeOpened(1, "one", "", "no room")))
-    rings["control_events"].push(encode(Event(UNHEARD, "nobody listens", 0.1, data=told)))
+    rings["control_events"].push(encode(Event(NO_SUBSCRIBER, "nobody listens", 0.1, data=told)))
     rings["control_events"].push(encode(Event("displaced", "the arm was moved", 0.1)))
     station.restart_coordinator()
     assert [event["kind"] for event in station.coordinator.events.since(0)] == [
-        UNHEARD,
+        NO_SUBSCRIBER,
         "displaced",
         "source_frozen_cam_high",
     ]

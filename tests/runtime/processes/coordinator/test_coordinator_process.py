@@ -69,7 +69,7 @@ def test_in_a_run_the_curves_are_those_of_one_step(watched: Watched) -> None:
     seen = watched.joints()
     assert all(seen[name].shape == (DIM,) for name in ("measured", "raw", "planned", "commanded"))
     assert all(seen[name].dtype == np.float32 for name in ("measured", "raw", "planned", "commanded"))
-    raw = station.coordinator.inference.raw(seen["step"])
+    raw = station.coordinator.inference.raw_action(seen["step"])
     assert raw is not None
     assert np.allclose(seen["raw"], raw)
     assert np.allclose(seen["planned"], raw, atol=1e-4)  # every chunk of this policy wants the same

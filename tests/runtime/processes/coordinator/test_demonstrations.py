@@ -13,10 +13,10 @@ from runtime.config import loader
 from runtime.core.errors import RecordingError, SetupError
 from runtime.datasets.published import publish
 from runtime.ipc.session_state import SessionState
-from runtime.processes.control.process import Loop, make_tick, outlive
-from runtime.recording.labels import labels
+from runtime.processes.control.process import Loop, hold_then_end, make_tick
+from runtime.recording.labels import read_labels
 from runtime.recording.reader import Episode
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from tests.runtime.collect_station import CollectStation, SelfDriven, collecting
 from tests.runtime.lockstep_station import MOVED, STANDS, column, stubbed
 
@@ -242,7 +242,7 @@ def outlived(station: CollectStation, seconds: float = 5.0) -> float:
     """How long control goes on after its supervisor has ended [s]."""
     began = station.clock.now()
     loop = Loop(station._tick, station.shared, station.clock, station.spec.rate, "virtual")
-    outlive(loop, station._tick, station.shared, station.clock, seconds)
+    hold_then_end(loop, station._tick, station.shared, station.clock, seconds)
     return station.clock.now() - began
 
 
@@ -343,7 +343,7 @@ def test_whatever_stops_us_stops_the_node_too(tmp_path: Path, cause: str) -> Non
         station.guard.press("anna", "a test")
         station.go(10)
     elif cause == "lease":
-        station.coordinator.lease.give_up("lockstep", station.coordinator.lease.epoch, station.clock.now())
+        station.coordinator.lease.release("lockstep", station.coordinator.lease.epoch, station.clock.now())
         for _ in range(10):
             station.tick()
     else:
@@ -384,7 +384,7 @@ def test_the_arm_falls_with_its_sentence(tmp_path: Path, cause: str) -> None:
     station = collecting(tmp_path).armed()
     station.go(2)
     if cause == "lease":
-        station.coordinator.lease.give_up("lockstep", station.coordinator.lease.epoch, station.clock.now())
+        station.coordinator.lease.release("lockstep", station.coordinator.lease.epoch, station.clock.now())
         station.tick()
     elif cause == "e-stop":
         station.guard.press("anna", "a test")
@@ -455,7 +455,7 @@ def test_a_node_that_cannot_be_told_to_leave_off_is_refused(
         "recording": {"min_free_bytes": 0},
     }
     with pytest.raises(SetupError, match=r"to leave off.*nor says what it applied") as refused:
-        checked_spec(loader.resolve(tree, {}, "test"))
+        check_deployment(loader.resolve_deployment(tree, {}, "test"))
     assert f"collection.leader.kind = '{leader}'" in str(refused.value)
 
 
@@ -533,7 +533,7 @@ def test_labels_are_lines_of_which_the_newest_counts(tmp_path: Path) -> None:
     episode = demonstrated(station, 10).manifest["uuid"]
     station.command("label", result="partial")
     station.command("label", result="success", note="slow")
-    said = labels(tmp_path, episode)
+    said = read_labels(tmp_path, episode)
     assert [(label.result, label.note, label.by) for label in said] == [
         ("partial", "", "lockstep"),
         ("success", "slow", "lockstep"),
@@ -561,7 +561,7 @@ def test_discarding_ends_the_open_episode_keeps_its_files_and_the_next_may_begin
     assert (tmp_path / "episodes" / episode / "outcome.json").exists()
     assert station.collect["episode"] not in (None, episode)
     station.command("label", episode=episode, result="fail")
-    assert [label.discarded for label in labels(tmp_path, episode)] == [True, True]
+    assert [label.discarded for label in read_labels(tmp_path, episode)] == [True, True]
     assert station.state is SessionState.RUNNING
     with pytest.raises(SetupError, match="is the open one"):
         station.command("discard", episode=station.collect["episode"])

@@ -118,11 +118,11 @@ def test_a_run_that_has_not_begun_does_not_begin_without_its_holder(running: Run
     station = running(FINISH)
     station.command("stop")
     station.go(5)
-    real = station.coordinator.runs.opened
-    station.coordinator.runs.opened = lambda message, running: ""  # media takes its time
+    real = station.coordinator.runs.on_episode_opened
+    station.coordinator.runs.on_episode_opened = lambda message, running: ""  # media takes its time
     station.command("run", **TRIAL)
     alone(station, 6.0)
-    station.coordinator.runs.opened = real
+    station.coordinator.runs.on_episode_opened = real
     assert station.state is SessionState.HOLDING
     with pytest.raises(SetupError, match="not allowed"):
         station.command("run")

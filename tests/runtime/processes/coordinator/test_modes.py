@@ -509,7 +509,7 @@ def test_the_end_of_the_lease_stops_a_gripper_that_is_on_its_way(
         station.command("gripper", arm="left_arm", action="lock")
     station.command("gripper", arm="left_arm", action="open")
     station.go(3)
-    station.coordinator.lease.give_up("lockstep", station.coordinator.lease.epoch, station.clock.now())
+    station.coordinator.lease.release("lockstep", station.coordinator.lease.epoch, station.clock.now())
     station.tick()
     at = left_gripper(station)
     for _ in range(40):

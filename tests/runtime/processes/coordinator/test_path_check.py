@@ -72,7 +72,7 @@ def test_what_was_accepted_is_not_refused_by_control_half_way() -> None:
         accepted += 1
         steps = start + np.linspace(0, 1, 37)[:, None] * (goal - start)
         for before, after in pairwise(steps):
-            assert collisions(margin).approached(after, before) is None
+            assert collisions(margin).closer_pair(after, before) is None
     assert accepted > 5
 
 

@@ -13,7 +13,7 @@ from uuid import uuid4
 import pytest
 import zmq
 
-from runtime.ipc.bus import GREEDY, Endpoints, Key, Subscriber
+from runtime.ipc.bus import MAX_WAITING_PER_CONNECTION, Endpoints, Key, Subscriber
 from runtime.ipc.messages import Ack, Command, decode, encode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
@@ -200,7 +200,7 @@ def test_a_flood_of_questions_is_told_once_and_a_stop_is_answered_in_a_few_turns
     for _ in range(30):
         bench.service.serve(0.0)
     assert len(bench.told("flood")) == 1
-    assert f"more than {GREEDY} requests at once" in bench.told("flood")[0]["text"]
+    assert f"more than {MAX_WAITING_PER_CONNECTION} requests at once" in bench.told("flood")[0]["text"]
 
 
 def test_a_press_at_the_wrong_socket_stops_the_robot_and_is_latched_by_the_guard(bench: Bench) -> None:
@@ -262,11 +262,11 @@ def test_streams_that_nobody_reads_are_not_made_and_who_begins_to_read_has_them_
 
 def test_a_station_rests_until_somebody_can_command_it_or_something_goes_on(bench: Bench) -> None:
     bench.station.reach(SessionState.IDLE)
-    now, lease = bench.coordinator.people.now(), bench.coordinator.lease
+    now, lease = bench.coordinator.client_clock.now(), bench.coordinator.lease
     held = lease.current(now)  # by who plays the operator in lockstep
     assert held is not None
     assert not bench.coordinator.rests
-    assert lease.give_up(held.holder, held.epoch, now) == ""
+    assert lease.release(held.holder, held.epoch, now) == ""
     assert bench.coordinator.rests
     epoch = lease.epoch + 1
     claim = Command(str(uuid4()), "lease_claim", user="ann", holder=PAGE, epoch=epoch, role="operator")

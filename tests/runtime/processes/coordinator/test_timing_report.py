@@ -26,28 +26,28 @@ def watching(shared: SharedState, asked: bool = True) -> TimingReport:
 
 
 def kinds(punctuality: TimingReport, now: float) -> list[str]:
-    return [event.kind for event in punctuality.look(now)]
+    return [event.kind for event in punctuality.poll(now)]
 
 
 def test_who_has_the_real_time_class_and_is_on_time_is_told_nothing(shared: SharedState) -> None:
     tell(shared, "FIFO 20")
-    assert watching(shared).look(10.0) == []
+    assert watching(shared).poll(10.0) == []
 
 
 def test_another_class_is_told_once_with_what_to_do_about_it(shared: SharedState) -> None:
     tell(shared, "slice 0.1 ms unlocked")
     told = watching(shared)
-    (event,) = told.look(10.0)
+    (event,) = told.poll(10.0)
     assert event.kind == "scheduling"
     assert "'slice 0.1 ms unlocked'" in event.text
     assert "rtprio limit of 20" in event.text
     assert "LimitRTPRIO=20" in event.text
-    assert told.look(12.0) == []
+    assert told.poll(12.0) == []
 
 
 def test_who_did_not_ask_for_the_class_gets_no_advice(shared: SharedState) -> None:
     tell(shared, "ordinary")
-    assert watching(shared, asked=False).look(10.0) == []
+    assert watching(shared, asked=False).poll(10.0) == []
 
 
 def test_late_ticks_are_told_once_and_once_again_when_they_are_over(shared: SharedState) -> None:
@@ -64,16 +64,16 @@ def test_nothing_is_judged_before_two_seconds_of_ticks_nor_without_a_clock_of_it
 ) -> None:
     told = watching(shared)
     tell(shared, "ordinary", 5.0, ticks=199)
-    assert told.look(10.0) == []
+    assert told.poll(10.0) == []
     tell(shared, "", 5.0)  # lockstep
-    assert told.look(12.0) == []
+    assert told.poll(12.0) == []
     tell(shared, "ordinary", 5.0, ticks=200)
     assert kinds(told, 14.0) == ["scheduling", "late_ticks"]
 
 
 def test_it_looks_once_a_second(shared: SharedState) -> None:
     told = watching(shared)
-    assert told.look(10.0) == []
+    assert told.poll(10.0) == []
     tell(shared, "ordinary", 5.0)
-    assert told.look(10.9) == []
+    assert told.poll(10.9) == []
     assert kinds(told, 11.0) == ["scheduling", "late_ticks"]

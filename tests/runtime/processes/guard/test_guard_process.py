@@ -7,12 +7,12 @@ import zmq
 
 from runtime.core.clock import VirtualClock
 from runtime.ipc.bus import Endpoints, Key
-from runtime.ipc.endpoints import account
+from runtime.ipc.endpoints import account_name
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.messages import Command, decode, encode
 from runtime.ipc.shared_state import EStop, SharedState, SharedStateLayout
 from runtime.processes.guard import process as guard_module
-from runtime.processes.guard.process import Desk, Guard
+from runtime.processes.guard.process import EStopServer, Guard
 from tests import presses
 from tests.processes import PATIENCE_MS
 
@@ -207,11 +207,11 @@ def test_a_latch_that_cannot_be_removed_stays_latched_and_the_guard_lives(shared
     guard = Guard(shared, latch, control, PERIOD)
     press(guard)
     shared.ask_release()
-    guard.watch()
+    guard.poll()
     assert shared.estop is EStop.LATCHED
     latch.fails = False
     shared.ask_release()
-    guard.watch()
+    guard.poll()
     assert shared.estop is EStop.CLEAR
 
 
@@ -226,7 +226,7 @@ def test_a_restarted_guard_does_not_carry_out_releases_of_before(shared, latch, 
     press(Guard(shared, latch, control, PERIOD))
     shared.ask_release()
     restarted = Guard(shared, latch, control, PERIOD)
-    restarted.watch()
+    restarted.poll()
     assert shared.estop is EStop.LATCHED
 
 
@@ -246,7 +246,7 @@ def test_a_press_that_came_to_main_is_latched_on_disk_with_who_and_why(guard, sh
 def test_a_press_that_came_to_main_while_there_was_no_guard_is_latched_by_the_next(shared, latch, control):
     to_main(shared)
     restarted = Guard(shared, latch, control, PERIOD)
-    restarted.watch()
+    restarted.poll()
     assert (shared.estop, latch.read().by) == (EStop.LATCHED, "ben")
 
 
@@ -293,7 +293,7 @@ class Door:
         self.folder, self.shared, self.latch = folder, shared, Counting(folder)
         self.context = zmq.Context()
         self.guard = Guard(shared, self.latch, control, PERIOD, "bench-1")
-        self.desk = Desk(self.guard, shared, self.context, folder)
+        self.desk = EStopServer(self.guard, shared, self.context, folder)
         self._endpoint = Endpoints(folder).read("guard")["estop"]
 
     def client(self):
@@ -306,7 +306,7 @@ class Door:
     def serve(self, turns=1):
         for _ in range(turns):
             self.desk.serve(2.0)
-            self.guard.watch()
+            self.guard.poll()
 
     def heard(self, client):
         """What the client is answered first, however many turns what others send takes."""
@@ -353,7 +353,7 @@ def test_a_press_of_a_program_is_recorded_by_account(door):
     client.send(pressed())
     door.serve()
     assert answers(client)[0].status == "done"
-    assert door.latch.read().by == f"account:{account(os.geteuid())}"
+    assert door.latch.read().by == f"account:{account_name(os.geteuid())}"
 
 
 @pytest.mark.parametrize("trouble", ["forged", "no key", "a key for everybody", "a folder for a key"])
@@ -382,7 +382,7 @@ def test_whatever_is_wrong_with_a_press_it_is_pressed_recorded_and_answered(door
     door.serve()
     (ack,) = answers(client)
     assert (ack.status, shared.estop) == ("done", EStop.LATCHED)
-    assert door.latch.read().by == f"account:{account(os.geteuid())}"
+    assert door.latch.read().by == f"account:{account_name(os.geteuid())}"
     assert 0 < len(door.latch.read().why) < 1000
 
 
@@ -436,7 +436,9 @@ def test_presses_behind_a_flood_of_long_garbage_are_answered_before_it_is_read(d
 
 def test_the_flag_is_up_before_anybody_is_asked_who_he_is(door, shared, monkeypatch):
     seen = []
-    monkeypatch.setattr(guard_module, "identified", lambda command, *_: seen.append(shared.estop) or command)
+    monkeypatch.setattr(
+        guard_module, "authenticate", lambda command, *_: seen.append(shared.estop) or command
+    )
     client = door.client()
     client.send(pressed())
     door.serve()

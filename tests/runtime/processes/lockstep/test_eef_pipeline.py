@@ -18,7 +18,7 @@ from runtime.kinematics.base import IkFlag
 from runtime.processes.coordinator.builders import make_kinematics
 from runtime.spaces.conversion import ActionSpaces
 from runtime.spaces.pose_rows import PoseRows
-from runtime.spaces.relative_poses import absolute
+from runtime.spaces.relative_poses import to_absolute
 from runtime.transports.base import Capabilities
 from tests.runtime.lockstep_station import MOVED, STANDS, Station, column, on_time, ramp, stubbed
 
@@ -33,7 +33,7 @@ def reversed_offsets(vectors: Float64, start: Float64, mode: ActionMode) -> Floa
         return vectors
     made, before = vectors.copy(), start
     for row, wanted in zip(made, vectors, strict=True):
-        turned = absolute(_inverse(before)[None], wanted, "relative", "tool")[0]
+        turned = to_absolute(_inverse(before)[None], wanted, "relative", "tool")[0]
         row[:, :3] = wanted[:, :3] - before[:, :3]
         row[:, 3:7] = turned[:, 3:7]
         before = start if mode == "relative" else wanted
@@ -190,7 +190,7 @@ def test_the_recording_says_which_poses_there_were_and_which_the_policy_was_show
     tmp_path: Path, wanted: Any
 ) -> None:
     station = speaking(Station(stubbed(tmp_path)), on_time, SIX, "relative")
-    station.policy.sees_poses, station.policy.observation_eef = True, wanted
+    station.policy.uses_poses, station.policy.observation_eef = True, wanted
     receive = station.robot.receive
 
     def with_poses(timeout: float) -> Observation | None:
@@ -219,7 +219,7 @@ def publishing(tmp_path: Path, pose: PoseFormat) -> Station:
     made = stubbed(tmp_path)
     wanted = {"publication": {"space": "eef", "pose": pose.model_dump()}}
     takes = Capabilities(moves_robot=True, spaces=frozenset({"joint", "eef"}))
-    resolved = loader.changed(made.spec.resolved, wanted, "test")
+    resolved = loader.apply_changes(made.spec.resolved, wanted, "test")
     made.spec = replace(made.spec, resolved=resolved, capabilities=takes)
     return Station(made)
 

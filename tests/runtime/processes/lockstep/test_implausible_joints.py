@@ -135,7 +135,7 @@ def test_a_run_does_not_begin_where_a_joint_is_in_doubt_once_its_recording_is_op
     station = ready(tmp_path)
     station.command("run")  # accepted, and opened some ticks later
     monkeypatch.setattr(
-        SharedState, "doubt", f"{JOINT} reads 0.450 rad and is held at 0.000"
+        SharedState, "joint_problem", f"{JOINT} reads 0.450 rad and is held at 0.000"
     )  # said before, so no event
     station.go(30)
     assert station.state is SessionState.READY

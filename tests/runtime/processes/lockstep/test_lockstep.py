@@ -20,7 +20,7 @@ from runtime.kinematics.forward import ChainForward
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.spaces.end_effectors import EndEffectors
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 from tests.processes import PATIENCE_S
 from tests.runtime.lockstep_station import DIM, MOVED, STANDS, Station, column, on_time, ramp, stubbed
 from tests.runtime.recording.samples import decoded, numbers
@@ -419,7 +419,7 @@ def test_the_policy_is_told_once_of_each_end_of_what_it_drove(
 ) -> None:
     station = Station(stubbed(tmp_path)).ready()
     policy = station.coordinator.inference.policy
-    monkeypatch.setattr(policy, "rest", lambda: policy.calls.append("rest"))
+    monkeypatch.setattr(policy, "end_episode", lambda: policy.calls.append("rest"))
     station.command("run", mode="manual")
     station.go(5)
     station.command("stop")
@@ -441,7 +441,7 @@ def test_a_policy_that_cannot_end_its_rollout_keeps_no_run_from_ending(
         raise PolicyError("the server is mute")
 
     station = Station(stubbed(tmp_path)).ready()
-    monkeypatch.setattr(station.coordinator.inference.policy, "rest", rest)
+    monkeypatch.setattr(station.coordinator.inference.policy, "end_episode", rest)
     station.command("run")
     station.go(20)
     episode = station.stop()
@@ -544,7 +544,7 @@ def test_without_room_on_the_disk_nothing_is_begun_and_the_refusal_says_how_much
     with pytest.raises(SetupError, match=wanted):
         station.command(kind)
     station.go(5)
-    assert (station.state, station.coordinator.run, station.coordinator.runs.alone) == (
+    assert (station.state, station.coordinator.run, station.coordinator.runs.is_recording_standalone) == (
         SessionState.READY,
         None,
         False,
@@ -677,7 +677,7 @@ def test_what_was_published_plays_through_the_whole_pipeline_unchanged(tmp_path:
         "safety": {"report_only": True},
         "recording": {"min_free_bytes": 0},
     }
-    done = lockstep.run(checked_spec(loader.resolve(tree, {}, "test")))
+    done = lockstep.run(check_deployment(loader.resolve_deployment(tree, {}, "test")))
     assert (done.state, done.reason) == (SessionState.READY, "the recording that is the source has ended")
     source, copy = open_episode(Path(first.episode["path"])), open_episode(Path(done.episode["path"]))
     assert copy.frames == source.frames == 60

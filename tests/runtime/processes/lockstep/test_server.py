@@ -18,7 +18,7 @@ from runtime.core.clock import VirtualClock
 from runtime.core.errors import SetupError
 from runtime.core.types import ActionChunk
 from runtime.ipc.bus import Endpoints, Subscriber, TransportError
-from runtime.ipc.endpoints import account
+from runtime.ipc.endpoints import account_name
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.messages import Ack, Command, decode, encode
 from runtime.ipc.session_state import SessionState
@@ -82,7 +82,7 @@ class Client:
         )
         socket.send(encode(command))
         for _ in range(TURNS):
-            self.station.turn()
+            self.station.poll()
             if socket.poll(1):
                 answer = decode(socket.recv())
                 assert isinstance(answer, Ack)
@@ -94,7 +94,7 @@ class Client:
         before = self.station.step
         for _ in range(count):
             self.people.advance(seconds)
-            self.station.turn()
+            self.station.poll()
         return self.station.step - before
 
     def until(self, *states: SessionState) -> None:
@@ -102,7 +102,7 @@ class Client:
             if self.state in states:
                 return
             self.people.advance(self._waits)
-            self.station.turn()
+            self.station.poll()
         raise AssertionError(f"never {states}; {self.state}: {self.reason}")
 
     def ready(self) -> Client:
@@ -115,7 +115,7 @@ class Client:
         begun = self.station.step
         while self.station.step < begun + ticks:
             self.people.advance(self._waits)
-            self.station.turn()
+            self.station.poll()
         return self
 
     def episode(self) -> Episode:
@@ -123,7 +123,7 @@ class Client:
         for _ in range(TURNS):
             if found := self.station.coordinator.runs.last_episode:
                 return open_episode(Path(found["path"]))
-            self.station.turn()
+            self.station.poll()
         raise AssertionError("no episode is closed")
 
     def hangs(self) -> threading.Event:
@@ -137,7 +137,7 @@ class Client:
 
         self.policy.infer = hanging  # type: ignore[method-assign]
         while not asked.is_set():
-            self.station.turn()
+            self.station.poll()
         return gate
 
     def accepted(self, kind: str, **arguments: Any) -> None:
@@ -243,7 +243,7 @@ def test_a_policy_that_takes_long_changes_nothing_of_what_is_recorded(tmp_path: 
 def test_no_tick_more_passes_after_a_run(client: Client) -> None:
     client.ready().accepted("run", duration_s=1.0)
     client.until(SessionState.READY)
-    while client.station._asking.begin():  # the policy is told that the rollout is over
+    while client.station._asking.start_waiting():  # the policy is told that the rollout is over
         pass
     assert client.turn(20, 0.1) == 0
 
@@ -359,7 +359,7 @@ def test_the_e_stop_is_obeyed_at_once(client: Client, during: str) -> None:
     gate.set()
     client.turn(20, 1 / 30)
     assert client.state is SessionState.FAULTED
-    assert f"account:{account(os.getuid())}: smoke" in client.reason
+    assert f"account:{account_name(os.getuid())}: smoke" in client.reason
     assert Latch(client.station.spec.deployment.station_dir).read() is not None
     client.accepted("release")
     client.turn(20, 1 / 30)

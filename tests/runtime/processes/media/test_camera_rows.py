@@ -17,8 +17,8 @@ def played(silent: list[bool], camera: str = "cam") -> tuple[list[Event], list[E
     silences = DropoutLog([camera])
     events: list[Event] = []
     for row, here in enumerate(silent):
-        events += silences.look(row / RATE, row, {camera: 0.6} if here else {})
-    return events, silences.rest(len(silent) / RATE)
+        events += silences.update(row / RATE, row, {camera: 0.6} if here else {})
+    return events, silences.flush(len(silent) / RATE)
 
 
 def rows(*stretches: tuple[bool, float]) -> list[bool]:
@@ -74,8 +74,10 @@ def test_what_was_counted_is_said_at_the_end_of_the_episode() -> None:
 
 def test_each_camera_has_a_quiet_time_of_its_own() -> None:
     silences = DropoutLog(["wrist", "high"])
-    assert [event.data["camera"] for event in silences.look(0.0, 0, {"wrist": 1.0})] == ["wrist"]
-    assert [event.data["camera"] for event in silences.look(1.0, 1, {"wrist": 2.0, "high": 1.0})] == ["high"]
+    assert [event.data["camera"] for event in silences.update(0.0, 0, {"wrist": 1.0})] == ["wrist"]
+    assert [event.data["camera"] for event in silences.update(1.0, 1, {"wrist": 2.0, "high": 1.0})] == [
+        "high"
+    ]
 
 
 @settings(max_examples=some(200))

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from runtime.processes.media import export_jobs as module
-from runtime.processes.media.export_jobs import Exports
-from runtime.recording.export import place
-from runtime.recording.files import read_document
+from runtime.processes.media.export_jobs import ExportQueue
+from runtime.recording.export import export_path
+from runtime.recording.files import read_json
 from tests.processes import PATIENCE_S
 from tests.runtime.recording.test_export import recorded
 
@@ -24,9 +24,9 @@ def folder(tmp_path_factory):
 @pytest.mark.exhaustive
 @pytest.mark.slow
 def test_a_closed_episode_is_exported_and_one_that_cannot_be_is_logged(folder, tmp_path, caplog):
-    exports = Exports(tmp_path)
-    exports.start(folder)
-    exports.start(tmp_path / "absent")
+    exports = ExportQueue(tmp_path)
+    exports.submit(folder)
+    exports.submit(tmp_path / "absent")
     exports.finish(PATIENCE_S)
     (path,) = (tmp_path / "exports").rglob("*.parquet")
     assert path.stem == folder.name
@@ -38,8 +38,8 @@ def test_a_process_that_cannot_be_started_is_logged(folder, tmp_path, monkeypatc
         raise OSError(11, "Resource temporarily unavailable")
 
     monkeypatch.setattr(module.subprocess, "Popen", full)
-    exports = Exports(tmp_path)
-    exports.start(folder)
+    exports = ExportQueue(tmp_path)
+    exports.submit(folder)
     exports.finish(PATIENCE_S)
     assert "is not exported: [Errno 11] Resource temporarily unavailable" in caplog.text
 
@@ -64,9 +64,9 @@ def test_of_many_episodes_one_is_exported_at_a_time_in_the_order_they_were_close
             return 0
 
     monkeypatch.setattr(module.subprocess, "Popen", Child)
-    exports = Exports(tmp_path)
+    exports = ExportQueue(tmp_path)
     for number in range(20):
-        exports.start(tmp_path / str(number))
+        exports.submit(tmp_path / str(number))
     exports.finish(PATIENCE_S)
     assert order == [str(number) for number in range(20)]
 
@@ -74,7 +74,7 @@ def test_of_many_episodes_one_is_exported_at_a_time_in_the_order_they_were_close
 @pytest.mark.slow
 def test_it_ends_with_its_standard_input(folder, tmp_path):
     """Kept from its work by a lock that we hold, it would wait for ever."""
-    folder_of_it = place(read_document(folder / "manifest.json"), tmp_path).parent
+    folder_of_it = export_path(read_json(folder / "manifest.json"), tmp_path).parent
     folder_of_it.mkdir(parents=True)
     lock = os.open(folder_of_it, os.O_RDONLY)
     fcntl.flock(lock, fcntl.LOCK_EX)

@@ -29,14 +29,14 @@ from runtime.ipc.messages import (
     encode,
 )
 from runtime.ipc.shared_state import PICTURE_SLOTS, SharedState, SharedStateLayout
-from runtime.processes.media.crash_repair import leftovers, repair_leftovers
+from runtime.processes.media.crash_repair import find_open_episodes, repair_open_episodes
 from runtime.processes.media.episode_closing import at_once, in_background
 from runtime.processes.media.process import Media
 from runtime.processes.media.recorder import DatasetGrid, Recorder
 from runtime.processes.reception.process import Reception
 from runtime.recording.base import Outcome
 from runtime.recording.files import UnclosedError
-from runtime.recording.repair import Report
+from runtime.recording.repair import RepairReport
 from runtime.transports.base import Source
 from tests.processes import PATIENCE_S
 from tests.runtime.processes.media.test_recorder import FakeJournal
@@ -108,10 +108,10 @@ class Desk:
 
     def pump(self, timeout: float = 0.0) -> None:
         """What both processes do, and what comes of it at once."""
-        self.reception.pump(timeout)
-        self.media.digest()
-        if self.reception.hear():
-            self.media.digest()
+        self.reception.poll(timeout)
+        self.media.poll()
+        if self.reception.poll_commands():
+            self.media.poll()
 
     def receive(self, *sequences: int) -> None:
         for sequence in sequences:
@@ -338,7 +338,7 @@ def test_what_was_addressed_to_a_predecessor_is_not_obeyed(desk: Desk) -> None:
     desk.receive(1)
     desk.post(BeginEpisode(1, {"uuid": "old"}))
     desk.tick(0, 1)
-    Media(desk.shared, desk.media._recorder, desk.clock).digest()
+    Media(desk.shared, desk.media._recorder, desk.clock).poll()
     assert not desk.media.recording
     assert desk.source.begun == 0
 
@@ -405,9 +405,9 @@ def test_a_run_that_the_source_began_for_a_coordinator_that_died_is_not_that_of_
     desk.receive(1)
     another_coordinator(desk)
     desk.post(BeginEpisode(1, {"uuid": "two"}, desk.shared.generation("coordinator")))
-    desk.media.digest()
+    desk.media.poll()
     desk.post(RunBegun(1, desk.shared.generation("coordinator") - 1), "observations")
-    desk.media.digest()
+    desk.media.poll()
     assert desk.told(EpisodeOpened) == []
     desk.pump()
     assert [opened.uuid for opened in desk.told(EpisodeOpened)] == ["two"]
@@ -450,11 +450,11 @@ def test_a_tick_that_comes_before_the_observation_it_saw_was_read_is_a_row_of_th
         desk.shared.rings["observations"].drain = drain  # type: ignore[method-assign]
         yield from drain()
         desk.source.waiting.append(desk.observation(2))
-        desk.reception.pump(0.0)
+        desk.reception.poll(0.0)
         desk.tick(0, 2)
 
     desk.shared.rings["observations"].drain = late  # type: ignore[method-assign]
-    desk.media.digest()
+    desk.media.poll()
     (row,) = desk.journal.rows
     assert row.lost == frozenset()
     assert all((row.pictures[camera] == 2).all() for camera in CAMERAS)  # type: ignore[union-attr]
@@ -464,13 +464,13 @@ def test_pictures_that_were_overwritten_before_they_were_recorded_are_lost_and_s
     desk.receive(1)
     desk.begin()
     desk.tick(0, 1)
-    desk.media.digest()
+    desk.media.poll()
     for sequence in range(2, PICTURE_SLOTS + 4):  # media does nothing meanwhile
         desk.source.waiting.append(desk.observation(sequence))
-        desk.reception.pump(0.0)
+        desk.reception.poll(0.0)
         desk.clock.advance(1 / RATE)
         desk.tick(sequence - 1, sequence)
-    desk.media.digest()
+    desk.media.poll()
     lost = [row.lost == set(CAMERAS) for row in desk.journal.rows]
     assert lost == [False, True, True, *[False] * PICTURE_SLOTS]
     shown = [row.pictures["left"] for row in desk.journal.rows]
@@ -489,7 +489,7 @@ def test_what_media_had_no_room_for_is_lost_in_its_rows_and_said(
     desk.receive(1)
     desk.begin()
     desk.tick(0, 1)
-    desk.media.digest()
+    desk.media.poll()
     push = desk.shared.rings["observations"].push
     desk.shared.rings["observations"].push = lambda payload: False  # type: ignore[method-assign]
     desk.receive(2, 3)
@@ -497,7 +497,7 @@ def test_what_media_had_no_room_for_is_lost_in_its_rows_and_said(
     desk.tick(1, 3)
     desk.receive(4)
     desk.tick(2, 4)
-    desk.media.digest()
+    desk.media.poll()
     assert [row.lost for row in desk.journal.rows] == [frozenset(), set(CAMERAS), frozenset()]
     assert caplog.text.count("media does not read") == 1
     assert desk.shared.observation.read()["sequence"] == 4  # and control saw all of them
@@ -507,12 +507,12 @@ def test_a_recording_goes_on_over_another_reception(desk: Desk) -> None:
     desk.receive(1, 2)
     desk.begin(run=0)
     desk.tick(0, 2, run=0)
-    desk.media.digest()
+    desk.media.poll()
     desk.reception, desk.source.waiting = Reception(desk.shared, desk.source, desk.clock), deque()
     desk.receive(1)
     assert desk.shared.observation.read()["sequence"] == 3
     desk.tick(1, 3, run=0)
-    desk.media.digest()
+    desk.media.poll()
     assert [row.sequence for row in desk.journal.rows] == [2, 3]
     assert [row.lost for row in desk.journal.rows] == [frozenset(), frozenset()]
 
@@ -532,7 +532,7 @@ def test_a_restarted_media_lets_the_run_of_its_predecessor_end(desk: Desk) -> No
     desk.begin()
     ended = desk.source.ended
     desk.media = Media(desk.shared, desk.media._recorder, desk.clock)
-    desk.reception.pump(0.0)
+    desk.reception.poll(0.0)
     assert desk.source.ended == ended + 1
 
 
@@ -667,14 +667,14 @@ def test_the_end_of_an_episode_that_found_no_room_is_tried_again_and_told_twice(
     for _ in range(700):
         desk.clock.advance(0.1)
         before = full.tries
-        desk.media.digest()
+        desk.media.poll()
         times += [round(desk.clock.now(), 1)] if full.tries > before else []
     assert desk.told(MediaReport)[-1].unclosed == {"one": "disk full while writing it"}
     gaps = np.diff(times).round(1).tolist()
     assert gaps == pytest.approx([2.0, 4.0, 8.0, 16.0, 30.0], abs=0.11)
     full.room = True
     desk.clock.advance(30.0)
-    desk.media.digest()
+    desk.media.poll()
     (closed,) = desk.told(EpisodeClosed)
     assert (closed.uuid, closed.waits, closed.status, closed.reason, closed.rows) == (
         "one",
@@ -685,7 +685,7 @@ def test_the_end_of_an_episode_that_found_no_room_is_tried_again_and_told_twice(
     )
     assert desk.on_disk == [Path("/episodes/one")]
     desk.clock.advance(30.0)
-    desk.media.digest()
+    desk.media.poll()
     assert desk.told(MediaReport)[-1].unclosed == {}
 
 
@@ -695,7 +695,7 @@ def test_an_episode_that_waits_for_room_is_in_no_other_ones_way(desk: Desk) -> N
     assert desk.told(EpisodeOpened)[-1].uuid == "two"
     full.room = True
     desk.clock.advance(1.5)
-    desk.media.digest()
+    desk.media.poll()
     assert desk.media.recording
     assert desk.told(EpisodeClosed)[-1].uuid == "one"
 
@@ -782,8 +782,8 @@ def test_only_folders_without_an_outcome_are_left_over(tmp_path: Path) -> None:
     (left(tmp_path, "closed") / "outcome.json").write_text("{}", "utf-8")
     (tmp_path / "no episode").mkdir()
     left_open = left(tmp_path, "open")
-    assert leftovers(tmp_path) == [left_open]
-    assert leftovers(tmp_path / "nothing was ever recorded") == []
+    assert find_open_episodes(tmp_path) == [left_open]
+    assert find_open_episodes(tmp_path / "nothing was ever recorded") == []
 
 
 @pytest.mark.parametrize("error", [RecordingError("disk full"), ZeroDivisionError("a mistake")])
@@ -792,15 +792,15 @@ def test_a_leftover_that_cannot_be_repaired_keeps_no_other_from_it(
 ) -> None:
     seen: list[str] = []
 
-    def repaired(folder: Path) -> Report:
+    def repaired(folder: Path) -> RepairReport:
         seen.append(folder.name)
         if folder.name == "bad":
             raise error
-        return Report(folder, "repaired", frames=7)
+        return RepairReport(folder, "repaired", frames=7)
 
     monkeypatch.setattr("runtime.processes.media.crash_repair.repair", repaired)
     folders = [left(tmp_path, "bad"), left(tmp_path, "foreign", "bench-2"), left(tmp_path, "good")]
-    repair_leftovers(folders, "bench")
+    repair_open_episodes(folders, "bench")
     assert seen == ["bad", "good"]
     assert "episode bad was left open and stays as it is" in caplog.text
     assert str(error) in caplog.text
@@ -882,7 +882,7 @@ def test_an_episode_on_disk_is_passed_on_once_after_main_was_told() -> None:
     desk.receive(1)
     desk.begin()
     desk.media.end("finished", "over")
-    desk.media.digest()
+    desk.media.poll()
     assert desk.on_disk == [Path("/episodes/one")]
     assert len(desk.told(EpisodeClosed)) == 1
 
@@ -890,10 +890,10 @@ def test_an_episode_on_disk_is_passed_on_once_after_main_was_told() -> None:
 def test_a_leftover_that_was_repaired_is_passed_on_and_a_broken_one_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def repair(folder: Path) -> Report:
-        return Report(folder, "unreadable" if folder.name == "bad" else "repaired")
+    def repair(folder: Path) -> RepairReport:
+        return RepairReport(folder, "unreadable" if folder.name == "bad" else "repaired")
 
     monkeypatch.setattr("runtime.processes.media.crash_repair.repair", repair)
     heard: list[Path] = []
-    repair_leftovers([left(tmp_path, "bad"), left(tmp_path, "good")], "bench", heard.append)
+    repair_open_episodes([left(tmp_path, "bad"), left(tmp_path, "good")], "bench", heard.append)
     assert heard == [tmp_path / "good"]

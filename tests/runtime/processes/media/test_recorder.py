@@ -16,7 +16,7 @@ from runtime.core.errors import RecordingError
 from runtime.core.types import Observation
 from runtime.ipc.messages import ChunkMerged, PolicyAnswer, TickDone
 from runtime.processes.media.recorder import DatasetGrid, Recorder
-from runtime.recording.base import ExecutedTick, Journal, Loss, Outcome, RawChunk, Record, Row
+from runtime.recording.base import ExecutedTick, Journal, LostCamera, Outcome, RawChunk, Record, Row
 from runtime.recording.settings import RecordingSettings
 from tests.examples import some
 
@@ -32,7 +32,7 @@ class FakeJournal(Journal):
         self.taken: list[Record] = []
         self.events: list[Mapping[str, object]] = []
         self.outcome: Outcome | None = None
-        self.lost: list[Loss] = []
+        self.lost: list[LostCamera] = []
         self.failing: set[str] = set()
 
     def _check(self, name: str) -> None:
@@ -47,11 +47,11 @@ class FakeJournal(Journal):
         self._check("append")
         self.taken.append(record)
 
-    def mark(self, event: Mapping[str, object]) -> None:
+    def append_event(self, event: Mapping[str, object]) -> None:
         self._check("mark")
         self.events.append(event)
 
-    def losses(self) -> list[Loss]:
+    def pop_lost_cameras(self) -> list[LostCamera]:
         told, self.lost = self.lost, []
         return told
 
@@ -86,7 +86,7 @@ class Desk:
             "qpos": np.full(2, sequence, np.float32),
             "pictures": {CAMERA: PICTURE + sequence},
         }
-        self.recorder.see(Observation(**(fields | changes)))
+        self.recorder.add_observation(Observation(**(fields | changes)))
 
     def begin(self, run: int = 1) -> None:
         self.see(1)
@@ -108,15 +108,15 @@ class Desk:
             "notes": [],
             "refused": False,
         }
-        self.recorder.tick(TickDone(**(fields | changes)))
+        self.recorder.add_tick(TickDone(**(fields | changes)))
 
     def answer(self, chunk: int, rows: int = 3, source: list[int] | None = None, run: int = 1) -> None:
         actions = np.full((rows, 2), chunk, np.float32)
         mapping = np.array(range(rows) if source is None else source)
-        self.recorder.answered(PolicyAnswer(chunk, run, 10, actions, "joint", mapping, 12.0))
+        self.recorder.add_answer(PolicyAnswer(chunk, run, 10, actions, "joint", mapping, 12.0))
 
     def merge(self, chunk: int, targets: list[int], run: int = 1, dropped: str = "") -> None:
-        self.recorder.merged(ChunkMerged(chunk, run, 12, 2, np.array(targets, np.int64), 0, dropped))
+        self.recorder.add_merge(ChunkMerged(chunk, run, 12, 2, np.array(targets, np.int64), 0, dropped))
 
 
 @pytest.fixture
@@ -278,7 +278,7 @@ def test_what_was_missed_of_a_row_is_the_worst_of_the_steps_made_from_it(
     flags = np.array([[1, 0], [2, 8], [0, 4], [1, 0]], np.uint8)[: len(source)]
     actions, mapping = np.zeros((3, 2), np.float32), np.array(source)
     answer = PolicyAnswer(4, 1, 10, actions, "eef", mapping, 12.0, metres, 2 * metres, flags, "fk")
-    desk.recorder.answered(answer)
+    desk.recorder.add_answer(answer)
     desk.merge(4, list(range(len(source))))
     (chunk,) = desk.journal.of(RawChunk)
     expected = {
@@ -335,7 +335,7 @@ def test_without_an_episode_nothing_is_written() -> None:
     desk.tick(0)
     desk.answer(1)
     desk.merge(1, [1, 2, 3])
-    desk.recorder.mark({"kind": "x"})
+    desk.recorder.add_event({"kind": "x"})
     assert desk.journal.taken == []
     assert desk.journal.events == []
 
@@ -427,13 +427,13 @@ def test_a_journal_that_fails_in_the_middle_raises(desk: Desk) -> None:
     with pytest.raises(RecordingError, match="append"):
         desk.tick(0)
     with pytest.raises(RecordingError, match="mark"):
-        desk.recorder.mark({"kind": "x"})
+        desk.recorder.add_event({"kind": "x"})
 
 
 def test_a_chunk_is_kept_with_the_strategy_that_merged_it(desk: Desk) -> None:
     desk.answer(1)
     targets = np.array([12, 13, 14])
-    desk.recorder.merged(ChunkMerged(1, 1, 12, 2, targets, 0, "", strategy="ensemble", overlap=2))
+    desk.recorder.add_merge(ChunkMerged(1, 1, 12, 2, targets, 0, "", strategy="ensemble", overlap=2))
     desk.answer(2)
     desk.recorder.end("finished", "", {})
     merged, lost = desk.journal.of(RawChunk)
@@ -459,13 +459,13 @@ def test_a_camera_without_new_pictures_is_flagged_row_by_row_and_named_once() ->
         desk.tick(step, sequence=step + 2)
     stale = [CAMERA in row.stale for row in desk.journal.rows]
     assert stale == [34 < k < 50 for k in range(60)]  # half a second after its last picture, of row 19
-    told = desk.recorder.news()
+    told = desk.recorder.pop_events()
     assert [(event.kind, event.data) for event in told] == [
         ("pictures_stopped", {"camera": CAMERA, "row": 35}),
         ("pictures_back", {"camera": CAMERA, "row": 50}),
     ]
     assert [event["kind"] for event in desk.journal.events] == ["pictures_stopped", "pictures_back"]
-    assert desk.recorder.news() == []
+    assert desk.recorder.pop_events() == []
 
 
 def test_a_camera_that_flutters_is_flagged_in_every_row_and_named_now_and_then() -> None:
@@ -499,12 +499,12 @@ def test_what_the_journal_has_lost_is_told_once_and_stands_in_the_end() -> None:
     desk.see(1, captured=100.0)
     desk.recorder.begin({"uuid": "one"}, 1)
     desk.tick(0)
-    desk.journal.lost = [Loss(CAMERA, 7, "its encoder failed")]
-    (event,) = desk.recorder.news()
+    desk.journal.lost = [LostCamera(CAMERA, 7, "its encoder failed")]
+    (event,) = desk.recorder.pop_events()
     assert (event.kind, event.data) == ("video_lost", {"camera": CAMERA, "row": 7})
-    assert desk.recorder.news() == []
+    assert desk.recorder.pop_events() == []
     close = desk.recorder.end("finished", "stopped", {})
-    desk.journal.lost = [Loss("wrist", 9, "did not end in time")]
+    desk.journal.lost = [LostCamera("wrist", 9, "did not end in time")]
     closed = close()
     assert closed.status == "finished"
     assert closed.reason.startswith("stopped; its encoder failed")

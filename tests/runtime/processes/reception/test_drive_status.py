@@ -1,7 +1,7 @@
 import pytest
 
 from runtime.ipc.session_state import SessionState
-from runtime.processes.reception.drive_status import Drives
+from runtime.processes.reception.drive_status import DriveStatus
 from tests.runtime.lockstep_station import Station, stubbed
 
 GOOD = {"enabled": True, "faults": []}
@@ -10,7 +10,7 @@ OFF = {"enabled": False, "faults": []}
 
 @pytest.fixture
 def drives():
-    return Drives()
+    return DriveStatus()
 
 
 def test_what_is_as_it_should_be_needs_no_line(drives):

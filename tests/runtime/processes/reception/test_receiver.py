@@ -53,7 +53,7 @@ class Gate:
     def receive(self, count: int, **changes: Any) -> None:
         for sequence in range(1, count + 1):
             self.source.waiting.append(self.observation(sequence, **changes))
-            self.intake.pump(0.0)
+            self.intake.poll(0.0)
             self.clock.advance(1 / RATE)
 
 
@@ -150,7 +150,7 @@ def test_a_fault_is_said_with_its_sentence_where_the_source_has_one(
 ) -> None:
     gate.source.counts.update({"missing_camera": 1, "node_refused.stale": 2})
     why = {"missing_camera": "images lack cam", "node_refused.stale": "too late"}
-    monkeypatch.setattr(gate.source, "why", why.get)
+    monkeypatch.setattr(gate.source, "describe_fault", why.get)
     gate.intake.faults()
     assert [event.text for event in gate.said] == [
         "source: missing camera (1 so far): images lack cam",
@@ -167,11 +167,11 @@ def test_a_picture_that_has_no_room_is_counted_and_not_written(gate: Gate) -> No
 def test_a_source_that_fails_is_said_once_and_again_after_it_came_back(gate: Gate) -> None:
     failure = TransportError("the node is gone")
     gate.source.waiting = deque([failure, failure])
-    gate.intake.pump(0.0)
-    gate.intake.pump(0.0)
+    gate.intake.poll(0.0)
+    gate.intake.poll(0.0)
     gate.receive(1)
     gate.source.waiting.append(failure)
-    gate.intake.pump(0.0)
+    gate.intake.poll(0.0)
     assert [event.text for event in gate.said] == ["the node is gone", "the node is gone"]
 
 

@@ -25,11 +25,11 @@ class World:
 
     def end(self, code=1):
         self.started[-1].code = code
-        self.companion.look()
+        self.companion.poll()
 
     def wait(self, seconds):
         self.now += seconds
-        self.companion.look()
+        self.companion.poll()
 
 
 @pytest.fixture

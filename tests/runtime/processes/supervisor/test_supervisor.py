@@ -10,7 +10,7 @@ from runtime.ipc.bus import Endpoints
 from runtime.link.key_files import known_lab_path
 from runtime.processes.supervisor import supervisor
 from runtime.processes.supervisor.supervisor import Supervisor
-from runtime.station.checks import checked_spec
+from runtime.station.checks import check_deployment
 
 DEMO = Path(__file__).parents[4] / "deployments" / "demo.toml"
 WAITS = ["cat"]  # like our children it ends with its standard input
@@ -51,7 +51,7 @@ def started(monkeypatch):
 
 @pytest.fixture
 def station(tmp_path):
-    return Supervisor(checked_spec(load(DEMO, [f'data_dir="{tmp_path}"'])))
+    return Supervisor(check_deployment(load(DEMO, [f'data_dir="{tmp_path}"'])))
 
 
 def all_ended(made):
@@ -90,17 +90,17 @@ def test_a_companion_that_dies_does_not_end_the_family_and_ends_with_it(
     made, commands = started
     sets = [f'data_dir="{tmp_path}"', setting]
     commands[companion], commands["headless"] = DIES, ["sh", "-c", "sleep 0.3; exit 4"]
-    assert Supervisor(checked_spec(load(DEMO, sets))).run(headless=True) == 4
+    assert Supervisor(check_deployment(load(DEMO, sets))).run(headless=True) == 4
     names = [child.process for child in made]
     assert names == ["guard", "reception", "media", "control", "coordinator", companion, "headless"]
     commands[companion] = WAITS
-    assert Supervisor(checked_spec(load(DEMO, sets))).run(headless=True) == 4
+    assert Supervisor(check_deployment(load(DEMO, sets))).run(headless=True) == 4
     assert all_ended(made)
 
 
 def test_a_station_that_is_enrolled_meanwhile_is_linked_and_the_link_ends_with_it(tmp_path, started):
     made, commands = started
-    spec = checked_spec(load(DEMO, [f'data_dir="{tmp_path}"']))
+    spec = check_deployment(load(DEMO, [f'data_dir="{tmp_path}"']))
     enrolled, linked = known_lab_path(spec.deployment.station_dir), tmp_path / "linked"
     commands["link"] = ["sh", "-c", f"touch '{linked}'; exec cat"]
     # As `python -m runtime.keys enrol` does, once the family is up; it ends when its link has begun.
@@ -135,7 +135,7 @@ def test_headless_the_processes_log_only_what_matters_unless_told_otherwise(
     commands["coordinator"] = DIES  # so that it ends
     if given:
         monkeypatch.setenv("EVA_LOG_LEVEL", given)
-    Supervisor(checked_spec(load(DEMO, [f'data_dir="{tmp_path}"']))).run(headless)
+    Supervisor(check_deployment(load(DEMO, [f'data_dir="{tmp_path}"']))).run(headless)
     assert {child.environment.get("EVA_LOG_LEVEL") for child in made} == {level}
 
 

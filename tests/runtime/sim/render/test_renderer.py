@@ -7,10 +7,10 @@ import pytest
 import robots
 from runtime.sim import bench as benches
 from runtime.sim.bench import Bench, BenchState, BlockState
-from runtime.sim.limbs import limbs
+from runtime.sim.limbs import arm_frames
 from runtime.sim.render import Renderer
 
-ROBOT = robots.load("agilex_piper")
+ROBOT = robots.load_robot("agilex_piper")
 BENCH = Bench()
 HOME = ROBOT.poses["home"]
 LEFT = ROBOT.group("left_arm")
@@ -20,7 +20,7 @@ RENDERER = Renderer(ROBOT, BENCH, 640, 480)
 
 
 def state(*blocks: tuple[float, float, float], plate: tuple[float, float] = (0.1, 0.36)) -> BenchState:
-    return BenchState(tuple(BlockState(benches.on_table(block, BENCH)) for block in blocks), plate)
+    return BenchState(tuple(BlockState(benches.block_pose(block, BENCH)) for block in blocks), plate)
 
 
 def in_hand() -> BenchState:
@@ -70,7 +70,7 @@ def test_the_same_seed_draws_the_same_and_another_seed_another_table() -> None:
 @pytest.mark.parametrize("block", [(0.0, 0.3, 0.0), (-0.2, 0.38, 0.5), (0.21, 0.2, -0.7)])
 def test_the_block_is_where_the_overhead_camera_projects_it(block: tuple[float, float, float]) -> None:
     camera = benches.overhead_camera(640, 480)
-    wanted = outline(camera, benches.on_table(block, BENCH))
+    wanted = outline(camera, benches.block_pose(block, BENCH))
     seen = orange(RENDERER.draw(HOME, state(block, plate=(0.0, 0.5)))["cam_high"])
     assert np.linalg.norm(middle(seen) - middle(wanted)) < 1.0
     assert (seen & wanted).sum() / (seen | wanted).sum() > 0.9
@@ -108,7 +108,7 @@ def test_a_held_block_is_between_the_fingers_in_the_picture_of_its_wrist_only() 
 
 def test_an_arm_hides_the_block_under_it_from_above() -> None:
     camera = benches.overhead_camera(640, 480)
-    column, row = camera.project(limbs(ROBOT)[LEFT.name].eef(DOWN)[:3, 3])
+    column, row = camera.project(arm_frames(ROBOT)[LEFT.name].eef(DOWN)[:3, 3])
     there = state((*camera.pixel_to_table(column, row, BENCH.block_edge), 0.0), plate=(0.2, 0.36))
     hidden = orange(RENDERER.draw(DOWN, there)["cam_high"]).sum()
     free = orange(RENDERER.draw(HOME, there)["cam_high"]).sum()
@@ -129,7 +129,7 @@ def test_things_cast_shadows_on_the_table_beside_them() -> None:
 def test_the_plate_lies_where_it_is_said_to_and_a_block_can_lie_on_it() -> None:
     camera = benches.overhead_camera(640, 480)
     plate = (-0.05, 0.3)
-    on_plate = benches.on_table((*plate, 0.3), BENCH)
+    on_plate = benches.block_pose((*plate, 0.3), BENCH)
     on_plate[2, 3] += BENCH.plate_height
     picture = RENDERER.draw(HOME, BenchState((BlockState(on_plate),), plate))["cam_high"]
     rim = BENCH.plate_radius * 0.965

@@ -35,7 +35,7 @@ def test_the_moment_is_the_newest_that_all_streams_have_reached() -> None:
 def test_nothing_comes_before_every_stream_has_spoken() -> None:
     made = filled(joints=[1.0, 2.0], camera=[])
     assert made.frame() is None
-    assert made.reached() is None
+    assert made.newest_common_time() is None
     made.add("camera", Sample(2.0, 2.0, 0.0))
     assert stamps(made.frame()) == {"joints": 2.0, "camera": 2.0}
 
@@ -43,10 +43,10 @@ def test_nothing_comes_before_every_stream_has_spoken() -> None:
 def test_streams_that_do_not_belong_together_make_no_frame_until_they_do() -> None:
     made = filled(fast=[1.0, 1.3], slow=[1.15])
     assert made.frame() is None  # 1.15 has been reached, and the fast one is 0.15 s away on both sides
-    assert made.apart() == ["fast"]
+    assert made.unaligned_streams() == ["fast"]
     made.add("slow", Sample(1.29, 1.3, 0.0))
     assert stamps(made.frame()) == {"fast": 1.3, "slow": 1.29}
-    assert made.apart() == []
+    assert made.unaligned_streams() == []
 
 
 def test_readers_take_nothing_from_each_other() -> None:
@@ -111,7 +111,9 @@ def test_a_frame_is_bounded_nearest_and_at_the_newest_common_moment(streams: dic
     nearest = {name: min(abs(t - moment) for t in ticks) for name, ticks in kept.items()}
     if frame is None:
         assert max(nearest.values()) > WINDOW
-        assert set(made.apart()) == {name for name, distance in nearest.items() if distance > WINDOW}
+        assert set(made.unaligned_streams()) == {
+            name for name, distance in nearest.items() if distance > WINDOW
+        }
         return
     assert frame.time == moment
     for name, stamp in stamps(frame).items():

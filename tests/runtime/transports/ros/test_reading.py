@@ -8,10 +8,10 @@ import simplejpeg
 from PIL import Image as Pillow
 
 from runtime.transports.ros.messages import CompressedImage, Image, JointState, PoseStamped
-from runtime.transports.ros.reading import JointOrder, Unusable, check_picture, picture, pose
-from runtime.transports.ros.topics import Part
+from runtime.transports.ros.reading import JointOrder, UnusableMessage, check_picture, picture, pose
+from runtime.transports.ros.topics import StreamSpec
 
-PART = Part("joints", "arm", "/state", "JointState", ("a", "b", "grip"))
+PART = StreamSpec("joints", "arm", "/state", "JointState", ("a", "b", "grip"))
 RGB = np.zeros((4, 6, 3), np.uint8)
 RGB[..., 0], RGB[..., 2] = 200, 30
 BIG = np.kron(RGB, np.ones((8, 8, 1), np.uint8))
@@ -52,7 +52,9 @@ def test_velocity_and_effort_are_ordered_alike_and_left_out_where_they_are_short
 
 def test_messages_without_names_need_exactly_as_many_numbers() -> None:
     assert read(joints("", 1, 2, 3)) == [1, 2, 3]
-    with pytest.raises(Unusable, match="4 positions without names came; expected 3: a, b, grip") as caught:
+    with pytest.raises(
+        UnusableMessage, match="4 positions without names came; expected 3: a, b, grip"
+    ) as caught:
         read(joints("", 1, 2, 3, 4))
     assert caught.value.fault == "wrong_dimension"
 
@@ -67,14 +69,14 @@ def test_messages_without_names_need_exactly_as_many_numbers() -> None:
     ],
 )
 def test_doubtful_joints_are_refused(message: JointState, fault: str, text: str) -> None:
-    with pytest.raises(Unusable, match=text) as caught:
+    with pytest.raises(UnusableMessage, match=text) as caught:
         read(message)
     assert caught.value.fault == fault
 
 
 def test_names_may_be_ignored_where_a_deployment_says_so() -> None:
     assert read(joints("x y z more", 1, 2, 3, 4), "ignore") == [1, 2, 3]
-    with pytest.raises(Unusable, match="2 positions"):
+    with pytest.raises(UnusableMessage, match="2 positions"):
         read(joints("x y", 1, 2), "ignore")
 
 
@@ -164,7 +166,7 @@ def compressed(said: str, data: np.ndarray) -> CompressedImage:
 def test_unknown_or_impossible_pictures_are_refused_before_decoding(
     message: Image | CompressedImage, fault: str, text: str
 ) -> None:
-    with pytest.raises(Unusable, match=text) as caught:
+    with pytest.raises(UnusableMessage, match=text) as caught:
         check_picture(message)
     assert caught.value.fault == fault
 
@@ -180,7 +182,7 @@ def test_unknown_or_impossible_pictures_are_refused_before_decoding(
 def test_broken_files_are_refused(data: np.ndarray, fault: str) -> None:
     message = CompressedImage(1, "", "jpeg or png", data)
     check_picture(message)
-    with pytest.raises(Unusable) as caught:
+    with pytest.raises(UnusableMessage) as caught:
         picture(message)
     assert caught.value.fault == fault
 
@@ -204,6 +206,6 @@ def test_a_pose_is_turned_to_scalar_first_and_made_unit() -> None:
 def test_a_pose_that_is_none_or_in_another_frame_is_refused(
     numbers: list[float], frame: str, fault: str
 ) -> None:
-    with pytest.raises(Unusable) as caught:
+    with pytest.raises(UnusableMessage) as caught:
         pose(PoseStamped(1, frame, np.array(numbers)), "base")
     assert caught.value.fault == fault

@@ -18,7 +18,7 @@ from runtime.transports.ros.middleware import Deliver, Match, Middleware, Publis
 from runtime.transports.ros.sink import RosSink
 from runtime.transports.ros.topics import GroupTopics, Topics
 
-ROBOT = robots.load("r1_lite")
+ROBOT = robots.load_robot("r1_lite")
 LEFT, RIGHT = "/motion_target/target_joint_state_arm_left", "/motion_target/target_joint_state_arm_right"
 ACTION = np.linspace(-0.5, 0.8, 14).astype(np.float32)
 
@@ -141,14 +141,14 @@ def test_a_sink_that_is_not_connected_says_so(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(TransportError, match="connect before sending"):
         sink.send(command())
     with pytest.raises(TransportError, match="takes no control words"):
-        sink.tell("scene_reset", {})
+        sink.send_control_word("scene_reset", {})
 
 
 def test_who_does_not_hear_is_known_by_topic(monkeypatch: pytest.MonkeyPatch) -> None:
     sink, wall, _ = connected(monkeypatch)
-    assert sink.unheard() == {}
+    assert sink.missing_subscribers() == {}
     why = "a subscriber of it is incompatible in its reliability"
     wall.found = {LEFT: Match(0), RIGHT: Match(1, why)}
-    assert sink.unheard() == {LEFT: "", RIGHT: why}
+    assert sink.missing_subscribers() == {LEFT: "", RIGHT: why}
     sink.close()
-    assert sink.unheard() == {}
+    assert sink.missing_subscribers() == {}

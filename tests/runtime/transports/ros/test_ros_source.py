@@ -19,7 +19,7 @@ from runtime.transports.ros.source import RosSource
 from runtime.transports.ros.topics import GroupTopics, Topics
 from tests.runtime.transports.ros.hand import Hand
 
-ROBOT = robots.load("ur5e")
+ROBOT = robots.load_robot("ur5e")
 NAMES = ROBOT.groups[0].joints
 TOPICS = Topics(
     cameras={"wrist_image": "/wrist", "exterior_image": "/high"},
@@ -62,7 +62,7 @@ class Bench:
         return found
 
     def news(self) -> list[str]:
-        return [event.text for event in self.source.news()]
+        return [event.text for event in self.source.pop_events()]
 
 
 def nanoseconds(stamp: float) -> int:

@@ -23,7 +23,7 @@ from runtime.core.errors import SetupError, TransportError
 from runtime.transports.ros import packed, rospy_process
 from runtime.transports.ros.messages import JointState, MessageName, PoseStamped
 from runtime.transports.ros.middleware import COMMAND_QUALITY, SENSOR_QUALITY, Topic
-from runtime.transports.ros.rospy_process import RospyProcess, Site, require
+from runtime.transports.ros.rospy_process import RosEnvironment, RospyProcess, require
 from runtime.transports.ros.tcpros import TcpRosMiddleware
 from tests.processes import PATIENCE_S, alive, eventually, joined
 from tests.runtime.ros_master import PYTHON, RosMaster, master, needs_ros1
@@ -32,8 +32,8 @@ from tests.runtime.transports.ros.ros1_peer import Peer
 JOINTS, IMAGE, COMPRESSED = "sensor_msgs/JointState", "sensor_msgs/Image", "sensor_msgs/CompressedImage"
 
 
-def site(master: RosMaster) -> Site:
-    return Site(PYTHON, master.uri, "127.0.0.1")
+def site(master: RosMaster) -> RosEnvironment:
+    return RosEnvironment(PYTHON, master.uri, "127.0.0.1")
 
 
 @pytest.fixture
@@ -332,7 +332,7 @@ def test_a_master_that_is_not_there_is_named() -> None:
         match=rf"no ROS master is to be reached at {uri}: Connection refused; start roscore there, or say in "
         r"transport\.master where it is",
     ):
-        RospyProcess(Site(PYTHON, uri, "127.0.0.1"), "eva_test")
+        RospyProcess(RosEnvironment(PYTHON, uri, "127.0.0.1"), "eva_test")
 
 
 @needs_ros1
@@ -381,7 +381,7 @@ def test_what_is_no_master_is_named(answer: bytes, said: str) -> None:
         thread.start()
         uri = f"http://127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(TransportError, match=f"no ROS master is to be reached at {uri}: {said}"):
-            RospyProcess(Site(PYTHON, uri, "127.0.0.1"), "eva_test")
+            RospyProcess(RosEnvironment(PYTHON, uri, "127.0.0.1"), "eva_test")
         server.shutdown(
             socket.SHUT_RDWR
         )  # or it would wait on, and take who comes to the next one of this number
@@ -393,7 +393,7 @@ def test_a_master_that_is_mute_is_named_within_seconds() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         uri = f"http://127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(TransportError, match=f"no ROS master is to be reached at {uri}: timed out"):
-            RospyProcess(Site(PYTHON, uri, "127.0.0.1"), "eva_test")
+            RospyProcess(RosEnvironment(PYTHON, uri, "127.0.0.1"), "eva_test")
 
 
 def test_a_python_that_is_not_there_is_named() -> None:
@@ -416,7 +416,7 @@ def test_rospys_environment_is_the_deployments(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv("ROS_HOSTNAME", "elsewhere")
     monkeypatch.setenv("ROS_NAMESPACE", "/other")
     monkeypatch.setenv("ROS_MASTER_URI", "http://other:1")
-    made = Site(PYTHON, "http://127.0.0.1:5", "127.0.0.1").environment
+    made = RosEnvironment(PYTHON, "http://127.0.0.1:5", "127.0.0.1").environment
     assert (made["ROS_MASTER_URI"], made["ROS_IP"]) == ("http://127.0.0.1:5", "127.0.0.1")
     assert not {"ROS_HOSTNAME", "ROS_NAMESPACE"} & made.keys()
 

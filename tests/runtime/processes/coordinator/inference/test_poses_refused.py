@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robots import load
+from robots import load_robot
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import PolicyError
 from runtime.core.types import ActionChunk, Conditioning, Observation
@@ -15,7 +15,7 @@ from runtime.processes.coordinator.inference.requests import MissBound, PolicyRe
 from runtime.processes.coordinator.inference.worker import LockstepRunner
 from runtime.spaces.conversion import ActionSpaces
 
-ROBOT = load("agilex_piper")
+ROBOT = load_robot("agilex_piper")
 SPACES = ActionSpaces(ROBOT, CompiledKinematics(ROBOT), 30.0)
 START = np.asarray(ROBOT.poses["ready"], np.float64)
 BOUND = MissBound(0.02, 0.2, 0.5)
@@ -50,7 +50,7 @@ class Eyes:
     def commanded(self) -> tuple[int, np.ndarray] | None:
         return 100 + self.passed, START
 
-    def show_simulated(self, simulated: bool) -> None: ...
+    def use_simulated(self, simulated: bool) -> None: ...
 
 
 def asked(rows: np.ndarray, first: bool, bound: MissBound | None = BOUND, passed: int = 0) -> PolicyResponse:
@@ -59,10 +59,10 @@ def asked(rows: np.ndarray, first: bool, bound: MissBound | None = BOUND, passed
     requests = PolicyRequests(policy, "pick", SPACES, eyes, LockstepRunner(0), clock, bound)
     if not first:
         policy.rows = near(4)
-        requests.ask(executed=True).result()
+        requests.send(executed=True).result()
         policy.rows = rows
-    answered = requests.ask(executed=True).result()
-    requests.note(answered)
+    answered = requests.send(executed=True).result()
+    requests.log_ik_problems(answered)
     assert bool(answered.refused) == ("poses_refused" in [note.kind for note in requests.notes])
     return answered
 
@@ -90,11 +90,11 @@ def test_a_later_answer_that_begins_far_away_is_refused_by_name() -> None:
 @pytest.mark.parametrize("first", [True, False])
 def test_rows_before_the_first_that_is_missed_are_executed(first: bool) -> None:
     answered = asked(np.concatenate([near(10), in_millimetres(10)]), first)
-    assert len(answered.made.rows) == len(answered.made.source) == 10
-    assert answered.made.solved is not None
-    assert len(answered.made.solved.flags) == 10
+    assert len(answered.commands.rows) == len(answered.commands.source_rows) == 10
+    assert answered.commands.ik_result is not None
+    assert len(answered.commands.ik_result.flags) == 10
     assert "row 10 of the answer" in answered.refused
-    assert np.abs(answered.made.rows - START).max() < 0.1
+    assert np.abs(answered.commands.rows - START).max() < 0.1
 
 
 @pytest.mark.parametrize("first", [True, False])
@@ -103,7 +103,7 @@ def test_a_first_answer_is_no_licence(first: bool) -> None:
     rows = near(20)
     rows[1:, [8, 9, 10]] *= 1000.0
     if first:
-        assert len(asked(rows, first, passed=-1).made.rows) == 1
+        assert len(asked(rows, first, passed=-1).commands.rows) == 1
     else:
         with pytest.raises(PolicyError, match="right_arm that no joints meet"):
             asked(rows, first)
@@ -125,9 +125,9 @@ def test_joints_that_lag_behind_by_less_than_a_jump_are_held_back_as_those_of_jo
 
 def test_where_a_run_begins_farther_away_control_says_it_by_its_first_row() -> None:
     answered = asked(shifted(0.9, 20), first=True, passed=-1)
-    assert len(answered.made.rows) == 1
-    assert answered.made.first is not None
-    assert np.abs(answered.made.meant - START).max() == pytest.approx(0.9, abs=0.01)
+    assert len(answered.commands.rows) == 1
+    assert answered.commands.first is not None
+    assert np.abs(answered.commands.intended_start - START).max() == pytest.approx(0.9, abs=0.01)
 
 
 def test_a_later_answer_that_begins_farther_away_is_refused() -> None:
@@ -145,7 +145,7 @@ def test_stale_rows_do_not_count() -> None:
 
 def test_a_deployment_may_have_them_flagged_alone() -> None:
     answered = asked(in_millimetres(20), first=False, bound=None)
-    assert len(answered.made.rows) == 20
+    assert len(answered.commands.rows) == 20
     assert answered.ik["over"] > 0
 
 
@@ -155,8 +155,8 @@ def test_who_only_looks_sees_all_of_it() -> None:
         Answers(in_millimetres(20)), "pick", SPACES, Eyes(0), LockstepRunner(0), VirtualClock(0.0), BOUND
     )
     for _ in range(2):
-        answered = requests.ask().result()
-        assert (len(answered.made.rows), answered.refused) == (20, "")
+        answered = requests.send().result()
+        assert (len(answered.commands.rows), answered.refused) == (20, "")
 
 
 def test_the_arm_is_named() -> None:

@@ -34,7 +34,9 @@ def merged(
 ) -> ChunkMerged:
     """As control tells of rows from `observation_step` on; what is stale is told as what is not."""
     targets = observation_step + mistimed + np.arange(count)
-    return ChunkMerged(number, 1, observation_step + delay, delay, targets, mistimed, dropped, shares=ALONE)
+    return ChunkMerged(
+        number, 1, observation_step + delay, delay, targets, mistimed, dropped, contributions=ALONE
+    )
 
 
 def committed(
@@ -42,9 +44,9 @@ def committed(
 ) -> RtcPrefix:
     """A commitment to one chunk that answers the observation of `step`."""
     made, chunk = RtcPrefix(RATE), chunk or ActionChunk(rows(50))
-    made.answered(1, chunk, step, waited)
+    made.add_chunk(1, chunk, step, waited)
     count = int(len(chunk.actions) * RATE / (chunk.rate or RATE))
-    made.merged(merged(1, step + delay if waited else step, 0 if waited else delay, count, mistimed))
+    made.on_merged(merged(1, step + delay if waited else step, 0 if waited else delay, count, mistimed))
     return made
 
 
@@ -62,7 +64,7 @@ def asked(
 def test_nobody_is_committed_to_anything_before_a_chunk_was_merged() -> None:
     held = RtcPrefix(RATE)
     assert held.conditioning(100, [3], 0.9, None) is None
-    held.answered(1, ActionChunk(rows(50)), 100)
+    held.add_chunk(1, ActionChunk(rows(50)), 100)
     assert held.conditioning(104, [3], 0.9, None) is None
 
 
@@ -78,17 +80,17 @@ def test_what_is_left_begins_with_the_row_for_the_observation_whatever_the_delay
         assert found is None
     else:
         assert found is not None
-        assert found.consumed == later
-        np.testing.assert_array_equal(found.left_over, rows(count)[later:])
+        assert found.consumed_rows == later
+        np.testing.assert_array_equal(found.remaining_rows, rows(count)[later:])
 
 
 def test_a_chunk_that_was_shifted_counts_from_where_it_was_put() -> None:
-    assert asked(committed(delay=9, mistimed=4), 110).left_over[0, 0] == 6
+    assert asked(committed(delay=9, mistimed=4), 110).remaining_rows[0, 0] == 6
 
 
 def test_a_chunk_that_the_robot_waited_for_counts_from_its_arrival() -> None:
     held = committed(delay=60, waited=True)
-    assert asked(held, 170).left_over[0, 0] == 10
+    assert asked(held, 170).remaining_rows[0, 0] == 10
 
 
 @given(st.integers(1, 5), st.booleans())
@@ -96,28 +98,28 @@ def test_of_a_step_before_its_first_one_nothing_is_said(early: int, waited: bool
     """The robot was told something else then, and no row says what."""
     held = committed(delay=6, waited=waited)
     assert held.conditioning(106 - early, [3], 0.9, None) is None
-    assert asked(held, 106).left_over[0, 0] == (0 if waited else 6)
+    assert asked(held, 106).remaining_rows[0, 0] == (0 if waited else 6)
 
 
 def test_the_newest_merged_chunk_counts_and_what_was_dropped_does_not() -> None:
     held = committed()
-    held.answered(2, ActionChunk(rows(50, first=200)), 110)
-    held.answered(3, ActionChunk(rows(50, first=300)), 120)
-    held.merged(merged(2, 110, 3))
-    held.merged(merged(3, 120, 60, dropped="60 rows are stale"))
-    assert asked(held, 125).left_over[0, 0] == 215
+    held.add_chunk(2, ActionChunk(rows(50, first=200)), 110)
+    held.add_chunk(3, ActionChunk(rows(50, first=300)), 120)
+    held.on_merged(merged(2, 110, 3))
+    held.on_merged(merged(3, 120, 60, dropped="60 rows are stale"))
+    assert asked(held, 125).remaining_rows[0, 0] == 215
 
 
 def test_rows_of_the_models_own_space_go_before_actions() -> None:
     chunk = ActionChunk(rows(50), model_actions=rows(50, 32, first=0.5))
     found = asked(committed(chunk), 110)
     assert found.previous.shape == (50, 32)
-    assert found.left_over[0, 0] == 10.5
+    assert found.remaining_rows[0, 0] == 10.5
 
 
 def test_rows_without_an_action_do_not_count_as_left() -> None:
     held = committed(ActionChunk(rows(10), model_actions=rows(50, 32)))
-    assert asked(held, 109).consumed == 9
+    assert asked(held, 109).consumed_rows == 9
     assert held.conditioning(110, [3], 0.9, None) is None
 
 
@@ -131,9 +133,9 @@ def test_at_another_rate_what_is_left_begins_exactly_at_the_observation(
     held = committed(ActionChunk(rows(400), rate=rate))
     found = held.conditioning(103 + since, [delay], 0.9, None)
     assert found is not None
-    assert abs(found.consumed / rate - (3 + since) / RATE) <= 0.5 / rate + 1e-6
+    assert abs(found.consumed_rows / rate - (3 + since) / RATE) <= 0.5 / rate + 1e-6
     passed = (3 + since) * rate / RATE + np.arange(found.predicted_delay)
-    np.testing.assert_allclose(found.left_over[: found.predicted_delay, 0], passed, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(found.remaining_rows[: found.predicted_delay, 0], passed, rtol=1e-6, atol=1e-5)
     assert -1e-6 <= found.predicted_delay - delay * rate / RATE < 1 + 1e-6
 
 
@@ -166,15 +168,15 @@ def test_all_that_is_predicted_and_planned_is_fixed_and_it_warns_where_the_answe
     """Whatever the horizon is now: what was planned with another one stays planned, and rates have no row per step."""
     pace = 1.0 if rate is None else rate / RATE
     held = RtcPrefix(RATE)
-    held.answered(1, ActionChunk(rows(math.ceil((planned - 1) * pace) + 1), rate=rate), 100)
-    held.merged(merged(1, 100, 3, planned))
+    held.add_chunk(1, ActionChunk(rows(math.ceil((planned - 1) * pace) + 1), rate=rate), 100)
+    held.on_merged(merged(1, 100, 3, planned))
     found = held.conditioning(100 + later, [delay], 0.9, horizon)
     assert (found is None) == (later >= planned)
     if found is not None:
         wanted = min(math.ceil(delay * pace - 1e-9), math.floor((planned - 1 - later) * pace + 1e-9) + 1)
         assert found.predicted_delay == wanted
         meant = later * pace + np.arange(wanted)
-        np.testing.assert_allclose(found.left_over[:wanted, 0], meant, atol=1e-4)
+        np.testing.assert_allclose(found.remaining_rows[:wanted, 0], meant, atol=1e-4)
         assert bool(held.warning) == (delay > planned - later)
 
 
@@ -197,9 +199,9 @@ def test_the_warning_says_the_numbers() -> None:
 
 def test_a_reset_forgets_what_was_merged_and_what_was_on_its_way() -> None:
     held = committed()
-    held.answered(2, ActionChunk(rows(50)), 110)
+    held.add_chunk(2, ActionChunk(rows(50)), 110)
     held.clear()
-    held.merged(merged(2, 110, 3))
+    held.on_merged(merged(2, 110, 3))
     assert held.conditioning(115, [3], 0.9, None) is None
 
 
@@ -207,12 +209,12 @@ def test_a_reply_that_was_in_flight_at_a_reset_never_counts() -> None:
     held = committed()
     sent_in = held.generation
     held.clear()
-    held.answered(2, ActionChunk(rows(50)), 110, generation=sent_in)
-    held.merged(merged(2, 110, 3))
+    held.add_chunk(2, ActionChunk(rows(50)), 110, generation=sent_in)
+    held.on_merged(merged(2, 110, 3))
     assert held.conditioning(115, [3], 0.9, None) is None
-    held.answered(3, ActionChunk(rows(50)), 120, generation=held.generation)
-    held.merged(merged(3, 120, 3))
-    assert asked(held, 125).consumed == 5
+    held.add_chunk(3, ActionChunk(rows(50)), 120, generation=held.generation)
+    held.on_merged(merged(3, 120, 3))
+    assert asked(held, 125).consumed_rows == 5
 
 
 events = st.lists(
@@ -234,11 +236,11 @@ def test_only_an_answer_asked_for_and_merged_since_the_last_reset_counts(
             asked_in[number] = cleared
         elif what == "answer" and number in asked_in:
             chunk = ActionChunk(rows(50, first=1000.0 * number))
-            held.answered(number, chunk, 100, generation=asked_in[number])
+            held.add_chunk(number, chunk, 100, generation=asked_in[number])
             if asked_in.pop(number) == cleared:
                 answered_in[number] = cleared
         elif what in ("merge", "drop"):
-            held.merged(merged(number, 100, 3, dropped="late" if what == "drop" else ""))
+            held.on_merged(merged(number, 100, 3, dropped="late" if what == "drop" else ""))
             fresh = answered_in.pop(number, None) == cleared
             if what == "merge" and fresh and (expected is None or number >= expected):
                 expected = number
@@ -250,7 +252,7 @@ def test_only_an_answer_asked_for_and_merged_since_the_last_reset_counts(
     found = held.conditioning(105, [3], 0.9, None)
     assert (found is None) == (expected is None)
     if found is not None and expected is not None:
-        assert found.left_over[0, 0] == pytest.approx(1000.0 * expected + 5)
+        assert found.remaining_rows[0, 0] == pytest.approx(1000.0 * expected + 5)
 
 
 # What control has blended
@@ -259,11 +261,11 @@ def test_only_an_answer_asked_for_and_merged_since_the_last_reset_counts(
 def blended(first: ActionChunk, second: ActionChunk, shares: list[list[float]], **settings: Any) -> RtcPrefix:
     """A commitment to a chunk for step 100, and from 105 on to one for step 102, as far as `shares` do not say else."""
     held = RtcPrefix(RATE, Mixture(**settings))
-    held.answered(1, first, 100)
-    held.merged(merged(1, 100, 0, len(first.actions)))
-    held.answered(2, second, 102)
+    held.add_chunk(1, first, 100)
+    held.on_merged(merged(1, 100, 0, len(first.actions)))
+    held.add_chunk(2, second, 102)
     told = merged(2, 102, 3, len(second.actions))
-    held.merged(replace(told, shares=np.array(shares).reshape(-1, 3)))
+    held.on_merged(replace(told, contributions=np.array(shares).reshape(-1, 3)))
     return held
 
 
@@ -272,15 +274,20 @@ HALF = [[105, 1, 1.0], [106, 1, 0.5], [106, 2, 0.5]]
 
 def test_rows_that_control_has_blended_are_given_back_as_they_became() -> None:
     held = blended(ActionChunk(rows(50)), ActionChunk(rows(50, first=200)), HALF)
-    assert asked(held, 105).left_over[:4, 0].tolist() == [5.0, (6.0 + 204.0) / 2, 205.0, 206.0]
-    assert asked(held, 103).left_over[:4, 0].tolist() == [3.0, 4.0, 5.0, 105.0]  # also of the plan before
+    assert asked(held, 105).remaining_rows[:4, 0].tolist() == [5.0, (6.0 + 204.0) / 2, 205.0, 206.0]
+    assert asked(held, 103).remaining_rows[:4, 0].tolist() == [
+        3.0,
+        4.0,
+        5.0,
+        105.0,
+    ]  # also of the plan before
 
 
 def test_the_models_own_rows_are_mixed_by_the_same_weights() -> None:
     first = ActionChunk(rows(50), model_actions=rows(50, 32, first=0.5))
     second = ActionChunk(rows(50, first=200), model_actions=rows(50, 32, first=20))
     held = blended(first, second, HALF, dims=DimensionKinds(switched=(1,)))
-    left = asked(held, 105).left_over
+    left = asked(held, 105).remaining_rows
     assert left[:3, 0].tolist() == [5.5, (6.5 + 24.0) / 2, 25.0]
     assert left[:3, 1].tolist() == [5.5, 24.0, 25.0]  # a binary gripper does not lie in between
     assert left.shape[1] == 32
@@ -290,17 +297,17 @@ def test_angles_without_limits_mix_the_shorter_way_round_and_in_the_models_own_n
     first, second = (np.full((50, 2), angle, np.float32) for angle in (3.1, -3.1))
     shares = [[105, 1, 0.5], [105, 2, 0.5]]
     held = blended(ActionChunk(first), ActionChunk(second), shares, dims=DimensionKinds(wrapping=(0,)))
-    mixed = asked(held, 105).left_over[0]
+    mixed = asked(held, 105).remaining_rows[0]
     np.testing.assert_allclose(mixed, [-np.pi, 0.0], atol=1e-6)
     own = (ActionChunk(angles, model_actions=rows(50, 32)) for angles in (first, second))
     held = blended(*own, shares, dims=DimensionKinds(wrapping=(0,)))
     assert held.conditioning(105, [3], 0.9, None) is None
-    assert asked(held, 106).left_over[0, 0] == 4.0
+    assert asked(held, 106).remaining_rows[0, 0] == 4.0
 
 
 @pytest.mark.parametrize("orientation", ["wxyz", "euler", "rotation_vector", "6d"])
 def test_blended_poses_are_those_of_the_blended_joints(orientation: OrientationName) -> None:
-    robot, pose = robots.load("agilex_piper"), PoseFormat(orientation=orientation)
+    robot, pose = robots.load_robot("agilex_piper"), PoseFormat(orientation=orientation)
     layout, ends = PoseRows(pose, robot), EndEffectors(robot, ChainForward(robot))
     joints = [np.tile(robot.poses["ready"] + apart, (50, 1)) for apart in (0.0, 0.2)]
 
@@ -309,13 +316,13 @@ def test_blended_poses_are_those_of_the_blended_joints(orientation: OrientationN
 
     held = RtcPrefix(RATE, Mixture(robot=robot))
     for number, at in enumerate(joints, 1):
-        held.answered(number, chunk(at), 100, commands=at)
-        held.merged(
-            replace(merged(number, 100, number), shares=np.array([[105, 1, 0.5], [105, number, 0.5]]))
+        held.add_chunk(number, chunk(at), 100, commands=at)
+        held.on_merged(
+            replace(merged(number, 100, number), contributions=np.array([[105, 1, 0.5], [105, number, 0.5]]))
         )
     between = chunk((joints[0] + joints[1]) / 2)
-    np.testing.assert_allclose(asked(held, 105).left_over[0], between.actions[0], atol=1e-6)
-    np.testing.assert_array_equal(asked(held, 105).left_over[1:], chunk(joints[1]).actions[6:])
+    np.testing.assert_allclose(asked(held, 105).remaining_rows[0], between.actions[0], atol=1e-6)
+    np.testing.assert_array_equal(asked(held, 105).remaining_rows[1:], chunk(joints[1]).actions[6:])
 
 
 @pytest.mark.parametrize("shares", [[[106, 0, 0.5], [106, 2, 0.5]], [[106, 7, 1.0]], None])
@@ -324,12 +331,12 @@ def test_of_a_held_target_of_an_unknown_chunk_and_of_what_was_not_told_nothing_i
 ) -> None:
     held = blended(ActionChunk(rows(50)), ActionChunk(rows(50)), shares or [])
     if shares is None:
-        held.answered(3, ActionChunk(rows(50)), 104)
-        held.merged(replace(merged(3, 104, 2), shares=None))
+        held.add_chunk(3, ActionChunk(rows(50)), 104)
+        held.on_merged(replace(merged(3, 104, 2), contributions=None))
     assert held.conditioning(106, [3], 0.9, None) is None
 
 
 def test_answers_in_other_numbers_are_not_mixed() -> None:
     held = blended(ActionChunk(rows(50)), ActionChunk(rows(50), model_actions=rows(50, 32)), HALF)
     assert held.conditioning(105, [3], 0.9, None) is None
-    assert asked(held, 107).left_over[0, 0] == 5.0
+    assert asked(held, 107).remaining_rows[0, 0] == 5.0

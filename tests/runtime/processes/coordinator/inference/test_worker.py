@@ -62,11 +62,11 @@ def test_what_is_made_aside_waits_for_no_call_to_the_policy_and_makes_none_wait(
     runner = ThreadRunner()
     gate = threading.Event()
     first = runner.submit(lambda: gate.wait(PATIENCE_S))
-    assert runner.aside(lambda: 7).result(PATIENCE_S) == 7
+    assert runner.run_in_background(lambda: 7).result(PATIENCE_S) == 7
     gate.set()
     assert first.result(PATIENCE_S)
     never = threading.Event()
-    runner.aside(never.wait)
+    runner.run_in_background(never.wait)
     assert runner.submit(lambda: 8).result(PATIENCE_S) == 8
     assert not runner.busy
     never.set()
@@ -76,7 +76,7 @@ def test_what_is_made_aside_waits_for_no_call_to_the_policy_and_makes_none_wait(
 def test_an_error_aside_is_its_own() -> None:
     for runner in (ThreadRunner(), LockstepRunner(0)):
         with pytest.raises(ZeroDivisionError):
-            runner.aside(lambda: 1 // 0).result(PATIENCE_S)
+            runner.run_in_background(lambda: 1 // 0).result(PATIENCE_S)
         runner.close()
 
 
@@ -90,7 +90,7 @@ def test_a_declared_delay_counts_from_the_question_whatever_the_call_took() -> N
     gate = threading.Event()
     future = runner.submit(lambda: gate.wait(PATIENCE_S))
     assert runner.busy
-    assert runner.begin()  # being made: no time may pass now
+    assert runner.start_waiting()  # being made: no time may pass now
     gate.set()
     assert future.result(PATIENCE_S) == "True"
     ready = []
@@ -104,7 +104,7 @@ def test_a_declared_delay_counts_from_the_question_whatever_the_call_took() -> N
 def test_what_is_declared_to_take_no_time_is_there_with_the_next_tick() -> None:
     runner = declaring(0)
     future = runner.submit(lambda: 1)
-    runner.begin()
+    runner.start_waiting()
     assert future.result(PATIENCE_S) == "1"
     assert not runner.ready(future)
     runner.tick()
@@ -117,7 +117,7 @@ def test_no_call_is_made_before_time_stands_still() -> None:
     futures = [runner.submit(lambda number=number: made.append(number)) for number in range(3)]
     runner.tick()
     assert made == []
-    runner.begin()
+    runner.start_waiting()
     assert futures[-1].result(PATIENCE_S) == "None"
     assert made == [0, 1, 2]
     runner.close()
@@ -129,7 +129,7 @@ def test_an_error_of_a_call_or_of_what_it_declares_is_handed_over_with_the_next_
 
     runner = DeclaredRunner(declared)
     failing, odd = runner.submit(lambda: 1 // 0), runner.submit(lambda: 1)
-    runner.begin()
+    runner.start_waiting()
     with pytest.raises(PolicyError, match="ZeroDivisionError"):
         failing.result(PATIENCE_S)
     with pytest.raises(PolicyError, match="it says -1 ms"):
@@ -137,5 +137,5 @@ def test_an_error_of_a_call_or_of_what_it_declares_is_handed_over_with_the_next_
     runner.tick()
     assert runner.ready(failing)
     assert runner.ready(odd)
-    assert runner.aside(lambda: 7).result() == 7
+    assert runner.run_in_background(lambda: 7).result() == 7
     runner.close()

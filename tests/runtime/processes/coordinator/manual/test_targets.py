@@ -23,7 +23,7 @@ from runtime.spaces.conversion import ActionSpaces
 
 @cache
 def parts() -> tuple[Any, Any, Any]:
-    robot = robots.load("agilex_piper")
+    robot = robots.load_robot("agilex_piper")
     kinematics = compiled.build(compiled.Config(), robot)
     return robot, kinematics, ActionSpaces(robot, kinematics, 30.0)
 
@@ -58,7 +58,7 @@ def test_what_is_beyond_a_limit_is_clipped_and_named_by_aim_and_refused_by_move(
     assert aim.clipped == (robot.joint_names[1],)
     assert aim.joints[1] == robot.upper[1]
     with pytest.raises(RuntimeFault, match=rf"move: {robot.joint_names[1]} = .*; allowed: "):
-        targets().goal(MoveRequest(joints=joints.tolist()), ready())
+        targets().motion_goal(MoveRequest(joints=joints.tolist()), ready())
 
 
 def test_a_joint_that_is_null_stays_where_it_is_commanded_to_be() -> None:
@@ -66,7 +66,7 @@ def test_a_joint_that_is_null_stays_where_it_is_commanded_to_be() -> None:
     commanded[6] = 0.03
     joints = [None, 0.1, *[None] * 12]
     wanted = np.array([commanded[0], 0.1, *commanded[2:]])
-    assert np.array_equal(targets().goal(MoveRequest(joints=joints), commanded), wanted)
+    assert np.array_equal(targets().motion_goal(MoveRequest(joints=joints), commanded), wanted)
     assert np.array_equal(targets().aim(AimRequest(joints=joints), commanded).joints, wanted)
 
 
@@ -81,7 +81,7 @@ def test_a_joint_that_is_null_stays_where_it_is_commanded_to_be() -> None:
 )
 def test_a_wish_that_means_nothing_is_refused_with_what_is_allowed(asked: MoveRequest, sentence: str) -> None:
     with pytest.raises(RuntimeFault, match=sentence):
-        targets().goal(asked, ready())
+        targets().motion_goal(asked, ready())
 
 
 @pytest.mark.parametrize("frame", ["base", "tool"])
@@ -122,8 +122,8 @@ def test_a_way_that_leaves_the_workspace_box_is_refused_and_one_that_comes_back_
     away = ready()
     away[0] += 1.2
     with pytest.raises(RuntimeFault, match="left_arm would leave the workspace box on its way"):
-        boxed.goal(MoveRequest(joints=away.tolist()), ready())
-    assert np.array_equal(boxed.goal(MoveRequest(pose="ready"), away), ready())
+        boxed.motion_goal(MoveRequest(joints=away.tolist()), ready())
+    assert np.array_equal(boxed.motion_goal(MoveRequest(pose="ready"), away), ready())
 
 
 def test_half_the_speed_takes_longer_and_no_way_takes_no_time() -> None:

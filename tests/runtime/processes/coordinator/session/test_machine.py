@@ -11,7 +11,7 @@ from runtime.ipc.command_arguments import BenchRequest, LabelRequest, RunRequest
 from runtime.ipc.messages import Ack, Command
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.lease import Lease
-from runtime.processes.coordinator.operations import Parts, SessionActions
+from runtime.processes.coordinator.operations import SessionActions, SessionComponents
 from runtime.processes.coordinator.session import machine as session_module
 from runtime.processes.coordinator.session.machine import SessionMachine
 from runtime.processes.coordinator.session.transitions import (
@@ -84,13 +84,13 @@ MODES = (None, "continuous", "step", "preview", "sim", "manual")
 SITUATIONS = [
     *(GuardFacts(*fields) for fields in product(MODES, *[(False, True)] * 7)),
     *(
-        GuardFacts(mode, collection=collection, collecting=collecting, armed=armed, unled=unled)
+        GuardFacts(mode, collection=collection, collecting=collecting, armed=armed, leader_problem=unled)
         for mode, collection, collecting, armed, unled in product(
             (None, "collect", "manual"), *[(False, True)] * 3, ("", "the leader is silent")
         )
     ),
     *(
-        GuardFacts(mode, proposed=proposed, first_action=True, doubt="a reads 0.9 rad and is held at 0.0")
+        GuardFacts(mode, has_proposal=proposed, first_action=True, doubt="a reads 0.9 rad and is held at 0.0")
         for mode, proposed in product(MODES, (False, True))
     ),
 ]
@@ -188,7 +188,7 @@ def test_what_is_allowed_in_a_state_is_what_its_guards_say_in_every_situation(st
     bench = Bench(state)
     for situation in SITUATIONS:
         bench.effects.situation = situation
-        allowed, guarded = set(bench.session.allowed()), bench.session.guarded()
+        allowed, guarded = set(bench.session.allowed()), bench.session.blocked_commands()
         assert allowed == allowed_in(state, situation), situation
         of_the_state = {kind for kind, rule in COMMANDS.items() if state in rule.allowed}
         assert set(guarded) == of_the_state - allowed, situation
@@ -223,7 +223,7 @@ def test_a_command_is_carried_out_exactly_where_table_and_guards_allow_it(kind, 
 @pytest.mark.parametrize("name", ["hold", "end_run", "cancel_setup", *EFFECTS.values()])
 def test_what_carries_out_a_command_is_a_method_of_the_actions_or_of_one_of_their_parts(name):
     *part, method = name.split(".")
-    carries_out = get_type_hints(Parts)[part[0]] if part else SessionActions
+    carries_out = get_type_hints(SessionComponents)[part[0]] if part else SessionActions
     assert callable(getattr(carries_out, method))
 
 
@@ -232,8 +232,8 @@ def test_a_session_is_connected_while_complete_observations_arrive_whatever_its_
 
     def after(*happenings):
         for happening in happenings:
-            bench.session.observe(happening)
-        told = bench.session.told()
+            bench.session.handle_event(happening)
+        told = bench.session.state_meaning()
         return [name for name in ("connected", "latched", "idle") if told[name]]
 
     assert after(H.ESTOPPED) == ["latched"]
@@ -247,7 +247,7 @@ def test_a_refusal_names_the_state_or_what_the_guard_says():
     bench = Bench(S.IDLE)
     assert bench.give("step").reason.startswith("step is not allowed while idle (")
     bench = Bench(S.RUNNING)
-    bench.effects.situation = GuardFacts(mode="preview", proposed=True)
+    bench.effects.situation = GuardFacts(mode="preview", has_proposal=True)
     assert "a chunk is shown: commit or cancel it first" in bench.give("step").reason
     bench.effects.situation = GuardFacts(mode="continuous", trial=True)
     assert "one of a trial" in bench.give("tune").reason
@@ -258,7 +258,9 @@ def test_what_collects_is_refused_with_what_is_missing():
     assert "its deployment has no [collection]" in bench.give("arm").reason
     bench.effects.situation = GuardFacts(collection=True)
     assert "set up with collect first" in bench.give("arm").reason
-    bench.effects.situation = GuardFacts(collection=True, collecting=True, unled="the leader is silent")
+    bench.effects.situation = GuardFacts(
+        collection=True, collecting=True, leader_problem="the leader is silent"
+    )
     assert "the leader is silent" in bench.give("arm").reason
     assert "not armed: arm first" in bench.give("run").reason
     bench = Bench(S.HOLDING)
@@ -290,7 +292,7 @@ def test_going_to_the_first_action_is_a_set_up_of_its_own_but_within_a_run_the_r
     bench.give("approach")
     assert bench.session.state is S.SETTING_UP
     bench = Bench(S.RUNNING)
-    bench.effects.situation = GuardFacts(mode="preview", proposed=True)
+    bench.effects.situation = GuardFacts(mode="preview", has_proposal=True)
     bench.give("approach")
     assert bench.session.state is S.RUNNING
 
@@ -419,7 +421,7 @@ def test_the_panel_stops_whoever_holds_the_lease_and_does_nothing_else(state, ki
 def test_a_run_that_nobody_commands_takes_stops_of_everybody_and_no_other_command():
     bench = Bench(S.RUNNING)
     bench.clock.advance(5.0)
-    assert bench.session.observe(H.HOLDER_LOST, "nobody commands")
+    assert bench.session.handle_event(H.HOLDER_LOST, "nobody commands")
     assert (bench.session.state, bench.session.reason) == (S.RUNNING, "nobody commands")
     assert bench.effects.done == []
     refused = {bench.give(kind, holder="ben").reason for kind in COMMANDS if kind not in STOPPING}
@@ -431,7 +433,7 @@ def test_a_run_that_nobody_commands_takes_stops_of_everybody_and_no_other_comman
 def test_who_claims_a_run_that_nobody_commands_has_it_as_it_goes_on():
     bench = Bench(S.RUNNING)
     bench.clock.advance(5.0)
-    bench.session.observe(H.HOLDER_LOST, "nobody commands")
+    bench.session.handle_event(H.HOLDER_LOST, "nobody commands")
     assert bench.give("lease_claim", holder="ben").status == "accepted"
     assert (bench.session.state, bench.session.reason) == (S.RUNNING, "")
     assert bench.give("stop").reason == "ben holds the lease"
@@ -516,7 +518,7 @@ def test_a_repeated_refusal_is_the_same_refusal():
 def test_answers_of_before_a_restart_are_given_again_and_their_epochs_are_over():
     bench = Bench(S.READY)
     before = Ack("old", "accepted", boot="boot-0", data={"epoch": 12, "holder": "anna"})
-    bench.session.remember({"old": before, "odd": Ack("odd", "refused", data={"epoch": "x"})})
+    bench.session.restore_answers({"old": before, "odd": Ack("odd", "refused", data={"epoch": "x"})})
     assert bench.session.handle(bench.command("run", uuid="old")) is before
     assert bench.effects.done == []
     assert bench.lease.epoch == 12
@@ -560,7 +562,7 @@ EXPECTED_EFFECTS = {
 def test_what_happens_changes_the_state_as_the_table_says_and_in_no_other_case(happening, state):
     bench = Bench(state)
     sequence = bench.session.sequence
-    changed = bench.session.observe(happening, "because")
+    changed = bench.session.handle_event(happening, "because")
     after = EVENT_TRANSITIONS.get((happening, state))
     assert changed == (after is not None)
     if after is None:
@@ -586,34 +588,34 @@ def test_what_happens_changes_the_state_as_the_table_says_and_in_no_other_case(h
 )
 def test_a_run_is_closed_with_the_status_of_what_ended_it(happening, status):
     bench = Bench(S.RUNNING)
-    bench.session.observe(happening, "because")
+    bench.session.handle_event(happening, "because")
     assert bench.effects.done == [("end_run", status, "because")]
 
 
 @pytest.mark.parametrize("state", [s for s in SessionState if s is not S.FAULTED])
 def test_the_estop_faults_every_state_and_only_its_release_leads_out(state):
     bench = Bench(state)
-    bench.session.observe(H.ESTOPPED, "e-stop by anna")
+    bench.session.handle_event(H.ESTOPPED, "e-stop by anna")
     for happening in set(SessionEvent) - {H.RELEASED}:
-        bench.session.observe(happening, "because")
+        bench.session.handle_event(happening, "because")
         assert bench.session.state is S.FAULTED
     bench.give("release")
     assert bench.session.state is S.FAULTED  # until the guard has released
-    bench.session.observe(H.RELEASED, "released")
+    bench.session.handle_event(H.RELEASED, "released")
     assert bench.session.state is S.IDLE
 
 
 def test_nothing_that_happens_starts_a_motion():
     for happening, state in product(SessionEvent, SessionState):
         bench = Bench(state)
-        bench.session.observe(happening, "because")
+        bench.session.handle_event(happening, "because")
         assert not {"begin_setup", "begin_run", "resume_run", "go_home"} & set(bench.names)
         assert bench.session.state is state or bench.session.state not in (S.RUNNING, S.SETTING_UP)
 
 
 def test_the_end_of_the_lease_holds_a_run_and_leaves_it_open():
     bench = Bench(S.RUNNING)
-    bench.session.observe(H.LEASE_ENDED, "not renewed")
+    bench.session.handle_event(H.LEASE_ENDED, "not renewed")
     assert bench.session.state is S.HOLDING
     assert bench.effects.done == [("hold", "not renewed")]
     assert "resume" in bench.session.allowed()
@@ -623,5 +625,5 @@ def test_a_fault_of_an_effect_passes_through_where_nobody_can_be_refused():
     bench = Bench(S.RUNNING)
     bench.effects.refuse = {"hold"}
     with pytest.raises(RuntimeFault, match="cannot hold"):
-        bench.session.observe(H.HELD, "because")
+        bench.session.handle_event(H.HELD, "because")
     assert bench.session.state is S.RUNNING

@@ -200,7 +200,7 @@ class Machine(RuleBasedStateMachine):
             self.release(1)
         elif kind == "lease":
             self.keeps_lease = not self.keeps_lease
-            main.lease.give_up("lockstep", main.lease.epoch, self.station.clock.now())
+            main.lease.release("lockstep", main.lease.epoch, self.station.clock.now())
             self.going = False
         elif kind == "control":
             self.restart_control()
@@ -291,7 +291,7 @@ class Machine(RuleBasedStateMachine):
             station.shared.estop is EStop.LATCHED and self.moved <= RESTS
         )  # with an arm that was pushed meanwhile
         if self.still > 1 and not along:  # it comes to a stand, and stays there
-            less = np.maximum(np.abs(speed) - BRAKES * self.limits.reach * PERIOD, 0.0)
+            less = np.maximum(np.abs(speed) - BRAKES * self.limits.radian_scale * PERIOD, 0.0)
             slower = np.abs(self.speed) <= less + 1e-3
             assert slower[arms].all(), (
                 station.state,
@@ -313,7 +313,7 @@ class Machine(RuleBasedStateMachine):
         speed = (sent - before) / PERIOD
         assert (np.abs(speed) <= limits.velocity * 1.001 + 1e-4).all()
         if self.station.shared.estop is EStop.CLEAR:
-            rate = 60.0 * limits.reach * PERIOD
+            rate = 60.0 * limits.radian_scale * PERIOD
             assert (np.abs(speed - self.speed) <= rate * 1.06 + 1e-3).all()
         self.speed = speed
 
@@ -334,7 +334,7 @@ class Machine(RuleBasedStateMachine):
             return False  # whatever is asked for in it
         ways = np.abs(status["locked"] - status["commanded"]) > 1e-6  # to where a gripper is locked
         moves = bytes(status["behaviour"]) == b"motion" or bool(status["remaining"])
-        return moves or main.inference.asked or bool(ways.any())
+        return moves or main.inference.is_pending or bool(ways.any())
 
     def weigh(self) -> None:
         for record in self.records:

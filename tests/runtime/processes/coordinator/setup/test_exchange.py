@@ -142,7 +142,7 @@ def test_the_manifest_says_what_was_really_used(tmp_path: Path) -> None:
     station.command("run")
     station.go(20)
     manifest = station.stop().manifest
-    expected = loader.changed(station.spec.resolved, {"policy": OTHER, "task": "fold"}, "test")
+    expected = loader.apply_changes(station.spec.resolved, {"policy": OTHER, "task": "fold"}, "test")
     assert manifest["configuration"] == expected.tree
     assert manifest["configuration_hash"] == expected.digest != station.spec.resolved.digest
     assert manifest["task"] == "fold"

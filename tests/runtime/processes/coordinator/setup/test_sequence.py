@@ -37,9 +37,9 @@ def without_control(station: Station, seconds: float, beating: bool = True) -> N
         for process in ("control", *others) if beating else others:
             station.shared.beat(process, now)
         station._handle("lease_renew")
-        station.reception.pump(0.0)
-        station.media.digest()
-        station.coordinator.pump()
+        station.reception.poll(0.0)
+        station.media.poll()
+        station.coordinator.poll()
         station.clock.advance(1 / 30)
 
 
@@ -64,7 +64,7 @@ def test_kinematics_that_are_not_compiled_yet_are_waited_for_and_that_is_said(
 ) -> None:
     compiled: Future[Any] = Future()
     monkeypatch.setattr(assembly, "kinematics_compiled", lambda spec: False)
-    monkeypatch.setattr(LockstepRunner, "aside", lambda self, call: compiled)
+    monkeypatch.setattr(LockstepRunner, "run_in_background", lambda self, call: compiled)
     station = Station(stubbed(tmp_path))
     station.until(lambda: station.state is SessionState.IDLE, 5.0, "observations")
     station.command("setup")
@@ -184,7 +184,7 @@ def test_joints_that_read_exactly_0_are_named_before_anything_moves(tmp_path: Pa
     standing[[3, 12]] = 0.0
     station = Station(stubbed(tmp_path, start=standing)).ready()
     (named,) = station.events("zero_joints")
-    zero = np.flatnonzero(station.spec.limits.places & (standing == 0.0))
+    zero = np.flatnonzero(station.spec.limits.position_mask & (standing == 0.0))
     assert named.startswith(", ".join(station.spec.limits.names[i] for i in zero) + " read exactly 0 rad")
     station.close()
 
@@ -196,7 +196,9 @@ def test_a_set_up_waits_until_the_joints_are_believed(tmp_path: Path) -> None:
     station.robot.blocked = True
     station.command("setup")
     for _ in range(60):
-        station.robot.position = STANDS + noise.normal(0.0, 0.6, len(STANDS)) * station.spec.limits.places
+        station.robot.position = (
+            STANDS + noise.normal(0.0, 0.6, len(STANDS)) * station.spec.limits.position_mask
+        )
         station.go(1)
     assert station.state is SessionState.IDLE
     assert "no complete observation within 1 s: " in station.reason
@@ -295,7 +297,7 @@ def with_horizon(tmp_path: Path, steps: int, **said: Any) -> Station:
     """A station that is to execute so many steps of each answer; its policy says of itself what is `said`."""
     made = stubbed(tmp_path, strategy="sync")
     strategy = {"strategy": {"execution_horizon": steps}}
-    made.spec = replace(made.spec, resolved=loader.changed(made.spec.resolved, strategy, "test"))
+    made.spec = replace(made.spec, resolved=loader.apply_changes(made.spec.resolved, strategy, "test"))
     station = Station(made)
     station.policy.connect = lambda: PolicyInfo("stub", **said)  # type: ignore[method-assign]
     return station
@@ -336,7 +338,7 @@ def test_what_goes_wrong_with_an_answer_ends_the_set_up_and_not_main(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     station = Station(stubbed(tmp_path))
-    monkeypatch.setattr(CommandRows, "meant", property(lambda made: made.rows[len(made.rows)]))
+    monkeypatch.setattr(CommandRows, "intended_start", property(lambda made: made.rows[len(made.rows)]))
     assert "the policy's answer cannot be used: IndexError: index 20 is out of bounds" in failed(station)
     assert "Traceback" in caplog.text
     station.close()
@@ -371,7 +373,7 @@ def measuring(tmp_path: Path, off: float) -> Station:
 
 def test_measured_poses_of_another_link_are_an_error_where_the_policy_depends_on_them(tmp_path: Path) -> None:
     station = measuring(tmp_path, 0.1)
-    station.policy.sees_poses = True
+    station.policy.uses_poses = True
     why = failed(station)
     assert (
         "measures the pose of right_arm 100 mm and 0 degrees from where its joints have gripper_base" in why
@@ -388,14 +390,14 @@ def test_they_are_said_where_it_does_not_and_no_matter_where_it_is_shown_those_o
     assert "right_arm 100 mm" in said
     station.close()
     station = measuring(tmp_path / "fk", 0.1)
-    station.policy.sees_poses, station.policy.observation_eef = True, "fk"
+    station.policy.uses_poses, station.policy.observation_eef = True, "fk"
     assert station.ready().events("eef_disagrees") == []
     station.close()
 
 
 def test_measured_poses_that_agree_are_nothing_to_speak_of(tmp_path: Path) -> None:
     station = measuring(tmp_path, 0.01)
-    station.policy.sees_poses = True
+    station.policy.uses_poses = True
     assert station.ready().events("eef_disagrees") == []
     station.close()
 
