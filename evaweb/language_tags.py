@@ -22,6 +22,13 @@ def said(context: Any, sentence: object) -> str:
 
 
 @register.simple_tag(takes_context=True)
+def label(context: Any, text: object) -> str:
+    """The head of a column, the name of a filter, or what a choice is called, in the chosen language."""
+    request = context.get("request")
+    return languages.label(str(text), languages.chosen(request) if request else None)
+
+
+@register.simple_tag(takes_context=True)
 def language_choice(context: Any) -> dict[str, Any]:
     """The languages that are offered, and the code of the one that is chosen; "" for English."""
     spoken = languages.chosen(context["request"])
@@ -44,8 +51,15 @@ class TextNode(template.Node):
         words = spoken.templates.get(self.id) if spoken is not None else None
         if words is None:
             return self.english.render(context)
-        shown = {name: conditional_escape(value.resolve(context)) for name, value in self.values.items()}
+        shown = {name: self._shown(value, context, spoken) for name, value in self.values.items()}
         return mark_safe(words.format_map(shown))
+
+    def _shown(self, value: FilterExpression, context: Any, spoken: languages.Language | None) -> str:
+        found = value.resolve(context)
+        if isinstance(found, str):
+            of_a_choice = "_display" in value.token
+            found = languages.label(found, spoken) if of_a_choice else languages.translated(found, spoken)
+        return conditional_escape(found)
 
 
 @register.tag("t")

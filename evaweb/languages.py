@@ -23,6 +23,7 @@ from runtime.core.sentences import Sentence, names_of
 
 log = logging.getLogger(__name__)
 COOKIE = "eva_language"
+_PART = re.compile(r"[a-z0-9]+")
 _CODE = re.compile(r"[a-z]{2,3}(-[A-Z][A-Za-z]{1,3})?")
 _LARGEST, _MOST = 4 << 20, 20_000  # bytes and values of a file
 
@@ -86,6 +87,16 @@ def translated(text: str, spoken: Language | None) -> str:
         return _filled(pattern, text.arguments, spoken)
     except (ValueError, KeyError, IndexError):
         return text
+
+
+def label(text: str, spoken: Language | None) -> str:
+    """A word of ours that stands in a table, a list or a choice, by an id that follows from it; else as it is."""
+    return spoken.patterns.get(label_id(text), text) if spoken is not None else text
+
+
+def label_id(text: str) -> str:
+    """ "To be scored" is label.to_be_scored."""
+    return f"label.{'_'.join(_PART.findall(text.casefold()))[:60] or 'empty'}"
 
 
 def _filled(pattern: str, arguments: Mapping[str, Any], spoken: Language | None) -> str:

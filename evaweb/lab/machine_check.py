@@ -32,8 +32,8 @@ _PORTS = (8000, 8001)  # of web and stops, where the lab is started without opti
 _PRIORITY = 20  # control.realtime_priority where a deployment says nothing else
 _TRY = """
 import json
-from runtime.core.realtime import advice, enter
-got = enter({0})
+from runtime.core.realtime import advice, enter_realtime
+got = enter_realtime({0})
 print(json.dumps([got, advice(got, {0})]))
 """
 

@@ -6,6 +6,7 @@ Sentences of Python are declared as patterns; scripts write `t("an.id", "English
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,6 +15,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from django.apps import apps
+
+from evaweb.languages import label_id
 from runtime.core.sentences import Pattern, known, names_of
 
 _ROOT = Path(__file__).parents[2]
@@ -70,6 +74,17 @@ def of_templates() -> list[Entry]:
     return once(found)
 
 
+def of_labels() -> list[Entry]:
+    """Heads of columns, names of filters and words of choices: what `{% label %}` says."""
+    found = {
+        text for path, source in _sources("evaweb", "*.py") for text in _labels(ast.parse(source, str(path)))
+    }
+    for model in apps.get_models():
+        if model.__module__.startswith("evaweb."):
+            found |= {str(text) for field in model._meta.fields for _, text in field.flatchoices}
+    return once(Entry(label_id(text), text.casefold(), frozenset()) for text in sorted(found) if text)
+
+
 def catalogue(entries: Iterable[Entry]) -> list[dict[str, Any]]:
     """Id, English and names of the arguments of each."""
     return [{"id": one.id, "english": one.english, "arguments": sorted(one.names)} for one in entries]
@@ -97,6 +112,22 @@ def once(entries: Iterable[Entry]) -> list[Entry]:
         if found.setdefault(one.id, one) != one:
             raise ValueError(f"{one.id} is two texts: {found[one.id].english!r} and {one.english!r}")
     return [found[id] for id in sorted(found)]
+
+
+def _labels(tree: ast.AST) -> Iterator[str]:
+    """What lists call their columns and filters."""
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id in ("Column", "Filter")
+        ):
+            named = [
+                keyword.value for keyword in node.keywords if keyword.arg in ("title", "label", "hint", "any")
+            ]
+            for text in (*node.args[1:2], *named):
+                if isinstance(text, ast.Constant) and isinstance(text.value, str):
+                    yield text.value
 
 
 def _entry(pattern: Pattern) -> Entry:

@@ -130,7 +130,9 @@ def test_templates_say_the_words_of_a_language_with_their_values_escaped(german)
 
 def test_every_language_that_ships_says_all():
     entries = {
-        "sentences": sentences.once([*sentences.of_python(), *sentences.of_scripts()]),
+        "sentences": sentences.once(
+            [*sentences.of_python(), *sentences.of_labels(), *sentences.of_scripts()]
+        ),
         "templates": sentences.of_templates(),
     }
     for path in sorted((STATIC / "languages").glob("*.json")):

@@ -178,8 +178,8 @@ def test_a_stream_that_was_closed_goes_nowhere(words: list[str], code: int, clos
 
 def test_what_is_opened_takes_no_number_of_a_stream_and_children_have_them_too() -> None:
     program = (
-        "import os, subprocess, sys; from robots.broken_pipe import unread_ends\n"
-        "@unread_ends\n"
+        "import os, subprocess, sys; from robots.broken_pipe import exit_on_broken_pipe\n"
+        "@exit_on_broken_pipe\n"
         "def main():\n"
         "    child = 'import os; [os.fstat(number) for number in range(3)]'\n"
         "    return subprocess.run([sys.executable, '-c', child]).returncode or 10 * (os.open('.', 0) > 2)\n"

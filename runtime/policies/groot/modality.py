@@ -44,7 +44,7 @@ class Modality:
 
 @dataclass(frozen=True, slots=True)
 class Modalities:
-    """All four; `early` where the server is of version N1.5, `reads_mnp` where it reads arrays as N1.7 does.
+    """All four; `is_n15` where the server is of version N1.5, `reads_mnp` where it reads arrays as N1.7 does.
 
     `reads_mnp` is None where its answer has the mark of no version.
 

@@ -107,9 +107,9 @@ def test_arguments_may_have_the_words_of_the_clients_own(client, station):
     client.claim()
     client.status()
     with pytest.raises(Refused, match="timeout"):
-        client.give("run", {"timeout": 5, "kind": "x", "identity": "y"})
+        client.send_command("run", {"timeout": 5, "kind": "x", "identity": "y"})
     with pytest.raises(Refused, match="no such arm"):
-        client.ask("aim", {"kind": 1, "timeout": 2})
+        client.query_with("aim", {"kind": 1, "timeout": 2})
     assert [dict(command.args) for command in station.received if command.args] == [
         {"timeout": 5, "kind": "x", "identity": "y"},
         {"kind": 1, "timeout": 2},
@@ -171,7 +171,7 @@ def test_a_lease_that_was_lost_is_told_when_it_is_renewed(client, station):
 
 def test_a_lease_can_be_given_up(client, connect, station):
     client.claim()
-    client.give_up()
+    client.release()
     connect("ben").claim()
     assert station.lease.current(station.time).holder == "ben"
 
@@ -217,7 +217,7 @@ def test_waiting_ends_with_the_first_status_that_will_do_and_keeps_the_lease(cli
 
 def test_waiting_does_not_renew_a_lease_that_was_given_up(client, station):
     client.claim()
-    client.give_up()
+    client.release()
     client._renewed -= 1.0
     assert client.wait(lambda status: station.kinds().count("status") > 1, 2.0)["state"] == "ready"
 

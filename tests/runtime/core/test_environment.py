@@ -22,7 +22,7 @@ from runtime.station import preflight_child as child
 from tests.processes import PATIENCE_S, eventually
 
 SHED = (
-    "import os; from runtime.core import environment; before = os.getpid(); environment.shed(); "
+    "import os; from runtime.core import environment; before = os.getpid(); environment.restart_without_web_secrets(); "
     "print(open('/proc/self/environ').read().replace(chr(0), ' '), os.environ.get('KEPT'))"
 )
 

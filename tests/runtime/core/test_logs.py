@@ -14,7 +14,7 @@ PIPE_SIZE = 1031  # F_SETPIPE_SZ
 STUCK = """
 import logging, sys
 from runtime.core import logs as log
-log.start("main")
+log.configure_logging("main")
 for number in range(5000):
     logging.info("line %d of a process whose terminal has stopped", number)
 print("went on", flush=True)
@@ -110,19 +110,21 @@ def python(code, **environment):
 
 def test_everything_that_was_logged_is_there_when_the_process_has_ended():
     done = python(
-        "import logging; from runtime.core import logs as log; log.start('media'); logging.info('last words')"
+        "import logging; from runtime.core import logs as log; log.configure_logging('media'); logging.info('last words')"
     )
     assert done.stderr.endswith("media      INFO    last words\n")
 
 
 def test_the_level_is_that_of_the_environment():
-    code = "import logging; from runtime.core import logs as log; log.start('x'); logging.info('a'); logging.error('b')"
+    code = "import logging; from runtime.core import logs as log; log.configure_logging('x'); logging.info('a'); logging.error('b')"
     assert "ERROR   b" in python(code, EVA_LOG_LEVEL="WARNING").stderr
     assert "INFO    a" not in python(code, EVA_LOG_LEVEL="WARNING").stderr
 
 
 def test_the_error_that_ends_a_process_is_logged_with_its_traceback():
-    done = python("from runtime.core import logs as log; log.start('main'); raise ValueError('so it ends')")
+    done = python(
+        "from runtime.core import logs as log; log.configure_logging('main'); raise ValueError('so it ends')"
+    )
     assert done.returncode == 1
     assert "CRITICAL this process ends" in done.stderr
     assert done.stderr.endswith("ValueError: so it ends\n")
@@ -130,7 +132,7 @@ def test_the_error_that_ends_a_process_is_logged_with_its_traceback():
 
 def test_the_thread_of_a_process_that_turns_real_time_stays_in_the_ordinary_class():
     code = (
-        "import os, threading; from runtime.core import logs as log; log.start('control')\n"
+        "import os, threading; from runtime.core import logs as log; log.configure_logging('control')\n"
         "os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))\n"
         "(thread,) = [t for t in threading.enumerate() if t.name == 'log']\n"
         "print(os.sched_getscheduler(0) == os.SCHED_FIFO, os.sched_getscheduler(thread.native_id))"

@@ -10,7 +10,7 @@ _ROUNDS = """
 import resource, sys
 from runtime.core import malloc as heap
 if sys.argv[1] == "keep":
-    assert heap.keep()
+    assert heap.keep_freed_memory()
 pieces = lambda: [bytearray(b"x") * 900_000 for _ in range(6)]
 for _ in range(3):
     pieces()

@@ -13,17 +13,17 @@ from runtime.core import realtime
 
 _ASK = (
     "from runtime.core import realtime; import gc, os; "
-    "print(realtime.enter(20), os.sched_getscheduler(0), gc.isenabled())"
+    "print(realtime.enter_realtime(20), os.sched_getscheduler(0), gc.isenabled())"
 )
 
 
 _ASK_BELOW = (
     "from runtime.core import realtime; import gc, os, threading; "
-    "words = realtime.enter_below(20); found = []; "
+    "words = realtime.enter_realtime_below(20); found = []; "
     "child = threading.Thread(target=lambda: found.append(os.sched_getscheduler(0))); child.start(); child.join(); "
-    "leaver = threading.Thread(target=lambda: (realtime.leave(), found.append(os.sched_getscheduler(0)))); "
+    "leaver = threading.Thread(target=lambda: (realtime.leave_realtime(), found.append(os.sched_getscheduler(0)))); "
     "leaver.start(); leaver.join(); "
-    "got = os.sched_getscheduler(0); realtime.leave_all(); "
+    "got = os.sched_getscheduler(0); realtime.leave_realtime_all(); "
     "print(words, got, *found, gc.isenabled(), os.sched_getscheduler(0), sep='|')"
 )
 
@@ -99,7 +99,7 @@ def test_advice_is_for_who_lacks_the_class_and_names_both_ways_to_get_it() -> No
 _LOCKED = (
     "from runtime.core import realtime; import mmap; "
     "large, small = mmap.mmap(-1, 64 << 20, mmap.MAP_PRIVATE), mmap.mmap(-1, 1 << 20, mmap.MAP_PRIVATE); "
-    "words = realtime.enter(20); "
+    "words = realtime.enter_realtime(20); "
     "held = int([row for row in open('/proc/self/status') if row.startswith('VmLck')][0].split()[1]); "
     "used = int([row for row in open('/proc/self/status') if row.startswith('VmRSS')][0].split()[1]); "
     "print(words, held >> 10, used >> 10, sep='|')"

@@ -170,7 +170,10 @@ def events_said(function):
     for node in ast.walk(function):
         if isinstance(node, ast.Call) and len(node.args) >= 2:
             name = getattr(node.func, "id", getattr(node.func, "attr", ""))
-            told = name in ("say", "_say", "_event", "_note", "_say_seldom") and len(node.args) == 2
+            told = (
+                name in ("emit", "_emit", "_event", "_note", "_emit_rate_limited", "say", "_say")
+                and len(node.args) == 2
+            )
             if name == "Event" or told:
                 text = node.args[1]
                 yield local.get(text.id, text) if isinstance(text, ast.Name) else text

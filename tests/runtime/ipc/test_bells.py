@@ -37,7 +37,7 @@ def rung(shared: SharedState) -> set[str]:
     ("put", "wakes"),
     [
         (lambda shared: shared.rings["presses"].push(b"x"), {"guard"}),
-        (lambda shared: shared.ask_release(), {"guard"}),
+        (lambda shared: shared.request_release(), {"guard"}),
         (lambda shared: shared.rings["minutes"].push(b"x"), {"media"}),
         (lambda shared: shared.rings["observations"].push(b"x"), {"media"}),
         (lambda shared: shared.rings["ticks"].push(b"x"), set()),

@@ -170,9 +170,9 @@ def test_a_socket_that_somebody_removed_is_listened_at_anew(context, server, tmp
     early.connect(before)
     early.send(encode(Command("early", "run")))
     address, _ = next_command(server)
-    assert not server.moved()
+    assert not server.rebind_if_unreachable()
     shutil.rmtree(os.environ["XDG_RUNTIME_DIR"] + "/eva-web")  # as with the last logout of the account
-    assert server.moved()
+    assert server.rebind_if_unreachable()
     assert server.endpoint != before
     assert f"it is {server.endpoint.removeprefix('ipc://')} now" in caplog.text
     server.answer(address, Ack("early", "accepted"))

@@ -445,7 +445,7 @@ def test_where_numba_is_missing_the_error_says_what_to_do() -> None:
         from runtime.core.errors import SetupError
         from runtime.kinematics.compiled import Config, build
         try:
-            build(Config(), robots.load("agilex_piper"))
+            build(Config(), robots.load_robot("agilex_piper"))
         except SetupError as error:
             print(error)
     """
@@ -458,9 +458,9 @@ def test_without_a_folder_to_write_kernels_are_kept_in_memory_and_that_is_said(t
     file.touch()  # nobody can make a folder below a file, not even root
     code = """if True:
         import numpy as np, robots
-        from runtime.kinematics.links import Links
+        from runtime.kinematics.links import LinkPoses
         from runtime.kinematics.kernels.compiling import CACHE
-        print(CACHE, Links(robots.Body(robots.load("agilex_piper"))).poses(np.zeros(14)).shape[1:])
+        print(CACHE, LinkPoses(robots.Body(robots.load_robot("agilex_piper"))).poses(np.zeros(14)).shape[1:])
     """
     done = python(code, NUMBA_CACHE_DIR=str(file / "below"))
     assert done.stdout.startswith("None (")
@@ -471,8 +471,8 @@ def test_without_a_folder_to_write_kernels_are_kept_in_memory_and_that_is_said(t
 def test_kernels_are_kept_in_the_folder_that_is_named(tmp_path: Path) -> None:
     code = """if True:
         import robots
-        from runtime.kinematics.links import Links
-        Links(robots.Body(robots.load("agilex_piper")))
+        from runtime.kinematics.links import LinkPoses
+        LinkPoses(robots.Body(robots.load_robot("agilex_piper")))
     """
     python(code, NUMBA_CACHE_DIR=str(tmp_path))
     assert [path.suffix for path in sorted(tmp_path.glob("kernels-*/*/*"))] == [".nbc", ".nbi"]

@@ -37,7 +37,7 @@ def test_control_and_media_load_no_compiler() -> None:
         import runtime.processes.control.process, runtime.processes.media.process, runtime.processes.reception.process
         from runtime.spaces.end_effectors import EndEffectors
         from runtime.kinematics.forward import ChainForward
-        robot = robots.load("agilex_piper")
+        robot = robots.load_robot("agilex_piper")
         EndEffectors(robot, ChainForward(robot)).eef_of(numpy.zeros(14))
         print([name for name in ("numba", "llvmlite") if name in sys.modules])
     """

@@ -151,11 +151,11 @@ def test_a_run_by_hand_begins_when_steps_can_be_answered(
     station.go(30)
     loaded.append(True)
     station.go(3)
-    assert station.coordinator.run.begun is not None
+    assert station.coordinator.run.begun_at is not None
     station.command("stop")
     station.go(3)
     loaded.clear()
     station.command("run")
     station.go(10)
-    assert station.coordinator.run.begun is not None, "a policy's run needs none of it"
+    assert station.coordinator.run.begun_at is not None, "a policy's run needs none of it"
     station.close()

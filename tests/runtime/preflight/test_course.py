@@ -224,7 +224,7 @@ def test_a_report_is_json_whatever_the_server_says(flown: Any) -> None:
         3: {"type": int},
     }
     report = flown(Stub(info=PolicyInfo("stub", metadata=metadata)))  # type: ignore[arg-type]
-    told = json.loads(json.dumps(report.plain(), allow_nan=False))
+    told = json.loads(json.dumps(report.to_dict(), allow_nan=False))
     said = told["metadata"]
     assert said["weights"] == "array [3, 4] float64"
     assert (said["blob"], said["loss"], said["step"]) == ("3 bytes", "nan", 7)

@@ -32,7 +32,7 @@ class Recorder:
         self.started.append((asked, resolved))
         return 60.0
 
-    def look(self) -> PreflightRun | None:
+    def poll(self) -> PreflightRun | None:
         ended, self.ended = self.ended, None
         return ended
 

@@ -220,9 +220,9 @@ def test_what_the_limits_allow_is_followed_to_the_last_bit_whatever_was_wanted_b
 
 def test_a_verdict_names_what_was_changed_most():
     verdict = judge([0.3, 1.02, 0.05], state())
-    assert verdict.most == "arm.joint0 limited from 0.3000 to 0.0667"
+    assert verdict.largest_change_note == "arm.joint0 limited from 0.3000 to 0.0667"
     assert verdict.change == pytest.approx(0.3 - 60.0 * DT**2)
-    assert judge([0.01, 1.0, 0.05]).most == ""
+    assert judge([0.01, 1.0, 0.05]).largest_change_note == ""
 
 
 def test_a_motion_that_is_too_fast_for_a_limit_brakes_as_hard_as_a_policy_may():
@@ -264,9 +264,9 @@ def test_by_default_a_step_into_the_other_arm_is_sent_and_warned_of():
     action = turned(inwards(1.2))
     verdict = arms(action, turned(1.2))
     assert np.array_equal(verdict.action, action)
-    assert verdict.near is not None
-    assert verdict.notes == (str(verdict.near),)
-    assert arms(turned(inwards(0.5)), turned(0.5)).near is None
+    assert verdict.near_collision is not None
+    assert verdict.notes == (str(verdict.near_collision),)
+    assert arms(turned(inwards(0.5)), turned(0.5)).near_collision is None
 
 
 def test_where_collisions_are_refused_such_a_step_is_and_one_that_parts_is_not():
@@ -276,7 +276,7 @@ def test_where_collisions_are_refused_such_a_step_is_and_one_that_parts_is_not()
     assert "deep)" in refused.notes[0]
     assert not arms(turned(1.18), turned(1.2), collision="refuse").refused
     assert not arms(turned(1.2), turned(1.2), collision="refuse").refused
-    assert arms(turned(1.18), turned(1.2), collision="refuse").near is None
+    assert arms(turned(1.18), turned(1.2), collision="refuse").near_collision is None
 
 
 def test_an_arm_that_could_not_stop_before_the_other_is_refused_while_there_is_room():
@@ -299,7 +299,7 @@ def test_motions_of_ours_are_refused_even_where_policies_are_not_judged():
         assert arms(turned(inwards(1.2)), turned(1.2), path="motion", collision=mode).refused
         assert not arms(turned(1.19), turned(1.2), path="motion", collision=mode).refused
     off = arms(turned(inwards(1.2)), turned(1.2), collision="off")
-    assert (off.refused, off.near, off.notes) == (False, None, ())
+    assert (off.refused, off.near_collision, off.notes) == (False, None, ())
 
 
 def test_report_only_tells_of_a_collision_and_sends_the_action():
@@ -307,7 +307,7 @@ def test_report_only_tells_of_a_collision_and_sends_the_action():
     told = arms(action, turned(1.2), report_only=True, collision="refuse")
     assert np.array_equal(told.action, action)
     assert "deep)" in told.notes[0]
-    assert arms(action, turned(1.2), report_only=True).near is not None
+    assert arms(action, turned(1.2), report_only=True).near_collision is not None
 
 
 def test_a_collision_is_judged_after_the_box_and_before_the_following_error():

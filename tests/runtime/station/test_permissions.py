@@ -175,7 +175,7 @@ def keys(table: type[Settings], prefix=""):
 def test_every_key_that_sounds_like_a_file_or_a_variable_is_marked_as_one(kind):
     for key, words in keys(variants("runtime.policies")[kind].Config):
         sounds = key.endswith(("_env", "_file", "_config", "_dir")) or key == "path"
-        assert ("Names." in words) == sounds, key
+        assert ("HostReference." in words) == sounds, key
 
 
 def test_values_that_name_something_are_found_in_tables_within_tables(own):

@@ -44,7 +44,7 @@ def test_a_lifeline_is_cut_when_its_other_end_is_gone(pipe):
     assert not lifeline.is_cut
     os.close(pipe.pop("writing"))
     assert lifeline.is_cut
-    assert lifeline.cut
+    assert lifeline.is_cut
 
 
 def test_words_on_a_lifeline_do_not_cut_it(pipe):

@@ -36,9 +36,9 @@ def test_what_a_strategy_uses_is_among_the_parameters_of_all(kind):
 
 def test_which_strategies_wait_and_which_tell_what_the_robot_is_committed_to():
     queries = {kind: module.query(module.Config()) for kind, module in STRATEGIES.items()}
-    assert {kind for kind, query in queries.items() if query.waits} == {"sync"}
-    assert {kind for kind, query in queries.items() if query.continues} == {"rtc"}
-    assert {kind for kind, module in STRATEGIES.items() if merger(module).waits} == {"sync"}
+    assert {kind for kind, query in queries.items() if query.requests_while_stopped} == {"sync"}
+    assert {kind for kind, query in queries.items() if query.uses_rtc} == {"rtc"}
+    assert {kind for kind, module in STRATEGIES.items() if merger(module).requests_while_stopped} == {"sync"}
 
 
 def test_back_to_back_asks_at_once_but_never_twice():
@@ -84,7 +84,7 @@ def test_a_switched_strategy_takes_over_from_the_old_plan_whatever_its_own_windo
     assert [timeline.at(step).action[0] for step in range(3, 12)] == pytest.approx(
         [0, 1, 2, 3, 4, 5, 6, 7, 7]
     )
-    assert dict(timeline.at(4).makers) == pytest.approx({7: 6 / 7, 8: 1 / 7})
+    assert dict(timeline.at(4).contributions) == pytest.approx({7: 6 / 7, 8: 1 / 7})
     assert merged.overlap == 6
 
 
@@ -94,7 +94,7 @@ def test_an_old_plan_that_ends_early_is_held_where_it_ends():
     assert [timeline.at(step).action[0] for step in range(3, 12)] == pytest.approx(
         [0, 1, 2, 3, 4, 5, 6, 7, 7]
     )
-    assert [timeline.at(step).makers[0][0] for step in (4, 5)] == [7, HELD]
+    assert [timeline.at(step).contributions[0][0] for step in (4, 5)] == [7, HELD]
 
 
 def test_a_switch_while_nothing_is_planned_starts_from_the_last_command():
@@ -111,7 +111,7 @@ def test_chunks_that_come_while_a_fade_is_under_way_do_not_end_it():
     join(merge, timeline, ArrivedChunk(8, 0, rows(7, 20)), 3, None, PLAIN, joining=True)
     join(merge, timeline, ArrivedChunk(9, 2, rows(7, 20)), 5, None, PLAIN)
     assert [timeline.at(step).action[0] for step in range(5, 11)] == pytest.approx([2, 3, 4, 5, 6, 7])
-    assert dict(timeline.at(5).makers) == pytest.approx({7: 5 / 7, 9: 2 / 7})
+    assert dict(timeline.at(5).contributions) == pytest.approx({7: 5 / 7, 9: 2 / 7})
 
 
 def test_a_second_join_starts_from_what_was_executed_and_not_from_what_was_planned_beneath():
@@ -119,7 +119,7 @@ def test_a_second_join_starts_from_what_was_executed_and_not_from_what_was_plann
     join(merger(naive), timeline, ArrivedChunk(8, 0, rows(7, 20)), 3, None, PLAIN, joining=True)
     join(merger(overlap), timeline, ArrivedChunk(9, 2, rows(-7, 20)), 5, None, PLAIN, joining=True)
     assert timeline.at(5).action[0] == pytest.approx(2)
-    assert dict(timeline.at(5).makers) == pytest.approx({7: 5 / 7, 8: 2 / 7})
+    assert dict(timeline.at(5).contributions) == pytest.approx({7: 5 / 7, 8: 2 / 7})
     assert timeline.at(12).action[0] == -7
 
 
@@ -159,7 +159,7 @@ def test_an_angle_that_wraps_joins_the_plan_the_shorter_way_round():
     dims = DimensionKinds(wrapping=(0,))
     timeline = planned(3.0, 30)
     join(merger(overlap, dims), timeline, ArrivedChunk(1, 0, rows(-3.0, 20)), 0, None, dims)
-    actions = timeline.span(0)[0][:, 0]
+    actions = timeline.executed_rows(0)[0][:, 0]
     assert actions[0] == pytest.approx(3.0)
     assert actions[-1] == pytest.approx(2 * np.pi - 3.0)
     assert np.abs(np.diff(actions)).max() < 0.05

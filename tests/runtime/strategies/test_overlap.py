@@ -19,7 +19,7 @@ def after_two(old=0.0, new=1.0, **parameters):
 
 def test_each_step_names_the_chunks_it_was_made_from():
     timeline, merged = after_two(blend_window=3)
-    assert [timeline.at(step).makers for step in (4, 5, 6, 7)] == [
+    assert [timeline.at(step).contributions for step in (4, 5, 6, 7)] == [
         ((1, 1.0),),
         ((1, 0.5), (2, 0.5)),
         ((2, 1.0),),

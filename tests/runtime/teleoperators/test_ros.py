@@ -114,7 +114,7 @@ def test_what_cannot_be_used_is_said_and_moves_nothing(
     assert "/leader/left" in bench.leader.problem
     bench.say("/leader/left", np.zeros(7))
     assert bench.leader.latest_pose is not None
-    assert "positions" not in bench.leader.refused
+    assert "positions" not in bench.leader.problem
 
 
 def test_bytes_that_are_no_message_are_said(bench: Bench) -> None:

@@ -29,7 +29,9 @@ class Command(BaseCommand):
     def handle(self, *args: Any, file: Path | None = None, **options: Any) -> None:
         """Print the one or the other."""
         entries = {
-            "sentences": sentences.once([*sentences.of_python(), *sentences.of_scripts()]),
+            "sentences": sentences.once(
+                [*sentences.of_python(), *sentences.of_labels(), *sentences.of_scripts()]
+            ),
             "templates": sentences.of_templates(),
         }
         if file is None:

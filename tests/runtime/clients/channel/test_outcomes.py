@@ -44,7 +44,7 @@ def test_these_are_done_at_once(kind):
 def test_what_has_a_state_of_its_own_is_over_when_that_is_left(kind, states, result):
     outcome = given(kind, "ready")
     for state in states:
-        outcome.look(status(state, reason="because"), none_since)
+        outcome.poll(status(state, reason="because"), none_since)
     assert outcome.result == result
     assert ("because" in outcome.reason) == (result != "accepted")
 
@@ -52,51 +52,51 @@ def test_what_has_a_state_of_its_own_is_over_when_that_is_left(kind, states, res
 def test_a_step_is_done_when_the_robot_stands_for_some_ticks():
     outcome = given("step")
     for step, phase in ((0, "asking"), (5, "executing"), (9, "executing"), (15, "waiting"), (17, "waiting")):
-        outcome.look(ticking("running", step, phase), none_since)
+        outcome.poll(ticking("running", step, phase), none_since)
         assert outcome.result == "accepted"
-    outcome.look(ticking("running", 18), none_since)
+    outcome.poll(ticking("running", 18), none_since)
     assert (outcome.result, outcome.reason) == ("done", "")
 
 
 def test_a_move_that_was_over_between_two_looks_is_not_failed_before_its_end_is_told():
     outcome = given("move")
     told = [event(1, "motion_done")]
-    outcome.look(ticking("running", 0), none_since)  # it has not begun
-    outcome.look(ticking("running", 30), none_since)  # it has ended at this tick
+    outcome.poll(ticking("running", 0), none_since)  # it has not begun
+    outcome.poll(ticking("running", 30), none_since)  # it has ended at this tick
     assert outcome.result == "accepted"
-    outcome.look(ticking("running", 33, newest_event=1), lambda number: told)
+    outcome.poll(ticking("running", 33, newest_event=1), lambda number: told)
     assert outcome.result == "done"
 
 
 def test_a_step_whose_chunk_was_dropped_has_failed_with_the_reason():
     outcome = given("step")
     dropped = [event(1, "chunk_dropped", "chunk 4 dropped: too late")]
-    outcome.look(ticking("running", 1, newest_event=1), lambda number: dropped if number < 1 else [])
-    outcome.look(ticking("running", 9, newest_event=1), none_since)
-    outcome.look(ticking("running", 12, newest_event=1), none_since)
+    outcome.poll(ticking("running", 1, newest_event=1), lambda number: dropped if number < 1 else [])
+    outcome.poll(ticking("running", 9, newest_event=1), none_since)
+    outcome.poll(ticking("running", 12, newest_event=1), none_since)
     assert (outcome.result, outcome.reason) == ("failed", "chunk 4 dropped: too late")
 
 
 @pytest.mark.parametrize(("events", "result"), [([event(1, "motion_done")], "done"), ([], "failed")])
 def test_a_move_is_done_when_the_motion_was_told_to_be(events, result):
     outcome = given("move")
-    outcome.look(ticking("running", 1, "moving"), none_since)
-    outcome.look(ticking("running", 2, newest_event=len(events)), lambda number: events)
-    outcome.look(ticking("running", 9, newest_event=len(events)), none_since)
-    outcome.look(ticking("running", 12, newest_event=len(events)), none_since)
+    outcome.poll(ticking("running", 1, "moving"), none_since)
+    outcome.poll(ticking("running", 2, newest_event=len(events)), lambda number: events)
+    outcome.poll(ticking("running", 9, newest_event=len(events)), none_since)
+    outcome.poll(ticking("running", 12, newest_event=len(events)), none_since)
     assert outcome.result == result
 
 
 def test_what_a_stop_has_ended_has_failed():
     outcome = given("move")
-    outcome.look(ticking("holding", 1), none_since)
+    outcome.poll(ticking("holding", 1), none_since)
     assert outcome.result == "failed"
     assert "holding" in outcome.reason
 
 
 def test_after_a_restart_of_the_station_it_is_not_known():
     outcome = given("run", "ready")
-    outcome.look(status("idle", boot="boot-2"), none_since)
+    outcome.poll(status("idle", boot="boot-2"), none_since)
     assert (outcome.result, outcome.reason) == ("unknown", "the station was restarted")
 
 

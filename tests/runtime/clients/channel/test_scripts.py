@@ -15,7 +15,7 @@ class Client:
     def renew(self):
         self._do("renew")
 
-    def give_up(self):
+    def release(self):
         self._do("give_up")
 
     def close(self):
@@ -53,56 +53,56 @@ def test_a_lease_is_kept_as_long_as_its_script_speaks(world):
     world.holding("a")
     for _ in range(5):
         world.now += 9.0
-        world.lives.heard("a")
-        assert world.scripts.keep() == []
+        world.lives.record("a")
+        assert world.scripts.poll() == []
     assert world.made["a"].done == ["renew"] * 5
 
 
 def test_the_lease_of_a_silent_script_is_given_up_once(world):
     script = world.holding("a")
     world.now += 10.5
-    (told,) = world.scripts.keep()
+    (told,) = world.scripts.poll()
     assert told == "a has said nothing for 10.5 s: its lease is over"
     assert not script.holds
-    assert world.scripts.keep() == []
+    assert world.scripts.poll() == []
     assert world.made["a"].done == ["give_up"]
 
 
 def test_another_script_does_not_keep_it(world):
     world.holding("a")
     world.now += 10.5
-    world.lives.heard("b")
-    assert len(world.scripts.keep()) == 1
+    world.lives.record("b")
+    assert len(world.scripts.poll()) == 1
 
 
 def test_a_script_without_a_lease_is_left_alone(world):
-    world.scripts.of("a")
+    world.scripts.get_or_create("a")
     world.now += 100.0
-    assert world.scripts.keep() == []
+    assert world.scripts.poll() == []
     assert world.made["a"].done == []
 
 
 def test_a_lease_that_was_taken_away_is_told_and_not_claimed_again(world):
     script = world.holding("a")
     world.made["a"].fault = Refused("anna holds the lease")
-    assert world.scripts.keep() == ["a has the lease no longer: anna holds the lease"]
+    assert world.scripts.poll() == ["a has the lease no longer: anna holds the lease"]
     assert not script.holds
 
 
 def test_a_station_that_does_not_answer_is_asked_again_while_the_script_lives(world):
     script = world.holding("a")
     world.made["a"].fault = TransportError("no answer")
-    assert world.scripts.keep() == []
+    assert world.scripts.poll() == []
     assert script.holds
     world.now += 11.0
-    assert world.scripts.keep() == ["a: no answer"]
+    assert world.scripts.poll() == ["a: no answer"]
     assert not script.holds
 
 
 def test_who_has_never_spoken_is_none_of_the_channel(world):
-    world.lives.heard("a")
-    assert world.lives.knows("a")
-    assert not world.lives.knows("browser:anna")
+    world.lives.record("a")
+    assert world.lives.is_known("a")
+    assert not world.lives.is_known("browser:anna")
     assert world.lives.silence("browser:anna") == float("inf")
 
 
@@ -110,9 +110,9 @@ def test_old_scripts_are_forgotten_but_not_who_holds(world, monkeypatch):
     monkeypatch.setattr(module, "KEPT", 3)
     world.holding("keeper")
     for number in range(6):
-        world.scripts.of(str(number))
+        world.scripts.get_or_create(str(number))
     closed = [name for name, client in world.made.items() if client.done == ["close"]]
     assert closed == ["0", "1", "2"]
-    assert world.scripts.of("keeper").holds
+    assert world.scripts.get_or_create("keeper").holds
     world.scripts.close()
     assert all(client.done[-1] == "close" for client in world.made.values())

@@ -59,7 +59,7 @@ def test_a_certificate_that_cannot_be_read_is_named(tmp_path):
     ("resolved", "sentence"), [(None, "is not known here"), ('{"panel": null}', "has no [panel]: add one")]
 )
 def test_a_station_without_a_panel_is_a_sentence(tmp_path, capsys, monkeypatch, resolved, sentence):
-    monkeypatch.setattr("runtime.clients.panel.__main__.logs.start", lambda process: None)
+    monkeypatch.setattr("runtime.clients.panel.__main__.logs.configure_logging", lambda process: None)
     folder = tmp_path / "stations" / "bench-1"
     folder.mkdir(parents=True)
     if resolved:

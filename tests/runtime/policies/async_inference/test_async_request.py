@@ -27,12 +27,12 @@ def sent(made: AsyncRequest) -> Any:
     wire = pytest.importorskip("runtime.sim.lerobot_wire", reason="the extra lerobot-grpc is not installed")
     pictures = {camera.key: np.full((4, 6, 3), 7, np.uint8) for camera in ROBOT.cameras}
     qpos = np.arange(14, dtype=np.float32) / 4
-    return wire.read(made.build(Observation(1, 0.0, {}, qpos, pictures, prompt="pick"), 5))
+    return wire.unpickle(made.build(Observation(1, 0.0, {}, qpos, pictures, prompt="pick"), 5))
 
 
 def told(made: AsyncRequest) -> Any:
     wire = pytest.importorskip("runtime.sim.lerobot_wire", reason="the extra lerobot-grpc is not installed")
-    return wire.read(made.setup_message())
+    return wire.unpickle(made.setup_message())
 
 
 def test_an_observation_has_motors_pictures_and_task_and_must_go() -> None:

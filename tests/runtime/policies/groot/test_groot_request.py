@@ -32,7 +32,7 @@ def wanted(**changes: Any) -> Modalities:
         "state": Modality(("left", "right")),
         "action": Modality(("left", "right"), tuple(range(16))),
         "language": Modality(("task",)),
-        "early": False,
+        "is_n15": False,
     }
     return Modalities(**{**made, **changes})
 
@@ -77,7 +77,7 @@ def test_the_sim_wrapper_and_n15_want_flat_keys() -> None:
     assert set(flat) == {"video.ego_view", "state.left", "state.right", "task"}
     assert flat["video.ego_view"].shape == (1, 1, 4, 6, 3)
     assert flat["task"] == ["pick"]
-    early = shown(request(wanted(early=True), dialect="n1.5"))
+    early = shown(request(wanted(is_n15=True), dialect="n1.5"))
     assert set(early) == set(flat)
     assert early["video.ego_view"].shape == (1, 4, 6, 3)
     assert early["state.left"].shape == (1, 7)
@@ -115,10 +115,10 @@ def test_grippers_are_counted_as_the_model_does() -> None:
 
 def test_flat_answers_and_single_numbers_without_axis_are_read() -> None:
     flat = {f"action.{key}": part[0] for key, part in answer().items()}
-    made = request(wanted(early=True), dialect="n1.5")
+    made = request(wanted(is_n15=True), dialect="n1.5")
     np.testing.assert_array_equal(made.rows(flat), np.arange(28).reshape(2, 14))
     names = {"left": LEFT, "most": RIGHT[:-1], "last": RIGHT[-1:]}
-    apart = request(wanted(early=True, action=Modality()), dialect="n1.5", actions=names)
+    apart = request(wanted(is_n15=True, action=Modality()), dialect="n1.5", actions=names)
     whole = flat["action.right"]
     parts = {"left": flat["action.left"], "most": whole[:, :-1], "last": whole[:, -1]}
     np.testing.assert_array_equal(apart.rows(parts), np.arange(28).reshape(2, 14))
@@ -163,7 +163,7 @@ REPLIES = st.recursive(
 def test_whatever_is_decoded_is_rows_or_an_error(reply: object) -> None:
     for dialect in ("nested", "n1.5"):
         with contextlib.suppress(PolicyError):
-            assert request(wanted(early=dialect == "n1.5"), dialect=dialect).rows(reply).shape[1] == 14
+            assert request(wanted(is_n15=dialect == "n1.5"), dialect=dialect).rows(reply).shape[1] == 14
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_maps_that_do_not_fit_the_robot_are_refused(settings: dict[str, Any], sa
 @pytest.mark.parametrize(
     ("changes", "settings", "says"),
     [
-        ({"early": True}, {}, "of version N1.5"),
+        ({"is_n15": True}, {}, "of version N1.5"),
         ({}, {"dialect": "n1.5"}, "newer than N1.5"),
         ({"video": Modality(("front",))}, {}, "video keys front; policy.video has ego_view"),
         ({"state": Modality(("left",))}, {}, "state keys left"),

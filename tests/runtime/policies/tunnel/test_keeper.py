@@ -21,13 +21,13 @@ class FakeSsh:
         self.code: int | None = None
         self.up = self.ended = False
 
-    def look(self) -> int | None:
+    def poll(self) -> int | None:
         return self.code
 
-    def listens(self) -> bool:
+    def is_listening(self) -> bool:
         return self.up
 
-    def end(self) -> None:
+    def terminate(self) -> None:
         self.ended = True
 
 

@@ -194,7 +194,7 @@ from runtime.policies.tunnel.process import Ssh
 code = "import sys, time; print('up', file=sys.stderr, flush=True); time.sleep(60)"
 ssh = Ssh([sys.executable, "-c", code], 1)
 while not ssh.said:
-    ssh.look()
+    ssh.poll()
     time.sleep(0.01)
 print(ssh.pid, flush=True)
 time.sleep(60)

@@ -87,7 +87,7 @@ def test_a_brake_at_an_angle_without_limits_is_as_soft_as_configured():
     actuator = robot(Bench(), limits=limits, dims=DimensionKinds(wrapping=(0,)))
     actuator.engage(np.zeros(2))
     actuator.velocity = np.array([2.0, 0.0])
-    assert actuator.brake().duration == pytest.approx(2.0 / 20.0)
+    assert actuator.braking_motion().duration == pytest.approx(2.0 / 20.0)
 
 
 def test_a_binary_gripper_has_no_velocity_to_brake_from():
@@ -112,8 +112,8 @@ def test_a_stop_after_a_step_to_where_the_robot_is_begins_at_rest():
     """That is no speed to brake from, and the record says why the command is elsewhere."""
     actuator = robot(Bench())
     actuator.engage(np.zeros(2))
-    actuator.step_to(np.array([0.3, -0.1]), "moved by hand")
-    assert actuator.brake().duration == 0.0
+    actuator.rebase_command(np.array([0.3, -0.1]), "moved by hand")
+    assert actuator.braking_motion().duration == 0.0
     sent = actuator.send(0, 100.0, HELD, np.array([0.3, -0.1]))
     assert sent.notes == ("moved by hand: a stepped 0.300 rad",)
     assert actuator.send(1, 100.0 + PERIOD, HELD, np.array([0.3, -0.1])).notes == ()
@@ -122,7 +122,7 @@ def test_a_stop_after_a_step_to_where_the_robot_is_begins_at_rest():
 def test_a_step_ends_within_the_joint_limits_and_goes_no_farther_than_it_may():
     actuator = robot(Bench())
     actuator.engage(np.array([1.9, 0.0]))
-    actuator.step_to(np.array([2.05, 1.0]), "e-stop", np.array([1.0, 0.2]))
+    actuator.rebase_command(np.array([2.05, 1.0]), "e-stop", np.array([1.0, 0.2]))
     assert actuator.commanded.tolist() == pytest.approx([2.0, 0.2])
 
 

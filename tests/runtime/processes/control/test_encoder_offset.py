@@ -236,14 +236,14 @@ def leapt(way):
 @pytest.mark.parametrize("way", [0.4, 0.9, -0.9])
 def test_where_a_joint_leapt_is_in_the_status_until_a_set_up_meets_it(way):
     bench = leapt(way)
-    assert bench.shared.doubt.startswith(f"a reads {way:.3f} rad and is held at 0.000")
+    assert bench.shared.joint_problem.startswith(f"a reads {way:.3f} rad and is held at 0.000")
     bench.fault = lambda true, since: way  # the encoder is right: the joint stands there
     bench.say("meet")
     for _ in range(60):
         bench.go(PERIOD)
-        assert abs(bench.sent[-1, 0] - way) <= 0.1001 or bench.shared.doubt
+        assert abs(bench.sent[-1, 0] - way) <= 0.1001 or bench.shared.joint_problem
     assert bench.sent[-1, 0] == pytest.approx(way, abs=1e-3)
-    assert bench.shared.doubt == ""
+    assert bench.shared.joint_problem == ""
     most = TWO_JOINTS.velocity[0] * bench.safety.motion_velocity_scale * PERIOD
     assert np.abs(np.diff(bench.sent[:, 0])).max() <= most * 1.01
 
@@ -253,7 +253,7 @@ def test_a_joint_that_goes_away_from_the_set_up_that_meets_it_is_led_no_further(
     bench = leapt(way)
     bench.say("meet")
     bench.go(FOR)
-    assert "set up again" in bench.shared.doubt
+    assert "set up again" in bench.shared.joint_problem
     assert 0.0 < bench.true[0] <= 0.25, "far enough to see that its reading goes along"
     assert "is its encoder off?" in bench.said("implausible")[-1].text
 
@@ -289,7 +289,7 @@ def test_a_stop_ends_at_once_what_a_set_up_leads_to_where_a_joint_is_read(end):
     assert 0.05 < begins < 0.6
     bench.go(2.0)
     assert abs(bench.true[0] - begins) <= 0.1
-    assert bench.shared.doubt
+    assert bench.shared.joint_problem
 
 
 @pytest.mark.some(4)

@@ -77,7 +77,7 @@ def test_a_first_sample_that_is_wrong_is_not_believed(watcher):
     watcher.see([0.0, 0.0, 0.0])
     assert all(watcher.stand(3))
     assert watcher.stand(3) == ["", "", ""]
-    assert not watcher.judge.apart(STANDS, 0.01)
+    assert not watcher.judge.is_displaced(STANDS, 0.01)
 
 
 def test_an_isolated_spike_is_named_and_over_with_the_next_sample():
@@ -103,7 +103,7 @@ def test_zeros_of_a_dead_encoder_are_never_believed_however_long_they_last():
     watcher = stood()
     for _ in range(300):
         assert watcher.see([0.0, -0.4, 0.05]) == "hip read exactly 0 rad after 0.800: is an encoder dead?"
-    assert watcher.judge.apart(STANDS, 0.1) is False
+    assert watcher.judge.is_displaced(STANDS, 0.1) is False
     assert watcher.see(STANDS) == ""
 
 
@@ -163,9 +163,9 @@ def test_samples_from_before_a_contradiction_do_not_count_for_how_long_others_ag
     watcher = stood()
     watcher.stand(10, [-0.4, 0.8, 0.05])  # swapped
     assert watcher.stand(2, [0.6, -0.4, 0.05]) == ["", ""]
-    assert not watcher.judge.settled
+    assert not watcher.judge.is_settled
     watcher.stand(2, [0.6, -0.4, 0.05])
-    assert watcher.judge.settled
+    assert watcher.judge.is_settled
 
 
 def test_swapped_joints_are_noticed_beside_one_that_begins_another_turn():
@@ -189,7 +189,7 @@ def test_an_arm_that_is_elsewhere_is_believed_once_several_samples_agree():
     doubts = watcher.stand(5, elsewhere)
     assert all(doubt.startswith("hip reads -0.500 rad") for doubt in doubts[:3])
     assert doubts[3:] == ["", ""]
-    assert watcher.judge.apart(STANDS, 0.5)
+    assert watcher.judge.is_displaced(STANDS, 0.5)
 
 
 def test_an_encoder_that_was_noisy_and_is_stuck_elsewhere_is_never_believed():
@@ -260,7 +260,7 @@ def test_noise_of_a_broken_encoder_never_agrees_with_itself_for_long_enough(seed
     noise = np.random.default_rng(seed)
     for _ in range(3000):
         watcher.see([noise.uniform(-2, 2), -0.4, 0.05])
-        assert not watcher.judge.apart(STANDS, 0.5)
+        assert not watcher.judge.is_displaced(STANDS, 0.5)
 
 
 def test_what_contradicted_itself_again_and_again_has_to_agree_for_longer():
@@ -282,7 +282,7 @@ def test_what_contradicted_itself_is_believed_again_at_any_rate():
     for _ in range(1500):
         watcher.now += 0.001 - PERIOD  # 1 kHz
         assert watcher.see(STANDS) == ""
-    assert watcher.judge.settled
+    assert watcher.judge.is_settled
 
 
 def test_an_arm_that_is_moved_as_fast_as_it_can_is_believed_all_the_way():
@@ -306,7 +306,7 @@ def test_no_motion_within_the_velocity_is_ever_doubted_whatever_the_stamps(speed
         watcher.now = max(watcher.now + 1e-3, captured)
         joints = np.array([hip, -0.4, 0.05])
         seen = LatestObservation(1, joints.astype(np.float32), joints, captured, (), True)
-        assert watcher.judge.judge(seen, watcher.now, None).doubt == ""
+        assert watcher.judge.judge(seen, watcher.now, None).implausible_reason == ""
 
 
 def test_a_repeated_sample_is_not_judged_again():
@@ -329,10 +329,10 @@ def test_joints_that_change_under_an_old_stamp_are_judged_as_well():
 def test_after_missing_joints_everything_is_seen_anew_and_zeros_are_named():
     watcher = stood()
     watcher.miss(20)
-    assert not watcher.judge.known or watcher.see(np.zeros(3)) != ""
+    assert not watcher.judge.has_known_sample or watcher.see(np.zeros(3)) != ""
     watcher.stand(5, np.zeros(3))
-    assert watcher.judge.returned() > 0.5
-    assert watcher.judge.returned() == 0.0
+    assert watcher.judge.pop_outage() > 0.5
+    assert watcher.judge.pop_outage() == 0.0
     assert watcher.judge.dead == "hip, knee read exactly 0 rad after 0.800, -0.400"
 
 
@@ -373,7 +373,7 @@ def test_what_was_seen_is_never_written_to():
     watcher = stood()
     watcher.see(STANDS, STANDS)
     watcher.see(STANDS)
-    assert watcher.judge.middle(np.zeros(3)) == pytest.approx(STANDS)
+    assert watcher.judge.median_joints(np.zeros(3)) == pytest.approx(STANDS)
 
 
 def test_a_frozen_joint_may_be_tried_again():

@@ -76,8 +76,8 @@ def test_renewing_extends_it(lease):
 
 def test_only_the_holder_gives_it_up(lease):
     lease.claim("anna", 0, 10.0)
-    assert lease.give_up("ben", 1, 11.0) == "anna holds the lease"
-    assert lease.give_up("anna", 1, 11.0) == ""
+    assert lease.release("ben", 1, 11.0) == "anna holds the lease"
+    assert lease.release("anna", 1, 11.0) == ""
     assert lease.current(11.0) is None
 
 
@@ -104,11 +104,11 @@ def test_a_terminal_can_claim_after_the_highest_epoch(lease):
 
 
 def test_epochs_of_before_a_restart_are_over(lease):
-    lease.never_below(9)
+    lease.raise_epoch_floor(9)
     assert lease.claim("anna", 9, 10.0) == "epoch 9 is over, the lease is in epoch 9"
     assert lease.claim("anna", 0, 10.0) == ""
     assert lease.epoch == 10
-    lease.never_below(3)
+    lease.raise_epoch_floor(3)
     assert lease.epoch == 10
 
 
@@ -154,7 +154,7 @@ def test_a_lease_is_lost_only_by_silence(lease):
     assert not lease.lost(14.9)
     assert lease.lost(15.0)
     lease.claim("anna", 0, 20.0)
-    lease.give_up("anna", 2, 21.0)
+    lease.release("anna", 2, 21.0)
     assert not lease.lost(30.0)
 
 

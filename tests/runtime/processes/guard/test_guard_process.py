@@ -124,10 +124,10 @@ def test_the_flag_is_raised_before_the_disk_is_touched(shared, control, latch, m
 def test_nothing_is_logged_before_the_flag_the_disk_and_the_answer(guard, shared, latch, caplog):
     ack = press(guard)
     assert (ack.status, caplog.text) == ("done", "")
-    guard.watch()
+    guard.poll()
     assert "E-STOP by anna: arm too low" in caplog.text
     caplog.clear()
-    guard.watch()
+    guard.poll()
     assert caplog.text == ""
 
 
@@ -172,32 +172,32 @@ def test_what_a_control_said_before_it_died_does_not_count_for_a_new_press(guard
 
 def test_a_release_clears_the_flag_and_the_disk(guard, shared, latch):
     press(guard)
-    shared.ask_release()
-    guard.watch()
+    shared.request_release()
+    guard.poll()
     assert shared.estop is EStop.CLEAR
     assert latch.read() is None
 
 
 def test_nothing_is_released_that_was_not_asked_for(guard, shared):
     press(guard)
-    guard.watch()
+    guard.poll()
     assert shared.estop is EStop.LATCHED
 
 
 def test_one_release_releases_one_press(guard, shared):
     press(guard)
-    shared.ask_release()
-    guard.watch()
+    shared.request_release()
+    guard.poll()
     press(guard)
-    guard.watch()
+    guard.poll()
     assert shared.estop is EStop.LATCHED
 
 
 def test_a_release_asked_for_before_a_press_does_not_undo_that_press(guard, shared, latch):
     press(guard)
-    shared.ask_release()
+    shared.request_release()
     press(guard)  # comes in before the guard has looked for releases
-    guard.watch()
+    guard.poll()
     assert shared.estop is EStop.LATCHED
     assert latch.read() is not None
 
@@ -206,11 +206,11 @@ def test_a_latch_that_cannot_be_removed_stays_latched_and_the_guard_lives(shared
     latch = FailingLatch(tmp_path)
     guard = Guard(shared, latch, control, PERIOD)
     press(guard)
-    shared.ask_release()
+    shared.request_release()
     guard.poll()
     assert shared.estop is EStop.LATCHED
     latch.fails = False
-    shared.ask_release()
+    shared.request_release()
     guard.poll()
     assert shared.estop is EStop.CLEAR
 
@@ -224,7 +224,7 @@ def test_a_restarted_guard_trusts_the_flag_where_the_disk_has_nothing(shared, la
 
 def test_a_restarted_guard_does_not_carry_out_releases_of_before(shared, latch, control):
     press(Guard(shared, latch, control, PERIOD))
-    shared.ask_release()
+    shared.request_release()
     restarted = Guard(shared, latch, control, PERIOD)
     restarted.poll()
     assert shared.estop is EStop.LATCHED
@@ -238,7 +238,7 @@ def to_main(shared, uuid="u"):
 
 def test_a_press_that_came_to_main_is_latched_on_disk_with_who_and_why(guard, shared, latch):
     to_main(shared)
-    guard.watch()
+    guard.poll()
     assert (latch.read().by, latch.read().why) == ("ben", "at the wrong door")
     assert shared.estop is EStop.LATCHED
 
@@ -252,9 +252,9 @@ def test_a_press_that_came_to_main_while_there_was_no_guard_is_latched_by_the_ne
 
 def test_a_release_under_way_does_not_undo_a_press_that_comes_to_main(guard, shared, latch):
     press(guard)
-    shared.ask_release()
+    shared.request_release()
     to_main(shared)
-    guard.watch()
+    guard.poll()
     assert (shared.estop, latch.read().by) == (EStop.LATCHED, "ben")
 
 
@@ -456,8 +456,8 @@ def test_the_answer_says_whether_the_press_latched_and_when_it_was_carried_out(d
     first, again, other = asked("u"), asked("u"), asked("v")
     assert [latched for latched, _ in (first, again, other)] == ["anew", "before", "already"]
     assert again[1] == first[1] < other[1]
-    shared.ask_release()
-    door.guard.watch()
+    shared.request_release()
+    door.guard.poll()
     late = asked("u")
     assert late[0] == "anew"
     assert late[1] > other[1]
@@ -514,8 +514,8 @@ def test_a_repeat_after_a_release_presses_again(door, shared):
     client = door.client()
     client.send(pressed())
     door.serve()
-    shared.ask_release()
-    door.guard.watch()
+    shared.request_release()
+    door.guard.poll()
     assert (shared.estop, door.latch.read()) == (EStop.CLEAR, None)
     client.send(pressed())
     door.serve()

@@ -37,7 +37,7 @@ class Looking:
     def publish(self, stream: str, jpeg: bytes) -> None:
         self._shown.append((stream, jpeg))
 
-    def moved(self) -> bool:
+    def rebind_if_unreachable(self) -> bool:
         return False
 
     def seen(self, arrived: float, captured: float, brightness: int = 90) -> list[tuple[str, bytes]]:

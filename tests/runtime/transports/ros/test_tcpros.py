@@ -273,9 +273,9 @@ def test_commands_that_waited_too_long_are_not_published(
 def test_it_ends_with_the_process_that_it_works_for(ros_master: RosMaster) -> None:
     code = (
         "import time\n"
-        "from runtime.transports.ros.rospy_process import Site\n"
+        "from runtime.transports.ros.rospy_process import RosEnvironment\n"
         "from runtime.transports.ros.tcpros import TcpRosMiddleware\n"
-        f"made = TcpRosMiddleware(Site({PYTHON!r}, {ros_master.uri!r}, '127.0.0.1'), 'eva_test')\n"
+        f"made = TcpRosMiddleware(RosEnvironment({PYTHON!r}, {ros_master.uri!r}, '127.0.0.1'), 'eva_test')\n"
         "while made.pid is None: time.sleep(0.05)\n"
         "print(made.pid, flush=True)\n"
         "time.sleep(60)\n"

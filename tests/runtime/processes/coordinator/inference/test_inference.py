@@ -572,7 +572,7 @@ def test_a_mode_on_demand_asks_once_per_step_and_the_answer_waited(mode: Mode) -
     assert chunk.requested_while_stopped
     desk.merged(chunk.chunk_id)
     assert not desk.inference.is_pending
-    assert desk.inference.pump() is None
+    assert desk.inference.poll() is None
     assert desk.policy.calls == ["reset", "infer"]
 
 

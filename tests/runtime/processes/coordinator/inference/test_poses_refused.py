@@ -44,7 +44,7 @@ class Eyes:
     def __init__(self, passed: int) -> None:
         self.passed = passed
 
-    def now(self, task: str, pictures: bool = True) -> Observation:
+    def latest(self, task: str, pictures: bool = True) -> Observation:
         return Observation(1, 0.0, {"joints": 0.0}, START.astype(np.float32), {}, step=100)
 
     def commanded(self) -> tuple[int, np.ndarray] | None:

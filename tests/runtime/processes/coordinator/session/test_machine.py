@@ -30,15 +30,15 @@ EFFECTS = {
     "halt": "hold",
     "resume": "resume_run",
     "home": "go_home",
-    "release": "shared.ask_release",
+    "release": "shared.request_release",
     "record_start": "start_recording",
-    "record_stop": "runs.stop_alone",
+    "record_stop": "runs.stop_standalone_recording",
     "tune": "tune",
     "step": "inference.step",
     "commit": "inference.commit",
     "cancel": "cancel",
     "move": "manual.move",
-    "gripper": "grip",
+    "gripper": "move_gripper",
     "approach": "approach",
     "arm": "arm",
     "disarm": "collecting.disarm",
@@ -64,9 +64,9 @@ ON_DEMAND = ("step", "preview")
 GUARDED = {
     "step": (
         S.RUNNING,
-        lambda s: s.mode in ON_DEMAND and not (s.proposed or s.asked or s.executing or s.opening),
+        lambda s: s.mode in ON_DEMAND and not (s.has_proposal or s.is_requesting or s.executing or s.opening),
     ),
-    "commit": (S.RUNNING, lambda s: s.mode == "preview" and s.proposed and not s.approaching),
+    "commit": (S.RUNNING, lambda s: s.mode == "preview" and s.has_proposal and not s.approaching),
     "cancel": (S.RUNNING, lambda s: s.mode in (*ON_DEMAND, "manual") and not s.opening),
     "move": (S.RUNNING, lambda s: s.mode == "manual" and not s.opening),
 }
@@ -111,11 +111,11 @@ def allowed_in(state, situation):
     if situation.collection:
         found |= {"label", "discard"}
         switched = "disarm" if situation.armed else "arm"
-        possible = situation.armed or (situation.collecting and not situation.unled)
+        possible = situation.armed or (situation.collecting and not situation.leader_problem)
         found |= {switched} if possible and state in (S.READY, S.HOLDING) else set()
     if situation.doubt:
         return found - PLACED
-    committable = situation.mode == "preview" and situation.proposed
+    committable = situation.mode == "preview" and situation.has_proposal
     if (state is S.READY and situation.first_action) or (state is S.RUNNING and committable):
         found.add("approach")
     return found
@@ -145,7 +145,7 @@ class Recorded:
     def __init__(self):
         self.done, self.refuse = [], set()
 
-    def attribute(self, by, command):
+    def set_requester(self, by, command):
         self.by = by
 
     def __getattr__(self, name):
