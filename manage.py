@@ -7,10 +7,10 @@ import sys
 from django.core.exceptions import ImproperlyConfigured
 from django.core.management import execute_from_command_line
 
-from robots.broken_pipe import unread_ends
+from robots.broken_pipe import exit_on_broken_pipe
 
 
-@unread_ends
+@exit_on_broken_pipe
 def main() -> int:
     """Exit code 0, or that of the command."""
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")

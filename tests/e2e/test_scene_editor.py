@@ -73,10 +73,10 @@ def test_a_scene_is_laid_by_dragging_and_offered_at_the_bench(admin):
         page.keyboard.press(key)
     assert [number(page, name) for name in ("x mm", "y mm", "turn °")] == [x - 10, y - 1, turn + 5]
 
-    page.locator("#overlay > summary").click()  # on a picture of the real bench, with keys and by dragging
     page.locator("[data-overlay=file]").set_input_files(
         {"name": "bench.png", "mimeType": "image/png", "buffer": _picture()}
     )
+    page.locator("#overlay > summary").click()  # on a picture of the real bench, with keys and by dragging
     page.locator("[data-overlay=picture]:not([hidden])").wait_for()
     over = page.locator("[data-overlay=svg] [data-over=block]")
     over.focus()

@@ -139,7 +139,7 @@ def test_a_scribe_hears_and_writes_down(scribe, live, runtime, services, ann):
 def test_a_lease_that_is_lost_ends_its_row(scribe, live, runtime, services, ann):
     scribe.start()
     lease = leases.claim(user=ann, station=live, page="p1")
-    runtime.do(lambda: runtime.lease.give_up("web:ann:p1", lease.epoch, 0.0))
+    runtime.do(lambda: runtime.lease.release("web:ann:p1", lease.epoch, 0.0))
     until(lambda: Lease.objects.get(pk=lease.pk).ended_at is not None)
     assert Lease.objects.get(pk=lease.pk).end_reason == "expired: it was not renewed"
 

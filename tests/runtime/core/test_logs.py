@@ -110,13 +110,16 @@ def python(code, **environment):
 
 def test_everything_that_was_logged_is_there_when_the_process_has_ended():
     done = python(
-        "import logging; from runtime.core import logs as log; log.configure_logging('media'); logging.info('last words')"
+        "import logging; from runtime.core import logs; logs.configure_logging('media'); logging.info('last words')"
     )
     assert done.stderr.endswith("media      INFO    last words\n")
 
 
 def test_the_level_is_that_of_the_environment():
-    code = "import logging; from runtime.core import logs as log; log.configure_logging('x'); logging.info('a'); logging.error('b')"
+    code = (
+        "import logging; from runtime.core import logs; logs.configure_logging('x'); "
+        "logging.info('a'); logging.error('b')"
+    )
     assert "ERROR   b" in python(code, EVA_LOG_LEVEL="WARNING").stderr
     assert "INFO    a" not in python(code, EVA_LOG_LEVEL="WARNING").stderr
 
