@@ -27,7 +27,7 @@ PROGRAMS = (
     *("runtime.preflight", "runtime.quality", "runtime.recording", "runtime.clients.channel"),
     *("runtime.clients.panel", "runtime.clients.headless", "robots", "benchmarks"),
 )
-_WORDS_OF_AN_EVENT = ("Event", "say", "emit", "_say", "_emit", "note", "log")
+_WORDS_OF_AN_EVENT = ("Event", "emit", "_emit", "_flag", "record_event", "_say", "note")
 
 
 def surface() -> dict[str, Any]:
