@@ -6,7 +6,7 @@ from runtime.processes.coordinator.lease import HIGHEST_EPOCH, Lease
 
 TTL = 5.0
 ACTS = st.tuples(
-    st.sampled_from(["claim", "renew", "give_up", "check"]),
+    st.sampled_from(["claim", "renew", "release", "check"]),
     st.sampled_from(["anna", "ben", "carla"]),
     st.integers(-1, 8),
     st.floats(0.0, 4.0),
@@ -143,7 +143,7 @@ def test_who_holds_it_keeps_it_until_it_ends_unless_a_higher_epoch_or_its_own_wo
         after = lease.current(now)
         if before is None or (after and after.holder == before.holder):
             continue
-        gave_up = act == "give_up" and (holder, epoch) == (before.holder, before.epoch)
+        gave_up = act == "release" and (holder, epoch) == (before.holder, before.epoch)
         taken = act == "claim" and epoch > before.epoch
         assert gave_up or taken
 
