@@ -55,7 +55,7 @@ export class Beside {
     const head = document.createElement("div");
     head.className = "row line small";
     const select = document.createElement("select");
-    select.setAttribute("aria-label", t("page.curves.joint_of", "Joint of another curve"));
+    select.setAttribute("aria-label", t("page.curves.joint_beside", "Joint of another curve"));
     select.append(...jointOptions(this.#names, this.#grippers));
     select.selectedIndex = joint;
     const off = Object.assign(document.createElement("button"), { type: "button", className: "button button-quiet", textContent: "×" });
