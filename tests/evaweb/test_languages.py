@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -126,6 +127,17 @@ def test_templates_say_the_words_of_a_language_with_their_values_escaped(german)
     for wrong in ("{% t home.n %}{% endt %}", '{% t "home.n" 3 %}{% endt %}', "{% t %}{% endt %}"):
         with pytest.raises(TemplateSyntaxError, match="expected"):
             Template(wrong)
+
+
+def test_words_of_lists_and_choices_have_ids_of_their_own(german):
+    words = {"label.to_be_scored": "zu bewerten", "test.languages.why": "es ist spät"}
+    spoken = replace(german, patterns=words, templates={"a.b": "{state} ({reason}) von {who}"})
+    request = SimpleNamespace(COOKIES={}, _eva_language=spoken)
+    trial = SimpleNamespace(get_status_display=lambda: "To be scored")
+    given = Context({"request": request, "trial": trial, "why": WHY, "name": "to be scored"})
+    source = '{% t "a.b" state=trial.get_status_display reason=why who=name %}x{% endt %}, {% label name %}'
+    assert Template(source).render(given) == "zu bewerten (es ist spät) von to be scored, zu bewerten"
+    assert languages.label("To be scored", None) == "To be scored"
 
 
 def test_every_language_that_ships_says_all():

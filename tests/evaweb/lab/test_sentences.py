@@ -100,7 +100,10 @@ def test_the_catalogue_has_all_and_tells_what_a_language_lacks(tmp_path):
 MODES = ("continuous", "step", "preview", "manual", "collect")
 FACTS = [
     {},
-    *({name: True} for name in ("trial", "opening", "approaching", "has_proposal", "is_requesting", "executing")),
+    *(
+        {name: True}
+        for name in ("trial", "opening", "approaching", "has_proposal", "is_requesting", "executing")
+    ),
     *({"mode": mode, "has_proposal": shown} for mode in MODES for shown in (True, False)),
     *({"mode": "step", name: True} for name in ("opening", "is_requesting", "executing")),
     {"mode": "preview", "approaching": True},
