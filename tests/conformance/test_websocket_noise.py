@@ -65,11 +65,11 @@ def _unconnected(kind: str) -> Any:
 def _read(policy: Any, kind: str, payload: bytes) -> np.ndarray:
     """What `infer` does with the bytes of an answer."""
     if kind == "openpi":
-        return np.asarray(policy._chunk(policy._result(policy._unpacked(payload, "an answer")), 1.0).actions)
+        return np.asarray(policy._chunk(policy._result(policy._decode(payload, "an answer")), 1.0).actions)
     if kind == "roboarena":
         return np.asarray(policy._meant.chunk(policy._value(payload, "an answer"), {}).actions)
-    reply = policy._unpacked(payload, "an answer")
-    policy._require_answered(reply, {"request_id": "infer-2"})
+    reply = policy._decode(payload, "an answer")
+    policy._check_reply(reply, {"request_id": "infer-2"})
     return np.asarray(policy._chunk(reply.get("data"), 1.0).actions)
 
 
@@ -98,7 +98,7 @@ def _read(policy: Any, kind: str, payload: bytes) -> np.ndarray:
 def test_metadata_without_sense_are_a_policy_error_or_understood(kind: str, metadata: dict[str, Any]) -> None:
     policy: Any = _unconnected(kind)
     policy._ping = lambda seconds: None  # there is no server behind
-    found = outcome(lambda: policy._greeted(metadata))
+    found = outcome(lambda: policy._check_metadata(metadata))
     assert len(str(found)) > 20 if isinstance(found, PolicyError) else found.metadata == metadata
 
 

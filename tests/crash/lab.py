@@ -149,7 +149,7 @@ class Lab:
         while self.client.status()["state"] != "idle":
             self.client.command("setup")
             self.client.command("stop")  # which cancels it
-        self.client.give_up()
+        self.client.release()
         return self
 
     def reach(self, *states):

@@ -85,7 +85,7 @@ def test_a_terminal_sets_up_runs_and_stops_a_station(lab):
         )
 
     lab.client.claim()  # it may be held from the test before
-    lab.client.give_up()
+    lab.client.release()
     before = {folder.name for folder in lab.episodes()}
     setup = ctl("setup")
     out, err = setup.communicate()
