@@ -17,6 +17,8 @@ from typing import Any
 
 from django.apps import apps
 
+from evaweb.datasets.listing import RESULTS, VERDICTS
+from evaweb.episodes.selectors import QUALITY, REVIEW
 from evaweb.languages import label_id
 from evaweb.roles import Role
 from runtime.core.sentences import Pattern, known, names_of
@@ -81,6 +83,11 @@ def of_labels() -> list[Entry]:
         text for path, source in _sources("evaweb", "*.py") for text in _labels(ast.parse(source, str(path)))
     }
     found |= {role.value for role in Role}
+    found |= {words for words, _ in (*QUALITY.values(), *REVIEW.values())} | {
+        *RESULTS,
+        *VERDICTS,
+        "every attempt",
+    }
     for model in apps.get_models():
         if model.__module__.startswith("evaweb."):
             found |= {str(text) for field in model._meta.fields for _, text in field.flatchoices}

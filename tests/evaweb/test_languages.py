@@ -167,11 +167,25 @@ def test_files_that_are_no_language_are_not_offered(german, tmp_path, caplog):
         assert (languages.chosen(request) is not None) is (code == "de")
 
 
-def test_english_alone_is_shipped_and_no_choice_is_shown(client, ann):
+def test_without_a_language_no_choice_is_shown(client, ann, settings, tmp_path):
+    settings.LANGUAGES_DIR = tmp_path
     client.force_login(ann)
     assert languages.offered() == []
     assert b"data-language" not in client.get("/").content
     assert client.get("/languages/de.json").status_code == 404
+
+
+def test_pages_are_in_chinese_for_who_chose_it_and_the_catalogue_is_sent_once(client, ann):
+    client.force_login(ann)
+    assert '<html lang="en"' in client.get("/").content.decode()
+    client.cookies[languages.COOKIE] = "zh-Hans"
+    page = client.get("/").content.decode()
+    assert '<html lang="zh-Hans"' in page
+    assert languages.language("zh-Hans").templates["base.find"] in page
+    first = client.get("/languages/zh-Hans.json")
+    assert first.json()["sentences"]["label.trial"] == "试验"
+    again = client.get("/languages/zh-Hans.json", headers={"If-None-Match": first["ETag"]})
+    assert (again.status_code, again.content) == (304, b"")
 
 
 def test_who_has_chosen_is_refused_in_words(german, live, ann):
