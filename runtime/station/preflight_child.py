@@ -22,7 +22,7 @@ from runtime.ipc.command_arguments import PreflightRequest
 
 _UNDER_WAY = Pattern("preflight.under_way", "a preflight of {about} is under way: wait for it")
 _NOT_STARTED = Pattern("preflight.not_started", "the process of a preflight cannot be started: {error}")
-_CANCELLED = Pattern("preflight_child.cancelled", "cancelled: {why}")
+_CANCELLED = Pattern("preflight.cancelled", "cancelled: {why}")
 _NOT_IN_TIME = fixed("preflight.not_in_time", "it did not end in time")
 _UNKNOWN = Pattern(
     "preflight.unknown",
