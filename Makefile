@@ -78,6 +78,7 @@ lint: setup-dev ## ruff, mypy, the contracts of .importlinter, and how tests wai
 	$(PY) -m mypy
 	$(VENV)/bin/lint-imports --no-logo
 	$(PY) -m tests.lint.waits
+	$(PY) -m tests.lint.texts
 
 format: setup-dev ## let ruff format and mend
 	$(PY) -m ruff check --fix .

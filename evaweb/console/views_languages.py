@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+
 from django.http import HttpRequest, HttpResponse, JsonResponse
+from django.utils.cache import get_conditional_response
 
 from evaweb.errors import NotFound
 from evaweb.languages import language, offered
@@ -18,5 +21,6 @@ def catalogue(request: HttpRequest, code: str) -> HttpResponse:
         known = ", ".join(one.code for one in offered()) or "none but English"
         raise NotFound(_NO_LANGUAGE(code=code, known=known))
     answer = JsonResponse({"name": found.name, "sentences": dict(found.patterns)})
-    answer["Cache-Control"] = "no-cache"
-    return answer
+    answer["Cache-Control"] = "no-cache"  # asked for by every page, and sent where it has changed
+    answer["ETag"] = f'"{hashlib.sha256(answer.content).hexdigest()[:32]}"'
+    return get_conditional_response(request, etag=answer["ETag"], response=answer) or answer

@@ -17,7 +17,10 @@ from typing import Any
 
 from django.apps import apps
 
+from evaweb.datasets.listing import RESULTS, VERDICTS
+from evaweb.episodes.selectors import QUALITY, REVIEW
 from evaweb.languages import label_id
+from evaweb.roles import Role
 from runtime.core.sentences import Pattern, known, names_of
 
 _ROOT = Path(__file__).parents[2]
@@ -75,9 +78,15 @@ def of_templates() -> list[Entry]:
 
 
 def of_labels() -> list[Entry]:
-    """Heads of columns, names of filters and words of choices: what `{% label %}` says."""
+    """Heads of columns, names of filters, tabs and roles, and words of choices: what `{% label %}` says."""
     found = {
         text for path, source in _sources("evaweb", "*.py") for text in _labels(ast.parse(source, str(path)))
+    }
+    found |= {role.value for role in Role}
+    found |= {words for words, _ in (*QUALITY.values(), *REVIEW.values())} | {
+        *RESULTS,
+        *VERDICTS,
+        "every attempt",
     }
     for model in apps.get_models():
         if model.__module__.startswith("evaweb."):
@@ -115,8 +124,10 @@ def once(entries: Iterable[Entry]) -> list[Entry]:
 
 
 def _labels(tree: ast.AST) -> Iterator[str]:
-    """What lists call their columns and filters."""
+    """What lists call their columns and filters, and what tabs are called."""
     for node in ast.walk(tree):
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).endswith("_TABS"):
+            yield from (title for title, _ in ast.literal_eval(node.value))
         if (
             isinstance(node, ast.Call)
             and isinstance(node.func, ast.Name)

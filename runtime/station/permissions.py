@@ -18,6 +18,7 @@ from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.identity import LOCAL, SCRIPT
 from runtime.ipc.messages import Command
 
+_NOT_ALLOWED = Pattern("rights.not_allowed", "policy.{key} = {value!r:.200}: {advice}")
 _TABLES_FOR_ADMINISTRATORS = Pattern(
     "rights.tables_for_administrators",
     "{kind}: {key} by {user}, whose role is {role}: tables are for administrators; allowed: a "
@@ -80,7 +81,7 @@ def require_allowed_references(own: Deployment, given: Deployment) -> None:
     said = {(what, value) for _, what, value in find_host_references(own.policy)}
     for key, what, value in find_host_references(given.policy):
         if (what, value) not in said and not _is_allowed(own, what, value):
-            raise ConfigurationError(f"policy.{key} = {value!r:.200}: {_advice(own, what)}")
+            raise ConfigurationError(_NOT_ALLOWED(key=key, value=value, advice=_advice(own, what)))
 
 
 def _is_allowed(own: Deployment, what: HostReference, value: str) -> bool:

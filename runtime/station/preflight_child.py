@@ -22,6 +22,7 @@ from runtime.ipc.command_arguments import PreflightRequest
 
 _UNDER_WAY = Pattern("preflight.under_way", "a preflight of {about} is under way: wait for it")
 _NOT_STARTED = Pattern("preflight.not_started", "the process of a preflight cannot be started: {error}")
+_CANCELLED = Pattern("preflight.cancelled", "cancelled: {why}")
 _NOT_IN_TIME = fixed("preflight.not_in_time", "it did not end in time")
 _UNKNOWN = Pattern(
     "preflight.unknown",
@@ -116,7 +117,7 @@ class Preflights:
     def cancel(self, why: str) -> None:
         """End what is under way, if anything is."""
         if self._flight is not None and not self._flight.failure:
-            self._flight.end(f"cancelled: {why}")
+            self._flight.end(_CANCELLED(why=why))
 
     def report(self, id: str) -> dict[str, Any]:
         """The preflight of that id, as by `PreflightRun.to_dict`; RuntimeFault where it is not known (any more)."""

@@ -3,19 +3,39 @@
 import { config } from "../console/live/config.js";
 import { post, RequestFailed } from "../site/api.js";
 import { otherPresses } from "../site/presses.js";
-import { armWords, big, discarding, leaderWords, subject, Twice, whyNotDiscard, whyNotLabel, whyNotStart } from "./moments.js";
+import { ARM_FIRST, armWords, big, discarding, leaderWords, subject, Twice, whyNotDiscard, whyNotLabel, whyNotStart } from "./moments.js";
 import { gamepads } from "./pads.js";
+import { t } from "../site/sentences.js";
 
 const SETTLE_MS = 600; // a Start that took the place of Stop is not yet pressed by the hand that pressed Stop
 const REST_MS = 10000; // for the robot to be at rest before it is recorded again
 const QUEUE_MS = 2000;
 const OF_SESSIONS = ["collect", "episode", "job"];
+const [OPEN, PUBLISH] = [t("page.collect.open", "Open"), t("page.collect.publish", "Publish")];
+const ACTS = {
+  setup: t("page.collect.act_setup", "setup"),
+  arm: t("page.collect.act_arm", "arm"),
+  big: t("page.collect.act_big", "big"),
+  discard: t("page.collect.act_discard", "discard"),
+  rerecord: t("page.collect.act_rerecord", "rerecord"),
+  label: t("page.collect.act_label", "label"),
+  open: t("page.collect.act_open", "open"),
+  close: t("page.collect.act_close", "close"),
+  resume: t("page.collect.act_resume", "resume"),
+  publish: t("page.collect.act_publish", "publish"),
+  retry: t("page.collect.act_retry", "retry"),
+};
+const RESULTS = {
+  success: t("page.collect.success", "success"),
+  partial: t("page.collect.partial", "partial"),
+  fail: t("page.collect.fail", "fail"),
+};
 
 export class CollectPanel {
   #store;
   #commands;
   #busy = "";
-  #twice = new Twice(() => this.#commands.say("Not pressed again: nothing was done", "pressed"));
+  #twice = new Twice(() => this.#commands.say(t("page.collect.forgotten", "Not pressed again: nothing was done"), "pressed"));
   #seen = ""; // the newest episode that this page knows of
   #closed = ""; // the newest that is on disk
   #older = ""; // one after which a start was pressed that did not take: it is not the newest attempt
@@ -64,7 +84,7 @@ export class CollectPanel {
     this.#twice.about(this.#asked);
     document.getElementById("collects-nothing").hidden = !snapshot || Boolean(collect);
     const task = document.querySelector("[data-session-uuid]")?.dataset.task;
-    write("prompt", task ? `“${task}”` : "No session is open.");
+    write("prompt", task ? `“${task}”` : t("page.collect.no_session", "No session is open."));
     write("armed", armWords(snapshot ?? {}));
     const { text, weight } = leaderWords(collect);
     write("leader", text);
@@ -72,7 +92,7 @@ export class CollectPanel {
     this.#drawArm(collect);
     this.#drawBig(snapshot);
     this.#drawEpisode(snapshot ?? {}, collect);
-    for (const button of document.querySelectorAll('[data-collect="setup"]')) button.dataset.blocked = this.session ? "" : "open or resume a session first";
+    for (const button of document.querySelectorAll('[data-collect="setup"]')) button.dataset.blocked = this.session ? "" : t("page.collect.open_first", "open or resume a session first");
     this.#commands.gate();
   }
 
@@ -88,8 +108,8 @@ export class CollectPanel {
     const button = document.getElementById("arm");
     button.setAttribute("aria-checked", String(Boolean(collect?.armed)));
     button.dataset.gate = collect?.armed ? "disarm" : "arm";
-    button.dataset.blocked = collect?.armed || !collect ? "" : this.session ? (collect.set_up ? "" : "set up first") : "open or resume a session first";
-    write("arm", collect?.armed ? "Armed" : "Arm");
+    button.dataset.blocked = collect?.armed || !collect ? "" : this.session ? (collect.set_up ? "" : t("page.collect.set_up_first", "set up first")) : t("page.collect.open_first", "open or resume a session first");
+    write("arm", collect?.armed ? t("page.collect.armed", "Armed") : t("page.collect.arm", "Arm"));
   }
 
   #drawBig(snapshot) {
@@ -111,7 +131,7 @@ export class CollectPanel {
   #drawEpisode(snapshot, collect) {
     const episode = subject(collect, this.#seen);
     const said = collect?.last?.uuid === episode ? collect.last : null;
-    const busy = this.#busy === "rerecord" ? "the robot comes to rest first" : "";
+    const busy = this.#busy === "rerecord" ? t("page.collect.rest_first", "the robot comes to rest first") : "";
     for (const button of document.querySelectorAll('[data-collect="label"]')) {
       button.dataset.blocked = whyNotLabel(snapshot, episode);
       button.setAttribute("aria-pressed", String(said?.result === button.dataset.result && !said.discarded));
@@ -120,9 +140,9 @@ export class CollectPanel {
       document.querySelector(`[data-collect="${name}"]`).dataset.blocked = busy || whyNotDiscard(snapshot, episode);
       document.querySelector(`[data-collect="${name}"]`).toggleAttribute("data-asks", this.#twice.asks(name));
     }
-    write("discard", this.#twice.asks("discard") ? "Again: discard" : "Discard");
-    write("rerecord", this.#twice.asks("rerecord") ? "Again: re-record" : "Re-record");
-    write("result", collect?.episode ? "recording" : said ? (said.discarded ? "discarded" : said.result ? "" : "how did it go?") : "");
+    write("discard", this.#twice.asks("discard") ? t("page.collect.again_discard", "Again: discard") : t("page.collect.discard", "Discard"));
+    write("rerecord", this.#twice.asks("rerecord") ? t("page.collect.again_rerecord", "Again: re-record") : t("page.collect.rerecord", "Re-record"));
+    write("result", collect?.episode ? t("page.collect.recording", "recording") : said ? (said.discarded ? t("page.collect.discarded", "discarded") : said.result ? "" : t("page.collect.how", "how did it go?")) : "");
   }
 
   // --- what is pressed -----------------------------------------------------------------------------------------
@@ -155,11 +175,11 @@ export class CollectPanel {
     if (!this.#twice.asks(result ?? what)) this.#twice.clear();
     if (what === "big" && this.#kind === "run" && !("settling" in button.dataset)) this.#older = this.#episode;
     if (button.getAttribute("aria-disabled") === "true") {
-      this.#commands.say(`${nameOf(button)}: ${button.title}`, "refused");
+      this.#commands.say(t("page.common.why", "{name}: {why}", { name: nameOf(button), why: button.title }), "refused");
       return;
     }
     const stops = what === "big" && this.#kind === "stop";
-    if (this.#busy && !stops) this.#commands.say(`${nameOf(button)}: not yet, ${this.#busy} is on its way`, "refused");
+    if (this.#busy && !stops) this.#commands.say(t("page.common.not_yet", "{name}: not yet, {busy} is on its way", { name: nameOf(button), busy: ACTS[this.#busy] ?? this.#busy }), "refused");
     else this.#do(what, button);
   }
 
@@ -171,11 +191,11 @@ export class CollectPanel {
       discard: () => this.#discard(),
       rerecord: () => this.#rerecord(),
       label: () => this.#label(button.dataset.result),
-      open: () => this.#ask("Open", config.sessions, opening()),
-      close: () => this.#ask("Close", `${config.session}/${this.session}/close`),
-      resume: () => this.#ask("Resume", `${config.session}/${document.getElementById("session-earlier").value}/resume`),
-      publish: () => this.#ask("Publish", `${config.session}/${this.session}/publish`, publishing()),
-      retry: () => this.#ask("Retry", `${config.jobs}/${button.dataset.job}/retry`),
+      open: () => this.#ask(OPEN, config.sessions, opening()),
+      close: () => this.#ask(t("page.collect.close", "Close"), `${config.session}/${this.session}/close`),
+      resume: () => this.#ask(t("page.collect.resume", "Resume"), `${config.session}/${document.getElementById("session-earlier").value}/resume`),
+      publish: () => this.#ask(PUBLISH, `${config.session}/${this.session}/publish`, publishing()),
+      retry: () => this.#ask(t("page.collect.retry", "Retry"), `${config.jobs}/${button.dataset.job}/retry`),
     };
     const before = this.#busy;
     this.#busy = what;
@@ -216,7 +236,7 @@ export class CollectPanel {
   async #label(result) {
     const episode = this.#episode;
     if (episode && episode === this.#older && !this.#twice.press(result)) {
-      this.#commands.say(`${result}: the last start did not take; press again to label the episode before it`, "pressed");
+      this.#commands.say(t("page.collect.label_again", "{result}: the last start did not take; press again to label the episode before it", { result: RESULTS[result] ?? result }), "pressed");
       return;
     }
     if (await this.#commands.give("label", { episode, result })) this.#older = "";
@@ -224,7 +244,7 @@ export class CollectPanel {
 
   async #discard() {
     if (!this.#twice.press("discard")) {
-      this.#commands.say("Discard: press again to discard the episode; its files stay, it is never published", "pressed");
+      this.#commands.say(t("page.collect.discard_again", "Discard: press again to discard the episode; its files stay, it is never published"), "pressed");
       return;
     }
     await this.#commands.give("discard", discarding(this.#store.snapshot?.collect, this.#episode));
@@ -232,14 +252,14 @@ export class CollectPanel {
 
   async #rerecord() {
     if (!this.#twice.press("rerecord")) {
-      this.#commands.say("Re-record: press again to discard the episode and start the next at once", "pressed");
+      this.#commands.say(t("page.collect.rerecord_again", "Re-record: press again to discard the episode and start the next at once"), "pressed");
       return;
     }
     this.draw();
     const answer = await this.#commands.give("discard", discarding(this.#store.snapshot?.collect, this.#episode));
     if (!answer) return;
     const why = await this.#rested();
-    if (why) this.#commands.say(`Re-record: discarded, not started: ${why}`, "refused");
+    if (why) this.#commands.say(t("page.collect.rerecord_not_started", "Re-record: discarded, not started: {why}", { why }), "refused");
     else await this.#start();
   }
 
@@ -252,19 +272,19 @@ export class CollectPanel {
       why = whyNotStart(snapshot, this.session) || this.#commands.reason("run");
       const open = Boolean(snapshot?.collect?.episode) || snapshot?.state_is.going;
       if (!open && !why) return "";
-      if (!open && !snapshot?.state_is.held && why === "arm first") return snapshot.collect.why_not || why;
+      if (!open && !snapshot?.state_is.held && why === ARM_FIRST) return snapshot.collect.why_not || why;
       await new Promise((resolve) => setTimeout(resolve, 50));
     }
-    return why || "the robot is not at rest";
+    return why || t("page.collect.not_at_rest", "the robot is not at rest");
   }
 
   /** One request to the web, with its outcome on the page. */
   async #ask(name, address, content = {}) {
-    this.#commands.say(`${name}: pressed …`, "pressed");
+    this.#commands.say(t("page.common.pressed", "{name}: pressed …", { name }), "pressed");
     try {
       await post(address, content);
-      this.#commands.say(name === "Publish" ? "Publish: asked for; the queue below shows how far it is" : `${name}: done`, "accepted");
-      const form = name === "Open" && document.getElementById("open-session");
+      this.#commands.say(name === PUBLISH ? t("page.collect.publish_asked", "Publish: asked for; the queue below shows how far it is") : t("page.common.done", "{name}: done", { name }), "accepted");
+      const form = name === OPEN && document.getElementById("open-session");
       if (form) form.dispatchEvent(new Event("eva:saved", { bubbles: true }));
     } catch (error) {
       if (!(error instanceof RequestFailed)) throw error;

@@ -1,24 +1,26 @@
 // The buttons of gamepads as presses: of a button that went down while we looked, never of one that was held before.
 // A pedal is a keyboard: its key can stand in the place of a button.
 
+import { t } from "../site/sentences.js";
+
 /** What can be pressed by a pad, and which button does it as delivered (numbers of the standard mapping). */
 export const ACTIONS = {
-  arm: { name: "Arm, disarm", button: 9 },
-  big: { name: "Start; stop and save", button: 0 },
-  discard: { name: "Discard", button: 1 },
-  rerecord: { name: "Re-record", button: 3 },
-  success: { name: "Success", button: 12 },
-  partial: { name: "Partial", button: 15 },
-  fail: { name: "Fail", button: 13 },
+  arm: { name: t("page.pads.arm", "Arm, disarm"), button: 9 },
+  big: { name: t("page.pads.big", "Start; stop and save"), button: 0 },
+  discard: { name: t("page.pads.discard", "Discard"), button: 1 },
+  rerecord: { name: t("page.pads.rerecord", "Re-record"), button: 3 },
+  success: { name: t("page.pads.success", "Success"), button: 12 },
+  partial: { name: t("page.pads.partial", "Partial"), button: 15 },
+  fail: { name: t("page.pads.fail", "Fail"), button: 13 },
 };
 
-const NAMES = ["A", "B", "X", "Y", "LB", "RB", "LT", "RT", "Back", "Start", "left stick", "right stick", "up", "down", "left", "right", "Guide"];
+const NAMES = ["A", "B", "X", "Y", "LB", "RB", "LT", "RT", "Back", "Start", t("page.pads.left_stick", "left stick"), t("page.pads.right_stick", "right stick"), t("page.pads.up", "up"), t("page.pads.down", "down"), t("page.pads.left", "left"), t("page.pads.right", "right"), "Guide"];
 
 /** A button as it stands on a pad of the standard mapping, else its number; a key by its name. */
 export function buttonName(button, mapping) {
-  if (button === null || button === undefined) return "none";
-  if (typeof button === "string") return `key ${button.length === 1 ? button.toUpperCase() : button}`;
-  return mapping === "standard" && NAMES[button] ? `${NAMES[button]} (${button})` : `button ${button}`;
+  if (button === null || button === undefined) return t("page.pads.none", "none");
+  if (typeof button === "string") return t("page.pads.key", "key {key}", { key: button.length === 1 ? button.toUpperCase() : button });
+  return mapping === "standard" && NAMES[button] ? `${NAMES[button]} (${button})` : t("page.pads.button", "button {button}", { button });
 }
 
 export function delivered() {
@@ -27,9 +29,9 @@ export function delivered() {
 
 /** Why a key cannot be that of a pedal, "" where it can; `taken` are the keys that the page has. */
 export function whyNotKey(key, taken) {
-  if (key === " " || key === "Escape") return `${key === " " ? "Space" : "Esc"} is the e-stop`;
-  if (/^(Tab|Shift|Control|Alt|Meta|AltGraph|CapsLock|Dead|Process|Unidentified)$/.test(key)) return `${key} alone cannot be assigned`;
-  return taken.includes(key.toLowerCase()) || key === "?" ? `the page already uses ${key}` : "";
+  if (key === " " || key === "Escape") return t("page.pads.is_estop", "{key} is the e-stop", { key: key === " " ? "Space" : "Esc" });
+  if (/^(Tab|Shift|Control|Alt|Meta|AltGraph|CapsLock|Dead|Process|Unidentified)$/.test(key)) return t("page.pads.alone", "{key} alone cannot be assigned", { key });
+  return taken.includes(key.toLowerCase()) || key === "?" ? t("page.pads.used", "the page already uses {key}", { key }) : "";
 }
 
 /** `mapping` with `action` on `button`, or on a key; whatever was on that before is on none. */

@@ -2,6 +2,7 @@
 
 import { PRESSED } from "../site/presses.js";
 import { ACTIONS, assigned, buttonName, delivered, Presses, restored, whyNotKey } from "./pad_buttons.js";
+import { t } from "../site/sentences.js";
 
 const KEY = "eva-pad";
 const TYPED = 'input, textarea, select, [contenteditable="true"]'; // keep their keys
@@ -44,16 +45,16 @@ export function gamepads(press) {
   function draw() {
     const [first] = pads();
     for (const row of rows) {
-      row.querySelector(".pad-button").textContent = changing === row.dataset.action ? "press a button or a key …" : buttonName(mapping[row.dataset.action], first?.mapping);
-      row.querySelector("button").textContent = changing === row.dataset.action ? "Cancel" : "Change";
+      row.querySelector(".pad-button").textContent = changing === row.dataset.action ? t("page.pads.press", "press a button or a key …") : buttonName(mapping[row.dataset.action], first?.mapping);
+      row.querySelector("button").textContent = changing === row.dataset.action ? t("page.pads.cancel", "Cancel") : t("page.pads.change", "Change");
     }
-    part("state").textContent = first ? first.id.slice(0, 32) : "none connected: press one of its buttons";
+    part("state").textContent = first ? first.id.slice(0, 32) : t("page.pads.unconnected", "none connected: press one of its buttons");
   }
 
   function pressed(button) {
     const action = !changing && Object.keys(mapping).find((one) => mapping[one] === button);
     if (changing) keep(assigned(mapping, changing, button));
-    else part("said").textContent = `${buttonName(button, pads()[0]?.mapping)}: ${action ? ACTIONS[action].name : "does nothing"}`;
+    else part("said").textContent = t("page.pads.does", "{button}: {does}", { button: buttonName(button, pads()[0]?.mapping), does: action ? ACTIONS[action].name : t("page.pads.nothing", "does nothing") });
     if (action) press(action);
     else window.dispatchEvent(new Event(PRESSED));
   }

@@ -2,7 +2,7 @@
 
 import { get, RequestFailed } from "../site/api.js";
 import { quietFragments } from "../site/fragments.js";
-import { localized } from "../site/sentences.js";
+import { localized, t } from "../site/sentences.js";
 import { badge } from "./live/badge.js";
 
 const EVERY_MS = 4000;
@@ -25,7 +25,7 @@ async function ask(element) {
 function show(element, session) {
   element.toggleAttribute("data-stale", !session);
   badge(element, session);
-  element.textContent = session ? session.label : "not running";
+  element.textContent = session ? session.label : t("page.home.not_running", "not running");
 }
 
 /** The newest picture in place of the one before, which stays until it is here; none where there is none. */

@@ -1,15 +1,16 @@
 // A line of hints for who has a simulated station for the first time: the next thing to press, until it is hidden.
 
 import { current } from "./trial/steps.js";
+import { t } from "../site/sentences.js";
 
 const KEY = "eva-tour"; // of this browser: "off" once the hints were hidden
 const HINTS = {
-  free: "Take the station: you command, all others watch.",
-  choose: "Choose a position, then press Set up.",
-  setup: "The policy answers a first time; then press Run.",
-  run: "Press Run: the policy moves the arms.",
-  running: "Press Stop once the block is on the plate.",
-  score: "Tick what was reached, then press Save score.",
+  free: t("page.tour.free", "Take the station: you command, all others watch."),
+  choose: t("page.tour.choose", "Choose a position, then press Set up."),
+  setup: t("page.tour.setup", "The policy answers a first time; then press Run."),
+  run: t("page.tour.run", "Press Run: the policy moves the arms."),
+  running: t("page.tour.running", "Press Stop once the block is on the plate."),
+  score: t("page.tour.score", "Tick what was reached, then press Save score."),
 };
 
 function hint(store) {

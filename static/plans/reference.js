@@ -1,6 +1,7 @@
 // Regions of a reference picture: drawn with mouse or finger, or typed, and saved as another reference.
 
 import { post } from "../site/api.js";
+import { t } from "../site/sentences.js";
 import { between, changed, fresh, LEAST, moved } from "./rectangles.js";
 
 const NUMBERS = ["x", "y", "width", "height"];
@@ -43,7 +44,7 @@ class Drawing {
     const index = pressed ? Number(pressed.dataset.region) : this.#regions.length;
     const before = this.#regions[index];
     if (!before && this.#regions.length >= this.#most) {
-      this.#tell(`A picture has at most ${this.#most} regions`);
+      this.#tell(t("page.reference.most", "A picture has at most {most} regions", { most: this.#most }));
       return;
     }
     const sized = event.target.matches(".region-corner");
@@ -73,7 +74,7 @@ class Drawing {
   }
 
   #add(rectangle) {
-    if (this.#regions.length >= this.#most) return this.#tell(`A picture has at most ${this.#most} regions`);
+    if (this.#regions.length >= this.#most) return this.#tell(t("page.reference.most", "A picture has at most {most} regions", { most: this.#most }));
     this.#regions.push({ name: this.#fresh(), ...rectangle });
     return this.#name(this.#regions.length - 1);
   }
@@ -108,7 +109,7 @@ class Drawing {
       row.dataset.row = index;
       row.querySelector("[data-of=name]").value = region.name;
       for (const key of NUMBERS) row.querySelector(`[data-of=${key}]`).value = (100 * region[key]).toFixed(1);
-      row.querySelector("[data-remove]").setAttribute("aria-label", `Remove ${region.name}`);
+      row.querySelector("[data-remove]").setAttribute("aria-label", t("page.reference.remove", "Remove {name}", { name: region.name }));
     });
     document.getElementById("no-regions").hidden = this.#regions.length > 0;
     this.#draw();
@@ -140,7 +141,7 @@ class Drawing {
       const made = await post(address, { regions: this.#regions });
       location.assign(next.replace("/0/", `/${made.id}/`));
     } catch (error) {
-      this.#tell(`Not saved: ${error.message}`);
+      this.#tell(t("page.reference.not_saved", "Not saved: {why}", { why: error.message }));
       this.#save.disabled = false;
     }
   }

@@ -1,6 +1,7 @@
 // Segments of an episode: begun and ended by keys at the cursor or drawn on their lane, with the lab's vocabulary.
 
 import { get, post } from "../site/api.js";
+import { t } from "../site/sentences.js";
 import { SegmentLane } from "./segment_lane.js";
 
 const element = (id) => document.getElementById(id);
@@ -26,7 +27,7 @@ export class Annotation {
     this.#lane = new SegmentLane({
       ...{ strip, clock, user: bar.dataset.user },
       drawn: (span) => this.#fill(span, "", ""),
-      moved: (segment) => this.#put({ first: segment.first, last: segment.last, segment: segment.uuid, label: segment.label, milestone: segment.milestone }, `“${segment.label}” is rows ${segment.first} to ${segment.last}.`),
+      moved: (segment) => this.#put({ first: segment.first, last: segment.last, segment: segment.uuid, label: segment.label, milestone: segment.milestone }, t("page.segments.moved", "“{label}” is rows {first} to {last}.", { label: segment.label, first: segment.first, last: segment.last })),
     });
     element("segment-form").addEventListener("submit", (event) => this.#save(event));
     for (const kind of ["tick", "seek"]) clock.addEventListener(kind, () => this.at());
@@ -38,7 +39,7 @@ export class Annotation {
     try {
       this.#labels = await get(this.#bar.dataset.labels);
     } catch (error) {
-      this.#tell(`the vocabulary did not load: ${error.message}`, true);
+      this.#tell(t("page.segments.no_vocabulary", "the vocabulary did not load: {why}", { why: error.message }), true);
       return;
     }
     element("segment-vocabulary").replaceChildren(...this.#labels.map((label) => this.#button(label)));
@@ -46,7 +47,7 @@ export class Annotation {
   }
 
   #button({ words, colour, key }) {
-    const button = Object.assign(document.createElement("button"), { type: "button", className: "button segment-label", title: "Start a segment of that label at this row; press again to end it" });
+    const button = Object.assign(document.createElement("button"), { type: "button", className: "button segment-label", title: t("page.segments.label_title", "Start a segment of that label at this row; press again to end it") });
     Object.assign(button.dataset, { colour, label: words });
     button.setAttribute("aria-pressed", "false");
     button.append(Object.assign(document.createElement("span"), { textContent: words }));
@@ -85,13 +86,13 @@ export class Annotation {
   mark(label) {
     const { row } = this.#clock;
     if (this.#edited) {
-      this.#put({ ...this.#edited, label, milestone: element("segment-form").elements.milestone.value }, `“${label}” is saved.`).then((kept) => kept && this.#done());
+      this.#put({ ...this.#edited, label, milestone: element("segment-form").elements.milestone.value }, t("page.segments.label_saved", "“{label}” is saved.", { label })).then((kept) => kept && this.#done());
       return;
     }
     const begun = this.#begun;
     if (begun?.label && (begun.label === label || begun.row !== row)) {
       const last = begun.label === label ? row : row + Math.sign(begun.row - row);
-      this.#put({ first: Math.min(begun.row, last), last: Math.max(begun.row, last), label: begun.label, milestone: "" }, `“${begun.label}” is saved.`).then((kept) => kept || this.#begun || this.#mark(begun));
+      this.#put({ first: Math.min(begun.row, last), last: Math.max(begun.row, last), label: begun.label, milestone: "" }, t("page.segments.label_saved", "“{label}” is saved.", { label: begun.label })).then((kept) => kept || this.#begun || this.#mark(begun));
     }
     if (begun?.label !== label) this.begin(begun && !begun.label ? begun.row : row, label);
     else this.#mark(null);
@@ -99,12 +100,12 @@ export class Annotation {
 
   begin(row = this.#clock.row, label = "") {
     this.#mark({ row, label });
-    this.#tell(`${label ? `“${label}”` : "A segment"} from row ${row} on.`);
+    this.#tell(label ? t("page.segments.label_from", "“{label}” from row {row} on.", { label, row }) : t("page.segments.from", "A segment from row {row} on.", { row }));
   }
 
   end() {
     if (this.#begun === null) {
-      this.#tell("No segment has begun: press [ at its first row.", true);
+      this.#tell(t("page.segments.not_begun", "No segment has begun: press [ at its first row."), true);
       return;
     }
     const { row, label } = this.#begun;
@@ -119,7 +120,7 @@ export class Annotation {
 
   remove() {
     const found = this.#own();
-    if (found) this.#ask(() => post(`${this.#bar.dataset.segments}/${found.uuid}/remove`, {}), `“${found.label}” is removed.`);
+    if (found) this.#ask(() => post(`${this.#bar.dataset.segments}/${found.uuid}/remove`, {}), t("page.segments.removed", "“{label}” is removed.", { label: found.label }));
   }
 
   /** Nothing is being written any more. */
@@ -136,7 +137,7 @@ export class Annotation {
   #fill(edited, label, milestone) {
     this.#clock.pause();
     this.#edited = edited;
-    element("segment-span").textContent = `${edited.first} to ${edited.last}`;
+    element("segment-span").textContent = t("page.segments.span", "{first} to {last}", { first: edited.first, last: edited.last });
     const { elements } = element("segment-form");
     elements.label.value = label;
     elements.milestone.value = milestone;
@@ -147,7 +148,7 @@ export class Annotation {
   async #save(event) {
     event.preventDefault();
     const { label, milestone } = event.target.elements;
-    if (await this.#put({ ...this.#edited, label: label.value, milestone: milestone.value }, "The segment is saved.")) this.#done();
+    if (await this.#put({ ...this.#edited, label: label.value, milestone: milestone.value }, t("page.segments.saved", "The segment is saved."))) this.#done();
   }
 
   #put(content, done) {
@@ -159,7 +160,7 @@ export class Annotation {
     const { row } = this.#clock;
     const own = this.#segments.filter((one) => one.annotator === this.#bar.dataset.user && one.first <= row && row <= one.last);
     own.sort((one, other) => one.last - one.first - (other.last - other.first));
-    if (!own.length) this.#tell("None of your segments is at this row.", true);
+    if (!own.length) this.#tell(t("page.segments.none_own", "None of your segments is at this row."), true);
     return own[0];
   }
 }

@@ -3,9 +3,10 @@
 import { KINDS, SECOND } from "../console/curves/curve_kinds.js";
 import { jointOptions } from "../console/manual/joint_names.js";
 import { last } from "../site/ascending.js";
+import { t } from "../site/sentences.js";
 import { Plot } from "./plot.js";
 
-const OTHERS = ["state", "executed", "smoothed"];
+const OTHERS = { state: t("page.curves.state", "state"), executed: t("page.curves.executed", "executed"), smoothed: t("page.curves.smoothed", "smoothed") };
 
 export class CurveCell {
   #read;
@@ -27,7 +28,7 @@ export class CurveCell {
     const place = this.element.querySelector(".curves-plot");
     this.#select = this.element.querySelector("select");
     if (!number) [this.#select.id, place.id] = ["joint", "curves"];
-    this.#select.setAttribute("aria-label", `Joint of curve ${number + 1}`);
+    this.#select.setAttribute("aria-label", t("page.curves.joint_of", "Joint of curve {n}", { n: number + 1 }));
     this.#select.replaceChildren(...jointOptions(joints, grippers));
     this.#select.value = String(index);
     this.#select.addEventListener("change", () => {
@@ -36,14 +37,14 @@ export class CurveCell {
       chose();
     });
     this.#second = this.element.querySelector("[data-second]");
-    this.#second.setAttribute("aria-label", `Another signal in curve ${number + 1}`);
-    this.#second.append(...OTHERS.map((kind) => signals(kind, joints)));
+    this.#second.setAttribute("aria-label", t("page.curves.another_in", "Another signal in curve {n}", { n: number + 1 }));
+    this.#second.append(...Object.keys(OTHERS).map((kind) => signals(kind, joints)));
     this.#second.addEventListener("change", () => {
       this.#beside();
       chose();
     });
     const off = this.element.querySelector("[data-remove]");
-    off.setAttribute("aria-label", `Leave out curve ${number + 1}, ${joints[index]}`);
+    off.setAttribute("aria-label", t("page.curves.leave_out", "Leave out curve {n}, {joint}", { n: number + 1, joint: joints[index] }));
     off.hidden = count < 2;
     off.addEventListener("click", remove);
     this.#write();
@@ -68,8 +69,8 @@ export class CurveCell {
     const [kind, index] = this.#second.value.split(":");
     this.#other = kind ? this.#read(Number(index)).curves[kind] : null;
     const value = this.#values.get("second");
-    this.#second.title = kind ? this.#second.selectedOptions[0].text : "Another signal in this plot";
-    value.title = kind ? `${this.#second.title}, dotted, axis at the right` : "";
+    this.#second.title = kind ? this.#second.selectedOptions[0].text : t("page.curves.another", "Another signal in this plot");
+    value.title = kind ? t("page.curves.dotted", "{signal}, dotted, axis at the right", { signal: this.#second.title }) : "";
     this.#plot.beside(this.#other);
   }
 
@@ -121,8 +122,8 @@ export class CurveCell {
 /** A group of options: `kind` of every joint. */
 function signals(kind, joints) {
   const group = document.createElement("optgroup");
-  group.label = kind;
-  group.append(...joints.map((name, index) => new Option(`${name} ${kind}`, `${kind}:${index}`)));
+  group.label = OTHERS[kind];
+  group.append(...joints.map((name, index) => new Option(`${name} ${OTHERS[kind]}`, `${kind}:${index}`)));
   return group;
 }
 

@@ -2,6 +2,7 @@
 
 import { Legend } from "../console/curves/curve_legend.js";
 import { last } from "../site/ascending.js";
+import { t } from "../site/sentences.js";
 import { Chunks } from "./chunks.js";
 import { CurveCell } from "./curve_cell.js";
 import { joint, message } from "./data.js";
@@ -21,10 +22,10 @@ export async function curvePane({ clock, address, uplot }) {
     const library = (await import(uplot).catch(() => null))?.default;
     if (library) new Pane(clock, episode, library);
     note.hidden = Boolean(library);
-    note.textContent = library ? "" : "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.";
+    note.textContent = library ? "" : t("page.replay.no_uplot", "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.");
     return { held: header.held, marks: header.marks, chunks: episode.chunks.spans };
   } catch (error) {
-    note.textContent = `No curves: ${error.message}.`;
+    note.textContent = t("page.replay.no_curves", "No curves: {why}.", { why: error.message });
     console.error(error);
     return { held: [], marks: [], chunks: [] };
   }
@@ -83,7 +84,7 @@ class Pane {
     const missing = this.#moving.length - joints.length;
     const add = document.getElementById("joint-add");
     add.setAttribute("aria-disabled", String(!missing));
-    add.title = missing ? "Draw one more joint" : "All joints are drawn";
+    add.title = missing ? t("page.replay.one_more", "Draw one more joint") : t("page.replay.all_drawn", "All joints are drawn");
     this.#at();
   }
 
@@ -149,15 +150,15 @@ class Pane {
   #explain(element) {
     const { safety } = this.#episode.ticks;
     const { chunks, header } = this.#episode;
-    if (chunks.spans.length) mark(element, "chunk", "--mark-chunk", "hairline", "another chunk takes over; the strip over the curves has its number");
-    if (chunks.overlaps.length) mark(element, "overlap", "--mark-overlap", "patch", "steps that several chunks made");
-    if (header.held.length) mark(element, "held", "--warn-soft", "patch", "nothing was asked of the robot");
-    if (safety.includes(1)) mark(element, "changed", "--warn", "tick", "safety sent another action than the one requested");
-    if (safety.includes(2)) mark(element, "refused", "--danger", "tick", "safety sent nothing");
-    if (header.marks.length) mark(element, "event", "--text-normal", "tick", "an event from the list");
-    if (header.marks.some(({ kind }) => tunes(kind))) mark(element, "tuned", "--active", "hairline", "another strategy, or other parameters, from here on");
+    if (chunks.spans.length) mark(element, t("page.marks.chunk", "chunk"), "--mark-chunk", "hairline", t("page.marks.chunk_means", "another chunk takes over; the strip over the curves has its number"));
+    if (chunks.overlaps.length) mark(element, t("page.marks.overlap", "overlap"), "--mark-overlap", "patch", t("page.marks.overlap_means", "steps that several chunks made"));
+    if (header.held.length) mark(element, t("page.marks.held", "held"), "--warn-soft", "patch", t("page.marks.held_means", "nothing was asked of the robot"));
+    if (safety.includes(1)) mark(element, t("page.marks.changed", "changed"), "--warn", "tick", t("page.marks.changed_means", "safety sent another action than the one requested"));
+    if (safety.includes(2)) mark(element, t("page.marks.refused", "refused"), "--danger", "tick", t("page.marks.refused_means", "safety sent nothing"));
+    if (header.marks.length) mark(element, t("page.marks.event", "event"), "--text-normal", "tick", t("page.marks.event_means", "an event from the list"));
+    if (header.marks.some(({ kind }) => tunes(kind))) mark(element, t("page.marks.tuned", "tuned"), "--active", "hairline", t("page.marks.tuned_means", "another strategy, or other parameters, from here on"));
     const { spaces } = this.#episode;
-    if (!spaces.includes("joint")) this.#legend.explain("raw", `The policy acts in ${spaces.join(", ") || "no"} space: it has no joints to draw.`);
+    if (!spaces.includes("joint")) this.#legend.explain("raw", spaces.length ? t("page.replay.other_space", "The policy acts in {spaces} space: it has no joints to draw.", { spaces: spaces.join(", ") }) : t("page.replay.no_space", "The policy acts in no space: it has no joints to draw."));
   }
 
   #hover(time) {

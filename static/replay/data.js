@@ -1,14 +1,16 @@
 // The binary messages of an episode.
 
 import { decode } from "../console/live/frame.js";
+import { sentence, t } from "../site/sentences.js";
 
 /** The message at `address`; throws with the server's sentence. */
 export async function message(address) {
   const response = await fetch(address, { credentials: "same-origin", redirect: "manual", headers: { Accept: "application/json" } });
   if (response.ok) return decode(await response.arrayBuffer());
-  if (response.type === "opaqueredirect") throw new Error("your session has ended: log in again");
+  if (response.type === "opaqueredirect") throw new Error(t("page.site.session_ended", "your session has ended: log in again"));
   const said = await response.json().catch(() => ({}));
-  throw new Error(said.error ?? `the server answered with HTTP ${response.status}`);
+  if (said.error) throw new Error(sentence({ ...said, text: said.error }));
+  throw new Error(t("page.site.http_status", "the server answered with HTTP {status}", { status: response.status }));
 }
 
 /** Joint j of an array that lies joint by joint; nothing is copied. */

@@ -1,5 +1,7 @@
 // The episodes that are chosen in the list go along with a deletion.
 
+import { t } from "../site/sentences.js";
+
 const form = document.getElementById("delete");
 const chosen = () => [...document.querySelectorAll("[data-episode-index]:checked")];
 
@@ -12,7 +14,7 @@ if (form) {
   form.addEventListener("submit", (event) => {
     if (!chosen().length) {
       event.preventDefault();
-      count.closest("button").title = "Choose episodes in the list first";
+      count.closest("button").title = t("page.datasets.choose_first", "Choose episodes in the list first");
       return;
     }
     for (const { dataset } of chosen()) form.append(Object.assign(document.createElement("input"), { type: "hidden", name: "episodes", value: dataset.episodeIndex }));

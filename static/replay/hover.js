@@ -1,5 +1,7 @@
 // What lies under the pointer on the time axis, before it is gone to: the time, what happened there, small pictures.
 
+import { t } from "../site/sentences.js";
+
 const HALF_THUMB = 8; // px, at both ends of a range input: where its axis begins and ends
 const NEAR = 6; // px from a mark
 const MOST = 4; // cameras; with one shown large that one first
@@ -71,7 +73,7 @@ export class Hover {
     }
     const reach = (NEAR * rows) / fps / Math.max(1, width);
     const near = this.#marks.filter(({ time }) => Math.abs(time - row / fps) <= reach).map(({ text }) => text);
-    this.#box.querySelector("[data-words]").textContent = [`${this.stamp(row / fps)} · row ${row}`, ...near].join(" · ");
+    this.#box.querySelector("[data-words]").textContent = [`${this.stamp(row / fps)} · ${t("page.replay.row", "row {row}", { row })}`, ...near].join(" · ");
     this.#box.hidden = false;
     const half = this.#box.offsetWidth / 2;
     this.#box.style.left = `${Math.min(Math.max(x, half), width - half)}px`;

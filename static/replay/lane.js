@@ -1,6 +1,7 @@
 // The strip over the curves that says which chunk owns which steps, with the hairlines and bands that go with it.
 
 import { css } from "../console/curves/curve_kinds.js";
+import { t } from "../site/sentences.js";
 
 export const LANE = 20; // px, over the plot
 const LEAST = 4; // px that a chunk takes on average, for its own tint
@@ -34,7 +35,7 @@ export class Lane {
     ctx.textBaseline = "middle";
     ctx.textAlign = "center";
     for (const span of seen.spans) this.#span(ctx, x, span, { top, tall, chosen, legible: seen.legible });
-    if (!seen.legible) this.#summary(ctx, `${seen.count} chunks: drag over the curves to look closer`, { left, top, width, tall });
+    if (!seen.legible) this.#summary(ctx, t("page.replay.many_chunks", "{n} chunks: drag over the curves to look closer", { n: seen.count }), { left, top, width, tall });
   }
 
   /** The spans in sight, in which every second owner is `odd`; whether each has room. */
@@ -53,7 +54,7 @@ export class Lane {
     ctx.fillStyle = css(own ? "--curve-4" : id === 0 ? "--warn" : "--mark-chunk");
     ctx.fillRect(begin, top, wide, tall);
     ctx.globalAlpha = 1;
-    const name = id === 0 ? "held" : String(id);
+    const name = id === 0 ? t("page.replay.held", "held") : String(id);
     const middle = (Math.max(begin, x.left) + Math.min(end, x.right)) / 2;
     if (!legible || ctx.measureText(name).width + ROOM * devicePixelRatio > Math.min(end, x.right) - Math.max(begin, x.left)) return;
     ctx.fillStyle = css(own ? "--panel" : "--text-strong");

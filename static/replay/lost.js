@@ -1,8 +1,10 @@
 // Which cameras show another picture than the one of the row, said where the picture is: it was given, and is not in the video.
 
+import { t } from "../site/sentences.js";
+
 const WORDS = {
-  lost: () => "lost: the one before",
-  video_lost: ({ first }) => (first > 0 ? `ended at row ${first}` : "no video"),
+  lost: () => t("page.replay.lost", "lost: the one before"),
+  video_lost: ({ first }) => (first > 0 ? t("page.replay.video_ended", "ended at row {row}", { row: first }) : t("page.replay.no_video", "no video")),
 };
 
 /** What is to be said of a camera at a row by the flags of the checks; "" where its picture is that of the row. */

@@ -1,5 +1,6 @@
 // The page of one episode: cameras, robot and curves on one clock. Pictures come first, what is drawn after them.
 
+import { t } from "../site/sentences.js";
 import { cameras, firstPictures } from "./cameras.js";
 import { Clock } from "./clock.js";
 import { enlarged } from "./enlarged.js";
@@ -14,7 +15,7 @@ const timeline = new Timeline(clock, { videos: config.videos, grid: config.grid 
 
 /** Say in a pane's note why its scripts are not there. */
 function absent(note, error) {
-  document.getElementById(note).textContent = `The scripts of this pane did not load: ${error.message}. Load the page again.`;
+  document.getElementById(note).textContent = t("page.replay.not_loaded", "The scripts of this pane did not load: {why}. Load the page again.", { why: error.message });
   console.error(error);
 }
 

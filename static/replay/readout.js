@@ -1,49 +1,53 @@
 // One line about the chunk under the cursor: whose step it is, how late its chunk came, what else made it.
 
+import { t } from "../site/sentences.js";
+
 const NAMED = 3; // of the chunks that made a step
 const percent = (weight) => `${Math.round(100 * weight)} %`;
-const steps = (count) => `${count} step${count === 1 ? "" : "s"}`;
+const steps = (n) => (n === 1 ? t("page.readout.step", "1 step") : t("page.readout.steps", "{n} steps", { n }));
 
 /** Sentences about the step at `time`: [{text, warn}], the most important first. */
 export function readout(chunks, time) {
   const id = chunks.ownerAt(time);
-  if (id < 0) return [{ text: "no policy output at this step" }];
+  if (id < 0) return [{ text: t("page.readout.none", "no policy output at this step") }];
   return whose(chunks, id, makers(chunks, time));
 }
 
 function whose(chunks, id, makers) {
-  if (id === 0) return [{ text: "the held target: nothing is planned here", strong: true }, ...makers];
+  if (id === 0) return [{ text: t("page.readout.held", "the held target: nothing is planned here"), strong: true }, ...makers];
   const chunk = chunks.about(id);
-  const name = { text: `chunk ${id}${chunk?.strategy ? ` · ${chunk.strategy}` : ""}`, strong: true };
-  if (!chunk) return [name, { text: "its rows were not recorded" }, ...makers];
+  const name = { text: `${t("page.readout.chunk", "chunk {id}", { id })}${chunk?.strategy ? ` · ${chunk.strategy}` : ""}`, strong: true };
+  if (!chunk) return [name, { text: t("page.readout.not_recorded", "its rows were not recorded") }, ...makers];
   return [name, ...delay(chunk), ...rows(chunk), ...makers, ...blend(chunk), ...inference(chunk)];
 }
 
 function delay({ delay: late, seconds, mistimed }) {
-  if (late < 0) return [{ text: "never arrived" }];
-  const found = [{ text: `delay ${steps(late)}${Number.isFinite(seconds) ? ` (${Math.round(1000 * seconds)} ms)` : ""}` }];
-  if (mistimed > 0) found.push({ text: `mistimed by ${steps(mistimed)}`, warn: true });
+  if (late < 0) return [{ text: t("page.readout.never_arrived", "never arrived") }];
+  const ms = Math.round(1000 * seconds);
+  const found = [{ text: Number.isFinite(seconds) ? t("page.readout.delay_ms", "delay {steps} ({ms} ms)", { steps: steps(late), ms }) : t("page.readout.delay", "delay {steps}", { steps: steps(late) }) }];
+  if (mistimed > 0) found.push({ text: t("page.readout.mistimed", "mistimed by {steps}", { steps: steps(mistimed) }), warn: true });
   return found;
 }
 
 function rows({ first, last, rows: all }) {
-  return [{ text: first < 0 ? `none of ${all} rows planned` : `rows ${first} to ${last} of ${all}` }];
+  return [{ text: first < 0 ? t("page.readout.no_rows", "none of {all} rows planned", { all }) : t("page.readout.rows", "rows {first} to {last} of {all}", { first, last, all }) }];
 }
 
 function blend({ overlap }) {
-  return overlap > 0 ? [{ text: `blended in over ${steps(overlap)}` }] : [];
+  return overlap > 0 ? [{ text: t("page.readout.blended", "blended in over {steps}", { steps: steps(overlap) }) }] : [];
 }
 
 function inference({ inference: ms }) {
-  return Number.isFinite(ms) && ms > 0 ? [{ text: `policy ${Math.round(ms)} ms` }] : [];
+  return Number.isFinite(ms) && ms > 0 ? [{ text: t("page.readout.inference", "policy {ms} ms", { ms: Math.round(ms) }) }] : [];
 }
 
 function makers(chunks, time) {
   const found = chunks.makersAt(time);
   if (found.length < 2) return [];
-  const named = found.slice(0, NAMED).map(({ id, weight }) => `${percent(weight)} of ${id || "the held target"}`);
+  const named = found.slice(0, NAMED).map(({ id, weight }) => (id ? t("page.readout.share", "{percent} of {id}", { percent: percent(weight), id }) : t("page.readout.share_held", "{percent} of the held target", { percent: percent(weight) })));
   const more = found.length - named.length;
-  return [{ text: `this step is ${named.join(", ")}${more > 0 ? `, ${more} more` : ""}` }];
+  const shares = named.join(", ");
+  return [{ text: more > 0 ? t("page.readout.made_of_more", "this step is {shares}, {n} more", { shares, n: more }) : t("page.readout.made_of", "this step is {shares}", { shares }) }];
 }
 
 /** Write the sentences into `element`. */

@@ -1,10 +1,11 @@
 // The review of an episode: what the checks found, verdicts, annotated parts; everything has a key.
 
 import { get, post } from "../site/api.js";
+import { t } from "../site/sentences.js";
 import { when } from "../site/times.js";
 import { Annotation } from "./annotation.js";
 import { sayLost } from "./lost.js";
-import { bands, flagFrom, flagsAt, list } from "./review_lanes.js";
+import { bands, flagFrom, flagsAt, list, span, verdictWord } from "./review_lanes.js";
 
 const NOTE_S = 2; // a note is shown from its moment on
 const LOOK_AGAIN_MS = 4000; // while the checks are not done
@@ -82,7 +83,7 @@ export class Review {
     this.#said = { ...said, flags: said.quality?.flags ?? [] };
     const { flags, segments, reviews, verdict, quality, covered } = this.#said;
     const state = element("review-state");
-    state.textContent = verdict ? `${verdict.verdict} by ${verdict.reviewer}` : "unreviewed";
+    state.textContent = verdict ? t("page.review.verdict_by", "{verdict} by {who}", { verdict: verdictWord(verdict.verdict), who: verdict.reviewer }) : t("page.review.unreviewed", "unreviewed");
     state.dataset.verdict = verdict?.verdict ?? "";
     const notes = this.#notes.map(({ frame, note, reviewer }) => ({ first: frame, last: frame, severity: "note", text: `${reviewer}: ${note}` }));
     bands(element("flags"), [...[...flags].reverse(), ...notes], this.#frames, (band, flag) => {
@@ -91,26 +92,26 @@ export class Review {
       band.addEventListener("click", () => this.#clock.seekRow(flag.first));
     });
     const go = ({ first }) => (first >= 0 ? () => this.#clock.seekRow(first) : null);
-    list(element("flags-list"), this.#flagLines(), quality ? "The checks found nothing." : "The checks are not done yet.");
+    list(element("flags-list"), this.#flagLines(), quality ? t("page.review.nothing_found", "The checks found nothing.") : t("page.review.not_done", "The checks are not done yet."));
     list(
       element("segments-list"),
-      segments.map((one) => ({ words: one.label, detail: `${one.first} to ${one.last}${one.milestone ? `, then ${one.milestone}` : ""}, ${one.annotator}`, go: go(one) })),
-      "No segment is annotated yet.",
+      segments.map((one) => ({ words: one.label, detail: span(one, one.annotator), go: go(one) })),
+      t("page.review.no_segments_yet", "No segment is annotated yet."),
     );
     list(
       element("history-list"),
       reviews.map((one) => ({
-        words: one.note ? `${one.verdict}: ${one.note}` : one.verdict,
-        detail: `${one.frame === null ? "" : `at ${this.#seconds(one.frame)}, `}${one.reviewer}, ${when(one.at)}`,
+        words: one.note ? `${verdictWord(one.verdict)}: ${one.note}` : verdictWord(one.verdict),
+        detail: one.frame === null ? `${one.reviewer}, ${when(one.at)}` : t("page.review.said_at", "at {moment}, {who}, {when}", { moment: this.#seconds(one.frame), who: one.reviewer, when: when(one.at) }),
         mark: one.verdict,
         go: one.frame === null ? null : () => this.#clock.seekRow(one.frame),
       })),
-      "No review yet.",
+      t("page.review.no_reviews_yet", "No review yet."),
     );
-    element("flags-count").textContent = quality ? (flags.length ? `Flags ${flags.length}` : "Clean") : "Unchecked";
+    element("flags-count").textContent = quality ? (flags.length ? t("page.review.flags", "Flags {n}", { n: flags.length }) : t("page.review.clean", "Clean")) : t("page.review.unchecked", "Unchecked");
     element("flags-count").dataset.severity = quality?.worst ?? "";
-    element("segments-count").textContent = `Segments ${segments.length || ""}`.trim();
-    element("history-count").textContent = `Notes ${reviews.length || ""}`.trim();
+    element("segments-count").textContent = segments.length ? t("page.review.segments_n", "Segments {n}", { n: segments.length }) : t("page.review.segments", "Segments");
+    element("history-count").textContent = reviews.length ? t("page.review.notes_n", "Notes {n}", { n: reviews.length }) : t("page.review.notes", "Notes");
     element("history-covered").hidden = !covered;
     this.#annotation.show(segments);
     this.#at();
@@ -119,7 +120,7 @@ export class Review {
   #flagLines() {
     const flags = this.#said.flags.map((flag) => ({
       words: flag.text,
-      detail: [flag.kind.replaceAll("_", " "), flag.bound === null ? "" : `allowed ${Number(flag.bound.toPrecision(3))}`].filter(Boolean).join(", "),
+      detail: [flag.kind.replaceAll("_", " "), flag.bound === null ? "" : t("page.review.allowed", "allowed {bound}", { bound: Number(flag.bound.toPrecision(3)) })].filter(Boolean).join(", "),
       mark: flag.severity,
       go: flag.first >= 0 ? () => this.#clock.seekRow(flag.first) : null,
     }));
@@ -175,7 +176,7 @@ export class Review {
   }
 
   #verdict(verdict) {
-    return this.#ask(() => post(this.#bar.dataset.address, { verdict }), verdict === "pass" ? "Passed." : "Failed.");
+    return this.#ask(() => post(this.#bar.dataset.address, { verdict }), verdict === "pass" ? t("page.review.passed", "Passed.") : t("page.review.failed", "Failed."));
   }
 
   async #verdictAndNext(verdict) {
@@ -192,7 +193,7 @@ export class Review {
     event.preventDefault();
     const { note: field, here } = event.target.elements;
     const frame = here.checked ? this.#noted : null;
-    const done = here.checked ? "The note is saved; the address of this page leads to its moment." : "The note is saved.";
+    const done = here.checked ? t("page.review.note_saved_here", "The note is saved; the address of this page leads to its moment.") : t("page.review.note_saved", "The note is saved.");
     if (await this.#ask(() => post(this.#bar.dataset.address, { verdict: "note", note: field.value, frame }), done)) {
       if (frame !== null) this.#clock.seekRow(frame);
       field.value = "";
@@ -202,14 +203,14 @@ export class Review {
 
   #toFlag(step) {
     const row = flagFrom(this.#said.flags, this.#clock.row, step);
-    if (row === null) this.#tell(step > 0 ? "No flag begins after this row." : "No flag begins before this row.");
+    if (row === null) this.#tell(step > 0 ? t("page.review.no_flag_after", "No flag begins after this row.") : t("page.review.no_flag_before", "No flag begins before this row."));
     else this.#clock.seekRow(row);
   }
 
   async #check() {
     try {
       await post(this.#bar.dataset.quality, {});
-      this.#tell("It is being checked again; reload the page in a moment.");
+      this.#tell(t("page.review.checking", "It is being checked again; reload the page in a moment."));
     } catch (error) {
       this.#tell(error.message, true);
     }
@@ -224,11 +225,11 @@ export class Review {
       const { episode } = await get(this.#bar.dataset.next);
       const { rate } = this.#clock;
       if (episode) {
-        this.#tell("Opening the next episode …");
+        this.#tell(t("page.review.opening", "Opening the next episode …"));
         window.location.assign(`${this.#bar.dataset.replay}${episode}/${rate === 1 ? "" : `?speed=${rate}`}`);
         return;
       }
-      this.#tell("No other episode is waiting for a review.");
+      this.#tell(t("page.review.none_waiting", "No other episode is waiting for a review."));
     } catch (error) {
       this.#tell(error.message, true);
     }
@@ -238,7 +239,7 @@ export class Review {
   async #tellWaiting() {
     try {
       const { waiting } = await get(this.#bar.dataset.next);
-      if (!this.#shown && !this.#leaving) this.#tell(waiting === 1 ? "1 episode is waiting for a review." : `${waiting} episodes are waiting for a review.`);
+      if (!this.#shown && !this.#leaving) this.#tell(waiting === 1 ? t("page.review.one_waiting", "1 episode is waiting for a review.") : t("page.review.many_waiting", "{n} episodes are waiting for a review.", { n: waiting }));
     } catch (error) {
       this.#tell(error.message, true);
     }
@@ -267,7 +268,7 @@ export class Review {
     const [action, label] = [keys[event.key], this.#annotation.labelOf(event.key)];
     if ((!action && !label) || event.repeat) return;
     event.preventDefault();
-    if (this.#leaving) this.#tell("Not counted: the next episode is still being opened.");
+    if (this.#leaving) this.#tell(t("page.review.leaving", "Not counted: the next episode is still being opened."));
     else if (action) this.#do(action);
     else this.#annotation.mark(label);
   }

@@ -1,5 +1,7 @@
 // Flags and segments as bands under the time axis, and as lists that lead to their frames.
 
+import { t } from "../site/sentences.js";
+
 const RANK = { error: 0, warning: 1, info: 2 };
 
 /** Bands of `items` ({first, last, ...}) in a strip; `dress` gives each its look. One about no frame has none. */
@@ -56,6 +58,18 @@ export function list(element, items, none) {
   });
   if (!made.length) made.push(Object.assign(document.createElement("li"), { className: "muted", textContent: none }));
   element.replaceChildren(...made);
+}
+
+/** Which rows a segment is, what it ends with, and whose it is. */
+export function span({ first, last, milestone }, who) {
+  if (milestone) return t("page.review.span_then", "{first} to {last}, then {milestone}, {who}", { first, last, milestone, who });
+  return t("page.review.span", "{first} to {last}, {who}", { first, last, who });
+}
+
+/** What a verdict is called. */
+export function verdictWord(verdict) {
+  const words = { pass: t("page.review.pass", "pass"), fail: t("page.review.fail", "fail"), note: t("page.review.note", "note") };
+  return words[verdict] ?? verdict;
 }
 
 /** Where several of the segments lie over each other: [{first, last, count}]. */

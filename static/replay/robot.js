@@ -1,6 +1,7 @@
 // The robot in 3D on the clock: poses come in parts of some hundred rows, when they are needed.
 
 import { get } from "../site/api.js";
+import { t } from "../site/sentences.js";
 import { Scene3D } from "../console/scene/scene3d.js";
 import { followBench } from "./bench.js";
 import { message } from "./data.js";
@@ -62,10 +63,10 @@ export class Robot {
 }
 
 /** Fill the pane in `root`, or put a sentence in its place; without an address that is `why`. */
-export async function robotPane({ root, clock, viewer, geometry: address, poses, bench = "", why = "the episode names no robot" }) {
+export async function robotPane({ root, clock, viewer, geometry: address, poses, bench = "", why = t("page.replay.no_robot", "the episode names no robot") }) {
   const note = root.querySelector("[data-scene-note]");
   if (!address) {
-    note.textContent = `No 3D scene: ${why}.`;
+    note.textContent = t("page.replay.no_scene", "No 3D scene: {why}.", { why });
     return;
   }
   try {
@@ -80,7 +81,7 @@ export async function robotPane({ root, clock, viewer, geometry: address, poses,
     if (bench) await followBench(scene, clock, bench);
     note.hidden = true;
   } catch (error) {
-    note.textContent = `No 3D scene: ${error.message}.`;
+    note.textContent = t("page.replay.no_scene", "No 3D scene: {why}.", { why: error.message });
     console.error(error);
   }
 }

@@ -1,6 +1,7 @@
 // The lane of the segments under the time axis: bands of their label's colour, those that overlap below each other.
 // On the empty lane a drag draws one; the ends of one's own are moved by a drag, or by arrow keys while they have the focus.
 
+import { t } from "../site/sentences.js";
 import { overlaps, stacked } from "./review_lanes.js";
 
 const SETTLED_MS = 700; // after the last arrow key an end is where it was meant to be
@@ -85,7 +86,7 @@ export class SegmentLane {
     this.#place(band, segment);
     const name = Object.assign(document.createElement("button"), { type: "button", className: "segment-name clip", textContent: segment.label });
     name.dataset.end = "name";
-    name.title = `${segment.label}, rows ${segment.first} to ${segment.last}, ${segment.annotator}`;
+    name.title = t("page.segments.title", "{label}, rows {first} to {last}, {who}", { label: segment.label, first: segment.first, last: segment.last, who: segment.annotator });
     name.addEventListener("click", () => this.#clock.seekRow(segment.first));
     band.append(name);
     const own = segment.annotator === this.#user && Boolean(this.#moved);
@@ -100,7 +101,8 @@ export class SegmentLane {
     handle.className = "segment-end";
     handle.tabIndex = 0;
     handle.setAttribute("role", "slider");
-    handle.setAttribute("aria-label", `${end === "first" ? "First" : "Last"} row of ${segment.label}`);
+    const { label } = segment;
+    handle.setAttribute("aria-label", end === "first" ? t("page.segments.first_row", "First row of {label}", { label }) : t("page.segments.last_row", "Last row of {label}", { label }));
     handle.dataset.end = end;
     this.#say(handle, segment, end);
     handle.addEventListener("pointerdown", (event) => this.#drag(event, handle, { segment: { ...segment }, end, band }));
@@ -112,7 +114,7 @@ export class SegmentLane {
   #say(handle, segment, end) {
     const row = segment[end];
     const [low, high] = end === "first" ? [0, segment.last] : [segment.first, this.#clock.rows - 1];
-    const said = { valuemin: low, valuemax: high, valuenow: row, valuetext: `row ${row}, ${(row / this.#clock.fps).toFixed(2)} s` };
+    const said = { valuemin: low, valuemax: high, valuenow: row, valuetext: t("page.segments.row_at", "row {row}, {seconds} s", { row, seconds: (row / this.#clock.fps).toFixed(2) }) };
     for (const [name, value] of Object.entries(said)) handle.setAttribute(`aria-${name}`, String(value));
   }
 

@@ -1,8 +1,9 @@
 // Annotations and verdicts that came along with an episode of a dataset: to be seen, not to be changed here.
 
 import { get } from "../site/api.js";
+import { t } from "../site/sentences.js";
 import { when } from "../site/times.js";
-import { list } from "./review_lanes.js";
+import { list, span, verdictWord } from "./review_lanes.js";
 import { SegmentLane } from "./segment_lane.js";
 
 /** Fetch what lies beside the episode and show it under the time axis and in a list. */
@@ -15,16 +16,16 @@ export async function travelled(clock, address) {
     new SegmentLane({ strip, clock }).show(segments.map((segment) => ({ ...segment, annotator: segment.by })));
     const said = segments.map(({ label, first, last, milestone, by }) => ({
       words: label,
-      detail: `${first} to ${last}${milestone ? `, then ${milestone}` : ""}, ${by}`,
+      detail: span({ first, last, milestone }, by),
       go: () => clock.seekRow(first),
     }));
-    const judged = [...reviews].reverse().map(({ verdict, note, by, at }) => ({ words: note ? `${verdict}: ${note}` : verdict, detail: `${by}, ${when(at)}`, mark: verdict }));
-    list(document.getElementById("segments-list"), said, "No segment is annotated.");
-    list(document.getElementById("history-list"), judged, "No review.");
-    count.textContent = `Segments ${segments.length || ""}`.trim();
-    document.getElementById("history-count").textContent = `Verdicts ${reviews.length || ""}`.trim();
+    const judged = [...reviews].reverse().map(({ verdict, note, by, at }) => ({ words: note ? `${verdictWord(verdict)}: ${note}` : verdictWord(verdict), detail: `${by}, ${when(at)}`, mark: verdict }));
+    list(document.getElementById("segments-list"), said, t("page.review.no_segments", "No segment is annotated."));
+    list(document.getElementById("history-list"), judged, t("page.review.no_reviews", "No review."));
+    count.textContent = segments.length ? t("page.review.segments_n", "Segments {n}", { n: segments.length }) : t("page.review.segments", "Segments");
+    document.getElementById("history-count").textContent = reviews.length ? t("page.review.verdicts_n", "Verdicts {n}", { n: reviews.length }) : t("page.review.verdicts", "Verdicts");
   } catch (error) {
-    count.textContent = "No segments";
+    count.textContent = t("page.review.segments_none", "No segments");
     count.title = error.message;
   }
 }

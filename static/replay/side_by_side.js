@@ -1,6 +1,7 @@
 // Several episodes on one clock: cameras of each in a column, curves of one joint over each other or below each.
 
 import { jointOptions } from "../console/manual/joint_names.js";
+import { t } from "../site/sentences.js";
 import { cameras } from "./cameras.js";
 import { Clock, Shifted } from "./clock.js";
 import { message } from "./data.js";
@@ -32,7 +33,7 @@ const episodes = config.episodes.map((episode, index) => {
   cameras(columns[index], episode.videos, own);
   const row = columns[index].querySelector("[data-row]");
   const say = () => {
-    const text = own.resting ? (own.row ? "is over" : "has not begun") : `row ${own.row} of ${own.rows}`;
+    const text = own.resting ? (own.row ? t("page.beside.over", "is over") : t("page.beside.not_begun", "has not begun")) : t("page.replay.row_of", "row {row} of {rows}", { row: own.row, rows: own.rows });
     if (row.textContent !== text) row.textContent = text;
   };
   for (const kind of ["tick", "seek"]) own.addEventListener(kind, say);
@@ -64,7 +65,7 @@ const SAMPLES = 400; // times at which episodes are held against each other
 
 async function curves() {
   const library = (await import(config.uplot).catch(() => null))?.default;
-  if (!library) throw new Error("uPlot is not installed: run make setup and start the lab again");
+  if (!library) throw new Error(t("page.beside.no_uplot", "uPlot is not installed: run make setup and start the lab again"));
   const read = await Promise.all(episodes.map(async (episode) => ({ ...episode, ...(await message(episode.curves)) })));
   const marks = read.flatMap(({ header, shift, number }) => header.marks.map((mark) => ({ ...mark, time: mark.time + shift, text: `${number}: ${mark.text || mark.kind}` })));
   timeline.fill({ held: [], marks });
@@ -133,7 +134,7 @@ class Plots {
 curves().then(
   () => (element("curves-note").hidden = true),
   (error) => {
-    element("curves-note").textContent = `No curves: ${error.message}.`;
+    element("curves-note").textContent = t("page.replay.no_curves", "No curves: {why}.", { why: error.message });
     console.error(error);
   },
 );

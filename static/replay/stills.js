@@ -1,5 +1,7 @@
 // Cameras whose pictures lie one by one in a column: the newest that has come is shown, and the next is asked for then.
 
+import { t } from "../site/sentences.js";
+
 export class Stills {
   #clock;
 
@@ -30,6 +32,6 @@ export class Stills {
 
   #failed(picture) {
     picture.coming = false;
-    picture.element.parentElement.querySelector("[data-fault]").textContent = `picture ${picture.row} cannot be shown`;
+    picture.element.parentElement.querySelector("[data-fault]").textContent = t("page.replay.no_picture", "picture {row} cannot be shown", { row: picture.row });
   }
 }

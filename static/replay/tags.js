@@ -1,6 +1,7 @@
 // The tags of an episode: each leads to the episodes that have it; one is typed in, one is taken off.
 
 import { post, RequestFailed } from "../site/api.js";
+import { t } from "../site/sentences.js";
 
 const place = document.querySelector("[data-tags]");
 
@@ -28,7 +29,7 @@ if (place?.dataset.tags) {
       link.textContent = words;
       link.href = `${place.dataset.list}?tag=${encodeURIComponent(words)}`;
       button.value = words;
-      button.setAttribute("aria-label", `Remove the tag ${words}`);
+      button.setAttribute("aria-label", t("page.tags.remove", "Remove the tag {words}", { words }));
       return item;
     });
     place.querySelector("ul").replaceChildren(...items);

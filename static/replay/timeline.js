@@ -1,5 +1,6 @@
 // The time axis of the transport, with held spans shaded, events, milestones and chunks marked, and the list of events.
 
+import { t } from "../site/sentences.js";
 import { Hover } from "./hover.js";
 
 function stamp(seconds) {
@@ -51,7 +52,7 @@ export class Timeline {
 
   #list(marks) {
     const list = document.getElementById("events");
-    if (!marks.length) list.append(Object.assign(document.createElement("li"), { className: "muted", textContent: "No events but the run itself." }));
+    if (!marks.length) list.append(Object.assign(document.createElement("li"), { className: "muted", textContent: t("page.replay.no_events", "No events but the run itself.") }));
     for (const mark of [...marks].sort((one, other) => one.time - other.time)) {
       const item = document.createElement("li");
       const button = document.createElement("button");
@@ -69,7 +70,7 @@ export class Timeline {
     const { row, rows, time } = this.#clock;
     this.#scrub.value = String(row);
     this.#scrub.setAttribute("aria-valuetext", `${time.toFixed(2)} s`);
-    document.getElementById("time").textContent = `${stamp(row / this.#clock.fps)} / ${stamp(this.#clock.duration)}  row ${row} of ${rows}`;
+    document.getElementById("time").textContent = `${stamp(row / this.#clock.fps)} / ${stamp(this.#clock.duration)}  ${t("page.replay.row_of", "row {row} of {rows}", { row, rows })}`;
     const now = this.#rows.findLastIndex((one) => one.time <= time + 1e-6);
     if (now === this.#now) return;
     this.#rows[this.#now]?.item.removeAttribute("aria-current");

@@ -1,5 +1,6 @@
 // Buttons and keys of the playback. Space plays here: this page is bound to no station.
 
+import { t } from "../site/sentences.js";
 import { link } from "./link.js";
 
 const SECOND_KEYS = { ArrowLeft: -1, ArrowRight: 1 };
@@ -14,7 +15,7 @@ export function transport(clock) {
   document.getElementById("forth").addEventListener("click", () => clock.step(1));
   speed.addEventListener("change", () => (clock.rate = Number(speed.value)));
   const say = () => {
-    label.textContent = clock.playing ? "Pause " : "Play ";
+    label.textContent = clock.playing ? t("page.player.pause", "Pause ") : t("page.player.play", "Play ");
     play.setAttribute("aria-pressed", String(clock.playing));
   };
   clock.addEventListener("play", say);
@@ -45,9 +46,9 @@ function rangeControls(clock) {
     band.hidden = !clock.narrowed;
     band.style.left = `${(100 * from) / clock.rows}%`;
     band.style.width = `${(100 * (to - from)) / clock.rows}%`;
-    band.title = `Rows ${from} to ${to - 1}`;
+    band.title = t("page.replay.range", "Rows {first} to {last}", { first: from, last: to - 1 });
     clear.setAttribute("aria-disabled", String(!clock.narrowed));
-    clear.title = clock.narrowed ? `Play all rows again, not only ${from} to ${to - 1}` : "All rows are played";
+    clear.title = clock.narrowed ? t("page.replay.play_all", "Play all rows again, not only {first} to {last}", { first: from, last: to - 1 }) : t("page.replay.all_played", "All rows are played");
     loop.setAttribute("aria-pressed", String(clock.loop));
   };
   clock.addEventListener("range", show);

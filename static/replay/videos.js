@@ -1,6 +1,8 @@
 // Any number of videos that follow the clock. Row k is shown from start + k / fps to start + (k + 1) / fps, where `start`
 // is that of the episode in a file that may hold many.
 
+import { t } from "../site/sentences.js";
+
 const NEAR_S = 0.02; // closer than a person sees
 const BEHIND_S = 0.06; // beyond it the clock waits for the video
 const FAR_S = 0.3; // beyond it a jump is quicker than catching up
@@ -33,7 +35,7 @@ export class Videos {
         return;
       }
       video.broken = true;
-      element.parentElement.querySelector("[data-fault]").textContent = "this video cannot be played";
+      element.parentElement.querySelector("[data-fault]").textContent = t("page.player.cannot_play", "this video cannot be played");
     };
     element.addEventListener("error", broken);
     element.addEventListener("loadedmetadata", () => this.#place(video));

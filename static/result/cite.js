@@ -1,5 +1,7 @@
 // Copies what stands beside its button, also where the browser keeps its clipboard to pages over HTTPS.
 
+import { t } from "../site/sentences.js";
+
 const SAID_MS = 2000;
 
 async function copy(area) {
@@ -20,7 +22,7 @@ for (const button of document.querySelectorAll("[data-copy]")) {
   const words = button.textContent;
   button.addEventListener("click", async () => {
     const done = await copy(button.closest("details").querySelector("textarea"));
-    button.textContent = done ? "Copied" : "Selected: copy it with the keyboard";
+    button.textContent = done ? t("page.cite.copied", "Copied") : t("page.cite.selected", "Selected: copy it with the keyboard");
     setTimeout(() => (button.textContent = words), SAID_MS);
   });
 }

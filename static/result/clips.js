@@ -1,5 +1,7 @@
 // Short clips of videos: only those in view are loaded, and play over and over; stills where no motion is wanted.
 
+import { t } from "../site/sentences.js";
+
 const NEAR = "200px"; // below the screen, so that a clip is there when it is scrolled to
 const END_S = 0.04;
 const LONGEST_MS = 8000; // that printing waits for a picture
@@ -78,7 +80,7 @@ export class Clips {
   #broken(video) {
     video.hidden = true;
     const fault = video.parentElement.querySelector("[data-fault]");
-    fault.textContent = "this video cannot be played";
+    fault.textContent = t("page.player.cannot_play", "this video cannot be played");
     fault.hidden = false;
   }
 }

@@ -2,6 +2,7 @@
 
 import { post } from "../site/api.js";
 import { drafts } from "../site/drafts.js";
+import { t } from "../site/sentences.js";
 
 const form = document.getElementById("draft");
 const said = document.getElementById("draft-saved");
@@ -52,11 +53,11 @@ function failed(words) {
   const again = document.createElement("button");
   again.type = "button";
   again.className = "button";
-  again.textContent = "Try again";
+  again.textContent = t("page.draft.again", "Try again");
   again.addEventListener("click", save);
   const why = document.createElement("span");
   why.className = "bad";
-  why.textContent = `Not saved: ${words}. `;
+  why.textContent = t("page.draft.not_saved", "Not saved: {words}. ", { words });
   said.replaceChildren(why, again);
 }
 
@@ -68,7 +69,7 @@ function reason(xhr) {
   try {
     return JSON.parse(xhr.responseText).error;
   } catch {
-    return `the server answered with HTTP ${xhr.status}`;
+    return t("page.site.http_status", "the server answered with HTTP {status}", { status: xhr.status });
   }
 }
 
@@ -89,7 +90,7 @@ document.body.addEventListener("htmx:afterRequest", ({ detail }) => {
       if (waiting) askToFreeze(document.getElementById(waiting));
     } else if (sessionStorage.getItem(BASE) !== null) sessionStorage.setItem(BASE, was());
     waiting = null;
-  } else failed(detail.xhr.status ? reason(detail.xhr) : "the server cannot be reached");
+  } else failed(detail.xhr.status ? reason(detail.xhr) : t("page.site.unreachable", "the server cannot be reached"));
 });
 document.body.addEventListener("htmx:beforeSwap", ({ detail }) => {
   if (detail.xhr.responseURL.includes("/login/")) {
@@ -129,7 +130,7 @@ async function preflight(button) {
     const asked = await post(ask, { checkpoint: button.dataset.preflightOf }, { timeout: 15000 });
     window.htmx.ajax("GET", `${result}${asked.id}/`, { target: place, swap: "innerHTML" });
   } catch (error) {
-    place.textContent = `Preflight: ${error.message}`;
+    place.textContent = t("page.draft.preflight", "Preflight: {why}", { why: error.message });
   } finally {
     button.disabled = false;
   }
@@ -140,7 +141,7 @@ function askToFreeze(dialog) {
   if (!dialog) return;
   const line = dialog.querySelector("[data-power]");
   const said = document.querySelector("#power [role=status]")?.textContent.trim();
-  if (line) line.textContent = said || "not known: see Design";
+  if (line) line.textContent = said || t("page.draft.power_unknown", "not known: see Design");
   dialog.showModal();
 }
 

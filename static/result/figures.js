@@ -1,5 +1,7 @@
 // Every figure can be kept: as SVG, as PNG drawn from it, and the numbers that it shows as CSV.
 
+import { t } from "../site/sentences.js";
+
 const LOOKS = ["stroke-width", "stroke-dasharray", "font-size", "font-weight", "letter-spacing"];
 const PAINTS = ["fill", "stroke"];
 const FONT = "Helvetica, Arial, sans-serif";
@@ -100,8 +102,8 @@ function offer() {
     const title = figure.querySelector("title").textContent;
     const line = Object.assign(document.createElement("div"), { className: "toolbar small muted figure-keep" });
     line.setAttribute("role", "group");
-    line.setAttribute("aria-label", `Download: ${title}`);
-    line.append("Download");
+    line.setAttribute("aria-label", t("page.figures.download_named", "Download: {title}", { title }));
+    line.append(t("page.figures.download", "Download"));
     for (const kind of Object.keys(KEPT)) {
       const button = Object.assign(document.createElement("button"), { type: "button", className: "link", textContent: kind });
       button.addEventListener("click", () => keep(figure, kind));

@@ -1,6 +1,7 @@
 // The failure gallery: arrow keys move between clips, a category's letter assigns it to the chosen one, Ctrl+Z undoes.
 
 import { post } from "../site/api.js";
+import { t } from "../site/sentences.js";
 import { Clips } from "./clips.js";
 
 const FIELDS = ["failure_phase", "failure"];
@@ -30,12 +31,12 @@ class Gallery {
 
   #play(playing) {
     this.#clips.playing = playing;
-    element("clips-play").textContent = playing ? "Pause the clips" : "Play the clips";
+    element("clips-play").textContent = playing ? t("page.gallery.pause", "Pause the clips") : t("page.gallery.play", "Play the clips");
   }
 
   async #print() {
     const playing = this.#clips.playing;
-    this.#tell("Bringing the pictures for print …");
+    this.#tell(t("page.gallery.printing", "Bringing the pictures for print …"));
     await this.#clips.stills();
     this.#tell("");
     window.print();
@@ -65,7 +66,7 @@ class Gallery {
 
   #show() {
     for (const choice of this.#choices) choice.setAttribute("aria-pressed", String(this.#chosen.dataset[choice.dataset.field] === choice.dataset.words));
-    for (const name of document.querySelectorAll("[data-chosen]")) name.textContent = `Trial ${this.#chosen.dataset.trial}`;
+    for (const name of document.querySelectorAll("[data-chosen]")) name.textContent = t("page.gallery.trial", "Trial {id}", { id: this.#chosen.dataset.trial });
   }
 
   /** The neighbour of the chosen card to that side; in the next line the one that is nearest. */
@@ -96,7 +97,7 @@ class Gallery {
     this.#next(async () => {
       const newest = this.#done.at(-1);
       if (!newest) {
-        this.#tell("Nothing is left to undo on this page.");
+        this.#tell(t("page.gallery.nothing_to_undo", "Nothing is left to undo on this page."));
         return;
       }
       newest.card.focus();
@@ -121,13 +122,13 @@ class Gallery {
       const changed = uuid !== card.dataset.score;
       card.dataset.score = uuid;
       for (const name of FIELDS) card.dataset[name] = scores[0][name];
-      const why = FIELDS.map((name) => scores[0][name]).filter(Boolean).join(": ") || "not specified";
+      const why = FIELDS.map((name) => scores[0][name]).filter(Boolean).join(": ") || t("page.gallery.not_specified", "not specified");
       card.querySelector("[data-why]").textContent = why;
       this.#show();
-      this.#tell(`Trial ${card.dataset.trial}: ${why}.`);
+      this.#tell(t("page.gallery.trial_said", "Trial {id}: {why}.", { id: card.dataset.trial, why }));
       return changed ? before : null;
     } catch (error) {
-      this.#tell(`Trial ${card.dataset.trial}: ${error.message}.`, true);
+      this.#tell(t("page.gallery.trial_said", "Trial {id}: {why}.", { id: card.dataset.trial, why: error.message }), true);
       return null;
     }
   }

@@ -3,6 +3,7 @@
 import { cameras } from "../replay/cameras.js";
 import { Clock, Shifted } from "../replay/clock.js";
 import { link } from "../replay/link.js";
+import { t } from "../site/sentences.js";
 
 const SECOND = { ArrowLeft: -1, ArrowRight: 1 };
 
@@ -46,11 +47,11 @@ class Player {
       play.focus();
     });
     const say = () => {
-      play.firstChild.textContent = clock.playing ? "Pause " : "Play ";
+      play.firstChild.textContent = clock.playing ? t("page.player.pause", "Pause ") : t("page.player.play", "Play ");
       whole.hidden = !clock.narrowed;
     };
     const show = () => {
-      const words = `${(clock.row / clock.fps).toFixed(2)} of ${clock.duration.toFixed(2)} s`;
+      const words = t("page.player.time", "{at} of {all} s", { at: (clock.row / clock.fps).toFixed(2), all: clock.duration.toFixed(2) });
       slider.value = String(clock.row);
       slider.setAttribute("aria-valuetext", words);
       this.#part("time").textContent = words;

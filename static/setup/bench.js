@@ -1,16 +1,19 @@
 // A position of a bench as drawings have it: from above in millimetres, the arms at the lower edge; markup and no page.
 
+import { t } from "../site/sentences.js";
+
 export const ROUND = 32; // corners of what stands for a circle
 const STEP = 10; // mm for an arrow key, 1 with Shift
 const TURN = 5; // degrees for Page Up and Page Down, 1 with Shift
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+export const THING = t("page.bench.thing", "thing on the bench"); // what readers of the page call a thing that can be moved
 const REACH = 2000; // mm in which things of a lab's own may lie, whatever the area is
 
 /** What lies on the bench of a position: [{key, name, kind, x, y, yaw, width, depth}], in millimetres and degrees. */
 export function things(bench, sizes) {
   const found = [];
-  if (bench?.plate) found.push({ key: "plate", name: "plate", kind: "plate", yaw: 0, ...at(bench.plate), ...square(2 * sizes.plate) });
-  if (bench?.block) found.push({ key: "block", name: "block", kind: "block", yaw: bench.block[2], ...at(bench.block), ...square(sizes.block) });
+  if (bench?.plate) found.push({ key: "plate", name: t("page.bench.plate", "plate"), kind: "plate", yaw: 0, ...at(bench.plate), ...square(2 * sizes.plate) });
+  if (bench?.block) found.push({ key: "block", name: t("page.bench.block", "block"), kind: "block", yaw: bench.block[2], ...at(bench.block), ...square(sizes.block) });
   for (const [name, place] of Object.entries(bench?.objects ?? {}).sort(([a], [b]) => a.localeCompare(b))) {
     found.push({ key: `object ${name}`, name, kind: "object", yaw: place[2], ...at(place), width: mm(place[3]), depth: mm(place[4]) });
   }
@@ -45,7 +48,9 @@ export function stepped(thing, { key, shiftKey, ctrlKey, altKey, metaKey }) {
 
 /** Where a thing lies, in words. */
 export function whereabouts({ name, kind, x, y, yaw }) {
-  return `${name}: x ${n(x)} mm, y ${n(y)} mm${kind === "plate" ? "" : `, turned by ${n(yaw)}°`}`;
+  const at = { name, x: n(x), y: n(y), yaw: n(yaw) };
+  if (kind === "plate") return t("page.bench.at", "{name}: x {x} mm, y {y} mm", at);
+  return t("page.bench.turned", "{name}: x {x} mm, y {y} mm, turned by {yaw}°", at);
 }
 
 /** The bench without one of its things. */
@@ -73,13 +78,13 @@ export function problems(bench, sizes) {
   const [left, right, near, far] = sizes.area.map(mm);
   const said = [];
   for (const { kind, name, x, y } of all) {
-    if (kind !== "object" && !(x >= left && x <= right && y >= near && y <= far)) said.push(`${name} is outside the area that a simulated bench can lay out`);
+    if (kind !== "object" && !(x >= left && x <= right && y >= near && y <= far)) said.push(t("page.bench.outside", "{name} is outside the area that a simulated bench can lay out", { name }));
   }
   all.forEach((one, index) => {
     for (const other of all.slice(index + 1)) {
       const least = one.kind !== "object" && other.kind !== "object" ? mm(sizes.apart) : radius(one) + radius(other);
       const apart = Math.hypot(one.x - other.x, one.y - other.y);
-      if (apart < least - 1e-6) said.push(`${one.name} and ${other.name} are ${apart.toFixed(0)} mm apart; at least ${least.toFixed(0)} mm are needed`);
+      if (apart < least - 1e-6) said.push(t("page.bench.apart", "{one} and {other} are {apart} mm apart; at least {least} mm are needed", { one: one.name, other: other.name, apart: apart.toFixed(0), least: least.toFixed(0) }));
     }
   });
   return said;
@@ -125,7 +130,7 @@ export function thumbnail(bench, sizes, view, title, picture = "") {
   const all = things(bench, sizes);
   const [x, y, width, height] = [view.x, view.y, view.width, view.height].map(n);
   const seen = `<image href="${escaped(picture)}" x="${x}" y="${y}" width="${width}" height="${height}" preserveAspectRatio="xMidYMid slice"/>`;
-  const words = `<text class="thing-name" x="${n(view.x + view.width / 2)}" y="${n(view.y + view.height / 2)}">in words</text>`;
+  const words = `<text class="thing-name" x="${n(view.x + view.width / 2)}" y="${n(view.y + view.height / 2)}">${escaped(t("page.bench.in_words", "in words"))}</text>`;
   const inside = all.length ? ground(sizes, view) + all.map((thing) => drawn(thing)).join("") : picture ? seen : words;
   const named = title ? `role="img" aria-label="${escaped(title)}"` : 'aria-hidden="true"';
   return `<svg class="bench-drawing" viewBox="${box(view)}" ${named}>${inside}</svg>`;

@@ -4,6 +4,7 @@ import { post, RequestFailed } from "../site/api.js";
 import { MilestoneList } from "./milestones.js";
 import { Overlay } from "./overlay.js";
 import { Positions } from "./positions.js";
+import { t } from "../site/sentences.js";
 
 const PREVIEW_MS = 600;
 const SAVE_MS = 30000; // an outcome that is not known is worse than a long wait
@@ -29,7 +30,7 @@ class Editor {
     this.positions = new Positions(this, { bench, kept, references, may: Boolean(this.#save), changed, overlay });
     this.milestones = new MilestoneList(this, changed);
     this.#fill();
-    if (draft) this.#tell("Your unsaved changes are restored.", "pressed");
+    if (draft) this.#tell(t("page.scene.restored", "Your unsaved changes are restored."), "pressed");
     document.getElementById("discard").addEventListener("click", () => this.#discard());
     this.#form.addEventListener("input", (event) => this.#typed(event.target));
     this.#save?.addEventListener("click", () => this.#sent());
@@ -80,7 +81,7 @@ class Editor {
   }
 
   #discard() {
-    if (!confirm("Discard everything that is not saved?")) return;
+    if (!confirm(t("page.scene.discard", "Discard everything that is not saved?"))) return;
     sessionStorage.removeItem(this.#key);
     location.reload();
   }
@@ -93,14 +94,14 @@ class Editor {
       const { html } = await post(this.#given.addresses.preview, { scene: this.scene, position: this.positions.index });
       place.innerHTML = html;
     } catch (error) {
-      place.textContent = `Not shown: ${error.message}`;
+      place.textContent = t("page.scene.not_shown", "Not shown: {why}", { why: error.message });
     }
   }
 
   async #sent() {
     if (this.#save.disabled) return;
     this.#save.disabled = true;
-    this.#tell("Saving …", "pressed");
+    this.#tell(t("page.scene.saving", "Saving …"), "pressed");
     this.#show([]);
     try {
       const { address, remarks, scene, seen, kept } = await post(location.pathname, { scene: this.scene, seen: this.seen }, { timeout: SAVE_MS });
@@ -114,7 +115,7 @@ class Editor {
       this.positions.kept = kept;
       this.#fill();
       this.#mark();
-      this.#tell(["Saved.", ...remarks].join(" "), "accepted");
+      this.#tell([t("page.scene.saved", "Saved."), ...remarks].join(" "), "accepted");
     } catch (error) {
       if (!(error instanceof RequestFailed)) throw error;
       this.#refused(error);
@@ -125,16 +126,16 @@ class Editor {
 
   #refused({ message, body }) {
     this.#show(body.faults ?? []);
-    this.#tell(body.faults ? "Not saved: see what is wrong. Nothing that you typed is lost." : `Not saved: ${message}`, "refused");
+    this.#tell(body.faults ? t("page.scene.not_saved_faults", "Not saved: see what is wrong. Nothing that you typed is lost.") : t("page.scene.not_saved", "Not saved: {message}", { message }), "refused");
     if (!body.seen) return;
     const over = document.createElement("button");
-    Object.assign(over, { type: "button", className: "button", textContent: "Overwrite with mine" });
+    Object.assign(over, { type: "button", className: "button", textContent: t("page.scene.overwrite", "Overwrite with mine") });
     over.addEventListener("click", () => {
       this.seen = body.seen;
       this.#sent();
     });
     const look = document.createElement("a");
-    Object.assign(look, { href: location.pathname, target: "_blank", rel: "noopener", textContent: "Show theirs" });
+    Object.assign(look, { href: location.pathname, target: "_blank", rel: "noopener", textContent: t("page.scene.theirs", "Show theirs") });
     this.#said.append(" ", look, " ", over);
   }
 

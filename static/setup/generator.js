@@ -2,6 +2,7 @@
 
 import { things } from "./bench.js";
 import { generated, nearest } from "./generate.js";
+import { t } from "../site/sentences.js";
 
 const MOST = 100; // positions at once
 
@@ -41,7 +42,7 @@ export class Generator {
     const choice = this.#form.elements.thing;
     const before = choice.value;
     const options = all.map(({ key, name }) => new Option(name, key));
-    if (method !== "grid" && all.length > 1) options.unshift(new Option("everything", "*"));
+    if (method !== "grid" && all.length > 1) options.unshift(new Option(t("page.generator.everything", "everything"), "*"));
     choice.replaceChildren(...options);
     if (options.some(({ value }) => value === before)) choice.value = before;
     document.getElementById("generate").disabled = !all.length;
@@ -62,15 +63,15 @@ export class Generator {
     const method = elements.method.value;
     const wanted = method === "grid" ? counts.columns * counts.rows : counts.n;
     if (!(Number.isInteger(wanted) && wanted >= 1 && wanted <= MOST && area[0] <= area[1] && area[2] <= area[3])) {
-      this.#say(`Not generated: allowed are 1 to ${MOST} positions, in an area given from low to high.`);
+      this.#say(t("page.generator.not_generated", "Not generated: allowed are 1 to {most} positions, in an area given from low to high.", { most: MOST }));
       return;
     }
     const { benches, left } = generated({ method, bench, sizes: this.#sizes, keys, area, ...counts });
     const apart = nearest(benches, this.#sizes);
-    const said = [`${benches.length} position${benches.length === 1 ? "" : "s"}, shown faintly`];
-    if (Number.isFinite(apart)) said.push(`the nearest two are ${apart.toFixed(0)} mm apart`);
-    if (left) said.push(`${left} of ${wanted} left out: too close to something, or out of reach`);
-    this.#show(benches, `${said.join("; ")}.`);
+    const said = [benches.length === 1 ? t("page.generator.one", "1 position, shown faintly") : t("page.generator.made", "{n} positions, shown faintly", { n: benches.length })];
+    if (Number.isFinite(apart)) said.push(t("page.generator.nearest", "the nearest two are {apart} mm apart", { apart: apart.toFixed(0) }));
+    if (left) said.push(t("page.generator.left", "{left} of {wanted} left out: too close to something, or out of reach", { left, wanted }));
+    this.#show(benches, said.join(t("page.common.semicolon", "; ")) + t("page.common.full_stop", "."));
   }
 
   #kept() {
@@ -86,7 +87,7 @@ export class Generator {
   #show(benches, words) {
     this.made = benches;
     document.getElementById("generated-actions").hidden = !benches.length;
-    document.getElementById("keep-generated").textContent = `Keep these ${benches.length}`;
+    document.getElementById("keep-generated").textContent = t("page.generator.keep", "Keep these {n}", { n: benches.length });
     this.#say(words);
     this.#draw();
   }

@@ -1,9 +1,12 @@
 // The milestones of a scene: a list in the order of their keys, dragged or moved by arrow keys.
 
 import { orderable } from "./order.js";
+import { t } from "../site/sentences.js";
 
 const FIELDS = ["text", "points", "required", "time_limit_s", "truth"];
 const KEYS = 9; // milestones that have a key at scoring
+
+const inAll = (n) => (n === 1 ? t("page.milestones.point", "1 point in all") : t("page.milestones.points", "{n} points in all", { n }));
 
 export class MilestoneList {
   #editor;
@@ -41,18 +44,18 @@ export class MilestoneList {
         if (field.type === "checkbox") field.checked = milestone[name];
         else field.value = milestone[name] ?? "";
       }
-      const words = `Milestone ${index + 1}`;
+      const words = t("page.milestones.milestone", "Milestone {n}", { n: index + 1 });
       const key = row.querySelector("kbd");
       key.textContent = index < KEYS ? index + 1 : "–";
-      key.title = index < KEYS ? `Key ${index + 1} ticks it at scoring` : "No key: the first nine have one";
+      key.title = index < KEYS ? t("page.milestones.key", "Key {n} ticks it at scoring", { n: index + 1 }) : t("page.milestones.no_key", "No key: the first nine have one");
       row.querySelector("[data-milestone=text]").setAttribute("aria-label", words);
-      row.querySelector("[data-handle]").setAttribute("aria-label", `Move milestone ${index + 1}: drag, or arrow keys`);
-      row.querySelector("[data-remove]")?.setAttribute("aria-label", `Remove milestone ${index + 1}`);
-      row.querySelector("summary").setAttribute("aria-label", `More of milestone ${index + 1}`);
+      row.querySelector("[data-handle]").setAttribute("aria-label", t("page.milestones.move", "Move milestone {n}: drag, or arrow keys", { n: index + 1 }));
+      row.querySelector("[data-remove]")?.setAttribute("aria-label", t("page.milestones.remove", "Remove milestone {n}", { n: index + 1 }));
+      row.querySelector("summary").setAttribute("aria-label", t("page.milestones.more", "More of milestone {n}", { n: index + 1 }));
     });
     document.getElementById("no-milestones").hidden = this.#all.length > 0;
     const points = this.#all.reduce((sum, { points: own }) => sum + (Number(own) || 0), 0);
-    document.getElementById("points").textContent = this.#all.length ? `${points} point${points === 1 ? "" : "s"} in all` : "";
+    document.getElementById("points").textContent = this.#all.length ? inAll(points) : "";
   }
 
   #typed(field) {
@@ -61,7 +64,7 @@ export class MilestoneList {
     if (field.type === "checkbox") milestone[name] = field.checked;
     else if (field.type === "number") milestone[name] = field.value === "" ? (name === "points" ? 0 : null) : Number(field.value);
     else milestone[name] = field.value;
-    if (name === "points") document.getElementById("points").textContent = `${this.#all.reduce((sum, { points }) => sum + points, 0)} points in all`;
+    if (name === "points") document.getElementById("points").textContent = t("page.milestones.points", "{n} points in all", { n: this.#all.reduce((sum, { points }) => sum + points, 0) });
     this.#changed();
   }
 
@@ -76,14 +79,15 @@ export class MilestoneList {
     const [{ text }] = this.#all.splice(index, 1);
     this.show();
     document.getElementById("add-milestone").focus();
-    this.#said.textContent = `Removed: ${text || "an empty milestone"}`;
+    this.#said.textContent = t("page.milestones.removed", "Removed: {text}", { text: text || t("page.milestones.empty", "an empty milestone") });
     this.#changed();
   }
 
   #moved(from, to) {
     this.#all.splice(to, 0, ...this.#all.splice(from, 1));
     this.show();
-    this.#said.textContent = `${this.#all[to].text || "It"} is milestone ${to + 1} of ${this.#all.length} now`;
+    const place = { text: this.#all[to].text, n: to + 1, all: this.#all.length };
+    this.#said.textContent = place.text ? t("page.milestones.moved", "{text} is milestone {n} of {all} now", place) : t("page.milestones.moved_empty", "It is milestone {n} of {all} now", place);
     this.#changed();
   }
 }

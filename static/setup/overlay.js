@@ -3,14 +3,15 @@
 // dragged there too. A picture of one's own stays in the browser.
 
 import { get } from "../site/api.js";
-import { escaped, moved, n, outline, stepped, things, whereabouts } from "./bench.js";
+import { escaped, moved, n, outline, stepped, THING, things, whereabouts } from "./bench.js";
 import { projection, seen } from "./plane.js";
+import { t } from "../site/sentences.js";
 
 const LIVE_MS = 700;
 const AGAIN_MS = 3000; // after a picture that did not come
 const SIDE = 1000; // units of the drawing along each side of the picture
 const FIRST = [[0.2, 0.85], [0.8, 0.85], [0.7, 0.25], [0.3, 0.25]]; // left and right near, right and left far: shares
-const NAMES = ["left near corner", "right near corner", "right far corner", "left far corner"];
+const NAMES = [t("page.overlay.left_near", "left near corner"), t("page.overlay.right_near", "right near corner"), t("page.overlay.right_far", "right far corner"), t("page.overlay.left_far", "left far corner")];
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
 export class Overlay {
@@ -64,8 +65,8 @@ export class Overlay {
   #offer(references) {
     this.#references = references;
     const before = this.#camera().value;
-    const live = this.#stations.flatMap(({ name, title, cameras }) => cameras.map((camera) => [`live ${name} ${camera}`, `${title}: ${camera}, live`]));
-    const kept = references.map(({ station, camera, picture }) => [`kept ${station} ${camera} ${picture}`, `${station}: ${camera}, reference`]);
+    const live = this.#stations.flatMap(({ name, title, cameras }) => cameras.map((camera) => [`live ${name} ${camera}`, t("page.overlay.live", "{title}: {camera}, live", { title, camera })]));
+    const kept = references.map(({ station, camera, picture }) => [`kept ${station} ${camera} ${picture}`, t("page.overlay.kept", "{station}: {camera}, reference", { station, camera })]);
     const own = this.#own ? [[`file own ${encodeURIComponent(this.#own.name)}`, this.#own.name]] : [];
     const options = [...own, ...kept, ...live].map(([value, text]) => new Option(text, value));
     this.#camera().replaceChildren(...options);
@@ -91,7 +92,7 @@ export class Overlay {
     if (!this.#root.open || !station) return;
     const kept = localStorage.getItem(this.#key_of(station, camera));
     this.#corners = kept ? JSON.parse(kept) : this.#default();
-    this.#part("picture").alt = `${kind === "live" ? "What" : "The reference of"} ${camera} of ${station}${kind === "live" ? " shows now" : ""}`;
+    this.#part("picture").alt = kind === "live" ? t("page.overlay.shows", "What {camera} of {station} shows now", { camera, station }) : t("page.overlay.reference", "The reference of {camera} of {station}", { camera, station });
     if (kind === "kept") this.#part("picture").src = picture;
     else if (kind === "file") this.#part("picture").src = this.#own.address;
     else this.#look(this.#address(station, camera));
@@ -116,13 +117,13 @@ export class Overlay {
     clearTimeout(this.#timer);
     this.#part("picture").hidden = true;
     if (this.#camera().value.startsWith("file ")) {
-      this.#told(`${this.#own.name} is no picture that this browser can show.`);
+      this.#told(t("page.overlay.no_picture_file", "{name} is no picture that this browser can show.", { name: this.#own.name }));
       return;
     }
     try {
       await get(this.#part("picture").getAttribute("src"));
     } catch (error) {
-      this.#told(`No picture: ${error.message}`);
+      this.#told(t("page.overlay.no_picture", "No picture: {why}", { why: error.message }));
     }
     this.#timer = setTimeout(() => this.#chosen(), AGAIN_MS);
   }
@@ -154,10 +155,10 @@ export class Overlay {
     const [left, right, near, far] = this.#sizes.area.map((side) => 1000 * side);
     const h = projection([[left, near], [right, near], [right, far], [left, far]], this.#corners);
     const shape = (points, kind, more = "") => `<polygon class="${kind}" ${more} points="${points.map((point) => seen(h, point).map((share) => n(SIDE * share)).join(" ")).join(", ")}"/>`;
-    const movable = (thing) => `data-over="${escaped(thing.key)}"${this.#changed ? ` tabindex="0" role="button" aria-roledescription="thing on the bench" aria-label="${escaped(whereabouts(thing))}"` : ""}`;
+    const movable = (thing) => `data-over="${escaped(thing.key)}"${this.#changed ? ` tabindex="0" role="button" aria-roledescription="${escaped(THING)}" aria-label="${escaped(whereabouts(thing))}"` : ""}`;
     const laid = h ? [shape([[left, near], [right, near], [right, far], [left, far]], "area"), ...things(this.#bench, this.#sizes).map((thing) => shape(outline(thing), `over over-${thing.kind}`, movable(thing)))] : [];
     const handles = this.#corners.map(
-      ([x, y], index) => `<circle class="corner" data-corner="${index}" cx="${n(SIDE * x)}" cy="${n(SIDE * y)}" r="14" tabindex="0" role="button" aria-label="${NAMES[index]} of the area"/>`,
+      ([x, y], index) => `<circle class="corner" data-corner="${index}" cx="${n(SIDE * x)}" cy="${n(SIDE * y)}" r="14" tabindex="0" role="button" aria-label="${escaped(t("page.overlay.corner", "{corner} of the area", { corner: NAMES[index] }))}"/>`,
     );
     svg.toggleAttribute("data-movable", Boolean(this.#changed && h));
     svg.innerHTML = `<g opacity="${this.#part("density").value}">${laid.join("")}</g>${handles.join("")}`;

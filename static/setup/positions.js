@@ -3,8 +3,9 @@
 import { escaped, placed, problems, things, thumbnail, windowOf, without } from "./bench.js";
 import { Generator } from "./generator.js";
 import { Stage } from "./stage.js";
+import { t } from "../site/sentences.js";
 
-const NUMBERS = [["x", "x mm"], ["y", "y mm"], ["yaw", "turn °"], ["width", "width mm"], ["depth", "depth mm"]];
+const NUMBERS = [["x", "x mm"], ["y", "y mm"], ["yaw", t("page.positions.turn", "turn °")], ["width", t("page.positions.width", "width mm")], ["depth", t("page.positions.depth", "depth mm")]];
 const OBJECT = [0, 0.3, 0, 0.08, 0.08]; // metres and degrees
 
 export class Positions {
@@ -66,7 +67,7 @@ export class Positions {
     this.#generator?.offer();
     const pictures = this.#references[this.#one?.id] ?? [];
     this.#part("references").innerHTML = pictures
-      .map(({ station, camera, picture, page }) => `<li class="small"><a href="${page}"><img src="${picture}" alt="" width="120" height="90">${escaped(`${camera} of ${station}`)}</a></li>`)
+      .map(({ station, camera, picture, page }) => `<li class="small"><a href="${page}"><img src="${picture}" alt="" width="120" height="90">${escaped(t("page.positions.camera_of", "{camera} of {station}", { camera, station }))}</a></li>`)
       .join("");
     this.#part("references-title").hidden = !pictures.length;
   }
@@ -92,7 +93,7 @@ export class Positions {
     const focused = list.contains(document.activeElement);
     list.innerHTML = this.#all
       .map(({ id, number, label, bench }, index) => {
-        const name = `Position ${number}${label ? ` · ${label}` : ""}`;
+        const name = `${t("page.positions.position", "Position {n}", { n: number })}${label ? ` · ${label}` : ""}`;
         return `<li><button type="button" class="position-pick" data-index="${index}"${index === this.index ? ' aria-current="true"' : ""}>${thumbnail(bench, this.#bench, view, "", this.#references[id]?.[0].picture)}<span class="clip">${escaped(name)}</span></button></li>`;
       })
       .join("");
@@ -110,9 +111,9 @@ export class Positions {
     const why = this.kept[one?.id];
     this.#part("position").hidden = !one;
     this.#part("position-kept").hidden = !why;
-    this.#part("position-kept").textContent = why ? `Position ${one.number} stays as it is, because of ${why}. Add a position: it begins like this one.` : "";
+    this.#part("position-kept").textContent = why ? t("page.positions.kept", "Position {n} stays as it is, because of {why}. Add a position: it begins like this one.", { n: one.number, why }) : "";
     if (!one) return;
-    this.#part("position-title").textContent = `Position ${one.number}`;
+    this.#part("position-title").textContent = t("page.positions.position", "Position {n}", { n: one.number });
     for (const name of ["label", "description"]) {
       const field = this.#part("position").querySelector(`[data-position=${name}]`);
       if (whole) field.value = one[name];
@@ -139,9 +140,9 @@ export class Positions {
   #row({ key, name, kind }) {
     const has = { plate: 2, block: 3, object: 5 }[kind];
     const fields = NUMBERS.slice(0, has).map(
-      ([field, words]) => `<label class="field small"><span class="label">${words}</span><input type="number" step="1" data-number="${field}" aria-label="${escaped(name)}: ${words}"></label>`,
+      ([field, words]) => `<label class="field small"><span class="label">${words}</span><input type="number" step="1" data-number="${field}" aria-label="${escaped(t("page.positions.number", "{name}: {words}", { name, words }))}"></label>`,
     );
-    const away = this.#may ? `<button type="button" class="button button-quiet" data-take-away aria-label="Take away ${escaped(name)}">Take away</button>` : "";
+    const away = this.#may ? `<button type="button" class="button button-quiet" data-take-away aria-label="${escaped(t("page.positions.take_away_one", "Take away {name}", { name }))}">${escaped(t("page.positions.take_away", "Take away"))}</button>` : "";
     return `<li class="thing-row" data-thing-row="${escaped(key)}"><span class="row spread line"><span class="strong thing-key thing-key-${kind}">${escaped(name)}</span>${away}</span><span class="thing-numbers">${fields.join("")}</span></li>`;
   }
 
@@ -184,7 +185,7 @@ export class Positions {
       return;
     }
     if (kind === "object" ? bench.objects?.[name] : bench[kind]) {
-      this.#tell(`${kind === "object" ? name : kind} is there already`);
+      this.#tell(t("page.positions.there", "{name} is there already", { name: kind === "object" ? name : kind }));
       return;
     }
     const more = kind === "object" ? { objects: { ...bench.objects, [name]: OBJECT } } : { [kind]: this.#bench.first[kind] };
@@ -204,7 +205,7 @@ export class Positions {
     this.#all.push({ ...structuredClone(like), id: null, label: "", number: 0 });
     this.#numbered();
     this.choose(this.#all.length - 1);
-    this.#tell(`Position ${this.#one.number} is added: move what should be elsewhere`);
+    this.#tell(t("page.positions.added", "Position {n} is added: move what should be elsewhere", { n: this.#one.number }));
     this.#changed();
   }
 
@@ -212,7 +213,7 @@ export class Positions {
     const [{ number }] = this.#all.splice(this.index, 1);
     this.#numbered();
     this.show();
-    this.#tell(`Position ${number} is removed`);
+    this.#tell(t("page.positions.removed", "Position {n} is removed", { n: number }));
     this.#changed();
   }
 
@@ -230,7 +231,7 @@ export class Positions {
     this.#all.push(...benches.map((bench) => ({ id: null, number: 0, label: "", description, bench })));
     this.#numbered();
     this.choose(first);
-    this.#tell(`${benches.length} position${benches.length === 1 ? " is" : "s are"} kept`);
+    this.#tell(benches.length === 1 ? t("page.positions.one_kept", "1 position is kept") : t("page.positions.many_kept", "{n} positions are kept", { n: benches.length }));
     this.#changed();
   }
 }

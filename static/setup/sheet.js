@@ -1,6 +1,7 @@
 // A sheet of paper on which the positions of a scene are drawn in true millimetres, to be laid on the bench.
 
 import { box, drawn, escaped, n, outline, things } from "./bench.js";
+import { t } from "../site/sentences.js";
 
 const PAPERS = { A4: [297, 210], A3: [420, 297], A2: [594, 420], A1: [841, 594], A0: [1189, 841] };
 const EDGE = 12; // mm that printers leave white
@@ -35,7 +36,7 @@ function draw() {
   const name = paper.value || smallest;
   const [width, height] = PAPERS[name];
   place.dataset.paper = name;
-  document.getElementById("fits").textContent = fits(PAPERS[name], needed) ? `Fits on ${name}.` : `Does not fit on ${name}: use ${smallest}.`;
+  document.getElementById("fits").textContent = fits(PAPERS[name], needed) ? t("page.sheet.fits", "Fits on {name}.", { name }) : t("page.sheet.too_big", "Does not fit on {name}: use {smallest}.", { name, smallest });
   place.innerHTML = sheet(rows, needed, width, height);
   return place;
 }
@@ -54,9 +55,9 @@ function sheet(rows, [left, right, near, far], width, height) {
   const laid = rows.flatMap((row) => things(row.bench, bench).map((thing) => drawn(thing) + tag(thing, row.number)));
   const head =
     `<text class="sheet-title" x="${n(view.x + EDGE)}" y="${n(top + 6)}">${escaped(title)}</text>` +
-    `<text class="ruled" x="${n(view.x + EDGE)}" y="${n(top + 13)}">Millimetres, from above; the arms are at the lower edge. Lay the crossings of x and y on those of the bench.</text>` +
-    `<path class="scale" d="M${n(view.x + EDGE)} ${n(top + 17)}v4h100v-4m-50 2v2"/><text class="ruled" x="${n(view.x + EDGE + 103)}" y="${n(top + 21)}">100 mm: measure it. If it is not, print at 100 %, without fitting to the page.</text>`;
-  return `<svg viewBox="${box(view)}" width="${width}mm" height="${height}mm" role="img" aria-label="Layout sheet of ${escaped(title)}">${lines.join("")}${laid.join("")}${head}</svg>`;
+    `<text class="ruled" x="${n(view.x + EDGE)}" y="${n(top + 13)}">${escaped(t("page.sheet.how", "Millimetres, from above; the arms are at the lower edge. Lay the crossings of x and y on those of the bench."))}</text>` +
+    `<path class="scale" d="M${n(view.x + EDGE)} ${n(top + 17)}v4h100v-4m-50 2v2"/><text class="ruled" x="${n(view.x + EDGE + 103)}" y="${n(top + 21)}">${escaped(t("page.sheet.scale", "100 mm: measure it. If it is not, print at 100 %, without fitting to the page."))}</text>`;
+  return `<svg viewBox="${box(view)}" width="${width}mm" height="${height}mm" role="img" aria-label="${escaped(t("page.sheet.of", "Layout sheet of {title}", { title }))}">${lines.join("")}${laid.join("")}${head}</svg>`;
 }
 
 function tag({ name, kind, x, y, yaw }, number) {

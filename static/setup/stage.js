@@ -1,6 +1,7 @@
 // The bench from above, on which things are moved and turned with mouse, finger and keys. Millimetres and degrees.
 
-import { box, drawn, ground, moved, n, stepped, things, turned, whereabouts, windowOf } from "./bench.js";
+import { box, drawn, ground, moved, n, stepped, THING, things, turned, whereabouts, windowOf } from "./bench.js";
+import { t } from "../site/sentences.js";
 
 const HANDLE = 26; // mm from a thing's far edge to the handle that turns it
 
@@ -39,7 +40,7 @@ export class Stage {
     const circles = sides.map(([x, y]) => `<circle class="reach" cx="${n(1000 * x)}" cy="${n(-1000 * y)}" r="${n(1000 * reach)}"/>`);
     const faint = this.#ghosts.flatMap((bench) => things(bench, this.#sizes).map((thing) => drawn(thing, { attributes: "data-ghost" })));
     const own = things(this.#bench, this.#sizes).map((thing) => this.#movable(thing));
-    const arms = `<text class="side" x="0" y="${n(this.#view.y + this.#view.height - 10)}">the arms are on this side</text>`;
+    const arms = `<text class="side" x="0" y="${n(this.#view.y + this.#view.height - 10)}">${attribute(t("page.stage.arms", "the arms are on this side"))}</text>`;
     this.#svg.setAttribute("viewBox", box(this.#view));
     this.#svg.innerHTML = ground(this.#sizes, this.#view) + circles.join("") + arms + faint.join("") + own.join("");
     if (focused) this.#svg.querySelector(`[data-thing="${CSS.escape(focused)}"]`)?.focus({ preventScroll: true });
@@ -52,7 +53,7 @@ export class Stage {
     if (this.#still) return drawn(thing, { attributes: `${named} role="img" aria-label="${attribute(label)}"`, words: name });
     const far = -depth / 2 - HANDLE;
     const handle = kind !== "plate" && key === this.#chosen ? `<path class="turn-line" d="M0 0V${n(far)}"/><circle class="turn" data-turn cy="${n(far)}" r="9"/>` : "";
-    const attributes = `${named} tabindex="0" role="button" aria-roledescription="thing on the bench" aria-label="${attribute(label)}"`;
+    const attributes = `${named} tabindex="0" role="button" aria-roledescription="${attribute(THING)}" aria-label="${attribute(label)}"`;
     return drawn(thing, { attributes, inside: handle, words: name });
   }
 

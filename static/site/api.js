@@ -1,6 +1,6 @@
 // Requests to our own server: the session's cookie, the CSRF token, and one sentence for whatever goes wrong.
 
-import { sentence } from "./sentences.js";
+import { sentence, t } from "./sentences.js";
 
 const TIMEOUT_MS = 8000;
 
@@ -23,8 +23,8 @@ function why(status, body) {
   const words = body.reason || body.error || body.detail || body.message;
   if (typeof words === "string" && words) return sentence({ ...body, text: words });
   if (Array.isArray(words)) return words.map((one) => one.msg || String(one)).join("; ");
-  if (status === 401) return "your session has ended: log in again";
-  return `the server answered with HTTP ${status}`;
+  if (status === 401) return t("page.api.session_ended", "your session has ended: log in again");
+  return t("page.api.http", "the server answered with HTTP {status}", { status });
 }
 
 async function bodyOf(response) {
@@ -52,11 +52,12 @@ export async function post(address, content, { timeout = TIMEOUT_MS, simple = fa
       signal: AbortSignal.timeout(timeout),
     });
   } catch (error) {
-    const what = error.name === "TimeoutError" ? `no answer within ${timeout / 1000} s` : "the server cannot be reached";
-    throw new RequestFailed(`${what}: outcome unknown`, { unknown: true });
+    const late = error.name === "TimeoutError";
+    const what = late ? t("page.api.late", "no answer within {seconds} s: outcome unknown", { seconds: timeout / 1000 }) : t("page.api.lost", "the server cannot be reached: outcome unknown");
+    throw new RequestFailed(what, { unknown: true });
   }
   if (response.type === "opaqueredirect") {
-    throw new RequestFailed("your session has ended: log in again", { status: 401 });
+    throw new RequestFailed(t("page.api.session_ended", "your session has ended: log in again"), { status: 401 });
   }
   const body = await bodyOf(response);
   if (!response.ok) {
@@ -72,7 +73,7 @@ export async function get(address) {
   try {
     response = await fetch(address, { credentials: "include", signal: AbortSignal.timeout(TIMEOUT_MS) });
   } catch {
-    throw new RequestFailed("the server cannot be reached");
+    throw new RequestFailed(t("page.api.unreachable", "the server cannot be reached"));
   }
   const body = await bodyOf(response);
   if (!response.ok) throw new RequestFailed(why(response.status, body), { status: response.status, body });

@@ -2,6 +2,7 @@
 
 import { get, RequestFailed } from "./api.js";
 import { meaning, open, press, refusal } from "./keys.js";
+import { t } from "./sentences.js";
 
 const WAIT_MS = 90; // between two letters of somebody who types
 const MOST = 8; // of a group
@@ -73,7 +74,7 @@ class Find {
 
   async #ask(words) {
     const turn = (this.#asked += 1);
-    this.#said.textContent = "Looking …";
+    this.#said.textContent = t("page.find.looking", "Looking …");
     try {
       const { groups } = await get(`${this.#dialog.dataset.address}?q=${encodeURIComponent(words)}`);
       if (turn === this.#asked && words === this.#now()) this.#draw(words, groups);
@@ -92,9 +93,9 @@ class Find {
     this.#shown = words;
     const commands = commandsFor(words);
     const all = groups.map(({ name, items, more }) => ({ name, more, options: items.map(link) }));
-    if (commands.length) all.push({ name: "On this page", more: commands.length > MOST, options: commands.slice(0, MOST).map(button) });
+    if (commands.length) all.push({ name: t("page.find.on_this_page", "On this page"), more: commands.length > MOST, options: commands.slice(0, MOST).map(button) });
     const found = all.reduce((count, { options }) => count + options.length, 0);
-    if (words) all.push({ name: "Replay", more: false, options: [link(this.#inReplay(words))] });
+    if (words) all.push({ name: t("page.find.replay", "Replay"), more: false, options: [link(this.#inReplay(words))] });
     this.#list.replaceChildren(...all.map(section));
     this.#options = all.flatMap(({ options }) => options);
     this.#options.forEach((option, index) => (option.id = `find-${index}`));
@@ -105,7 +106,7 @@ class Find {
 
   #inReplay(words) {
     const address = `${this.#dialog.dataset.replay}?words=${encodeURIComponent(words)}`;
-    return { title: `Episodes with “${words}”`, detail: "in task, scene, checkpoint, operator", address };
+    return { title: t("page.find.episodes_with", "Episodes with “{words}”", { words }), detail: t("page.find.in_replay", "in task, scene, checkpoint, operator"), address };
   }
 
   #choose(index) {
@@ -158,8 +159,8 @@ function commandsFor(query) {
 }
 
 function saidOf(words, count) {
-  if (!words) return "Type a number, a code, or the start of a name.";
-  return count ? `${count} found` : `Nothing found for “${words}”.`;
+  if (!words) return t("page.find.type", "Type a number, a code, or the start of a name.");
+  return count ? t("page.find.found", "{count} found", { count }) : t("page.find.nothing", "Nothing found for “{words}”.", { words });
 }
 
 function section({ name, more, options }, index) {
@@ -167,7 +168,7 @@ function section({ name, more, options }, index) {
   group.setAttribute("role", "group");
   const head = Object.assign(document.createElement("div"), { className: "small muted find-kind", id: `find-kind-${index}` });
   head.setAttribute("role", "presentation"); // a list of choices has nothing else in it
-  head.textContent = more ? `${name} · more match: type more` : name;
+  head.textContent = more ? t("page.find.more", "{name} · more match: type more", { name }) : name;
   group.setAttribute("aria-labelledby", head.id);
   group.append(head, ...options);
   return group;

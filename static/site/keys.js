@@ -1,11 +1,13 @@
 // Keys of every page: whatever has data-key can be pressed with it; `?` shows all of them, and why some cannot be now.
 
+import { t } from "./sentences.js";
+
 const TEXTS = 'input:not([type="checkbox"], [type="radio"], [type="range"], [type="number"]), textarea, [contenteditable="true"]';
 const STOPS = '[data-command="stop"], [data-command="halt"], [data-command="cancel"]';
 const SCROLLED = 'select, input[type="range"], input[type="radio"], #events'; // they go by arrows of their own
 const PRESSED = "button, summary, a[href]"; // by Enter and Space, where they have the focus
 const CAPS = { arrowleft: "←", arrowright: "→", arrowup: "↑", arrowdown: "↓", pageup: "PgUp", pagedown: "PgDn", shift: "⇧" };
-const ELSEWHERE = "not on the screen at the moment";
+const ELSEWHERE = t("page.keys.elsewhere", "not on the screen at the moment");
 
 function usable(element) {
   return element.checkVisibility();
@@ -39,8 +41,8 @@ export function meaning(element) {
 /** Why it cannot be pressed now, "" where it can. */
 export function refusal(element) {
   if (!usable(element)) return ELSEWHERE;
-  if (element.disabled) return element.title || "not now";
-  return element.getAttribute("aria-disabled") === "true" ? element.title || "not now" : "";
+  if (element.disabled) return element.title || t("page.keys.not_now", "not now");
+  return element.getAttribute("aria-disabled") === "true" ? element.title || t("page.keys.not_now", "not now") : "";
 }
 
 /** Of each key the one that it presses; where that is not on the screen all that it would press, each meaning once. */
@@ -138,6 +140,6 @@ export function keyboard(refused = () => {}) {
       return;
     }
     const hidden = meant(event, true);
-    if (hidden) refused(`${meaning(hidden)} (${label(hidden.dataset.key)}): ${ELSEWHERE}`);
+    if (hidden) refused(t("page.keys.refused", "{meaning} ({key}): {why}", { meaning: meaning(hidden), key: label(hidden.dataset.key), why: ELSEWHERE }));
   });
 }

@@ -1,6 +1,7 @@
 // Lists: the address says what one is narrowed to, without what is empty; and what is done to all that are ticked.
 
 import { post, RequestFailed } from "./api.js";
+import { t } from "./sentences.js";
 
 document.body.addEventListener("htmx:configRequest", ({ detail }) => {
   if (!detail.elt.matches("[data-list-filter]")) return;
@@ -9,7 +10,7 @@ document.body.addEventListener("htmx:configRequest", ({ detail }) => {
 
 const NONE = "00000000-0000-0000-0000-000000000000"; // stands for the uuid in an address
 
-const count = (n, thing) => `${n} ${thing}${n === 1 ? "" : "s"}`;
+const episodes = (n) => (n === 1 ? t("page.lists.one_episode", "1 episode") : t("page.lists.episodes", "{n} episodes", { n }));
 
 /** What can be done to several at once, one after the other, each by its own address: what is refused is named. */
 class Bulk {
@@ -59,7 +60,7 @@ class Bulk {
       all.indeterminate = this.#ticked.size > 0 && !all.checked;
     }
     this.#bar.hidden = !this.#ticked.size && !this.#busy && !this.#part("said").textContent;
-    this.#part("count").textContent = `${this.#ticked.size} chosen`;
+    this.#part("count").textContent = t("page.lists.chosen", "{n} chosen", { n: this.#ticked.size });
     for (const button of this.#bar.querySelectorAll("[data-bulk-address]")) button.disabled = this.#busy || !this.#ticked.size;
     this.#part("end").hidden = !this.#busy;
     this.#part("undo").hidden = this.#busy || !this.#undo.length;
@@ -75,7 +76,7 @@ class Bulk {
     const links = [...published].map(([address, indices]) => {
       const chosen = indices.sort((one, other) => one - other);
       const [name] = address.split("/").slice(-2);
-      const text = `New dataset from ${chosen.length} of ${decodeURIComponent(name)}`;
+      const text = t("page.lists.new_dataset", "New dataset from {n} of {name}", { n: chosen.length, name: decodeURIComponent(name) });
       return Object.assign(document.createElement("a"), { className: "button", href: `${address}?chosen=${chosen}#split`, textContent: text });
     });
     this.#part("datasets").replaceChildren(...links);
@@ -94,12 +95,12 @@ class Bulk {
     const words = button.textContent.trim();
     const content = this.#content(button);
     if (!content) {
-      this.#say("Type the tag first.");
+      this.#say(t("page.lists.type_tag", "Type the tag first."));
       this.#bar.querySelector("[name=tag]").focus();
       return;
     }
     const { bulkAsk, bulkTitle } = button.dataset;
-    if (bulkAsk && !(await this.#sure(bulkTitle.replace("N", count(chosen.length, "episode")), bulkAsk))) return;
+    if (bulkAsk && !(await this.#sure(bulkTitle.replace("N", episodes(chosen.length)), bulkAsk))) return;
     const work = chosen.map((value) => ({ value, content }));
     const answers = await this.#all(words, button.dataset.bulkAddress, work);
     this.#undo = answers
@@ -119,7 +120,7 @@ class Bulk {
 
   async #takeBack() {
     const work = this.#undo;
-    const done = await this.#all("Undo", this.#bar.querySelector("[data-bulk-tag]").dataset.bulkAddress, work);
+    const done = await this.#all(t("page.lists.undo", "Undo"), this.#bar.querySelector("[data-bulk-tag]").dataset.bulkAddress, work);
     const values = new Set(done.map(({ value }) => value));
     this.#undo = work.filter(({ value }) => !values.has(value));
     this.#show();
@@ -128,7 +129,7 @@ class Bulk {
   /** True if the person who is asked means it. */
   #sure(title, words) {
     const dialog = this.#part("sure");
-    dialog.querySelector("h2").textContent = `${title}?`;
+    dialog.querySelector("h2").textContent = t("page.lists.sure", "{title}?", { title });
     dialog.querySelector("form > p").textContent = words;
     dialog.querySelector("[value=yes]").textContent = title;
     dialog.returnValue = "";
@@ -146,7 +147,7 @@ class Bulk {
     const answers = [];
     for (const [index, { value, content }] of work.entries()) {
       if (this.#ended) break;
-      this.#say(`${words}: ${index + 1} of ${work.length} …`);
+      this.#say(t("page.lists.doing", "{words}: {n} of {all} …", { words, n: index + 1, all: work.length }));
       try {
         answers.push({ value, answer: await post(address.replace(NONE, value), content) });
       } catch (error) {
@@ -157,11 +158,11 @@ class Bulk {
     this.#busy = false;
     const left = work.length - answers.length - faults.length;
     const changes = answers.filter(({ answer: { added, removed } }) => added?.length || removed?.length).length;
-    const said = [`${words}: ${answers.length} of ${work.length} done`];
-    if (address.endsWith("/tags") && changes < answers.length) said.push(`${answers.length - changes} unchanged`);
-    if (left) said.push(`ended, ${left} left unchanged`);
-    if (faults.length) said.push(`${faults.length} refused: ${[...new Set(faults)].join("; ")}`);
-    this.#say(`${said.join(". ")}.`);
+    const said = [t("page.lists.done", "{words}: {n} of {all} done", { words, n: answers.length, all: work.length })];
+    if (address.endsWith("/tags") && changes < answers.length) said.push(t("page.lists.unchanged", "{n} unchanged", { n: answers.length - changes }));
+    if (left) said.push(t("page.lists.ended", "ended, {left} left unchanged", { left }));
+    if (faults.length) said.push(t("page.lists.refused", "{n} refused: {why}", { n: faults.length, why: [...new Set(faults)].join("; ") }));
+    this.#say(said.join(t("page.common.next_sentence", ". ")) + t("page.common.full_stop", "."));
     if (answers.length) window.htmx.ajax("GET", window.location.href, { target: "#list", select: "#list", swap: "outerHTML" });
     return answers;
   }

@@ -82,7 +82,7 @@ async function load(code) {
   const address = root.dataset.languages;
   if (!code || !address) return speak({});
   const kept = JSON.parse(localStorage.getItem(KEPT) ?? "{}");
-  if (kept.code === code) speak(kept.sentences);
+  if (kept.code === code && kept.sentences) speak(kept.sentences);
   try {
     const answer = await fetch(address.replace("_", code), { credentials: "same-origin" });
     if (!answer.ok) return;

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -128,6 +129,17 @@ def test_templates_say_the_words_of_a_language_with_their_values_escaped(german)
             Template(wrong)
 
 
+def test_words_of_lists_and_choices_have_ids_of_their_own(german):
+    words = {"label.to_be_scored": "zu bewerten", "test.languages.why": "es ist spät"}
+    spoken = replace(german, patterns=words, templates={"a.b": "{state} ({reason}) von {who}"})
+    request = SimpleNamespace(COOKIES={}, _eva_language=spoken)
+    trial = SimpleNamespace(get_status_display=lambda: "To be scored")
+    given = Context({"request": request, "trial": trial, "why": WHY, "name": "to be scored"})
+    source = '{% t "a.b" state=trial.get_status_display reason=why who=name %}x{% endt %}, {% label name %}'
+    assert Template(source).render(given) == "zu bewerten (es ist spät) von to be scored, zu bewerten"
+    assert languages.label("To be scored", None) == "To be scored"
+
+
 def test_every_language_that_ships_says_all():
     entries = {
         "sentences": sentences.once(
@@ -155,11 +167,25 @@ def test_files_that_are_no_language_are_not_offered(german, tmp_path, caplog):
         assert (languages.chosen(request) is not None) is (code == "de")
 
 
-def test_english_alone_is_shipped_and_no_choice_is_shown(client, ann):
+def test_without_a_language_no_choice_is_shown(client, ann, settings, tmp_path):
+    settings.LANGUAGES_DIR = tmp_path
     client.force_login(ann)
     assert languages.offered() == []
     assert b"data-language" not in client.get("/").content
     assert client.get("/languages/de.json").status_code == 404
+
+
+def test_pages_are_in_chinese_for_who_chose_it_and_the_catalogue_is_sent_once(client, ann):
+    client.force_login(ann)
+    assert '<html lang="en"' in client.get("/").content.decode()
+    client.cookies[languages.COOKIE] = "zh-Hans"
+    page = client.get("/").content.decode()
+    assert '<html lang="zh-Hans"' in page
+    assert languages.language("zh-Hans").templates["base.find"] in page
+    first = client.get("/languages/zh-Hans.json")
+    assert first.json()["sentences"]["label.trial"] == "试验"
+    again = client.get("/languages/zh-Hans.json", headers={"If-None-Match": first["ETag"]})
+    assert (again.status_code, again.content) == (304, b"")
 
 
 def test_who_has_chosen_is_refused_in_words(german, live, ann):

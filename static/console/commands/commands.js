@@ -8,9 +8,11 @@ import { Asking } from "./asking.js";
 import { refusal } from "./reasons.js";
 import { answered, STOPPING, Stops } from "./stops.js";
 import { verb } from "../live/words.js";
+import { t } from "../../site/sentences.js";
 
+const STATUS = { accepted: t("page.commands.accepted", "accepted"), done: t("page.commands.done", "done") };
 const AT_THE_DESK = ["score", "session"]; // what no robot is needed for
-const STOP_ADVICE = "Press it again; if the robot still moves, press E-STOP.";
+const STOP_ADVICE = t("page.commands.stop_advice", "Press it again; if the robot still moves, press E-STOP.");
 
 /** Gives commands, says what became of them, and shows which can be given now. */
 export class Commands {
@@ -49,10 +51,10 @@ export class Commands {
     const name = verb(kind);
     let told = 0; // when this press last said something
     const own = (words) => {
-      this.say(`${name}: ${words}`, "pressed");
+      this.say(t("page.common.why", "{name}: {why}", { name, why: words }), "pressed");
       told = this.#told;
     };
-    own("pressed …");
+    own(t("page.commands.pressed", "pressed …"));
     const command = { uuid: uuid(), kind, args, page: this.#store.page, epoch: this.#store.epoch };
     Object.assign(command, { boot: this.#store.snapshot?.boot ?? "", sequence: this.#store.snapshot?.sequence ?? 0 });
     if (trial) command.trial = Number(trial);
@@ -66,7 +68,7 @@ export class Commands {
       if (!answer) return null; // another press has ended it, and it was said
       // That it went well does not cover why a later press was refused.
       const later = this.#told !== told && ["refused", "unknown"].includes(document.getElementById("outcome").dataset.kind);
-      if (stops ? this.#newest.get(kind) === command.uuid : !later) this.say(`${name}: ${answer.status}`, "accepted");
+      if (stops ? this.#newest.get(kind) === command.uuid : !later) this.say(t("page.common.why", "{name}: {why}", { name, why: STATUS[answer.status] ?? answer.status }), "accepted");
       return answer;
     } catch (error) {
       this.fail(name, error, stops ? STOP_ADVICE : undefined);
@@ -82,7 +84,7 @@ export class Commands {
       const { fresh, lease, snapshot } = this.#store;
       return fresh && lease === "mine" && this.#store.epoch === epoch && snapshot.boot === boot && snapshot.sequence === sequence;
     };
-    this.#asking = new Asking({ holds, waits: (process) => own(`waiting for the process ${process}, trying again …`) });
+    this.#asking = new Asking({ holds, waits: (process) => own(t("page.commands.waiting", "waiting for the process {process}, trying again …", { process })) });
     // Under a uuid of its own each time: the station answers one that it knows as it did the first time.
     return this.#asking.answer(() => post(config.api.commands, { ...command, uuid: uuid() }));
   }
@@ -103,18 +105,18 @@ export class Commands {
     if (ack.uuid !== this.#unknown) return;
     const name = verb(ack.kind);
     try {
-      this.say(`${name}: ${answered(ack).status}, answered late`, "accepted");
+      this.say(t("page.commands.late", "{name}: {status}, answered late", { name, status: STATUS[answered(ack).status] ?? answered(ack).status }), "accepted");
     } catch (error) {
       this.fail(name, error, STOP_ADVICE);
     }
   }
 
   /** Say what went wrong with `name`, and what to do where nobody knows whether it was done. */
-  fail(name, error, advice = "Look at the state before you repeat it.") {
+  fail(name, error, advice = t("page.commands.look_first", "Look at the state before you repeat it.")) {
     if (!(error instanceof RequestFailed)) throw error;
-    if (error.unknown) this.say(`${name}: outcome unknown. ${error.message}. ${advice}`, "unknown");
-    else if (error.body.status === "failed") this.say(`${name} failed: ${error.message}`, "refused");
-    else this.say(`${name} refused: ${error.message}`, "refused");
+    if (error.unknown) this.say(t("page.commands.unknown", "{name}: outcome unknown. {why}. {advice}", { name, why: error.message, advice }), "unknown");
+    else if (error.body.status === "failed") this.say(t("page.commands.failed", "{name} failed: {why}", { name, why: error.message }), "refused");
+    else this.say(t("page.commands.refused", "{name} refused: {why}", { name, why: error.message }), "refused");
   }
 
   /** The one line in which answers stand. */
@@ -129,8 +131,8 @@ export class Commands {
   /** Why a score cannot be saved, or a session changed, now: it needs no robot, but it is for who commands to do. */
   #deskReason() {
     const { role, fresh, lease } = this.#store;
-    if (role === "viewer") return "a viewer watches; an administrator can make you an operator";
-    return fresh && lease === "other" ? "someone else commands the station; ask for it" : "";
+    if (role === "viewer") return t("page.reasons.viewer", "a viewer watches; an administrator can make you an operator");
+    return fresh && lease === "other" ? t("page.reasons.other", "someone else commands the station; ask for it") : "";
   }
 
   /** Why `kind` cannot be given now, "" where it can. */
@@ -151,7 +153,7 @@ export class Commands {
 
   #gateOne(button) {
     const kind = button.dataset.command ?? button.dataset.gate;
-    const own = "settling" in button.dataset ? "it has just come up: look, then press again" : (button.dataset.blocked ?? "");
+    const own = "settling" in button.dataset ? t("page.commands.just_come", "it has just come up: look, then press again") : (button.dataset.blocked ?? "");
     setReason(button, own || (AT_THE_DESK.includes(kind) ? this.#deskReason() : this.reason(kind)));
     if (button.dataset.onlyWhile) button.hidden = !this.#store.snapshot?.state_is[button.dataset.onlyWhile];
   }
@@ -161,11 +163,11 @@ export class Commands {
     if (!button) return;
     const { command: kind, trial, checkpoint, replay } = button.dataset;
     if (button.getAttribute("aria-disabled") === "true") {
-      this.say(`${verb(kind)}: ${button.title}`, "refused");
+      this.say(t("page.common.why", "{name}: {why}", { name: verb(kind), why: button.title }), "refused");
       return;
     }
     if (this.#pending.has(kind) && !STOPPING.includes(kind)) {
-      this.say(`${verb(kind)}: pressed already, and not answered yet`, "pressed");
+      this.say(t("page.commands.pressed_already", "{name}: pressed already, and not answered yet", { name: verb(kind) }), "pressed");
       return;
     }
     this.#pending.add(kind);

@@ -8,17 +8,19 @@ import { post } from "../../site/api.js";
 import { uuid } from "../../site/identity.js";
 import { config } from "../live/config.js";
 import { EStopState } from "./estop_state.js";
+import { t } from "../../site/sentences.js";
 
 const ACK_MS = 500;
 const ASK_MS = 5000;
 const CONTROLS = 'input, textarea, select, button, summary, [contenteditable="true"]'; // what was clicked gives the focus back: keys.js
 const AT_REST = ["idle", "ready"];
+const UNACKNOWLEDGED = t("page.estop.unacknowledged", "the software stop was not acknowledged"); // said beforehand: nothing that is pressed waits for words
 const OPEN = "dialog[open], details[open]:has(> .float)";
 const WORDS = {
-  pressed: { kind: "pressed", text: "E-stop pressed …" },
-  failed: { kind: "failed", text: "USE THE HARDWARE STOP" },
-  held: { kind: "stopped", text: "E-stop acknowledged: the robot is held." },
-  latched: { kind: "stopped", text: "E-stop is latched." },
+  pressed: { kind: "pressed", text: t("page.estop.pressed", "E-stop pressed …") },
+  failed: { kind: "failed", text: t("page.estop.failed", "USE THE HARDWARE STOP") },
+  held: { kind: "stopped", text: t("page.estop.held", "E-stop acknowledged: the robot is held.") },
+  latched: { kind: "stopped", text: t("page.estop.latched", "E-stop is latched.") },
 };
 
 const now = () => performance.now() / 1000;
@@ -69,7 +71,7 @@ export class EStop {
     const press = { ways: 0, left: new Set([config.api.estop]), why: `${why} on the page`, reason: "" };
     this.#presses.set(id, press);
     this.#show();
-    press.timer = setTimeout(() => this.#failed(id, "the software stop was not acknowledged"), ACK_MS);
+    press.timer = setTimeout(() => this.#failed(id, UNACKNOWLEDGED), ACK_MS);
     const sent = this.#socket.send({ type: "estop", uuid: id, why: press.why });
     if (sent) press.ways += 1;
     if (this.#way.there) this.#post(id, press, this.#way.estop);
@@ -81,7 +83,7 @@ export class EStop {
     if (!this.#state.waits(id)) return; // answered already, or released since
     this.#heed();
     if (status !== "accepted" && status !== "done") {
-      this.#oneWayFailed(id, reason || `the e-stop was ${status}`);
+      this.#oneWayFailed(id, reason || t("page.estop.was", "the e-stop was {status}", { status }));
       return;
     }
     this.#state.answered(id, now());

@@ -4,22 +4,23 @@
 import { post } from "../../site/api.js";
 import { clockTime } from "../../site/times.js";
 import { config } from "../live/config.js";
+import { t } from "../../site/sentences.js";
 
 const NAMES = {
-  claim: "Take the station",
-  give_up: "Give up",
-  request: "Ask for the station",
-  withdraw: "Withdraw",
-  hand_over: "Hand over",
-  decline: "Decline",
-  move: "Take it here",
+  claim: t("page.lease.claim", "Take the station"),
+  give_up: t("page.lease.give_up", "Give up"),
+  request: t("page.lease.request", "Ask for the station"),
+  withdraw: t("page.lease.withdraw", "Withdraw"),
+  hand_over: t("page.lease.hand_over", "Hand over"),
+  decline: t("page.lease.decline", "Decline"),
+  move: t("page.lease.move", "Take it here"),
 };
 
 const GIVEN_AWAY = ["give_up", "hand_over"];
 const WHY = {
-  elsewhere: "you took the station on another page",
+  elsewhere: t("page.lease.why_elsewhere", "you took the station on another page"),
   other: "",
-  free: "the lease was ended by the station",
+  free: t("page.lease.why_free", "the lease was ended by the station"),
 };
 
 export class LeaseControls {
@@ -60,7 +61,7 @@ export class LeaseControls {
       this.#away = "";
       this.#heardAt = performance.now();
     }
-    if (this.#refused > 1) this.#commands.say(`Lease not renewed: ${reason}`, "refused"); // once: it was just handed over
+    if (this.#refused > 1) this.#commands.say(t("page.lease.not_renewed", "Lease not renewed: {reason}", { reason }), "refused"); // once: it was just handed over
   }
 
   #draw() {
@@ -102,7 +103,7 @@ export class LeaseControls {
     const { facts, state_is } = this.#store.snapshot;
     const left = Math.ceil(facts.lease_ttl_s - (performance.now() - this.#hiddenAt) / 1000);
     if (!this.#hiddenAt || !state_is.moving || left < -1) return;
-    document.title = left > 0 ? `COME BACK: holds in ${left} s` : "the robot is held";
+    document.title = left > 0 ? t("page.lease.come_back", "COME BACK: holds in {left} s", { left }) : t("page.lease.held", "the robot is held");
     if (left > 0) this.#tone();
   }
 
@@ -125,17 +126,17 @@ export class LeaseControls {
     const form = event.target.closest("[data-lease-take]");
     if (!form) return;
     event.preventDefault();
-    const done = await this.#act("take", "Take over", { reason: form.elements.reason.value });
+    const done = await this.#act("take", t("page.lease.take_over", "Take over"), { reason: form.elements.reason.value });
     if (done) form.dispatchEvent(new Event("eva:saved", { bubbles: true }));
   }
 
   async #act(action, name, content) {
-    this.#commands.say(`${name}: pressed …`, "pressed");
+    this.#commands.say(t("page.common.pressed", "{name}: pressed …", { name }), "pressed");
     const mine = this.#mine;
     if (GIVEN_AWAY.includes(action)) this.#mine = false; // what is given up is not lost
     try {
       await post(config.api.lease, { action, page: this.#store.page, ...content });
-      this.#commands.say(`${name}: done`, "accepted");
+      this.#commands.say(t("page.common.done", "{name}: done", { name }), "accepted");
       return true;
     } catch (error) {
       this.#mine = mine;
@@ -157,7 +158,7 @@ export class LeaseControls {
     if (!this.#hiddenAt) return;
     const away = (performance.now() - this.#hiddenAt) / 1000;
     const held = this.#yields || document.title !== this.#title;
-    if (held) this.#away = `This page was hidden for ${away.toFixed(0)} s: its lease has ended, and a run in progress is held.`;
+    if (held) this.#away = t("page.lease.hidden", "This page was hidden for {seconds} s: its lease has ended, and a run in progress is held.", { seconds: away.toFixed(0) });
     this.#hiddenAt = 0;
     this.#yields = false;
     document.title = this.#title;
@@ -176,10 +177,11 @@ export class LeaseControls {
   #lost(lease) {
     const silent = (performance.now() - this.#heardAt) / 1000;
     const expired = silent > 0.8 * this.#store.snapshot.facts.lease_ttl_s;
-    const why = expired ? `your page was not heard for ${silent.toFixed(0)} s` : WHY[lease];
-    const taken = lease === "other" ? `${this.#store.commander} commands` : "";
+    const why = expired ? t("page.lease.unheard", "your page was not heard for {seconds} s", { seconds: silent.toFixed(0) }) : WHY[lease];
+    const taken = lease === "other" ? t("page.lease.taken", "{who} commands", { who: this.#store.commander }) : "";
     const at = clockTime(Date.now());
-    return `You do not command any more, since ${at}: ${[why, taken].filter(Boolean).join("; ")}.`;
+    const because = [why, taken].filter(Boolean).join(t("page.common.semicolon", "; "));
+    return t("page.lease.lost", "You do not command any more, since {at}: {because}.", { at, because });
   }
 
   #leaving(event) {

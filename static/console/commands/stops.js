@@ -2,6 +2,7 @@
 // same uuid where the socket is closed or both say nothing. The station carries out a uuid once, whichever way it came.
 
 import { RequestFailed } from "../../site/api.js";
+import { t } from "../../site/sentences.js";
 
 const ACK_MS = 500;
 const CARRIED_OUT = ["accepted", "done"];
@@ -13,7 +14,7 @@ export const STOPPING = ["stop", "halt"];
 export function answered(ack) {
   if (CARRIED_OUT.includes(ack.status)) return ack;
   const unknown = ack.status === "unknown" || ack.status === "pressed";
-  throw new RequestFailed(ack.reason || `the station answered ${ack.status}`, { body: ack, unknown });
+  throw new RequestFailed(ack.reason || t("page.stops.answered", "the station answered {status}", { status: ack.status }), { body: ack, unknown });
 }
 
 export class Stops {

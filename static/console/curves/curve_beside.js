@@ -2,6 +2,7 @@
 
 import { jointOptions } from "../manual/joint_names.js";
 import { Curves } from "./curves.js";
+import { t } from "../../site/sentences.js";
 
 const MOST = 3; // beside the first: further ones are too small to read
 const QUIET = { show() {} }; // marks are told of the first alone
@@ -54,11 +55,11 @@ export class Beside {
     const head = document.createElement("div");
     head.className = "row line small";
     const select = document.createElement("select");
-    select.setAttribute("aria-label", "Joint of another curve");
+    select.setAttribute("aria-label", t("page.curves.joint_beside", "Joint of another curve"));
     select.append(...jointOptions(this.#names, this.#grippers));
     select.selectedIndex = joint;
     const off = Object.assign(document.createElement("button"), { type: "button", className: "button button-quiet", textContent: "×" });
-    off.setAttribute("aria-label", `Remove the curve of ${this.#names[joint]}`);
+    off.setAttribute("aria-label", t("page.curves.remove", "Remove the curve of {joint}", { joint: this.#names[joint] }));
     head.append(select, off);
     const plot = document.createElement("div");
     plot.className = "curves-plot";
@@ -71,7 +72,7 @@ export class Beside {
     this.#cells.push(cell);
     select.addEventListener("change", () => {
       curves.show(select.selectedIndex);
-      off.setAttribute("aria-label", `Remove the curve of ${this.#names[select.selectedIndex]}`);
+      off.setAttribute("aria-label", t("page.curves.remove", "Remove the curve of {joint}", { joint: this.#names[select.selectedIndex] }));
       this.#keep();
     });
     off.addEventListener("click", () => {

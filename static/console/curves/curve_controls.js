@@ -9,6 +9,7 @@ import { GHOSTS } from "../scene/scene_ghosts.js";
 import { MarkLegend } from "./mark_legend.js";
 import { Tags } from "../scene/tags.js";
 import { duration } from "../live/words.js";
+import { t } from "../../site/sentences.js";
 
 const KEY = `eva-joint-${config.station}`;
 
@@ -20,7 +21,7 @@ export async function curvePane(store) {
     library = (await import(config.uplot)).default;
   } catch {
     note.hidden = false;
-    note.textContent = "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.";
+    note.textContent = t("page.curves.no_library", "Curves are drawn by uPlot, which is not installed: run make setup and start the lab again.");
     return { add() {}, joints() {} };
   }
   const legend = new Legend(document.getElementById("curves-legend"), (name, shown) => every().forEach((one) => one.reveal(name, shown)));
@@ -38,8 +39,8 @@ export async function curvePane(store) {
   pauseButton(every);
   const tags = new Tags(document.querySelector(".curves-pane"), "curves-tags");
   store.on("second", () => {
-    tags.show("paused", curves.paused && `paused ${duration(curves.pausedFor)} ago; data keeps arriving`);
-    tags.show("simulated", curves.simulated && "under the bar: executed by the simulated robot", GHOSTS.simulated.colour);
+    tags.show("paused", curves.paused && t("page.curves.paused", "paused {time} ago; data keeps arriving", { time: duration(curves.pausedFor) }));
+    tags.show("simulated", curves.simulated && t("page.curves.simulated", "under the bar: executed by the simulated robot"), GHOSTS.simulated.colour);
   });
   return {
     add: (samples) => every().forEach((one) => one.add(samples)),
@@ -87,6 +88,6 @@ function pauseButton(every) {
     const paused = !every()[0].paused;
     for (const one of every()) one.pause(paused);
     button.setAttribute("aria-pressed", String(paused));
-    button.textContent = paused ? "Continue" : "Pause";
+    button.textContent = paused ? t("page.curves.continue", "Continue") : t("page.curves.pause", "Pause");
   });
 }

@@ -1,11 +1,13 @@
 // The curves of a joint on the live pages and in Replay: the same words, colours and order in both.
 
-/** `colour` is a custom property; `means` is what a legend says of it. */
+import { t } from "../../site/sentences.js";
+
+/** `title` is the name that is shown, `colour` a custom property; `means` is what a legend says of it. */
 export const KINDS = [
-  { name: "raw", colour: "--curve-4", width: 1.5, means: "What the newest chunk of the policy wants" },
-  { name: "smoothed", colour: "--curve-3", width: 1.5, dash: [4, 4], means: "What the strategy made of all chunks, before safety" },
-  { name: "state", colour: "--curve-1", width: 2, means: "Where the joint was measured" },
-  { name: "executed", colour: "--curve-2", width: 1.5, means: "What was sent to the robot, after safety" },
+  { name: "raw", title: t("page.curves.raw", "raw"), colour: "--curve-4", width: 1.5, means: t("page.curves.raw_means", "What the newest chunk of the policy wants") },
+  { name: "smoothed", title: t("page.curves.smoothed", "smoothed"), colour: "--curve-3", width: 1.5, dash: [4, 4], means: t("page.curves.smoothed_means", "What the strategy made of all chunks, before safety") },
+  { name: "state", title: t("page.curves.state", "state"), colour: "--curve-1", width: 2, means: t("page.curves.state_means", "Where the joint was measured") },
+  { name: "executed", title: t("page.curves.executed", "executed"), colour: "--curve-2", width: 1.5, means: t("page.curves.executed_means", "What was sent to the robot, after safety") },
 ];
 
 /** A signal of another joint in the same plot, on an axis of its own. */

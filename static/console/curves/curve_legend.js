@@ -1,6 +1,7 @@
 // The legend of the curves: each entry shows and hides its curve, and carries the value at the cursor.
 
 import { KINDS } from "./curve_kinds.js";
+import { t } from "../../site/sentences.js";
 
 const KEY = "eva-curves-hidden"; // the same choice on every page of this browser
 
@@ -50,17 +51,17 @@ export class Legend {
   }
 }
 
-function button({ name, colour, dash, means }) {
+function button({ name, title, colour, dash, means }) {
   const entry = document.createElement("button");
   entry.type = "button";
   entry.className = "legend";
   entry.dataset.curve = name;
-  entry.title = `${means}. Press to show or hide it.`;
+  entry.title = t("page.curves.press", "{means}. Press to show or hide it.", { means });
   const swatch = document.createElement("i");
   swatch.style.setProperty("--colour", `var(${colour})`);
   swatch.toggleAttribute("data-dashed", Boolean(dash));
   const word = document.createElement("span");
-  word.textContent = name;
+  word.textContent = title;
   const value = document.createElement("span");
   value.className = "legend-value";
   entry.append(swatch, word, value);

@@ -1,11 +1,13 @@
 // What is drawn with the curves: where a chunk takes over, where chunks overlap, what safety changed. It is found in
 // the samples as they came, before fewer points are drawn: no mark is lost, and each is within one sample of its step.
 
-/** The kinds of marks, in their order in the legend; `colour` is a custom property, `shape` that of the swatch. */
+import { t } from "../../site/sentences.js";
+
+/** The kinds of marks, in their order in the legend; `title` is the name that is shown, `colour` a custom property, `shape` that of the swatch. */
 export const MARKS = [
-  { name: "chunk", colour: "--mark-chunk", shape: "hairline", means: "A hairline where another chunk takes over; beside it the chunk at the cursor, 0 for the held target" },
-  { name: "overlap", colour: "--mark-overlap", shape: "patch", means: "A band where an action combines more than one chunk; beside it, how many at the cursor" },
-  { name: "safety", colour: "--warn", shape: "tick", means: "A tick where safety changed or refused the action" },
+  { name: "chunk", title: t("page.curves.chunk", "chunk"), colour: "--mark-chunk", shape: "hairline", means: t("page.curves.chunk_means", "A hairline where another chunk takes over; beside it the chunk at the cursor, 0 for the held target") },
+  { name: "overlap", title: t("page.curves.overlap", "overlap"), colour: "--mark-overlap", shape: "patch", means: t("page.curves.overlap_means", "A band where an action combines more than one chunk; beside it, how many at the cursor") },
+  { name: "safety", title: t("page.curves.safety", "safety"), colour: "--warn", shape: "tick", means: t("page.curves.safety_means", "A tick where safety changed or refused the action") },
 ];
 
 const SAMPLE_S = 0.1; // how long a sample stands for at most: some come late, and nothing lies between

@@ -1,6 +1,7 @@
 // What the marks among the curves mean, and what they are at the cursor.
 
 import { MARKS } from "./curve_marks.js";
+import { t } from "../../site/sentences.js";
 
 export class MarkLegend {
   #values = new Map();
@@ -17,7 +18,7 @@ export class MarkLegend {
       swatch.style.setProperty("--colour", `var(${mark.colour})`);
       const value = document.createElement("span");
       value.className = "legend-value";
-      entry.append(swatch, mark.name, value);
+      entry.append(swatch, mark.title, value);
       element.append(entry);
       this.#values.set(mark.name, value);
     }
@@ -26,8 +27,8 @@ export class MarkLegend {
   /** Of the sample at the cursor: {chunk, chunks, limited}; nothing where there is none. */
   show(sample) {
     this.#write("chunk", sample && sample.chunk >= 0 ? String(sample.chunk) : "–");
-    this.#write("overlap", sample && sample.chunks > 1 ? `of ${sample.chunks}` : "–");
-    this.#write("safety", sample ? (sample.limited ? "changed" : "no") : "–");
+    this.#write("overlap", sample && sample.chunks > 1 ? t("page.curves.of_chunks", "of {n}", { n: sample.chunks }) : "–");
+    this.#write("safety", sample ? (sample.limited ? t("page.curves.changed", "changed") : t("page.curves.unchanged", "no")) : "–");
   }
 
   #write(name, text) {

@@ -4,39 +4,41 @@ import { summary, trouble } from "../live/camera_words.js";
 import { Distribution } from "./distribution.js";
 import { reachWords } from "../scene/reach.js";
 import { age, figure } from "../live/words.js";
+import { t } from "../../site/sentences.js";
 
 const TELL_MS = 500; // figures that flicker cannot be read
-const NO_ANSWER = "no answer yet";
+const NO_ANSWER = t("page.figures.no_answer", "no answer yet");
+const CONNECTION = t("page.figures.connection", "Connection");
 
 const TEXTS = [
-  ["Control", ({ control: c }) => `${figure(c.rate, 0, "Hz")}, ${c.behaviour || "–"}, ${c.scheduling}`],
-  ["Late by", ({ control: c }) => lateness(c)],
-  ["Missed", ({ control: c }) => `${c.missed} of ${c.ticks} ticks`],
-  ["Policy", ({ policy: p, strategy }) => `${p.name || p.kind}, ${strategy}`],
-  ["Connection", ({ policy: p }) => (p.lost ? `lost; next try ${soon(p.retry_in_s)}` : ""), "warn"],
-  ["Predicted", ({ policy: p, strategy }) => (strategy === "rtc" ? predicted(p.rtc ?? {}) : "")],
+  [t("page.figures.control", "Control"), ({ control: c }) => `${figure(c.rate, 0, "Hz")}, ${c.behaviour || "–"}, ${c.scheduling}`],
+  [t("page.figures.late", "Late by"), ({ control: c }) => lateness(c)],
+  [t("page.figures.missed", "Missed"), ({ control: c }) => t("page.figures.missed_of", "{n} of {all} ticks", { n: c.missed, all: c.ticks })],
+  [t("page.figures.policy", "Policy"), ({ policy: p, strategy }) => `${p.name || p.kind}, ${strategy}`],
+  [CONNECTION, ({ policy: p }) => (p.lost ? t("page.figures.lost", "lost; next try {soon}", { soon: soon(p.retry_in_s) }) : ""), "warn"],
+  [t("page.figures.predicted", "Predicted"), ({ policy: p, strategy }) => (strategy === "rtc" ? predicted(p.rtc ?? {}) : "")],
   ["RTC", ({ policy: p, strategy }) => (strategy === "rtc" ? p.rtc?.warning : ""), "warn"],
-  ["Poses", ({ policy: p }) => (p.ik?.over ? "" : reachWords(p.ik))],
-  ["Out of reach", ({ policy: p }) => (p.ik?.over ? reachWords(p.ik) : ""), "warn"],
-  ["Joints", ({ link: l }) => `${age(l.ages.joints ?? Infinity)} old`],
-  ["Received", ({ link: l }) => received(l)],
-  ["Own cameras", ({ link: l, clock }) => (troubled(l) ? "" : summary(l.cameras, clock))],
-  ["Camera", ({ link: l, clock }) => (troubled(l) ? summary(l.cameras, clock) : ""), "warn"],
-  ["Commands", ({ link: l }) => Object.entries(l.unheard ?? {}).map(([topic, why]) => why || `no listener on ${topic}`).join("; "), "warn"],
-  ["Faults seen", ({ link: l }) => Object.entries(l.faults).filter(([, count]) => count).map(([name, count]) => `${name} ${count}`).join(", ") || "none"],
-  ["Task", (snapshot) => snapshot.task || "–"],
-  ["Last episode", ({ episode }) => episode?.uuid || "–"],
-  ["Boot", (snapshot) => snapshot.boot],
+  [t("page.figures.poses", "Poses"), ({ policy: p }) => (p.ik?.over ? "" : reachWords(p.ik))],
+  [t("page.figures.out_of_reach", "Out of reach"), ({ policy: p }) => (p.ik?.over ? reachWords(p.ik) : ""), "warn"],
+  [t("page.figures.joints", "Joints"), ({ link: l }) => t("page.common.old", "{age} old", { age: age(l.ages.joints ?? Infinity) })],
+  [t("page.figures.received", "Received"), ({ link: l }) => received(l)],
+  [t("page.figures.cameras", "Own cameras"), ({ link: l, clock }) => (troubled(l) ? "" : summary(l.cameras, clock))],
+  [t("page.figures.camera", "Camera"), ({ link: l, clock }) => (troubled(l) ? summary(l.cameras, clock) : ""), "warn"],
+  [t("page.figures.commands", "Commands"), ({ link: l }) => Object.entries(l.unheard ?? {}).map(([topic, why]) => why || t("page.figures.no_listener", "no listener on {topic}", { topic })).join("; "), "warn"],
+  [t("page.figures.faults", "Faults seen"), ({ link: l }) => Object.entries(l.faults).filter(([, count]) => count).map(([name, count]) => `${name} ${count}`).join(", ") || t("page.figures.none", "none")],
+  [t("page.figures.task", "Task"), (snapshot) => snapshot.task || "–"],
+  [t("page.figures.episode", "Last episode"), ({ episode }) => episode?.uuid || "–"],
+  [t("page.figures.boot", "Boot"), (snapshot) => snapshot.boot],
 ];
 
-/** After which text they stand, what they show, and how. */
+/** After which text they stand, their key, their name, what they show, and how. */
 const DISTRIBUTIONS = [
-  ["Connection", "Latency", ({ policy: p }) => p.latencies_ms, { unit: "ms", nothing: NO_ANSWER, narrow: 10 }],
-  ["Connection", "Delay", ({ policy: p }) => p.delays, { unit: "ticks", nothing: NO_ANSWER, whole: true }],
+  [CONNECTION, "latency", t("page.figures.latency", "Latency"), ({ policy: p }) => p.latencies_ms, { unit: "ms", nothing: NO_ANSWER, narrow: 10 }],
+  [CONNECTION, "delay", t("page.figures.delay", "Delay"), ({ policy: p }) => p.delays, { unit: t("page.figures.ticks", "ticks"), nothing: NO_ANSWER, whole: true }],
 ];
 
 function received({ age_ms: ages, scheduling }) {
-  return ages?.p99 === undefined ? "" : `p50 ${figure(ages.p50, 1, "ms")}, p99 ${figure(ages.p99, 1, "ms")} old, ${scheduling}`;
+  return ages?.p99 === undefined ? "" : t("page.figures.received_ages", "p50 {p50}, p99 {p99} old, {scheduling}", { p50: figure(ages.p50, 1, "ms"), p99: figure(ages.p99, 1, "ms"), scheduling });
 }
 
 function troubled(link) {
@@ -71,9 +73,9 @@ function text(list, name, words, weight = "") {
   };
 }
 
-function distribution(list, name, values, look) {
+function distribution(list, key, name, values, look) {
   const { value } = entry(list, name);
-  value.dataset.figure = name.toLowerCase();
+  value.dataset.figure = key;
   const shown = new Distribution();
   value.append(shown.element);
   return (snapshot) => shown.show(values(snapshot) ?? [], look);
@@ -88,16 +90,16 @@ function entry(list, name) {
 }
 
 function lateness({ ticks, lateness_p50_ms: p50, lateness_p99_ms: p99, lateness_p999_ms: p999, lateness_max_ms: most }) {
-  if (!ticks) return "no tick yet";
-  const parts = [["p50", p50], ["p99", p99], ["p99.9", p999], ["most", most]];
+  if (!ticks) return t("page.figures.no_tick", "no tick yet");
+  const parts = [["p50", p50], ["p99", p99], ["p99.9", p999], [t("page.figures.most", "most"), most]];
   return `${parts.map(([name, ms]) => `${name}\u00a0${Number.isFinite(ms) ? ms.toFixed(2) : "–"}`).join(", ")} ms`;
 }
 
 function predicted({ predicted_delay: delay, conditioned }) {
-  if (!Number.isFinite(delay)) return "no delay measured yet";
-  return `delay ${delay} ticks; the last request ${conditioned ? "carried what is committed" : "carried nothing"}`;
+  if (!Number.isFinite(delay)) return t("page.figures.no_delay", "no delay measured yet");
+  return conditioned ? t("page.figures.carried", "delay {delay} ticks; the last request carried what is committed", { delay }) : t("page.figures.carried_nothing", "delay {delay} ticks; the last request carried nothing", { delay });
 }
 
 function soon(seconds) {
-  return Number.isFinite(seconds) ? `in ${Math.max(0, seconds).toFixed(1)} s` : "at once";
+  return Number.isFinite(seconds) ? t("page.figures.in", "in {seconds} s", { seconds: Math.max(0, seconds).toFixed(1) }) : t("page.figures.at_once", "at once");
 }

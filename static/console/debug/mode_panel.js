@@ -1,6 +1,7 @@
 // The step "Run" of the Debug page: which mode, the one big button of the moment, what is going on.
 
 import { distance, labels, MODES, phase, primary, proposed, SEEN, shown } from "./modes.js";
+import { t } from "../../site/sentences.js";
 
 const SETTLE_MS = 600; // a button that took the place of another is not yet pressed by the hand that pressed that one
 const POLICY_MODES = ["sim", "step", "preview", "continuous"];
@@ -58,12 +59,12 @@ export class ModePanel {
   #drawChoice(mode, open, offered) {
     for (const radio of this.#form.elements.mode) {
       radio.checked = radio.value === mode;
-      refuse(radio, open ? "the run is open: stop it first" : offered && !offered.includes(radio.value) ? "this station has no such mode" : "");
+      refuse(radio, open ? t("page.modes.run_open", "the run is open: stop it first") : offered && !offered.includes(radio.value) ? t("page.modes.no_mode", "this station has no such mode") : "");
     }
     part("seen").hidden = mode !== "sim" || open; // while it runs the note says it
     for (const radio of this.#form.elements.sim_state) {
       if (open && mode === "sim") radio.checked = radio.value === this.#store.snapshot.sim_state;
-      refuse(radio, open ? "the run is open: stop it first" : "");
+      refuse(radio, open ? t("page.modes.run_open", "the run is open: stop it first") : "");
     }
   }
 
@@ -86,7 +87,7 @@ export class ModePanel {
   #drawNote(snapshot, mode, open) {
     const running = open && this.#store.fresh;
     let text = "";
-    if (running && mode === "sim") text = `Simulated: the real robot holds still. ${SEEN[snapshot.sim_state] ?? ""}`;
+    if (running && mode === "sim") text = t("page.modes.simulated", "Simulated: the real robot holds still. {seen}", { seen: SEEN[snapshot.sim_state] ?? "" });
     else if (running && mode === "preview") text = proposed(snapshot.proposal);
     write("note", text);
     part("note").hidden = !text;
@@ -99,7 +100,7 @@ export class ModePanel {
     const before = !open && snapshot?.state_is.ready && POLICY_MODES.includes(mode) && mode !== "sim" ? snapshot.first_action : null;
     const far = [proposal, before].find((one) => one?.far);
     part("far").hidden = !far;
-    if (far) write("far-text", proposal ? `This chunk begins ${distance(far)}.` : `The policy's first action is ${distance(far)}: approach it on a limited path first, or run from here.`);
+    if (far) write("far-text", proposal ? t("page.modes.chunk_far", "This chunk begins {distance}.", { distance: distance(far) }) : t("page.modes.action_far", "The policy's first action is {distance}: approach it on a limited path first, or run from here.", { distance: distance(far) }));
   }
 }
 

@@ -1,21 +1,22 @@
 // The modes of a run in words: what each does, what can be pressed in it next, what it is doing just now.
 
 import { words } from "../live/words.js";
+import { t } from "../../site/sentences.js";
 
 /** In the order of the keys that choose them. */
 export const MODES = {
-  sim: "Drives a simulated robot, in 3D only.",
-  step: "Each press moves the robot by one chunk.",
-  preview: "Each press shows a chunk; Commit moves.",
-  continuous: "The policy drives the robot until Stop or the run's end.",
-  manual: "You move the robot; no policy is asked.",
-  collect: "A person leads the robot; each run is an episode.",
+  sim: t("page.modes.sim", "Drives a simulated robot, in 3D only."),
+  step: t("page.modes.step", "Each press moves the robot by one chunk."),
+  preview: t("page.modes.preview", "Each press shows a chunk; Commit moves."),
+  continuous: t("page.modes.continuous", "The policy drives the robot until Stop or the run's end."),
+  manual: t("page.modes.manual", "You move the robot; no policy is asked."),
+  collect: t("page.modes.collect", "A person leads the robot; each run is an episode."),
 };
 
 /** What the policy sees in the mode sim, to be said while it runs. */
 export const SEEN = {
-  simulated: "The policy sees the simulated robot's joints and the live cameras.",
-  live: "The policy sees the real robot's joints, which do not follow it, and the live cameras.",
+  simulated: t("page.modes.seen_simulated", "The policy sees the simulated robot's joints and the live cameras."),
+  live: t("page.modes.seen_live", "The policy sees the real robot's joints, which do not follow it, and the live cameras."),
 };
 
 /** The command of the one big button at this moment, "" where none is wanted; `key` of its label in LABELS. */
@@ -30,18 +31,18 @@ export function primary({ state_is: is, mode, proposal }) {
 /** Names of buttons that mean something else in each mode. */
 export function labels(mode) {
   return {
-    step: mode === "preview" ? "Show next" : "Next chunk",
-    cancel: mode === "manual" ? "Hold here" : "Cancel",
+    step: mode === "preview" ? t("page.modes.show_next", "Show next") : t("page.modes.next_chunk", "Next chunk"),
+    cancel: mode === "manual" ? t("page.modes.hold_here", "Hold here") : t("page.modes.cancel", "Cancel"),
   };
 }
 
 const PHASES = {
-  asking: "asking the policy",
-  waiting: "waiting for you",
-  proposed: "a chunk is shown",
-  moving: "moving",
-  approaching: "going to the policy's first action",
-  starved: "nothing planned: slowing down",
+  asking: t("page.modes.asking", "asking the policy"),
+  waiting: t("page.modes.waiting", "waiting for you"),
+  proposed: t("page.modes.proposed", "a chunk is shown"),
+  moving: t("page.modes.moving", "moving"),
+  approaching: t("page.modes.approaching", "going to the policy's first action"),
+  starved: t("page.modes.starved", "nothing planned: slowing down"),
 };
 
 /** What the run is doing, in words; "" where nothing is open. */
@@ -49,21 +50,23 @@ export function phase({ state_is: is, phase: now, control, rate }) {
   if (!now || !is.at_work) return "";
   if (now !== "executing") return PHASES[now] ?? words(now);
   const left = control?.remaining ?? 0;
-  return left > 0 && rate ? `executing, ${(left / rate).toFixed(1)} s ahead` : "executing";
+  return left > 0 && rate ? t("page.modes.ahead", "executing, {seconds} s ahead", { seconds: (left / rate).toFixed(1) }) : t("page.modes.executing", "executing");
 }
 
 /** How far a chunk's first row, or the policy's first action, is from where the robot is commanded. */
 export function distance({ distance: far, joint }) {
   if (!Number.isFinite(far)) return "";
-  return `${far.toFixed(2)} rad away${joint ? ` (${joint})` : ""}`;
+  const at = { distance: far.toFixed(2), joint };
+  return joint ? t("page.modes.joint_away", "{distance} rad away ({joint})", at) : t("page.modes.away", "{distance} rad away", at);
 }
 
 /** The chunk that is shown, in a sentence. */
 export function proposed(proposal) {
   if (!proposal?.chunk) return "";
   const from = distance(proposal);
-  const age = Number.isFinite(proposal.age_s) ? `, shown for ${proposal.age_s.toFixed(0)} s` : "";
-  return `Chunk ${proposal.chunk}: ${proposal.rows} steps${from && `, begins ${from}`}${age}.`;
+  const begins = from && t("page.modes.begins", ", begins {from}", { from });
+  const age = Number.isFinite(proposal.age_s) ? t("page.modes.shown_for", ", shown for {seconds} s", { seconds: proposal.age_s.toFixed(0) }) : "";
+  return t("page.modes.chunk", "Chunk {chunk}: {rows} steps{begins}{age}.", { chunk: proposal.chunk, rows: proposal.rows, begins, age });
 }
 
 /** The mode to begin with: the one of the run that is open, what was chosen, what the station does by itself. */

@@ -1,6 +1,7 @@
 // Grippers with their state, and what the drives say of themselves.
 
 import { digitsOf, withUnit } from "../curves/units.js";
+import { t } from "../../site/sentences.js";
 
 const KEYS = [
   { open: ",", close: ".", lock: "-" },
@@ -9,15 +10,16 @@ const KEYS = [
 
 /** Where a gripper is, in words; `about` has its unit and its range. */
 export function gripperWords({ locked, at }, about = {}) {
-  const place = Number.isFinite(at) ? `at ${withUnit(at.toFixed(digitsOf(about)), about.unit)}` : "";
-  return locked ? `locked ${place}`.trim() : place || "not known";
+  const place = Number.isFinite(at) ? t("page.robot.at", "at {where}", { where: withUnit(at.toFixed(digitsOf(about)), about.unit) }) : "";
+  if (!locked) return place || t("page.robot.unknown", "not known");
+  return place ? t("page.robot.locked_at", "locked {place}", { place }) : t("page.robot.locked", "locked");
 }
 
 /** What the drives say: {text, weight}. */
 export function driveWords(drives) {
-  if (!drives || drives.enabled === undefined) return { text: "This robot does not report them.", weight: "" };
-  if (drives.faults?.length) return { text: `Fault: ${drives.faults.join(", ")}`, weight: "bad" };
-  return drives.enabled ? { text: "enabled, no fault", weight: "good" } : { text: "disabled: the robot does not follow", weight: "warn" };
+  if (!drives || drives.enabled === undefined) return { text: t("page.robot.no_report", "This robot does not report them."), weight: "" };
+  if (drives.faults?.length) return { text: t("page.robot.fault", "Fault: {faults}", { faults: drives.faults.join(", ") }), weight: "bad" };
+  return drives.enabled ? { text: t("page.robot.enabled", "enabled, no fault"), weight: "good" } : { text: t("page.robot.disabled", "disabled: the robot does not follow"), weight: "warn" };
 }
 
 /** Keeps the panel true; `about(facts, name)` is what is known of the gripper of the group `name`. */
@@ -42,7 +44,7 @@ function build(list, rows, names, commands) {
     rows.set(name, row);
   });
   if (names.length) list.replaceChildren(...rows.values());
-  else list.firstElementChild.textContent = "This robot has no gripper that opens and closes.";
+  else list.firstElementChild.textContent = t("page.robot.no_gripper", "This robot has no gripper that opens and closes.");
   commands.gate();
 }
 
@@ -51,7 +53,11 @@ function named(button, arm, keys) {
   button.dataset.args = JSON.stringify({ arm, action: grip });
   if (!keys) return;
   button.dataset.key = keys[grip];
-  button.dataset.keyText = `Gripper ${arm}: ${grip === "lock" ? "lock or unlock" : grip}`;
+  button.dataset.keyText = {
+    open: t("page.robot.open_key", "Gripper {arm}: open", { arm }),
+    close: t("page.robot.close_key", "Gripper {arm}: close", { arm }),
+    lock: t("page.robot.lock_key", "Gripper {arm}: lock or unlock", { arm }),
+  }[grip];
   const cap = document.createElement("kbd");
   cap.textContent = keys[grip].replace(/^shift\+(.)$/, (_, key) => `⇧${key.toUpperCase()}`);
   button.append(" ", cap);
@@ -67,7 +73,7 @@ function draw(row, gripper, about) {
   const args = JSON.parse(lock.dataset.args);
   if (args.action === action) return;
   lock.dataset.args = JSON.stringify({ ...args, action });
-  lock.firstChild.textContent = gripper.locked ? "Unlock" : "Lock";
+  lock.firstChild.textContent = gripper.locked ? t("page.robot.unlock", "Unlock") : t("page.robot.lock", "Lock");
 }
 
 function drawDrives({ text, weight }) {
@@ -77,5 +83,5 @@ function drawDrives({ text, weight }) {
   const bad = weight === "bad" || weight === "warn";
   warning.hidden = !bad;
   warning.className = `small note note-${weight}`;
-  warning.textContent = bad ? `Drives: ${text}` : "";
+  warning.textContent = bad ? t("page.robot.drives", "Drives: {text}", { text }) : "";
 }

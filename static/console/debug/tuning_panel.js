@@ -1,6 +1,7 @@
 // Prompt and strategy: what is in force, what is edited, applied with one press before or while it runs.
 
 import { changes, cost, PARAMETERS, read, text } from "./tuning.js";
+import { t } from "../../site/sentences.js";
 
 export class TuningPanel {
   #store;
@@ -91,7 +92,7 @@ export class TuningPanel {
     const args = {};
     if (Object.keys(strategy.changes).length) args.strategy = strategy.changes;
     if (task && task !== snapshot.task) args.task = task;
-    const words = [...Object.keys(strategy.changes).map((name) => PARAMETERS[name]?.label ?? "Strategy"), ...(args.task ? ["Prompt"] : [])];
+    const words = [...Object.keys(strategy.changes).map((name) => PARAMETERS[name]?.label ?? t("page.tuning.strategy", "Strategy")), ...(args.task ? [t("page.tuning.prompt", "Prompt")] : [])];
     return { args, error: strategy.error, words };
   }
 
@@ -101,13 +102,13 @@ export class TuningPanel {
     this.#offer(snapshot);
     this.#show();
     const { error, words } = this.#wanted();
-    button("tune").dataset.blocked = error || (words.length ? "" : "nothing is edited: what is shown is in force");
+    button("tune").dataset.blocked = error || (words.length ? "" : t("page.tuning.nothing_edited", "nothing is edited: what is shown is in force"));
     part("undo").setAttribute("aria-disabled", String(!words.length && !error));
     part("deployed").setAttribute("aria-disabled", String(!snapshot.facts.strategy));
-    part("deployed").title = snapshot.facts.strategy ? "" : "the station does not say what its deployment has";
-    write("checkpoint", `In force: ${snapshot.checkpoint?.name || "as deployed"}`);
-    write("task", `In force: ${snapshot.task ? `“${snapshot.task}”` : "no prompt"}`);
-    write("edited", error || (words.length ? `Edited, not yet in force: ${words.join(", ")}` : ""));
+    part("deployed").title = snapshot.facts.strategy ? "" : t("page.tuning.no_deployed", "the station does not say what its deployment has");
+    write("checkpoint", t("page.tuning.in_force", "In force: {what}", { what: snapshot.checkpoint?.name || t("page.tuning.as_deployed", "as deployed") }));
+    write("task", t("page.tuning.in_force", "In force: {what}", { what: snapshot.task ? `“${snapshot.task}”` : t("page.tuning.no_prompt", "no prompt") }));
+    write("edited", error || (words.length ? t("page.tuning.edited", "Edited, not yet in force: {what}", { what: words.join(t("page.common.comma", ", ")) }) : ""));
     part("edited").dataset.kind = error ? "error" : "";
     this.#drawParameters(snapshot);
     this.#commands.gate();
@@ -120,12 +121,12 @@ export class TuningPanel {
     if (known === this.#known) return;
     this.#known = known;
     this.#kind.replaceChildren(...kinds.map((kind) => new Option(kind)));
-    const none = new Option(tasks.length ? "Configured prompts" : "No configured prompt", "");
+    const none = new Option(tasks.length ? t("page.tuning.prompts", "Configured prompts") : t("page.tuning.no_prompts", "No configured prompt"), "");
     none.disabled = none.hidden = true;
     this.#choice.replaceChildren(none, ...tasks.map((one) => new Option(one)));
     this.#choice.disabled = !tasks.length;
     this.#choice.selectedIndex = 0;
-    this.#task.placeholder = task ? `as deployed` : "what the robot is to do";
+    this.#task.placeholder = task ? t("page.tuning.as_deployed", "as deployed") : t("page.tuning.what_to_do", "what the robot is to do");
   }
 
   /** What nobody edits shows what is in force. */
@@ -147,10 +148,10 @@ export class TuningPanel {
       row.hidden = !uses.includes(name);
       row.toggleAttribute("data-edited", this.#edited.has(name));
       const now = text(name, this.#inForce[name]) || PARAMETERS[name].none;
-      row.querySelector(".parameter-unit").textContent = this.#edited.has(name) ? `in force: ${now}` : (PARAMETERS[name].unit ?? "");
+      row.querySelector(".parameter-unit").textContent = this.#edited.has(name) ? t("page.tuning.now", "in force: {now}", { now }) : (PARAMETERS[name].unit ?? "");
     }
     const unused = Object.keys(PARAMETERS).filter((name) => !uses.includes(name));
-    write("unused", unused.length ? `Not used by ${this.#kind.value}: ${unused.map((name) => PARAMETERS[name].label).join(", ")}.` : "");
+    write("unused", unused.length ? t("page.tuning.unused", "Not used by {kind}: {names}.", { kind: this.#kind.value, names: unused.map((name) => PARAMETERS[name].label).join(t("page.common.comma", ", ")) }) : "");
     const typed = Object.fromEntries([...this.#fields].map(([name, field]) => [name, read(name, field.value).value]));
     write("cost", cost(this.#kind.value, typed, facts.rate));
   }

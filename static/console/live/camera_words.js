@@ -1,11 +1,12 @@
 // How a camera of the station's own is, in words; those of the transport say no more than their age.
 
 import { age } from "./words.js";
+import { t } from "../../site/sentences.js";
 
 const WORDS = {
-  opening: "no picture yet",
-  lost: "reconnecting",
-  ended: "the video is over",
+  opening: t("page.cameras.opening", "no picture yet"),
+  lost: t("page.cameras.lost", "reconnecting"),
+  ended: t("page.cameras.ended", "the video is over"),
 };
 
 /**
@@ -15,15 +16,15 @@ const WORDS = {
 export function trouble(told, clock) {
   if (!told || told.condition === "live") return null;
   const word = WORDS[told.condition] ?? told.condition;
-  const lasts = told.condition === "lost" ? `, lost ${age(Math.max(0, clock - told.since))} ago` : "";
-  return { word: word + lasts, reason: told.why };
+  const lost = told.condition === "lost";
+  return { word: lost ? t("page.cameras.lost_since", "{word}, lost {age} ago", { word, age: age(Math.max(0, clock - told.since)) }) : word, reason: told.why };
 }
 
 /** Where its pictures come from, how old the newest is and how often it was lost. */
 export function origin(told) {
-  const seen = told.age === null ? "no picture yet" : `newest picture ${age(told.age)} old`;
-  const lost = told.losses ? `, lost ${told.losses === 1 ? "once" : `${told.losses} times`}` : "";
-  return `${told.kind} from ${told.source}: ${seen}${lost}`;
+  const seen = told.age === null ? t("page.cameras.opening", "no picture yet") : t("page.cameras.newest", "newest picture {age} old", { age: age(told.age) });
+  const lost = told.losses ? told.losses === 1 ? t("page.cameras.lost_once", ", lost once") : t("page.cameras.lost_times", ", lost {n} times", { n: told.losses }) : "";
+  return t("page.cameras.origin", "{kind} from {source}: {seen}{lost}", { kind: told.kind, source: told.source, seen, lost });
 }
 
 /** All of them in a line: each with its trouble, or its age. */
@@ -31,7 +32,7 @@ export function summary(cameras, clock) {
   return Object.entries(cameras ?? {})
     .map(([name, told]) => {
       const wrong = trouble(told, clock);
-      return wrong ? `${name}: ${wrong.word} (${wrong.reason})` : `${name}: ${origin(told)}`;
+      return wrong ? t("page.cameras.wrong", "{name}: {word} ({why})", { name, word: wrong.word, why: wrong.reason }) : t("page.common.why", "{name}: {why}", { name, why: origin(told) });
     })
     .join("; ");
 }

@@ -2,6 +2,7 @@
 
 import { origin, trouble } from "./camera_words.js";
 import { age } from "./words.js";
+import { t } from "../../site/sentences.js";
 
 const STALE_S = 0.5; // as the runtime's own bound on pictures
 const SLOW = 0.8; // of the fastest camera's rate
@@ -70,7 +71,7 @@ class Camera {
     const seconds = (now - this.capturedAt) / 1000;
     const stale = !(seconds < STALE_S);
     this.figure.toggleAttribute("data-stale", stale);
-    const text = Number.isFinite(seconds) && stale ? `${age(seconds)} old` : "";
+    const text = Number.isFinite(seconds) && stale ? t("page.common.old", "{age} old", { age: age(seconds) }) : "";
     if (this.ageText.textContent !== text) this.ageText.textContent = text;
     if (stale) this.freshText.textContent = "";
   }
@@ -84,7 +85,7 @@ class Camera {
   /** How a camera of the station's own is, `told` by the runtime at its `clock` [s]; nothing of any other. */
   health(told, clock) {
     const wrong = trouble(told, clock);
-    const text = wrong ? `${wrong.word}: ${wrong.reason}` : "";
+    const text = wrong ? t("page.common.why", "{name}: {why}", { name: wrong.word, why: wrong.reason }) : "";
     if (this.troubleText.textContent !== text) this.troubleText.textContent = text;
     this.troubleText.hidden = !text;
     this.figure.title = told ? origin(told) : "";
@@ -94,12 +95,14 @@ class Camera {
     const shown = this.shownRate(now);
     const known = Number.isFinite(measured);
     const slow = known && measured < SLOW * fastest;
-    const text = known ? `${measured.toFixed(1)} Hz${slow ? " !" : ""}` : this.drawnAny ? "rate unknown" : "no picture yet";
+    const text = known ? `${measured.toFixed(1)} Hz${slow ? " !" : ""}` : this.drawnAny ? t("page.cameras.rate_unknown", "rate unknown") : t("page.cameras.opening", "no picture yet");
     const fresh = known && !this.figure.hasAttribute("data-stale") && Number.isFinite(captured);
-    this.freshText.textContent = fresh ? `${age(captured)} ago` : "";
+    this.freshText.textContent = fresh ? t("page.common.ago", "{age} ago", { age: age(captured) }) : "";
     if (this.rateText.textContent !== text) this.rateText.textContent = text;
     this.rateText.toggleAttribute("data-slow", slow);
-    this.rateText.title = `The camera delivers ${known ? measured.toFixed(1) : "no"} pictures per second; this page shows ${shown.toFixed(1)}.`;
+    this.rateText.title = known
+      ? t("page.cameras.rates", "The camera delivers {rate} pictures per second; this page shows {shown}.", { rate: measured.toFixed(1), shown: shown.toFixed(1) })
+      : t("page.cameras.no_rate", "The camera delivers no pictures per second; this page shows {shown}.", { shown: shown.toFixed(1) });
   }
 }
 

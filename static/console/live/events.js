@@ -2,6 +2,7 @@
 
 import { clockTime } from "../../site/times.js";
 import { kindWords, sentence, weight } from "./event_words.js";
+import { t } from "../../site/sentences.js";
 
 const KEPT = 400;
 
@@ -39,14 +40,14 @@ export class Events {
       this.#list.replaceChildren();
     }
     if (boot && boot !== this.#boot) {
-      if (this.#boot && this.#newest) this.#divide("The station was started anew");
+      if (this.#boot && this.#newest) this.#divide(t("page.events.anew", "The station was started anew"));
       this.#boot = boot;
       this.#newest = 0;
     }
     const fresh = events.filter((event) => event.number > this.#newest);
     if (!fresh.length) return;
     const expected = this.#newest + 1;
-    if (this.#newest && !covered && fresh[0].number > expected) this.#divide(`Events ${expected} to ${fresh[0].number - 1} are no longer kept`);
+    if (this.#newest && !covered && fresh[0].number > expected) this.#divide(t("page.events.gone", "Events {first} to {last} are no longer kept", { first: expected, last: fresh[0].number - 1 }));
     for (const event of fresh) this.#list.prepend(this.#row(event));
     this.#newest = fresh.at(-1).number;
     while (this.#list.children.length > KEPT) this.#list.lastElementChild.remove();
@@ -63,7 +64,7 @@ export class Events {
     row.dataset.words = `${kind} ${kindWords(kind)} ${event.text} ${text}`.toLowerCase();
     const time = document.createElement("time");
     time.textContent = clockTime(wall * 1000);
-    if (!this.#covered) time.title = `event ${number}`;
+    if (!this.#covered) time.title = t("page.events.number", "event {n}", { n: number });
     const name = document.createElement("span");
     name.className = "event-kind clip";
     name.textContent = kindWords(kind);
@@ -101,7 +102,7 @@ export class Events {
       if (!row.hidden) shown += 1;
     }
     this.#list.toggleAttribute("data-empty", shown === 0);
-    this.#list.dataset.note = wanted.length ? "No events match." : "Events at the station appear here.";
-    this.#count.textContent = wanted.length ? `${shown} shown` : "";
+    this.#list.dataset.note = wanted.length ? t("page.events.no_match", "No events match.") : t("page.events.none", "Events at the station appear here.");
+    this.#count.textContent = wanted.length ? t("page.events.shown", "{n} shown", { n: shown }) : "";
   }
 }

@@ -2,8 +2,9 @@
 
 import { badge } from "./badge.js";
 import { advice, age, duration, figure, words } from "./words.js";
+import { t } from "../../site/sentences.js";
 
-const TITLES = { mine: "This page commands", elsewhere: "You command on another page", free: "The station is free" };
+const TITLES = { mine: t("page.status.mine", "This page commands"), elsewhere: t("page.status.elsewhere", "You command on another page"), free: t("page.status.free", "The station is free") };
 const shown = (name) => document.querySelectorAll(`[data-show="${name}"]`);
 
 function write(name, text) {
@@ -38,10 +39,10 @@ function drawState(store) {
 /** Why nothing is known, in a word and in a sentence. */
 function trouble(store) {
   if (store.closed) return store.closed;
-  if (!store.open) return { word: "no connection", reason: "The web server does not answer; this page tries again by itself." };
-  if (!store.link.ok) return { word: "no station", reason: store.link.reason || "The station's runtime does not answer." };
-  if (!store.snapshot) return { word: "waiting", reason: "No state has come yet." };
-  return { word: `silent ${age(store.age)}`, reason: "The station has said nothing for a while; what is shown is old." };
+  if (!store.open) return { word: t("page.status.no_connection", "no connection"), reason: t("page.status.no_connection_why", "The web server does not answer; this page tries again by itself.") };
+  if (!store.link.ok) return { word: t("page.status.no_station", "no station"), reason: store.link.reason || t("page.status.no_station_why", "The station's runtime does not answer.") };
+  if (!store.snapshot) return { word: t("page.status.waiting", "waiting"), reason: t("page.status.waiting_why", "No state has come yet.") };
+  return { word: t("page.status.silent", "silent {age}", { age: age(store.age) }), reason: t("page.status.silent_why", "The station has said nothing for a while; what is shown is old.") };
 }
 
 function drawSituation(store) {
@@ -53,9 +54,9 @@ function drawSituation(store) {
   if (box.hidden) return;
   const { word, reason } = store.fresh ? { word: "", reason: store.snapshot.reason } : trouble(store);
   box.dataset.tone = store.fresh ? store.snapshot.state_is.tone : "neutral";
-  part(box, "title").textContent = asked ? asked.title : `Nothing is known: ${word}`;
+  part(box, "title").textContent = asked ? asked.title : t("page.status.nothing_known", "Nothing is known: {word}", { word });
   part(box, "reason").textContent = reason;
-  part(box, "advice").textContent = asked ? asked.advice : "The robot goes on as its runtime decides; the hardware stop is yours.";
+  part(box, "advice").textContent = asked ? asked.advice : t("page.status.hardware_stop", "The robot goes on as its runtime decides; the hardware stop is yours.");
   const busy = document.querySelectorAll("#steps [data-command]:not([hidden])");
   const elsewhere = new Set([...busy].map((button) => button.dataset.command));
   for (const button of part(box, "buttons").children) {
@@ -71,27 +72,28 @@ function part(box, name) {
 function drawFigures(store, snapshot) {
   const joints = snapshot.link.ages.joints;
   if (!store.fresh) {
-    write("transport", `last news ${age(store.age)} ago`);
+    write("transport", t("page.status.last_news", "last news {age} ago", { age: age(store.age) }));
     return;
   }
-  write("transport", `${snapshot.transport} ${joints !== null && joints < 1 ? "ok" : `silent ${age(joints ?? Infinity)}`}`);
+  const { transport } = snapshot;
+  write("transport", joints !== null && joints < 1 ? t("page.status.transport_ok", "{transport} ok", { transport }) : t("page.status.transport_silent", "{transport} silent {age}", { transport, age: age(joints ?? Infinity) }));
   drawPolicy(snapshot.policy);
-  const held = { mine: "you", elsewhere: "other page", free: "free", other: store.commander }[store.lease];
-  write("lease", `lease: ${held}`);
+  const held = { mine: t("page.status.held_you", "you"), elsewhere: t("page.status.held_elsewhere", "other page"), free: t("page.status.held_free", "free"), other: store.commander }[store.lease];
+  write("lease", t("page.status.lease", "lease: {held}", { held }));
   for (const element of shown("lease")) {
     element.dataset.lease = store.lease;
-    element.title = TITLES[store.lease] ?? `${held} commands this station`;
+    element.title = TITLES[store.lease] ?? t("page.status.commands", "{held} commands this station", { held });
   }
   drawStage(snapshot);
   const { uuid, rows, repeated, unclosed } = snapshot.recording;
   const waiting = Object.values(unclosed ?? {});
-  const waits = waiting.length ? `; ${waiting.length} not closed yet: ${waiting[0]}` : "";
-  write("recording", (uuid ? `recording ${rows} rows, ${repeated} with a repeated picture` : "not recording") + waits);
+  const waits = waiting.length ? t("page.status.unclosed", "; {n} not closed yet: {first}", { n: waiting.length, first: waiting[0] }) : "";
+  write("recording", (uuid ? t("page.status.recording", "recording {rows} rows, {repeated} with a repeated picture", { rows, repeated }) : t("page.status.not_recording", "not recording")) + waits);
 }
 
 /** How far the set-up is, or what an idle station waits for: the reason why a set-up failed among it. */
 function drawStage({ state_is: is, stage, reason }) {
-  const text = is.preparing ? `${words(stage)} …` : is.idle ? reason : "";
+  const text = is.preparing ? t("page.status.stage", "{stage} …", { stage: words(stage) }) : is.idle ? reason : "";
   write("stage", text);
   for (const element of shown("stage")) {
     element.hidden = !text;
@@ -103,18 +105,19 @@ function drawStage({ state_is: is, stage, reason }) {
 function drawPolicy(policy) {
   for (const element of shown("policy")) element.toggleAttribute("data-lost", Boolean(policy.lost));
   if (policy.lost) {
-    write("policy", "policy lost, trying again");
-    for (const element of shown("policy")) element.title = `The policy's server does not answer; next try in ${figure(policy.retry_in_s, 1, "s")}`;
+    write("policy", t("page.status.policy_lost", "policy lost, trying again"));
+    for (const element of shown("policy")) element.title = t("page.status.policy_retry", "The policy's server does not answer; next try in {time}", { time: figure(policy.retry_in_s, 1, "s") });
     return;
   }
   const { latency_p50_ms: p50, latency_p90_ms: p90, answers } = policy;
   if (!answers || p50 === null) {
-    write("policy", "policy: no answer yet");
+    write("policy", t("page.status.policy_silent", "policy: no answer yet"));
     return;
   }
-  const title = `Inference latency of the last ${answers} answers: median ${figure(p50, 0, "ms")}, 90 % within ${figure(p90, 0, "ms")}`;
+  const title = t("page.status.latency", "Inference latency of the last {n} answers: median {p50}, 90 % within {p90}", { n: answers, p50: figure(p50, 0, "ms"), p90: figure(p90, 0, "ms") });
   for (const element of shown("policy")) {
-    if (!element.querySelector(".latency")) element.innerHTML = '<span class="muted">policy</span><span class="latency"><i></i></span><span></span>';
+    if (!element.querySelector(".latency")) element.innerHTML = '<span class="muted"></span><span class="latency"><i></i></span><span></span>';
+    element.firstElementChild.textContent = t("page.status.policy", "policy");
     element.title = title;
     element.style.setProperty("--p50", Math.min(1, p50 / 400));
     element.style.setProperty("--p90", Math.min(1, p90 / 400));

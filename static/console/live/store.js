@@ -1,6 +1,6 @@
 // What this page knows of its station: the newest of everything, and who wants to hear of it.
 
-import { localized } from "../../site/sentences.js";
+import { localized, t } from "../../site/sentences.js";
 
 /** Names told: "snapshot", "joints", "poses", "camera", "link", "events", "open", "hello", "second"; answers of the web: "ack", "renewed", "aimed"; "changed", with the names of what has in the database. */
 export class Store {
@@ -15,7 +15,7 @@ export class Store {
     this.snapshotAt = -Infinity; // when, on this page's clock [ms]
     this.facts = {}; // of the robot
     this.joints = null; // {step, engaged, measured, commanded, simulated, ...} as they last came
-    this.link = { ok: false, reason: "connecting" }; // between web and runtime
+    this.link = { ok: false, reason: t("page.status.connecting", "connecting") }; // between web and runtime
     this.open = false; // the socket to the web
     this.closed = null; // why the web lets this page in no more, as words.js has it
   }

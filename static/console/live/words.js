@@ -1,19 +1,21 @@
 // Words for what the station says; the states, what they mean (`state_is`) and what is allowed in them are the runtime's.
 
+import { t } from "../../site/sentences.js";
+
 const ADVICE = {
   away: {
-    title: "No complete picture of the robot",
-    advice: "Start the execution node; check the cameras that are grey.",
+    title: t("page.words.away", "No complete picture of the robot"),
+    advice: t("page.words.away_advice", "Start the execution node; check the cameras that are grey."),
     buttons: [],
   },
   held: {
-    title: "The robot holds",
-    advice: "Look at the bench first.",
+    title: t("page.words.held", "The robot holds"),
+    advice: t("page.words.held_advice", "Look at the bench first."),
     buttons: ["resume", "stop"],
   },
   latched: {
-    title: "E-stop is latched",
-    advice: "After the release, set up again.",
+    title: t("page.words.latched", "E-stop is latched"),
+    advice: t("page.words.latched_advice", "After the release, set up again."),
     buttons: ["release"],
   },
 };
@@ -25,34 +27,34 @@ export function advice({ connected, held, latched }) {
 
 /** Why the server closes the socket of a page, by its code. */
 export const CLOSED = {
-  4401: { word: "logged out", reason: "You are logged out: reload this page and log in again." },
-  4404: { word: "no such station", reason: "This station is not in the lab any more: go back to the list of stations." },
+  4401: { word: t("page.words.logged_out", "logged out"), reason: t("page.words.logged_out_why", "You are logged out: reload this page and log in again.") },
+  4404: { word: t("page.words.no_station", "no such station"), reason: t("page.words.no_station_why", "This station is not in the lab any more: go back to the list of stations.") },
 };
 
 export const VERBS = {
-  setup: "Set up",
-  run: "Run",
-  stop: "Stop",
-  halt: "Pause",
-  resume: "Resume",
-  home: "Home",
-  release: "Release",
-  record_start: "Start recording",
-  record_stop: "End recording",
-  estop: "E-stop",
-  tune: "Apply",
-  step: "Next chunk",
-  commit: "Commit",
-  cancel: "Cancel",
-  move: "Send",
-  gripper: "Gripper",
-  approach: "Approach",
-  arm: "Arm",
-  disarm: "Disarm",
-  label: "Result",
-  discard: "Discard",
-  lease_claim: "Station taken",
-  lease_give_up: "Station given up",
+  setup: t("page.words.setup", "Set up"),
+  run: t("page.words.run", "Run"),
+  stop: t("page.words.stop", "Stop"),
+  halt: t("page.words.halt", "Pause"),
+  resume: t("page.words.resume", "Resume"),
+  home: t("page.words.home", "Home"),
+  release: t("page.words.release", "Release"),
+  record_start: t("page.words.record_start", "Start recording"),
+  record_stop: t("page.words.record_stop", "End recording"),
+  estop: t("page.words.estop", "E-stop"),
+  tune: t("page.words.tune", "Apply"),
+  step: t("page.words.step", "Next chunk"),
+  commit: t("page.words.commit", "Commit"),
+  cancel: t("page.words.cancel", "Cancel"),
+  move: t("page.words.move", "Send"),
+  gripper: t("page.words.gripper", "Gripper"),
+  approach: t("page.words.approach", "Approach"),
+  arm: t("page.words.arm", "Arm"),
+  disarm: t("page.words.disarm", "Disarm"),
+  label: t("page.words.label", "Result"),
+  discard: t("page.words.discard", "Discard"),
+  lease_claim: t("page.words.lease_claim", "Station taken"),
+  lease_give_up: t("page.words.lease_give_up", "Station given up"),
 };
 
 export function words(state) {
@@ -69,7 +71,7 @@ export function duration(seconds) {
 }
 
 export function age(seconds) {
-  if (!Number.isFinite(seconds)) return "never seen";
+  if (!Number.isFinite(seconds)) return t("page.words.never", "never seen");
   if (seconds < 1) return `${Math.round(seconds * 1000)} ms`;
   return seconds < 100 ? `${seconds.toFixed(1)} s` : `${Math.round(seconds / 60)} min`;
 }

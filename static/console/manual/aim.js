@@ -1,5 +1,7 @@
 // Where the robot would go: asked over the live socket, answered by the station, shown by whoever listens.
 
+import { t } from "../../site/sentences.js";
+
 const EVERY_MS = 80; // between two questions; the newest one always goes out
 const PATIENCE_MS = 4000; // longer than the lab's own
 
@@ -24,9 +26,9 @@ export class Aim {
   ask(args) {
     const id = (this.#number += 1);
     return new Promise((resolve) => {
-      const timer = setTimeout(() => this.answered({ id, ok: false, reason: "the station has not said where that is" }), PATIENCE_MS);
+      const timer = setTimeout(() => this.answered({ id, ok: false, reason: t("page.aim.silent", "the station has not said where that is") }), PATIENCE_MS);
       this.#waiting.set(id, { resolve, timer });
-      if (!this.#send({ type: "aim", id, args })) this.answered({ id, ok: false, reason: "no connection to the lab" });
+      if (!this.#send({ type: "aim", id, args })) this.answered({ id, ok: false, reason: t("page.aim.no_connection", "no connection to the lab") });
     });
   }
 

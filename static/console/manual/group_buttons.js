@@ -1,5 +1,7 @@
 // Buttons for the groups of a robot's joints, one of which is chosen.
 
+import { t } from "../../site/sentences.js";
+
 /** One for each of `groups`; the key that chooses the next one stands on it. */
 export function groupButtons(groups, chosen) {
   const next = (chosen + 1) % groups.length;
@@ -15,7 +17,7 @@ function groupButton(name, index, chosen, next) {
   text.textContent = name.replaceAll("_", " ");
   button.append(text);
   if (index !== next || next === chosen) return button;
-  Object.assign(button.dataset, { key: "shift+a", keyText: "Next group of joints" });
+  Object.assign(button.dataset, { key: "shift+a", keyText: t("page.manual.next_group", "Next group of joints") });
   const cap = document.createElement("kbd");
   cap.textContent = "⇧A";
   button.append(" ", cap);

@@ -1,5 +1,7 @@
 // Names of joints, "group.joint": in groups, and as short as still tells one from the other.
 
+import { t } from "../../site/sentences.js";
+
 const LONG = 18; // letters that a list has room for
 
 /** {group, joint} of a full name. */
@@ -26,7 +28,7 @@ export function labels(joints) {
 /** Joints of one group [{joint, index}] with a short `label` each; a gripper is called so. */
 export function labelled(joints, grippers) {
   const short = labels(joints.filter(({ index }) => !grippers.includes(index)).map(({ joint }) => joint));
-  return joints.map((one) => ({ ...one, label: grippers.includes(one.index) ? "gripper" : short.shift() }));
+  return joints.map((one) => ({ ...one, label: grippers.includes(one.index) ? t("page.manual.gripper", "gripper") : short.shift() }));
 }
 
 /** Options of value 0, 1, ... for full names, `grippers` among them; several groups stand in the names and as headings. */

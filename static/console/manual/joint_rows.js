@@ -2,6 +2,7 @@
 
 import { within } from "./targets.js";
 import { digitsOf, shortUnit, stepOf } from "../curves/units.js";
+import { t } from "../../site/sentences.js";
 
 export class JointRows {
   #list = document.getElementById("joints");
@@ -52,10 +53,10 @@ export class JointRows {
     label.htmlFor = slider.id;
     label.textContent = joint.label;
     const { unit } = joint;
-    row.title = `${joint.full}: ${joint.lower} to ${joint.upper} ${unit}`.trim();
+    row.title = t("page.manual.range", "{joint}: {lower} to {upper} {unit}", { joint: joint.full, lower: joint.lower, upper: joint.upper, unit }).trim();
     row.querySelector(".joint-unit").textContent = shortUnit(unit);
     slider.setAttribute("aria-label", joint.full);
-    number.setAttribute("aria-label", unit ? `${joint.full} in ${unit}, as a number` : `${joint.full} as a number`);
+    number.setAttribute("aria-label", unit ? t("page.manual.number_in", "{joint} in {unit}, as a number", { joint: joint.full, unit }) : t("page.manual.number", "{joint} as a number", { joint: joint.full }));
     slider.addEventListener("input", () => this.#set(joint, slider.valueAsNumber, number));
     slider.addEventListener("keydown", (event) => this.#arrow(event, joint, slider, number));
     number.addEventListener("input", () => this.#type(joint, number.valueAsNumber, slider));

@@ -4,6 +4,7 @@ import { config } from "../live/config.js";
 import { groupButtons } from "./group_buttons.js";
 import { JointRows } from "./joint_rows.js";
 import { arrived, groups, handAt, jog, start, verdict } from "./targets.js";
+import { t } from "../../site/sentences.js";
 
 export class ManualPanel {
   #store;
@@ -67,7 +68,7 @@ export class ManualPanel {
   }
 
   /** The target is where the robot is, and goes with it. */
-  reset(said = "The target is where the robot is.") {
+  reset(said = t("page.manual.at_robot", "The target is where the robot is.")) {
     this.#edited = this.#sent = false;
     this.#held.clear();
     this.#pose = this.#clipped = "";
@@ -82,7 +83,7 @@ export class ManualPanel {
     const elsewhere = is.preparing || is.latched || (run?.number && mode !== "manual");
     if (elsewhere && this.#edited) this.reset(); // what was meant for another moment is not sent by accident
     const send = document.querySelector('[data-command="move"]');
-    send.dataset.blocked = this.#edited ? "" : "the target is where the robot is: move a slider, take a step, or choose a pose";
+    send.dataset.blocked = this.#edited ? "" : t("page.manual.no_target", "the target is where the robot is: move a slider, take a step, or choose a pose");
   }
 
   #build(facts) {
@@ -91,14 +92,14 @@ export class ManualPanel {
     this.#target = null;
     this.#edited = false;
     const poses = (facts.poses ?? []).map((name) => new Option(name));
-    const none = new Option(poses.length ? "pose" : "no pose", "");
+    const none = new Option(poses.length ? t("page.manual.pose", "pose") : t("page.manual.no_pose", "no pose"), "");
     none.disabled = true;
     this.#poses.replaceChildren(none, ...poses);
     this.#poses.disabled = !poses.length;
     this.#poses.selectedIndex = 0;
     this.#choose(0);
     this.#fromRobot();
-    this.#say("The target is where the robot is.");
+    this.#say(t("page.manual.at_robot", "The target is where the robot is."));
   }
 
   #choose(group) {
@@ -170,7 +171,7 @@ export class ManualPanel {
 
   #heard(answer) {
     if (this.#sent && answer.ok && arrived(answer)) {
-      this.reset("The robot has arrived.");
+      this.reset(t("page.manual.arrived", "The robot has arrived."));
       return;
     }
     const { text, weight } = verdict(answer, Number(this.#speed.value));

@@ -2,6 +2,7 @@
 
 import { labelled, parted } from "./joint_names.js";
 import { digitsOf } from "../curves/units.js";
+import { t } from "../../site/sentences.js";
 
 const ENDLESS = 2 * Math.PI; // a joint without a limit is offered one turn each way
 
@@ -21,7 +22,7 @@ export function groups({ joint_names: names = [], lower = [], upper = [], units 
 export function within({ lower, upper, full, unit }, value) {
   const clipped = Math.min(upper, Math.max(lower, value));
   if (clipped === value) return { value, said: "" };
-  return { value: clipped, said: `${full} ends at ${clipped.toFixed(digitsOf({ lower, upper, unit }))}` };
+  return { value: clipped, said: t("page.manual.ends", "{joint} ends at {at}", { joint: full, at: clipped.toFixed(digitsOf({ lower, upper, unit })) }) };
 }
 
 /** Where the robot is, or is told to be: the target to begin with; null where nothing is known. */
@@ -39,11 +40,11 @@ export function arrived({ distance }) {
 
 /** What the station said of a target, in a sentence with its weight: {text, weight}. */
 export function verdict({ ok, reason, distance, duration_s: seconds, reached, clipped = [], position_error_mm: mm, rotation_error_deg: deg }, speed) {
-  if (!ok) return { text: reason || "the station did not say where that is", weight: "warn" };
-  if (reached === false) return { text: `Out of reach: the nearest is ${mm.toFixed(0)} mm and ${deg.toFixed(1)}° off.`, weight: "warn" };
-  const limited = clipped.length ? ` Limited: ${clipped.join(", ")}.` : "";
-  if (arrived({ distance })) return { text: `The robot is there, within ${VERY_NEAR} rad.${limited}`, weight: limited ? "warn" : "" };
-  return { text: `${distance.toFixed(2)} rad from the robot, ${(seconds / speed).toFixed(1)} s.${limited}`, weight: limited ? "warn" : "" };
+  if (!ok) return { text: reason || t("page.manual.unsaid", "the station did not say where that is"), weight: "warn" };
+  if (reached === false) return { text: t("page.manual.unreachable", "Out of reach: the nearest is {mm} mm and {deg}° off.", { mm: mm.toFixed(0), deg: deg.toFixed(1) }), weight: "warn" };
+  const limited = clipped.length ? t("page.manual.limited", " Limited: {joints}.", { joints: clipped.join(", ") }) : "";
+  if (arrived({ distance })) return { text: t("page.manual.there", "The robot is there, within {near} rad.{limited}", { near: VERY_NEAR, limited }), weight: limited ? "warn" : "" };
+  return { text: t("page.manual.away", "{distance} rad from the robot, {seconds} s.{limited}", { distance: distance.toFixed(2), seconds: (seconds / speed).toFixed(1), limited }), weight: limited ? "warn" : "" };
 }
 
 /** Position [mm] of the hand of arm number `index` in the poses of an answer, in words; "" where there is none. */

@@ -12,6 +12,7 @@ import { place, robotParts, SIZE } from "./scene_robot.js";
 import { three } from "./scene_shapes.js";
 import { Tips } from "./scene_tips.js";
 import { Views } from "./scene_views.js";
+import { t } from "../../site/sentences.js";
 
 const STILL = 2e-5; // m, and about as much of a turn: less than a pixel
 const OURS = ["bench", "robot", "ghost", "capsules", "frame", "path", "chunk"];
@@ -38,7 +39,7 @@ export class Scene3D {
   #framed = false;
 
   constructor(element) {
-    if (!window.MeshCat) throw new Error("the viewer script did not load");
+    if (!window.MeshCat) throw new Error(t("page.scene3d.no_script", "the viewer script did not load"));
     const { renderer, software } = rendererIn(element);
     this.software = software;
     this.#viewer = new window.MeshCat.Viewer(element, undefined, renderer);

@@ -7,6 +7,7 @@ import { Scene3D } from "./scene3d.js";
 import { GHOSTS } from "./scene_ghosts.js";
 import { ShownChunk } from "./shown_chunk.js";
 import { Tags } from "./tags.js";
+import { t } from "../../site/sentences.js";
 
 const AGAIN_MS = 3000; // until shapes are asked for again
 
@@ -17,7 +18,7 @@ export async function scenePane(store) {
     const element = document.getElementById("scene");
     const scene = new Scene3D(element);
     const shapes = new Shapes(store, (geometry) => scene.show(geometry));
-    await shapes.fetch((why) => (note.textContent = `No 3D scene yet: ${why}. It is asked for again.`));
+    await shapes.fetch((why) => (note.textContent = t("page.scene3d.not_yet", "No 3D scene yet: {why}. It is asked for again.", { why })));
     note.hidden = true;
     aimGhost(scene);
     const shown = new ShownChunk(scene, () => store.snapshot?.facts?.rate ?? store.facts.rate);
@@ -38,7 +39,7 @@ export async function scenePane(store) {
       software: scene.software,
     };
   } catch (error) {
-    note.textContent = `No 3D scene: ${error.message}. Everything else works without it.`;
+    note.textContent = t("page.scene3d.none", "No 3D scene: {why}. Everything else works without it.", { why: error.message });
     console.error(error);
     return { poses() {}, bench() {}, chunk() {}, software: false };
   }
@@ -98,10 +99,10 @@ async function patiently(ask, say) {
 /** Say in the corner which robots are drawn beside the real one. */
 function nameGhosts(tags, scene, shown) {
   const words = {
-    simulated: "simulated robot; the solid one is the real robot, which receives none of this",
+    simulated: t("page.scene3d.simulated", "simulated robot; the solid one is the real robot, which receives none of this"),
     chunk: shown.proposal,
-    aim: "target; nothing moves until it is sent",
-    commanded: "commanded pose",
+    aim: t("page.scene3d.aim", "target; nothing moves until it is sent"),
+    commanded: t("page.scene3d.commanded", "commanded pose"),
   };
   for (const [ghost, { colour }] of Object.entries(GHOSTS)) tags.show(ghost, scene.draws(ghost) && words[ghost], colour);
   tags.show("reach", shown.reach, "var(--warn)");

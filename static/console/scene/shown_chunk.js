@@ -1,6 +1,7 @@
 // The chunk that the scene shows: drawn when it changes, a film while it is proposed, gone when nothing is heard of it.
 
 import { reachWords } from "./reach.js";
+import { t } from "../../site/sentences.js";
 
 const HEARD_MS = 2500; // the station speaks of a chunk each second while there is one
 
@@ -37,13 +38,13 @@ export class ShownChunk {
   get proposal() {
     if (this.#chunk?.state !== "proposed") return "";
     const rows = this.#chunk.targets?.length ?? 0;
-    return `chunk ${this.#chunk.chunk}, proposed: ${rows} steps, ${(rows / this.#rate()).toFixed(1)} s`;
+    return t("page.scene3d.proposed", "chunk {chunk}, proposed: {rows} steps, {seconds} s", { chunk: this.#chunk.chunk, rows, seconds: (rows / this.#rate()).toFixed(1) });
   }
 
   /** What of it could not be reached, in words; "" where all of it was. */
   get reach() {
     const { chunk, ik } = this.#chunk ?? {};
-    return ik?.over ? `chunk ${chunk}: ${reachWords(ik)}` : "";
+    return ik?.over ? t("page.scene3d.reach", "chunk {chunk}: {words}", { chunk, words: reachWords(ik) }) : "";
   }
 
   #set(chunk) {

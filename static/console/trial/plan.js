@@ -2,6 +2,7 @@
 
 import { post, RequestFailed } from "../../site/api.js";
 import { config } from "../live/config.js";
+import { t } from "../../site/sentences.js";
 
 const PRESSED = "[data-next], [data-return], [data-give-back], [data-confirm-cameras], [data-override], [data-take-reference]";
 
@@ -26,12 +27,12 @@ export class PlanControls {
     if (!button) return;
     const { next, giveBack, confirmCameras, override, scene, position } = button.dataset;
     if (button.getAttribute("aria-disabled") === "true") this.#commands.say(button.title, "refused");
-    else if (next) this.#act("Next trial", () => this.#next(next));
-    else if (button.dataset.return) this.#act("Return", () => post(`${config.trial}/${button.dataset.return}/abandon`, { reason: why("return-why") }));
-    else if (giveBack) this.#act("Give trials to others", () => post(`${config.plans}/${giveBack}/give-back`, { station: config.station, reason: why("back-why") }));
-    else if (confirmCameras !== undefined) this.#act("Cameras", () => post(config.cameras_confirmed, { first: confirmCameras === "first" }));
-    else if (override) this.#act("Bench accepted", () => post(`${config.trial}/${override}/achieved`, { override: why("override-why") }));
-    else this.#act("Reference taken", () => post(config.references, { scene, position: Number(position) }));
+    else if (next) this.#act(t("page.plan.next", "Next trial"), () => this.#next(next));
+    else if (button.dataset.return) this.#act(t("page.plan.return", "Return"), () => post(`${config.trial}/${button.dataset.return}/abandon`, { reason: why("return-why") }));
+    else if (giveBack) this.#act(t("page.plan.give_back", "Give trials to others"), () => post(`${config.plans}/${giveBack}/give-back`, { station: config.station, reason: why("back-why") }));
+    else if (confirmCameras !== undefined) this.#act(t("page.plan.cameras", "Cameras"), () => post(config.cameras_confirmed, { first: confirmCameras === "first" }));
+    else if (override) this.#act(t("page.plan.accepted", "Bench accepted"), () => post(`${config.trial}/${override}/achieved`, { override: why("override-why") }));
+    else this.#act(t("page.plan.reference", "Reference taken"), () => post(config.references, { scene, position: Number(position) }));
   }
 
   async #next(plan) {
@@ -46,8 +47,8 @@ export class PlanControls {
     const at = this.#store.snapshot?.run.elapsed ?? Number.NaN;
     const boxes = [...form.querySelectorAll('[name="milestone"]')];
     const earlier = boxes.slice(0, boxes.indexOf(box)).some((other) => !other.checked);
-    if (box.checked && box.dataset.limit && at > Number(box.dataset.limit)) this.#untick(box, `after its ${box.dataset.limit} s it does not count`);
-    else if (box.checked && form.dataset.ordered && earlier) this.#untick(box, "those before it come first");
+    if (box.checked && box.dataset.limit && at > Number(box.dataset.limit)) this.#untick(box, t("page.plan.late", "after its {limit} s it does not count", { limit: box.dataset.limit }));
+    else if (box.checked && form.dataset.ordered && earlier) this.#untick(box, t("page.plan.order", "those before it come first"));
     form.elements[`at-${box.value}`].value = box.checked && Number.isFinite(at) ? at.toFixed(1) : "";
     stamps();
     form.dispatchEvent(new Event("input", { bubbles: true })); // the draft has the time too
@@ -55,7 +56,7 @@ export class PlanControls {
 
   #untick(box, reason) {
     box.checked = false;
-    this.#commands.say(`Not ticked: ${reason}`, "refused");
+    this.#commands.say(t("page.plan.not_ticked", "Not ticked: {reason}", { reason }), "refused");
   }
 }
 
@@ -72,12 +73,12 @@ export function times(form) {
 function stamps() {
   for (const place of document.querySelectorAll("#live [data-at]")) {
     const at = place.closest("form").elements[`at-${place.dataset.at}`].value;
-    place.textContent = at ? ` at ${at} s` : "";
+    place.textContent = at ? t("page.plan.at", " at {at} s", { at }) : "";
   }
 }
 
 function why(id) {
   const reason = document.getElementById(id).value.trim();
-  if (!reason) throw new RequestFailed("say why, for those who read it later", { status: 400 });
+  if (!reason) throw new RequestFailed(t("page.plan.say_why", "say why, for those who read it later"), { status: 400 });
   return reason;
 }

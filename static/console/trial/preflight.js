@@ -4,6 +4,7 @@ import { post } from "../../site/api.js";
 import { setReason } from "../commands/commands.js";
 import { config } from "../live/config.js";
 import { whyNoPreflight } from "../commands/reasons.js";
+import { t } from "../../site/sentences.js";
 
 const TIMEOUT_MS = 15000; // other stations are asked first which server they use
 
@@ -35,20 +36,20 @@ export function preflights(store, commands) {
 
 async function ask(button, commands) {
   if (button.getAttribute("aria-disabled") === "true") {
-    commands.say(`Preflight: ${button.title}`, "refused");
+    commands.say(t("page.preflight.said", "Preflight: {said}", { said: button.title }), "refused");
     return;
   }
   if ("pressed" in button.dataset) return;
   button.dataset.pressed = "";
-  commands.say("Preflight: pressed …", "pressed");
+  commands.say(t("page.preflight.pressed", "Preflight: pressed …"), "pressed");
   try {
     const asked = await post(config.preflights.ask, { checkpoint: chosen(button), station: config.station }, { timeout: TIMEOUT_MS });
-    commands.say("Preflight: under way", "accepted");
+    commands.say(t("page.preflight.under_way", "Preflight: under way"), "accepted");
     const result = resultOf(button);
     result.dataset.asked = asked.id;
     show(result, `${config.preflights.result}${asked.id}/`);
   } catch (error) {
-    commands.fail("Preflight", error, "Look below the button before you repeat it.");
+    commands.fail(t("page.preflight.name", "Preflight"), error, t("page.preflight.look", "Look below the button before you repeat it."));
   } finally {
     delete button.dataset.pressed;
   }
@@ -59,7 +60,7 @@ function told(result, commands) {
   const shown = result.querySelector("[data-preflight]");
   if (shown?.dataset.preflight !== result.dataset.asked || shown.dataset.status === "running") return;
   delete result.dataset.asked;
-  commands.say(`Preflight: ${shown.querySelector(".state").textContent}`, shown.dataset.verdict === "ok" ? "accepted" : "refused");
+  commands.say(t("page.preflight.said", "Preflight: {said}", { said: shown.querySelector(".state").textContent }), shown.dataset.verdict === "ok" ? "accepted" : "refused");
 }
 
 function chosen(button) {

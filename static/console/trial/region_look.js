@@ -1,6 +1,7 @@
 // How the bench lies in each region of the references, as the gate before a run will find it: asked of the server.
 
 import { get } from "../../site/api.js";
+import { t } from "../../site/sentences.js";
 
 const LOOK_MS = 2000;
 const CROP = 96; // pixels of a picture's longer side
@@ -42,7 +43,7 @@ function show(aid, seen, trouble, regional, images) {
     for (const { camera } of found) regional.add(camera);
   }
   const list = document.getElementById("aid-regions");
-  const lines = trouble && regional.size ? [said(`Regions cannot be compared: ${trouble}`)] : found.map((region) => line(region, images));
+  const lines = trouble && regional.size ? [said(t("page.regions.trouble", "Regions cannot be compared: {trouble}", { trouble }))] : found.map((region) => line(region, images));
   list.replaceChildren(...lines);
   outline(found);
 }
@@ -56,20 +57,20 @@ function said(words) {
 
 /** One region in words, with what the reference and the camera show there. */
 function line(region, images) {
-  const item = said(`${region.camera}, ${inWords(region)}`);
+  const item = said(t("page.regions.line", "{camera}, {words}", { camera: region.camera, words: inWords(region) }));
   item.classList.toggle("warn", region.low);
   const pictures = document.createElement("span");
   pictures.className = "row line aid-crops";
   const live = document.querySelector(`[data-camera="${CSS.escape(region.camera)}"] canvas`);
-  pictures.append(crop(imageOf(images, region.reference), region.at, "as it should be"));
-  if (live) pictures.append(crop(live, region.at, "as it is"));
+  pictures.append(crop(imageOf(images, region.reference), region.at, t("page.regions.should_be", "as it should be")));
+  if (live) pictures.append(crop(live, region.at, t("page.regions.is", "as it is")));
   item.append(pictures);
   return item;
 }
 
 /** Its name, its match and where its object lies. */
 export function inWords({ name, match, words, low }) {
-  return `${name}: ${match.toFixed(2)}${low ? " !" : ""}, ${words}`;
+  return t("page.regions.match", "{name}: {match}, {words}", { name, match: `${match.toFixed(2)}${low ? " !" : ""}`, words });
 }
 
 /** What is cut out of a picture around a region: [x, y, width, height] in shares, inside the picture. */

@@ -1,6 +1,7 @@
 // The position's reference picture over the live cameras, and how well the bench matches it.
 
 import { below, correlation, grey, HEIGHT, WIDTH } from "./match.js";
+import { t } from "../../site/sentences.js";
 
 const LOOK_MS = 500;
 const BLINK_MS = 500;
@@ -91,8 +92,13 @@ function tell(aid, pictures, regional) {
   const low = new Set(below(matches, least).map(([camera]) => camera));
   const words = Object.entries(matches).map(([camera, value]) => `${camera} ${value.toFixed(2)}${low.has(camera) ? " !" : ""}`);
   line.hidden = !words.length && regional.size > 0;
-  line.textContent = words.length ? `Match: ${words.join(", ")}${Number.isFinite(least) ? ` (wanted ${least})` : ""}` : "Match: waiting for pictures";
+  line.textContent = matchWords(words.join(t("page.common.comma", ", ")), least);
   line.toggleAttribute("data-low", low.size > 0);
+}
+
+function matchWords(found, least) {
+  if (!found) return t("page.aid.waiting", "Match: waiting for pictures");
+  return Number.isFinite(least) ? t("page.aid.wanted", "Match: {found} (wanted {least})", { found, least }) : t("page.aid.match", "Match: {found}", { found });
 }
 
 function small(source) {

@@ -1,6 +1,7 @@
 // The set-up: its stages while it goes on, and which one failed.
 
 import { duration, words } from "../live/words.js";
+import { t } from "../../site/sentences.js";
 
 const MARKS = { done: "✓", active: "▸", waiting: "·", failed: "✕", skipped: "–" };
 
@@ -28,7 +29,7 @@ export function setUp(store) {
       line.toggleAttribute("data-said", Boolean(stages.length) && snapshot.state_is.preparing);
     }
     const failed = stages.some((stage) => stage.state === "failed");
-    for (const name of document.querySelectorAll("[data-set-up-name]")) name.textContent = failed ? "Retry" : "Set up";
+    for (const name of document.querySelectorAll("[data-set-up-name]")) name.textContent = failed ? t("page.setup.retry", "Retry") : t("page.setup.set_up", "Set up");
     for (const button of document.querySelectorAll("[data-hidden-while]")) button.hidden = snapshot.state_is[button.dataset.hiddenWhile];
   };
   store.on("snapshot", draw);
@@ -41,7 +42,7 @@ function fill(list, stages) {
   stages.forEach((stage, index) => {
     const item = list.children[index];
     item.dataset.state = stage.state;
-    const texts = [MARKS[stage.state] ?? "·", words(stage.name), stage.state === "skipped" ? "skipped" : spent(stage)];
+    const texts = [MARKS[stage.state] ?? "·", words(stage.name), stage.state === "skipped" ? t("page.setup.skipped", "skipped") : spent(stage)];
     texts.forEach((text, place) => {
       const cell = item.children[place];
       if (cell.textContent !== text) cell.textContent = text;

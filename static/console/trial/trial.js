@@ -5,6 +5,7 @@ import { uuid } from "../../site/identity.js";
 import { config } from "../live/config.js";
 import { PlanControls, times } from "./plan.js";
 import { duration } from "../live/words.js";
+import { t } from "../../site/sentences.js";
 
 const OF_TRIALS = ["trial", "episode", "sight"];
 
@@ -42,9 +43,9 @@ export class TrialPanel {
     const { setUp, status, limit } = this.#data;
     const { snapshot } = this.#store;
     const prepare = this.#panel.querySelector("[data-prepare]");
-    if (prepare) prepare.dataset.blocked = this.#panel.querySelector("#choose") ? "" : "nothing can be chosen yet: see step 1";
+    if (prepare) prepare.dataset.blocked = this.#panel.querySelector("#choose") ? "" : t("page.trial.nothing_to_choose", "nothing can be chosen yet: see step 1");
     for (const run of this.#panel.querySelectorAll("[data-needs-setup]")) {
-      run.dataset.blocked = status !== "prepared" ? "choose and set up first" : setUp === "yes" ? "" : "set up first";
+      run.dataset.blocked = status !== "prepared" ? t("page.trial.choose_first", "choose and set up first") : setUp === "yes" ? "" : t("page.trial.set_up_first", "set up first");
     }
     scoreRule();
     this.#commands.gate();
@@ -52,7 +53,7 @@ export class TrialPanel {
     this.#clock(snapshot, Number(limit));
     for (const word of this.#panel.querySelectorAll("[data-truth]")) {
       const reached = snapshot.truth?.milestones?.[word.dataset.truth];
-      word.textContent = reached === undefined ? "" : ` · bench: ${reached ? "reached" : "not reached"}`;
+      word.textContent = reached === undefined ? "" : reached ? t("page.trial.reached", " · bench: reached") : t("page.trial.not_reached", " · bench: not reached");
     }
   }
 
@@ -70,11 +71,11 @@ export class TrialPanel {
     if (button.getAttribute("aria-disabled") === "true") {
       this.#commands.say(button.title, "refused");
     } else if ("prepare" in button.dataset) {
-      this.#do("Set up", () => this.#prepare());
+      this.#do(t("page.trial.set_up", "Set up"), () => this.#prepare());
     } else if (button.dataset.abandon) {
-      this.#do("Choose again", () => post(`${config.trial}/${button.dataset.abandon}/abandon`, { reason: "chosen again" }));
+      this.#do(t("page.trial.again", "Choose again"), () => post(`${config.trial}/${button.dataset.abandon}/abandon`, { reason: "chosen again" }));
     } else {
-      this.#do("Void", () => this.#void(button));
+      this.#do(t("page.trial.void", "Void"), () => this.#void(button));
     }
   }
 
@@ -85,20 +86,20 @@ export class TrialPanel {
     event.preventDefault();
     const save = saveButton();
     if (save.getAttribute("aria-disabled") === "true") this.#commands.say(save.title, "refused");
-    else this.#do("Save score", () => this.#score(form));
+    else this.#do(t("page.trial.save", "Save score"), () => this.#score(form));
   }
 
   /** One thing at a time, with its outcome on the page. */
   async #do(name, act) {
     if (this.#busy) {
-      this.#commands.say(`${name}: not yet, ${this.#busy} is on its way`, "refused");
+      this.#commands.say(t("page.common.not_yet", "{name}: not yet, {busy} is on its way", { name, busy: this.#busy }), "refused");
       return;
     }
     this.#busy = name;
-    this.#commands.say(`${name}: pressed …`, "pressed");
+    this.#commands.say(t("page.common.pressed", "{name}: pressed …", { name }), "pressed");
     try {
       const said = await act();
-      if (said !== null) this.#commands.say(`${name}: done`, "accepted");
+      if (said !== null) this.#commands.say(t("page.common.done", "{name}: done", { name }), "accepted");
     } catch (error) {
       if (!(error instanceof RequestFailed)) throw error;
       this.#commands.fail(name, error);
@@ -111,7 +112,7 @@ export class TrialPanel {
   async #prepare() {
     const form = this.#panel.querySelector("#choose");
     const { scene, position, checkpoint, seed } = form.elements;
-    if (!position?.value) throw new RequestFailed("choose a position", { status: 400 });
+    if (!position?.value) throw new RequestFailed(t("page.trial.choose_position", "choose a position"), { status: 400 });
     const choice = { scene: scene.value, position: Number(position.value), checkpoint: checkpoint.value };
     if (seed?.value) choice.seed = Number(seed.value);
     const trial = await post(config.trials, choice);
@@ -158,7 +159,7 @@ function whyOf(form) {
 function unexplained(form) {
   const levels = [...form.querySelectorAll('#why[data-explained="yes"]:not([hidden]) fieldset')];
   const open = levels.filter((level) => !level.querySelector(":checked")).map((level) => level.querySelector("legend").textContent.toLowerCase());
-  return open.length ? `choose the ${open.join(" and the ")} of the failure` : "";
+  return open.length ? t("page.trial.unexplained", "choose the {levels} of the failure", { levels: open.join(t("page.trial.and_the", " and the ")) }) : "";
 }
 
 function saveButton() {
@@ -179,11 +180,11 @@ function scoreRule() {
   const criterion = form.querySelector("[data-criterion]");
   if (criterion) criterion.hidden = means;
   const wanted = criterion?.textContent || required.map((box) => box.dataset.text).join(", ");
-  if (success === null) verdict.textContent = "Success? Say yes or no.";
-  else if (means) verdict.textContent = `Success means: ${wanted}`;
-  else verdict.textContent = success ? "Success" : "No success";
+  if (success === null) verdict.textContent = t("page.trial.success_or_not", "Success? Say yes or no.");
+  else if (means) verdict.textContent = t("page.trial.means", "Success means: {wanted}", { wanted });
+  else verdict.textContent = success ? t("page.trial.success", "Success") : t("page.trial.no_success", "No success");
   verdict.dataset.verdict = String(success);
   const why = form.querySelector("#why");
   if (why) why.hidden = success !== false;
-  saveButton().dataset.blocked = success === null ? "say whether it was a success" : unexplained(form);
+  saveButton().dataset.blocked = success === null ? t("page.trial.say_success", "say whether it was a success") : unexplained(form);
 }
