@@ -143,7 +143,11 @@ def test_words_of_lists_and_choices_have_ids_of_their_own(german):
 def test_every_language_that_ships_says_all():
     entries = {
         "sentences": sentences.once(
-            [*sentences.of_python(), *sentences.of_labels(), *sentences.of_scripts()]
+            [
+                *(one for one in sentences.of_python() if not one.id.startswith("test.")),
+                *sentences.of_labels(),
+                *sentences.of_scripts(),
+            ]
         ),
         "templates": sentences.of_templates(),
     }
