@@ -9,10 +9,7 @@ from collections import deque
 from typing import NamedTuple
 
 _LEAP_S = 0.5  # [s] step ahead that no initial delay explains
-_LEARNT, _ENOUGH = (
-    32,
-    8,
-)  # intervals from which period and jitter are estimated, and the number needed at least
+_LEARNT, _ENOUGH = 32, 8  # intervals used to estimate period and jitter: at most, at least
 _LEAST_S = 0.01  # [s] least jitter: smaller steps age nothing
 _STEADY_S = 0.15  # [s] duration of constant lateness that indicates a clock step
 _SILENCE_S = 1.0  # [s] gap after which the time of the next message is unknown
@@ -86,9 +83,7 @@ class ClockStepDetector:
     def __init__(self, tolerance: float = 0.5) -> None:
         self._tolerance = tolerance
         self._intervals: deque[float] = deque(maxlen=_LEARNT)  # of stamps [s]
-        self._noise: deque[float] = deque(
-            maxlen=_LEARNT
-        )  # difference between intervals of arrivals and of stamps [s]
+        self._noise: deque[float] = deque(maxlen=_LEARNT)  # |arrival interval - stamp interval| [s]
         self.reset()
 
     def reset(self) -> None:

@@ -25,11 +25,7 @@ _OF_SSH = frozenset(
         *("SSH_AUTH_SOCK", "SSH_AGENT_PID", "KRB5CCNAME", "KRB5_CONFIG", "LANG", "LANGUAGE"),
     )
 )
-_BLAS_THREADS = (
-    "OPENBLAS_NUM_THREADS",
-    "GOTO_NUM_THREADS",
-    "OMP_NUM_THREADS",
-)  # the first that is set applies
+_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")  # the first set applies
 
 
 def without_web_secrets(given: Mapping[str, str]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Real-time settings of Linux for control and reception: scheduling class, locked memory, garbage collection."""
+"""Real-time settings of Linux for control, reception and guard: scheduling class, locked memory, garbage collection."""
 
 from __future__ import annotations
 

@@ -14,9 +14,7 @@ from pydantic_core import ErrorDetails
 from runtime.core.plugins import KindUnion, variants
 
 Key = tuple[str, ...]
-_SECRET = re.compile(
-    r"pass|secret|token|private", re.IGNORECASE
-)  # keys whose values must not appear in a message
+_SECRET = re.compile(r"pass|secret|token|private", re.IGNORECASE)  # keys whose values are not printed
 _NO_ORIGIN: Mapping[Key, str] = MappingProxyType({})
 
 

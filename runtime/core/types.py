@@ -49,9 +49,7 @@ class Observation:
     last: bool = False  # the source ends with this frame (a replayed recording is over)
     step: int = -1  # control tick for which it was assembled; -1: none yet
     prompt: str = ""
-    truth: Mapping[str, Any] | None = (
-        None  # ground truth of a simulated bench (JSON); never passed to a policy
-    )
+    truth: Mapping[str, Any] | None = None  # ground truth of a simulated bench (JSON), never for policies
     commanded: Float64 | None = None  # [D] last commanded position, None without commands
     drives: Mapping[str, Any] | None = None  # {"enabled": bool, "faults": [str]} if the node reports them
 

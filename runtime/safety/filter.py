@@ -54,9 +54,7 @@ class RobotState:
     joint_age: float = 0.0
     implausible_reason: str = ""  # why `measured` cannot be true, "" if it can
     picture_ages: dict[str, float] = field(default_factory=dict)
-    previous_target: Float64 | None = (
-        None  # requested action of the previous tick; None: there was none, `previous` is used
-    )
+    previous_target: Float64 | None = None  # action requested at the previous tick; None: use `previous`
 
 
 @dataclass(frozen=True, slots=True)

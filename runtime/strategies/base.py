@@ -183,9 +183,8 @@ def join(
     placed = merge.place(timeline, arrival, free_step)
     if placed.merged.dropped:
         return placed.merged
-    joining = (
-        joining or placed.merged.mistimed > 0
-    )  # mistimed rows are for other steps: they may not continue the plan
+    # Mistimed rows are for other steps, so they need not continue the plan.
+    joining = joining or placed.merged.mistimed > 0
     planned = timeline.at(free_step)
     standing = commanded if held is None and joining and planned is None else held
     going_on = commanded if planned is None else planned.action
