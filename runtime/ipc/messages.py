@@ -309,15 +309,12 @@ class ReceptionReport:
     rates: Mapping[str, float] = field(default_factory=dict)  # measured [Hz] per stream
     faults: Mapping[str, int] = field(default_factory=dict)
     truth: Mapping[str, Any] = field(default_factory=dict)  # of a simulated bench, from its node
-    drives: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # {"enabled": bool, "faults": [str]}, {} if not reported
-    cameras: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # of the deployment's own, as from Source.camera_health
-    age_ms: Mapping[str, float] = field(
-        default_factory=dict
-    )  # age of joints on arrival in shared state: p50, p99, max of the newest
+    # {"enabled": bool, "faults": [str]}, {} if not reported
+    drives: Mapping[str, Any] = field(default_factory=dict)
+    # of the deployment's own, as from Source.camera_health
+    cameras: Mapping[str, Any] = field(default_factory=dict)
+    # age of joints on arrival in shared state: p50, p99, max of the newest
+    age_ms: Mapping[str, float] = field(default_factory=dict)
     scheduling: str = ""  # scheduling class of the process, see runtime.core.realtime
 
 

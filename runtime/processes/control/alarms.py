@@ -63,9 +63,8 @@ class DisplacementMonitor:
         dim = len(settings.limits.names)
         self._followed = np.zeros(dim, bool)  # joints to whose readings the command was moved
         self._unsaid = np.zeros(dim, np.int64)  # number of such moves without a conclusion
-        self._along = np.zeros(
-            dim, np.int64
-        )  # parts in which readings moved with the command, since a hand was last proven
+        # Parts in which readings moved with the command, since a hand was last proven.
+        self._along = np.zeros(dim, np.int64)
         self._off = np.zeros(dim, bool)  # joints that were displaced again after that: distrusted
         self._apart_at = np.full(dim, float("-inf"))  # last time that each joint was displaced
         self._meeting = False  # a set-up converges to the measured joints, and is not finished

@@ -99,9 +99,8 @@ class ExecuteChunks(Behaviour):
         self._expecting = True
         self._useless = False  # the newest chunk was dropped, although the robot was waiting for it
         self._starved_since: float | None = None
-        self.borne_until = float(
-            "-inf"
-        )  # retries of a lost policy: until then an empty plan does not lead to holding
+        # While a lost policy is retried, an empty plan does not lead to holding.
+        self.borne_until = float("-inf")
 
     def target(self, step: int, elapsed: float) -> Target | None:
         planned = self.timeline.at(step)

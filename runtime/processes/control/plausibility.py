@@ -120,9 +120,8 @@ class JointPlausibility:
         self._doubt = ""
         self._digits = _LastDigitActivity(len(limits.names))
         self._frozen = _FrozenJointDetector(limits)
-        self.leapt = np.zeros(
-            len(limits.names), bool
-        )  # joints that reached their trusted position without a measured path
+        # Joints that reached their trusted position without a measured path.
+        self.leapt = np.zeros(len(limits.names), bool)
         self.dead = ""  # joints that read exactly 0 since they returned from elsewhere
 
     def reset_zeros(self) -> None:
