@@ -44,13 +44,13 @@ def stale_heartbeat(shared: SharedState, now: float, allowed: Callable[[str], fl
 class DisplacementMonitor:
     """Monitor of the displacement of a holding robot; it moves the hold target to the measured position.
 
-    A displaced robot was moved by hand, switched off, or its node was restarted: to send the old target would move it
-    unexpectedly, and so would a displacement during an outage of the measurements. A single sample is not enough:
-    several must agree (`JointPlausibility.is_displaced`).
+    A displaced robot was moved by hand, switched off, or its node was restarted, perhaps during an outage of the
+    measurements: to send the old target would move it unexpectedly. A single sample is not enough: several must agree
+    (`JointPlausibility.is_displaced`).
 
     An encoder with an offset looks the same, but its joint follows the command, so that the displacement remains. So
-    the command does not follow a joint that leapt until both have agreed for _AGREES_S, and does not follow a joint a
-    second time whose displacement remained: that requires a set-up, because the operator must check the robot.
+    the command does not follow a joint that leapt until both have agreed for _AGREES_S. If a displacement remains after
+    the command has followed it, it is not followed again before a set-up, because the operator must check the robot.
 
     A held arm may be displaced by the permitted following error. Under the e-stop, an arm at rest is followed from
     0.1 rad on: if its drive is off it has sagged, and would jump back when it is switched on.

@@ -101,7 +101,7 @@ class CommandPipeline:
         if actuator.engaged:
             self.hold_here()
 
-    # --- what it does --------------------------------------------------------------------------------------
+    # --- behaviours ----------------------------------------------------------------------------------------
 
     @property
     def run(self) -> ExecuteChunks | None:
@@ -126,7 +126,7 @@ class CommandPipeline:
         self.behaviour = NodeDriven()
 
     def hold(self) -> None:
-        """Brake and hold; a node-driven robot is disengaged, and its node stops what it drives."""
+        """Brake and hold; a node-driven robot is disengaged, and its node then stops it."""
         if isinstance(self.behaviour, NodeDriven):
             self.disengage()
         elif self.actuator.engaged and not isinstance(self.behaviour, Hold):

@@ -151,7 +151,7 @@ class Tick:
         """Control's status as the next tick will write it; the loop adds its own statistics."""
         return self._report.status
 
-    # --- lanes ---------------------------------------------------------------------------------------------
+    # --- pipelines -----------------------------------------------------------------------------------------
 
     @property
     def _pipelines(self) -> tuple[CommandPipeline, ...]:

@@ -170,7 +170,7 @@ class Coordinator:
         except RuntimeFault as error:
             log.error("grippers may still be locked: %s", error)
 
-    # --- what goes on ----------------------------------------------------------------------------------------
+    # --- set-up and inference --------------------------------------------------------------------------------
 
     def _advance_setup(self) -> None:
         if not self.setup.active:

@@ -116,7 +116,7 @@ class Demonstrations:
         self._reported: list[float] = []  # latest capture times, for their rate
         self._seen: dict[str, Any] | None = None  # the last known fingerprint
 
-    # --- the arm ---------------------------------------------------------------------------------------------
+    # --- arm switch ------------------------------------------------------------------------------------------
 
     @property
     def declared(self) -> bool:
@@ -200,7 +200,7 @@ class Demonstrations:
             commanded = np.array(status["commanded"], np.float64) if status["engaged"] else None
             self._setup.set_first_action(relay.first_goal(qpos, commanded))
 
-    # --- what the node reports ---------------------------------------------------------------------------------
+    # --- reports of the node -----------------------------------------------------------------------------------
 
     def _poll_node(self) -> None:
         if not self._node_leads:

@@ -254,7 +254,7 @@ class SessionActions:
         if not np.isnan(self.manual.grippers.locks).all():
             raise RuntimeFault(_TRIAL_WITH_LOCKED_GRIPPER)
 
-    # --- what a person does within a run ------------------------------------------------------------
+    # --- actions within a run -----------------------------------------------------------------------
 
     @property
     def situation(self) -> GuardFacts:
@@ -327,7 +327,7 @@ class SessionActions:
             self.end_run("finished", DISCARDED)
         return told
 
-    # --- what goes on -------------------------------------------------------------------------------
+    # --- hold, end, home, record --------------------------------------------------------------------
 
     def hold(self, reason: str) -> None:
         """Brake, hold, stop querying the policy; a run remains open."""

@@ -260,7 +260,7 @@ class Runs:
             if run.mode == "collect":  # a leader has moved while the robot was held: it is engaged anew
                 self._inference.requests.reset_episode()
 
-    # --- by a person, within a run ---------------------------------------------------------------------------
+    # --- motions within a run --------------------------------------------------------------------------------
 
     def move(self, goal: Float64, speed: float) -> None:
         """Move to `goal` on a limited path, within the open run if there is one."""

@@ -237,7 +237,7 @@ class Inference:
         self._commitment.clear()
         self.requests.resume()
 
-    # --- what control says -----------------------------------------------------------------------------------
+    # --- merged chunks ---------------------------------------------------------------------------------------
 
     def on_merged(self, merged: ChunkMerged) -> None:
         """Record that control has merged or dropped a chunk."""
@@ -269,7 +269,7 @@ class Inference:
         meant = np.flatnonzero(self._planned.targets == step)
         return self._planned.rows[meant[-1]] if len(meant) else None
 
-    # --- asking and answering --------------------------------------------------------------------------------
+    # --- requests and responses ------------------------------------------------------------------------------
 
     def poll(self) -> PolicyAnswer | None:
         """Process a response, or send a request; return the response for the record, if any.

@@ -238,7 +238,7 @@ class PolicyRequests:
     def _within(self, made: CommandRows, first: int, begins: bool) -> tuple[CommandRows, str]:
         """Return the rows before the first refused pose from row `first` on, and the reason, "" if none is refused.
 
-        Refused are poses out of reach, and poses farther from where the joints can be by then than a jump: a smaller
+        A pose is refused if it is out of reach, or farther than a jump from where the joints can be by then: a smaller
         lag is the same as that of joint rows that the safety filter limits. If a run `begins` with such a distant
         pose, that row is kept, so that control reports the distance.
 
