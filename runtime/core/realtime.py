@@ -58,7 +58,7 @@ def enter_realtime_below(priority: int) -> str:
 
 
 def leave_realtime(thread: int = 0) -> None:
-    """Remove thread `thread` (0: the calling one) from a real-time class; threads it starts later inherit that."""
+    """Remove thread `thread` (0: the calling one) from a real-time class; its later threads are in none either."""
     with contextlib.suppress(ProcessLookupError):  # the thread has ended
         if os.sched_getscheduler(thread) in (os.SCHED_FIFO, os.SCHED_RR):
             os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
@@ -114,7 +114,10 @@ def _class(libc: ctypes.CDLL, priority: int, locked: bool, below: int = 0) -> st
 
 
 def _fifo(priority: int, below: int = 0) -> str:
-    """Enter SCHED_FIFO `below` the priority that another process gets which requests `priority`."""
+    """Enter SCHED_FIFO and return the class, "" if not permitted.
+
+    The priority is `below` less than that of a process that requests `priority` itself.
+    """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     for wanted in (priority - below, min(priority, limit) - below):
         try:

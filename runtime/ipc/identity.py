@@ -147,7 +147,7 @@ def _unverified(command: Command, role: str) -> Command:
 
 
 def unverified_reason(command: Command) -> str:
-    """Return why an authenticated command is not obeyed unless it stops; "" if it may be."""
+    """Return the reason to refuse an authenticated command, unless it is a stop; "" if its sender is verified."""
     if command.role != UNVERIFIED:
         return ""
     return _FORGED(kind=command.kind)

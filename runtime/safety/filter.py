@@ -116,7 +116,7 @@ class SafetyFilter:
         }
 
     def judge(self, action: Float64, state: RobotState, path: Path = "policy") -> SafetyVerdict:
-        """Check and limit `action` [D]; with `report_only` it is returned unchanged, with the notes.
+        """Check and limit `action` [D]; return the verdict. With `report_only` the action is unchanged, with the notes.
 
         `path` selects the limits: "policy" for a policy's actions, "motion" for generated motions such as homing.
         """

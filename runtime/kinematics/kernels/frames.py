@@ -160,9 +160,9 @@ def _predicted_decrease(box: Record) -> float:
 
 @device_function
 def is_near_singular(joints: int, below: float, costs: Costs, frame: Record) -> bool:
-    """Return True if the smallest singular value of the first `joints` columns' Jacobian is less than `below`.
+    """Return True if the smallest singular value of the unweighted Jacobian of `joints` joints is less than `below`.
 
-    The Jacobian is unweighted. It is the case if J J^T - below^2 I (J^T J with fewer than six joints) has a pivot
+    That is so if J J^T - below^2 I (J^T J with fewer than six joints) has a pivot
     that is not positive.
     """
     normal = frame.normal
