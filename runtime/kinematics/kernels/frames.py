@@ -162,8 +162,7 @@ def _predicted_decrease(box: Record) -> float:
 def is_near_singular(joints: int, below: float, costs: Costs, frame: Record) -> bool:
     """Return True if the smallest singular value of the unweighted Jacobian of `joints` joints is less than `below`.
 
-    That is so if J J^T - below^2 I (J^T J with fewer than six joints) has a pivot
-    that is not positive.
+    That is so if J J^T - below^2 I (J^T J with fewer than six joints) has a pivot that is not positive.
     """
     normal = frame.normal
     set_normal_matrix(joints, costs, frame)
