@@ -1,1 +1,1 @@
-"""Basis of every layer: types, clock, errors, settings, plug-ins, logs; knows no robot, station, process."""
+"""Base layer of the runtime: types, clock, errors, settings, plug-ins, logs; independent of robots and stations."""

@@ -1,7 +1,7 @@
-"""Reads TOML and JSON that others wrote: how long, how deep and how many they are is looked at before they are parsed.
+"""Parsing of untrusted TOML and JSON, after a check of length, depth and number of values.
 
-Parsers pay for depth by its square, or with their stack: 20,000 nested parts of TOML cost a minute and gigabytes. What
-comes after them pays for each value: a list of three characters is 60 bytes, and is looked at a dozen times.
+The cost of parsing grows with the square of the depth, or with the stack: 20,000 nested TOML tables take a minute and
+gigabytes. Later stages pay for each value: a list of three characters takes 60 bytes and is visited a dozen times.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-MAX_BYTES = 2_000_000  # characters
-MAX_DEPTH = 40  # tables and lists within each other
+MAX_BYTES = 2_000_000  # [characters]
+MAX_DEPTH = 40  # nested tables and lists
 MAX_ITEMS = 100_000  # values, counted by brackets, commas and the = of keys
 
 _JSON = re.compile(r'"(?:[^"\\]++|\\.)*+"?|[\[\]{},]', re.DOTALL)
 _TOML = re.compile(
-    r'"""(?:[^"\\]++|\\.|"(?!""))*+(?:"{3,5}+)?'  # up to two of the quotes at its end are its own
+    r'"""(?:[^"\\]++|\\.|"(?!""))*+(?:"{3,5}+)?'  # up to two of the quotes at the end belong to the string
     r"|'''(?:[^']++|'(?!''))*+(?:'{3,5}+)?"
     r'|"(?:[^"\\\n]++|\\.)*+"?'
     r"|'[^'\n]*+'?"
@@ -31,11 +31,15 @@ _TOML = re.compile(
 
 
 class UnreadableDocument(ValueError):
-    """It cannot be read; the message says what it is, why, and what is allowed."""
+    """Document that cannot be read; the message names it, the reason and what is allowed."""
 
 
 def parse_toml(text: str, what: str, largest: int = MAX_BYTES) -> dict[str, Any]:
-    """The table in `text`; Unreadable, which calls it `what`."""
+    """Return the table in `text`.
+
+    Raises:
+        UnreadableDocument: too large, too deep or invalid; `what` is its name in the message.
+    """
     _require_small(text, what, largest)
     _require_flat(text, what, _TOML)
     found: dict[str, Any] = _parsed(tomllib.loads, text, what, "TOML")
@@ -43,7 +47,12 @@ def parse_toml(text: str, what: str, largest: int = MAX_BYTES) -> dict[str, Any]
 
 
 def load_toml(path: Path, what: str) -> dict[str, Any]:
-    """The table in a file, which is one; Unreadable, OSError."""
+    """Return the table in a TOML file.
+
+    Raises:
+        UnreadableDocument: no regular file, or as in `parse_toml`; `what` is its name in the message.
+        OSError: the file cannot be read.
+    """
     found = path.stat()
     if not stat.S_ISREG(found.st_mode):
         raise UnreadableDocument(f"{what}: is no file")
@@ -56,7 +65,11 @@ def load_toml(path: Path, what: str) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes, what: str, largest: int = MAX_BYTES, most: int = MAX_ITEMS) -> Any:
-    """The value in `text`; Unreadable, which calls it `what`."""
+    """Return the value in `text`.
+
+    Raises:
+        UnreadableDocument: too large, too deep, too many values or invalid; `what` is its name in the message.
+    """
     _require_small(text, what, largest)
     try:
         text = text if isinstance(text, str) else text.decode("utf-8")
@@ -69,7 +82,7 @@ def parse_json(text: str | bytes, what: str, largest: int = MAX_BYTES, most: int
 def _parsed(parse: Callable[[str], Any], text: str, what: str, language: str) -> Any:
     try:
         return parse(text)
-    except ValueError as error:  # also what Python refuses of long numbers
+    except ValueError as error:  # also Python's limit on the digits of an integer
         raise UnreadableDocument(f"{what}: is not valid {language}: {error}") from None
 
 
@@ -79,7 +92,10 @@ def _require_small(text: str | bytes, what: str, largest: int) -> None:
 
 
 def _require_flat(text: str, what: str, marks: re.Pattern[str], most: int = MAX_ITEMS) -> None:
-    """Brackets, commas and the dots of keys, outside of strings: never fewer levels than a parser would make."""
+    """Raise UnreadableDocument if nesting or number of values exceed their limits.
+
+    Counts brackets, commas and the dots of keys outside strings: never fewer levels than a parser would create.
+    """
     depth = dots = values = 0
     for mark in marks.finditer(text):
         word = mark[0]

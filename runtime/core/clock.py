@@ -1,4 +1,4 @@
-"""Time: one monotonic clock for everything we stamp, and a map from a peer's clock onto it."""
+"""Clocks: the machine's monotonic clock, and the mapping of a peer's clock to it."""
 
 from __future__ import annotations
 
@@ -8,45 +8,42 @@ from abc import ABC, abstractmethod
 from collections import deque
 from typing import NamedTuple
 
-_LEAP_S = 0.5  # more than a first message can have been late by
-_LEARNT, _ENOUGH = (
-    32,
-    8,
-)  # intervals of a stream that its period and jitter are taken from, and from how many on
-_LEAST_S = 0.01  # of a step: less ages nothing
-_STEADY_S = 0.15  # how long all that comes has to be equally late, so that it is the clock
-_SILENCE_S = 1.0  # after which nothing is known of when the next message was due
-_UNDECIDED_S = 5.0  # how long lateness that is never steady is looked at
-_SETTLED_S = 1.0  # until then what comes first may all have been late
+_LEAP_S = 0.5  # [s] step ahead that no initial delay explains
+_LEARNT, _ENOUGH = 32, 8  # intervals used to estimate period and jitter: at most, at least
+_LEAST_S = 0.01  # [s] least jitter: smaller steps age nothing
+_STEADY_S = 0.15  # [s] duration of constant lateness that indicates a clock step
+_SILENCE_S = 1.0  # [s] gap after which the time of the next message is unknown
+_UNDECIDED_S = 5.0  # [s] longest observation of a lateness that does not become constant
+_SETTLED_S = 1.0  # [s] after the start: until then all messages may have been late
 
 
 class Clock(ABC):
-    """Seconds that never go backwards."""
+    """Source of time that never goes backwards [s]."""
 
     @abstractmethod
     def now(self) -> float:
-        """Seconds since an arbitrary start."""
+        """Return the seconds since an arbitrary start."""
 
     @abstractmethod
     def sleep_until(self, deadline: float) -> None:
-        """Return at `deadline` or just after it; at once where it has passed."""
+        """Return at `deadline` or just after it; immediately if it has passed."""
 
 
 class MonotonicClock(Clock):
-    """CLOCK_MONOTONIC of this machine, shared by all of its processes."""
+    """CLOCK_MONOTONIC of this machine, which all processes share."""
 
     def now(self) -> float:
         return time.monotonic()
 
     def sleep_until(self, deadline: float) -> None:
-        # time.sleep itself waits on CLOCK_MONOTONIC, to an absolute deadline, through signals.
+        # time.sleep waits on CLOCK_MONOTONIC until an absolute deadline, through signals.
         remaining = deadline - time.monotonic()
         if remaining > 0:
             time.sleep(remaining)
 
 
 class VirtualClock(Clock):
-    """A clock that moves only when told; used by lockstep and by tests."""
+    """Clock that moves only by `advance` and `sleep_until`; for lockstep and tests."""
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = start
@@ -64,42 +61,42 @@ class VirtualClock(Clock):
 
 
 class _StepCandidate(NamedTuple):
-    """Messages that are as late as each other, and later than one before them."""
+    """Messages that are equally late, and later than a message before them."""
 
-    first: float  # arrival of the first that was late at all
-    since: float  # arrival of the first of those that are equally late
-    offset: float  # (arrival - stamp) of that one
-    before: float  # the same of the last that was not late
-    steady: float  # for how long they have to be so [s]
+    first: float  # arrival of the first late message
+    since: float  # arrival of the first of the equally late messages
+    offset: float  # (arrival - stamp) of that message
+    before: float  # (arrival - stamp) of the last message that was not late
+    steady: float  # time for which they must stay equally late [s]
 
 
 class ClockStepDetector:
-    """Tells steps of a peer's clock from delays, by the messages of one stream, which come in their order.
+    """Detector of steps of a peer's clock, which it distinguishes from delays, for one ordered stream.
 
-    A delay leaves stamps where the stream's period puts them, and moves arrivals; a step does the opposite. A stamp
-    more than `tolerance` before an earlier one is a step back at once. A lesser one is, or one that is off the period
-    where its arrival is not, when all that has followed for 0.15 s is equally late: a burst is not. After a silence, in
-    which nothing is known of periods, that takes 1 s. A message earlier than any before is a step ahead, unless it is
-    its arrival that is off the period. What is within the jitter is neither.
+    A delay leaves stamps on the stream's period and shifts arrivals; a clock step does the opposite. A stamp more
+    than `tolerance` [s] before an earlier one is a step back at once. A smaller step back, or a stamp off the period
+    whose arrival is on it, counts as a step when all messages of the next 0.15 s are equally late (in a burst they
+    are not); after a gap, when the period is unknown, of the next 1 s. A message earlier than all before it is a step
+    ahead, unless its arrival is off the period. Differences within the jitter are ignored.
     """
 
     def __init__(self, tolerance: float = 0.5) -> None:
         self._tolerance = tolerance
         self._intervals: deque[float] = deque(maxlen=_LEARNT)  # of stamps [s]
-        self._noise: deque[float] = deque(maxlen=_LEARNT)  # by how much those of arrivals differed [s]
+        self._noise: deque[float] = deque(maxlen=_LEARNT)  # |arrival interval - stamp interval| [s]
         self.reset()
 
     def reset(self) -> None:
-        """Compare what comes with nothing before it; period and jitter stay known."""
+        """Forget the last message; the estimates of period and jitter are kept."""
         self._newest = -math.inf
         self._began = math.inf
         self._last: tuple[float, float] | None = None  # stamp, arrival
         self._suspect: _StepCandidate | None = None
 
     def update(self, stamp: float, arrival: float, least: float) -> float:
-        """By how much the clock was set [s], < 0 back, as found with this message; 0.0 where it was not.
+        """Return the clock step detected with this message [s], negative if set back; 0.0 if there is none.
 
-        `least` is the least (arrival - stamp) of all streams of the peer.
+        `least` is the smallest (arrival - stamp) over all streams of the peer.
         """
         last, self._last = self._last, (stamp, arrival)
         newest, self._newest = self._newest, max(self._newest, stamp)
@@ -139,7 +136,7 @@ class ClockStepDetector:
 
     def _judge(self, suspect: _StepCandidate, offset: float, arrival: float) -> float:
         if offset - suspect.before <= self._jitter() or arrival - suspect.first > _UNDECIDED_S:
-            self._suspect = None  # a delay, and it is over; or neither is to be had
+            self._suspect = None  # a delay that is over, or an undecidable case
         elif abs(offset - suspect.offset) > self._jitter():
             self._suspect = suspect._replace(since=arrival, offset=offset)
         elif arrival - suspect.since >= suspect.steady:
@@ -147,29 +144,28 @@ class ClockStepDetector:
         return 0.0
 
     def _jitter(self) -> float:
-        """Jitter of intervals without a step [s]; inf while too little is known."""
+        """Return the jitter of intervals [s]; inf while too few are known."""
         if len(self._noise) < _ENOUGH:
             return math.inf
         return max(_LEAST_S, 3.0 * sorted(self._noise)[len(self._noise) * 9 // 10])
 
     def _off_more(self, moved: float, waited: float) -> float:
-        """Excess of the stamp's distance from the stream's period over that of the arrival [s]."""
+        """Return how much farther the stamp is from the stream's period than the arrival is [s]."""
         period = max(sorted(self._intervals)[len(self._intervals) // 2], _LEAST_S / 10)
         return _off(moved, period) - _off(waited, period)
 
 
 def _off(interval: float, period: float) -> float:
-    """Distance of an interval from one or more whole periods [s]."""
+    """Return the distance of an interval from the nearest multiple, at least one, of the period [s]."""
     return abs(interval - max(1, round(interval / period)) * period)
 
 
 class ClockMap:
-    """Maps a peer's clock onto ours by the smallest (arrival - stamp) of the last `window` seconds.
+    """Mapping of a peer's clock to ours by the smallest (arrival - stamp) of the last `window` seconds.
 
-    Clocks drift by tens of ppm, so the minimum is taken over a window and not for ever. Where `steps` tells that the
-    peer's clock was set, or that it was started anew, the map starts anew: `restarts` counts steps back, `leaps` those
-    ahead. Several streams of one peer have steps each.
-    Source: the minimum filter of NTP (RFC 5905, section 10).
+    Clocks drift by tens of ppm, hence a window and not the minimum of all times. After a step or restart of the
+    peer's clock the mapping starts anew: `restarts` counts steps back, `leaps` steps ahead. If a peer has several
+    streams, each needs its own ClockStepDetector. Source: the minimum filter of NTP (RFC 5905, section 10).
     """
 
     def __init__(self, window: float = 45.0, tolerance: float = 0.5) -> None:
@@ -180,7 +176,7 @@ class ClockMap:
         self.leaps = 0
 
     def map(self, stamp: float, arrival: float, steps: ClockStepDetector | None = None) -> float:
-        """The peer's `stamp` in our clock; never later than `arrival`. `steps` are those of the stamp's own stream."""
+        """Return the peer's `stamp` on our clock, never later than `arrival`; `steps` is the detector of its stream."""
         offset = arrival - stamp
         least = self._minima[0][1] if self._minima else math.inf
         step = (steps or self._steps).update(stamp, arrival, least)
@@ -193,4 +189,4 @@ class ClockMap:
         self._minima.append((arrival, offset))
         while self._minima[0][0] < arrival - self._window:
             self._minima.popleft()
-        return min(arrival, stamp + self._minima[0][1])  # rounding may put it a hair later
+        return min(arrival, stamp + self._minima[0][1])  # rounding could make it later than the arrival

@@ -1,4 +1,4 @@
-"""Environment variables of a station: none of the web's, secrets by their names alone."""
+"""Environment variables of a station: without the web's secrets; own secrets by the name of their variable."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from runtime.core.errors import ConfigurationError
 
-# What signs sessions, opens the database, broker and store, and logs in at the hub: no station has a use for it.
+# Session key, access to database, broker and object store, hub login: no station uses them.
 WEB_ONLY = frozenset(
     (
         *("EVA_SECRET_KEY", "DATABASE_URL", "REDIS_URL", "DJANGO_SUPERUSER_PASSWORD"),
@@ -17,19 +17,19 @@ WEB_ONLY = frozenset(
         *("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN", "HF_TOKEN_PATH"),
     )
 )
-_JUDGES = "EVA_JUDGE_"  # begins the names of keys of automatic judges, which the worker alone asks
-# For ssh: its agent, its tickets, its language, and where it finds itself.
+_JUDGES = "EVA_JUDGE_"  # prefix of automatic judges' keys, which only the worker uses
+# For ssh: agent, Kerberos tickets, language and session.
 _OF_SSH = frozenset(
     (
         *("HOME", "USER", "LOGNAME", "SHELL", "PATH", "TZ", "TMPDIR", "XDG_RUNTIME_DIR"),
         *("SSH_AUTH_SOCK", "SSH_AGENT_PID", "KRB5CCNAME", "KRB5_CONFIG", "LANG", "LANGUAGE"),
     )
 )
-_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")  # the first one given counts
+_BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")  # the first set applies
 
 
 def without_web_secrets(given: Mapping[str, str]) -> dict[str, str]:
-    """An environment without what is the web's alone."""
+    """Return the environment without the variables that only the web may have."""
     return {name: value for name, value in given.items() if not _web_alone(name)}
 
 
@@ -38,26 +38,26 @@ def _web_alone(name: str) -> bool:
 
 
 def program_environment(given: Mapping[str, str]) -> dict[str, str]:
-    """An environment for programs that start quickly and are still beside control, where it says nothing else.
+    """Return the environment for programs that must start quickly and must not disturb control.
 
-    One thread of BLAS: a robot's matrices are small, and more threads spin where they wait. No look for plug-ins of
-    pydantic among all installed packages, a twelfth of the start of a process.
+    Variables in `given` take precedence. BLAS gets one thread: a robot's matrices are small, and idle threads spin.
+    Pydantic does not search all installed packages for plug-ins, which takes a twelfth of a process's start.
     """
     blas = {} if any(name in given for name in _BLAS_THREADS) else {_BLAS_THREADS[0]: "1"}
     return {"PYDANTIC_DISABLE_PLUGINS": "__all__", **blas, **given}
 
 
 def ssh_environment() -> dict[str, str]:
-    """Variables of ours that an ssh gets: its configuration may tell it to send on whatever it has."""
+    """Return the variables that an ssh process gets; its configuration may forward all that it has."""
     return {
         name: value for name, value in os.environ.items() if name in _OF_SSH or name.startswith("LC_")
     } | {"SSH_ASKPASS_REQUIRE": "never"}
 
 
 def restart_without_web_secrets() -> None:
-    """Start a program that has secrets of the web again without, as the same process.
+    """Re-execute this program without the web's secrets, as the same process, if it has any.
 
-    Else they could be read in /proc for as long as it lives, and every child would have them.
+    Otherwise they could be read in /proc during its whole life, and every child would inherit them.
     """
     kept = without_web_secrets(os.environ)
     if len(kept) < len(os.environ):
@@ -65,7 +65,11 @@ def restart_without_web_secrets() -> None:
 
 
 def read_secret(key: str, name: str) -> str:
-    """The value of the variable `name`, which `key` of a deployment names; ConfigurationError where there is none."""
+    """Return the value of the variable `name`, which `key` of a deployment refers to.
+
+    Raises:
+        ConfigurationError: the variable is not set, or belongs to the web.
+    """
     if _web_alone(name):
         raise ConfigurationError(
             f"{key} names {name}, which is the web's and never a station's; allowed: a variable of its own, "

@@ -1,60 +1,60 @@
-"""One base for every error of the runtime: a sentence that names the offender and what is allowed."""
+"""Errors of the runtime, with one base; each message names the offender and what is allowed."""
 
 
 class RuntimeFault(Exception):
-    """Something that a person has to read: the message says what is wrong and what to do."""
+    """Error for a person to read: the message states what is wrong and what to do."""
 
 
 class ConfigurationError(RuntimeFault):
-    """A deployment file, a robot description or an option is wrong; names file, key, value, allowed."""
+    """Error in a deployment file, robot description or option; names file, key, value and allowed values."""
 
 
 class SetupError(RuntimeFault):
-    """A part cannot do what the deployment asks of it; found before anything moves."""
+    """A component cannot do what the deployment requires; detected before anything moves."""
 
 
 class PolicyError(RuntimeFault):
-    """The policy server is absent, mute, gone, or answered with something unusable."""
+    """The policy server is absent, silent or gone, or its response is unusable."""
 
 
 class ContradictionError(SetupError, PolicyError):
-    """The policy server says of itself what the deployment says otherwise; names both sides."""
+    """The policy server's own description contradicts the deployment; the message names both sides."""
 
 
 class ActionSpaceError(ContradictionError):
-    """The server's actions are of another space, form or width than the deployment says."""
+    """The server's actions have another space, format or width than the deployment declares."""
 
 
 class WrongProtocolError(PolicyError):
-    """The server at the policy's address does not speak the protocol that the deployment says."""
+    """The server at the policy's address does not speak the declared protocol."""
 
 
 class RefusedError(PolicyError):
-    """The policy server wants a key or a token, and was given none, or a wrong one."""
+    """The policy server requires a key or token that is missing or wrong."""
 
 
 class TlsError(PolicyError):
-    """There is no encrypted connection to the policy server: no TLS, or a certificate that is not trusted."""
+    """No encrypted connection to the policy server: it has no TLS, or its certificate is not trusted."""
 
 
 class ServerReportedError(PolicyError):
-    """The policy server answers, and says that it failed."""
+    """The policy server responds and reports a failure."""
 
 
 class ShapeError(PolicyError):
-    """The rows of an answer have another shape than this robot needs."""
+    """The rows of a response have another shape than the robot needs."""
 
 
 class NotFiniteError(PolicyError):
-    """The rows of an answer have numbers that are not finite."""
+    """The rows of a response contain numbers that are not finite."""
 
 
 class PolicyLostError(PolicyError):
-    """The policy server is not there any more, or did not answer in time; it may come back."""
+    """The policy server disappeared or did not respond in time; it may come back."""
 
 
 class PolicyTimeout(PolicyLostError):
-    """The server did not answer within the deadline; the connection is dropped."""
+    """The server did not respond within the deadline; the connection is closed."""
 
 
 class PolicyDisconnected(PolicyLostError):
@@ -62,27 +62,27 @@ class PolicyDisconnected(PolicyLostError):
 
 
 class UnsolicitedError(PolicyLostError):
-    """The server sent what nobody had asked for, so answers may be off by one; the connection is dropped."""
+    """The server sent a response without a request, so responses may be off by one; the connection is closed."""
 
 
 class PortClosedError(PolicyLostError):
-    """The policy server's machine answers, and nobody listens at the port."""
+    """The policy server's machine responds, but its port is closed."""
 
 
 class UnreachableError(PolicyLostError):
-    """The policy server's machine cannot be reached: its name is not known, or no way leads there."""
+    """The policy server's machine is unreachable: unknown host name, or no route."""
 
 
 class TunnelError(PolicyLostError):
-    """There is no SSH tunnel to the policy server at the moment; says why."""
+    """The SSH tunnel to the policy server is down; the message has the reason."""
 
 
 class TransportError(RuntimeFault):
-    """The execution node or the dataset is absent, gone, or sent something unusable."""
+    """The execution node or dataset is absent or gone, or sent something unusable."""
 
 
 class CodecError(RuntimeFault):
-    """Bytes from a peer do not follow the wire format that was expected of them."""
+    """Bytes from a peer do not follow the expected wire format."""
 
 
 class RecordingError(RuntimeFault):

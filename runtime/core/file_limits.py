@@ -1,4 +1,4 @@
-"""Number of files and connections that a process may have open."""
+"""Limit of the files and connections that a process may have open."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _ENOUGH = 4096
 
 
 def raise_file_limit() -> None:
-    """Raise the soft limit to the hard one: who runs out of descriptors is ended by ZMQ when somebody connects."""
+    """Raise the soft limit to the hard limit: ZMQ aborts a process that runs out of descriptors."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     if hard != resource.RLIM_INFINITY and hard < _ENOUGH:

@@ -1,4 +1,4 @@
-"""Which state of the source the runtime runs from."""
+"""Git revision of the source that is running."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from types import MappingProxyType
 from runtime import __file__ as _here
 
 _PATIENCE_S = 5.0
-_CODE = ("runtime/", "robots/", "deployments/")  # a new file there changes what runs
+_CODE = ("runtime/", "robots/", "deployments/")  # an untracked file there changes what runs
 
 
 @cache  # cache: of what runs here, which is what was loaded at the start
 def revision() -> Mapping[str, object]:
-    """`commit` and `dirty` of our own checkout, found once; {} where we run from none, or git does not tell."""
+    """Return `commit` and `dirty` of our own checkout, determined once; {} outside a checkout or if git fails."""
     return MappingProxyType(revision_of(Path(_here).resolve().parent.parent))
 
 
 def revision_of(root: Path) -> dict[str, object]:
-    """`commit` and `dirty` of the checkout whose top folder is `root`.
+    """Return `commit` and `dirty` of the checkout with top folder `root`, or {}.
 
-    Dirty: a tracked file differs from the commit, or there is a new one among runtime/, robots/, deployments/.
+    Dirty: a tracked file differs from the commit, or runtime/, robots/ or deployments/ has an untracked file.
     """
     top, commit = _git(root, "rev-parse", "--show-toplevel"), _git(root, "rev-parse", "HEAD")
     changes = _git(root, "status", "--porcelain")
     if not top or not commit or changes is None or Path(top).resolve() != root.resolve():
-        return {}  # also where an installed package lies within somebody else's checkout
+        return {}  # also if the package is installed inside another project's checkout
     return {"commit": commit, "dirty": any(_counts(line) for line in changes.splitlines())}
 
 
@@ -39,11 +39,12 @@ def _counts(line: str) -> bool:
 
 
 def _git(root: Path, *arguments: str) -> str | None:
-    """Output of git, None where it fails; it writes nothing and follows no variables of a hook."""
+    """Return the output of git, None if it fails; the call writes nothing and ignores GIT_ variables of a hook."""
     plain = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
         done = subprocess.run(
-            # The runtime may be started by another user (root, for its scheduling class) than owns the checkout.
+            # The runtime may run as another user (root, for its scheduling class) than the owner of the
+            # checkout.
             ("git", "-c", f"safe.directory={root}", "-C", str(root), *arguments),
             capture_output=True,
             text=True,

@@ -1,4 +1,4 @@
-"""Log lines on standard error through a thread, so that a stuck terminal never stops who logs."""
+"""Logging to standard error through a thread, so that a blocked terminal never blocks the caller."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from queue import SimpleQueue
 from types import TracebackType
 
 LINES_KEPT = 1000
-_AT_EXIT_S = 1.0  # for what is left when the process ends
+_AT_EXIT_S = 1.0  # [s] for the remaining lines when the process ends
 _STDERR = 2
-_STACK_BYTES = 256 * 1024  # control locks its memory
+_STACK_BYTES = 256 * 1024  # small, because control locks its memory
 
 
 def configure_logging(process: str) -> None:
-    """Log lines: time, process, level, sentence. EVA_LOG_LEVEL says from which level on."""
+    """Log to standard error: time, process, level, message. EVA_LOG_LEVEL is the lowest level."""
     lines = NonBlockingHandler(_STDERR)
     lines.setFormatter(
         logging.Formatter(f"%(asctime)s {process:<10} %(levelname)-7s %(message)s", "%H:%M:%S")
@@ -26,11 +26,11 @@ def configure_logging(process: str) -> None:
 
 
 class NonBlockingHandler(logging.Handler):
-    """Hands lines to a thread that writes them to a descriptor.
+    """Log handler with a thread that writes lines to a descriptor.
 
-    Where that takes no more (a stopped terminal, a pager, a pipe nobody reads), lines are dropped beyond
-    LINES_KEPT and counted; nobody ever waits, but for a second when the process ends. The writing goes around
-    Python's own buffers, whose locks a stuck writer would hold for ever.
+    If the descriptor blocks (a stopped terminal, a pager, a pipe without a reader), lines beyond LINES_KEPT are
+    dropped and counted; callers never wait, except at most a second at the end of the process. Writes bypass Python's
+    buffers, whose locks a blocked writer would hold forever.
     """
 
     def __init__(self, descriptor: int) -> None:
@@ -43,17 +43,17 @@ class NonBlockingHandler(logging.Handler):
         threading.stack_size(before)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Queue the line; no I/O and no lock that the writing thread could hold."""
+        """Queue the line; no I/O, and no lock that the writing thread could hold."""
         if self._queue.qsize() >= LINES_KEPT:
             self._dropped += 1
             return
         try:
             self._queue.put(f"{self.format(record)}\n".encode(errors="backslashreplace"))
-        except (TypeError, ValueError, LookupError) as error:  # of a wrong format string
+        except (TypeError, ValueError, LookupError) as error:  # the format string is wrong
             self._queue.put(f"{record.pathname}:{record.lineno}: cannot be logged: {error}\n".encode())
 
     def flush(self) -> None:
-        """Wait until everything is written, at most a second; `logging` calls it when the process ends."""
+        """Wait at most a second until everything is written; `logging` calls it when the process ends."""
         written = threading.Event()
         self._queue.put(written)
         written.wait(_AT_EXIT_S)
@@ -74,11 +74,11 @@ class NonBlockingHandler(logging.Handler):
             while line:
                 line = line[os.write(self._descriptor, line) :]
         except OSError:
-            self._dropped += 1  # the terminal is gone; it may come back
+            self._dropped += 1  # the terminal is gone, and may come back
 
 
 def _log_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Log the error that ends the process: a traceback must not wait for a terminal either."""
+    """Log the exception that ends the process: a traceback must not wait for a terminal either."""
     if issubclass(kind, Exception):
         logging.getLogger(__name__).critical("this process ends", exc_info=(kind, error, trace))
     else:

@@ -1,4 +1,4 @@
-"""Keys whose values name something of the station's own machine, so that others may not set them at will."""
+"""Configuration keys whose values refer to the station's own machine, and so must not be set by clients."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 
 class HostReference(Enum):
-    """Kinds of things that the value of such a key names."""
+    """Kinds of things that such a value refers to."""
 
     VARIABLE = "an environment variable"
     FILE = "a file that is read"
@@ -23,7 +23,7 @@ Recording = Annotated[str, HostReference.RECORDING]
 
 
 def find_host_references(table: BaseModel, prefix: str = "") -> Iterator[tuple[str, HostReference, str]]:
-    """The keys of a table, and of those in it, that name something, with what and which."""
+    """Yield (key, kind, value) for each key of a table, and of nested tables, that refers to this machine."""
     for key, field in type(table).model_fields.items():
         value = getattr(table, key)
         if isinstance(value, BaseModel):

@@ -1,8 +1,7 @@
-"""Memory that a process frees stays with it, because pictures come and go.
+"""Setting of glibc to reuse freed memory instead of returning it, for processes that handle pictures.
 
-glibc gives large pieces of freed memory back to the kernel, and each picture then begins with a page fault for every
-4 kB of it: of a request with three small pictures that is half of the processor time. Nothing grows by this: the
-process keeps what it has needed at most at one time.
+glibc returns large freed blocks to the kernel, so each new picture causes a page fault per 4 kB: half of the
+processor time of a request with three small pictures. Memory does not grow: the process holds its peak use at most.
 """
 
 from __future__ import annotations
@@ -10,14 +9,12 @@ from __future__ import annotations
 import ctypes
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-_KEPT = 256 * 1024 * 1024  # bytes of free memory in one piece; more is given back
-_FROM_THE_HEAP = (
-    32 * 1024 * 1024
-)  # bytes; the most that glibc takes. Larger pieces come from the kernel and go there
+_KEPT = 256 * 1024 * 1024  # [bytes] free memory at the top of the heap that is not returned
+_FROM_THE_HEAP = 32 * 1024 * 1024  # [bytes] glibc's maximum; larger blocks are mapped
 
 
 def keep_freed_memory() -> bool:
-    """Ask for it; False where the C library has no such setting."""
+    """Apply the setting; return False if the C library does not support it."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except AttributeError:  # musl

@@ -1,10 +1,9 @@
-"""The msgpack dialect for arrays that openpi and our execution nodes speak; knows nothing of robots.
+"""Codec of arrays in msgpack, in the dialect of openpi and our execution nodes; independent of robots.
 
-An array is a map with binary keys, in this order: `__ndarray__` true, `data` in C order, `dtype` (numpy's
-string), `shape`. A numpy scalar is a map of `__npgeneric__` true, `data` the Python number, `dtype`.
-Two other dialects are about (the package msgpack_numpy, and numpy's file format inside a map); their decoders
-return each other's arrays as plain maps without a word, so this one looks for their marks and says so.
-Nothing here ever unpickles.
+An array is a map with binary keys, in this order: `__ndarray__` true, `data` in C order, `dtype` (numpy's string),
+`shape`. A numpy scalar is a map of `__npgeneric__` true, `data` the Python number, `dtype`. Two other dialects exist
+(the package msgpack_numpy, and numpy's file format inside a map). Their decoders return arrays of another dialect as
+plain maps without an error; this one detects their marks and raises. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -18,17 +17,20 @@ import numpy as np
 
 from runtime.core.errors import CodecError
 
-DEFAULT_LIMIT = 256 * 1024 * 1024  # bytes of one message; a peer that sends more is not one of ours
+DEFAULT_LIMIT = 256 * 1024 * 1024  # [bytes] of one message
 _REFUSED_KINDS = frozenset("VOc")  # structures, Python objects, complex numbers
-_BUFFERED_KINDS = frozenset("biuf")  # kinds whose memory msgpack can read without a copy
+_BUFFERED_KINDS = frozenset("biuf")  # kinds whose memory msgpack reads without a copy
 _SCALARS = (bool, int, float, str, bytes)
 
 
 def pack(value: object) -> bytes:
-    """`value` as one message; raises CodecError for what the dialect cannot carry.
+    """Return `value` as one message.
 
-    Tuples become lists. float64, str_ and bytes_ scalars travel as plain numbers and strings: to msgpack
-    they are Python's own types.
+    Tuples become lists. float64, str_ and bytes_ scalars are packed as plain numbers and strings: to msgpack they are
+    Python's own types.
+
+    Raises:
+        CodecError: the dialect cannot represent the value.
     """
     try:
         packed: bytes = msgpack.packb(value, default=_encode)
@@ -38,10 +40,11 @@ def pack(value: object) -> bytes:
 
 
 def unpack(payload: bytes | bytearray | memoryview, limit: int = DEFAULT_LIMIT) -> Any:
-    """The value of one message; arrays come back **read-only**: copy them before writing.
+    """Return the value of one message; its arrays are **read-only**: copy them before writing.
 
-    Raises CodecError for more than `limit` bytes, broken msgpack, an array whose data do not fill its shape,
-    object, structured or complex types, and arrays of another dialect (which it names).
+    Raises:
+        CodecError: more than `limit` bytes, invalid msgpack, an array whose data do not fill its shape, an object,
+            structured or complex type, or an array of another dialect (which is named).
     """
     if len(payload) > limit:
         raise CodecError(f"a message of {len(payload)} bytes exceeds the limit of {limit}")
@@ -72,7 +75,7 @@ def _encode(value: object) -> dict[bytes, object]:
 
 
 def _bytes_of(array: np.ndarray[Any, Any]) -> bytes | memoryview:
-    # A picture is the bulk of a message: where its memory already lies in C order, it is copied only once.
+    # Pictures are the bulk of a message: memory that is in C order already is copied only once.
     if array.dtype.kind in _BUFFERED_KINDS and array.flags.c_contiguous:
         return array.data
     return array.tobytes()

@@ -1,4 +1,4 @@
-"""The most pixels and scans of pictures that others give us: some hundred bytes can say that they are gigabytes."""
+"""Limits on pixels and scans of untrusted pictures: some hundred bytes can declare gigabytes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 MOST_PIXELS = 2**24  # such as 4096 x 4096
-MOST_SCANS = 64  # encoders write about ten, and their thumbnails some more
-# FFmpeg's option, looked at before memory is taken: of sizes that decoders have rounded up, so that ours decides.
+MOST_SCANS = 64  # encoders write about ten; with thumbnails some more
+# FFmpeg's option, checked before memory is allocated. Decoders round sizes up, hence the margin: our own check
+# decides.
 DECODING = {"max_pixels": str(MOST_PIXELS * 5 // 4)}
 
 
-# What Pillow raises of a picture that is damaged, whichever its format, beside its own errors (which are OSError).
+# Exceptions of Pillow for damaged pictures of any format, in addition to its own (subclasses of OSError).
 DAMAGED = (
     *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, SyntaxError, TypeError, ValueError),
     *(struct.error, zlib.error),
@@ -21,11 +22,11 @@ DAMAGED = (
 
 
 class TooLargeError(ValueError):
-    """A picture has more pixels, or more scans, than any camera's."""
+    """A picture has more pixels or scans than that of any camera."""
 
 
 def require_size(width: int, height: int, whose: str = "its pictures are") -> None:
-    """Raise TooLargeError for more than MOST_PIXELS; `whose` begins its sentence."""
+    """Raise TooLargeError for more than MOST_PIXELS; `whose` begins its message."""
     if width * height > MOST_PIXELS:
         raise TooLargeError(
             f"{whose} {width} x {height}; allowed: {MOST_PIXELS} pixels in all, such as 4096 x 4096"
@@ -33,14 +34,18 @@ def require_size(width: int, height: int, whose: str = "its pictures are") -> No
 
 
 def require_scans(coded: bytes, whose: str = "its JPEG has") -> None:
-    """Raise TooLargeError for a JPEG of so many scans that some bytes each cost a whole picture."""
-    scans = coded.count(b"\xff\xda") if coded.startswith(b"\xff\xd8") else 0  # coded pixels never hold it
+    """Raise TooLargeError for a JPEG with so many scans that a few bytes each cost a whole decoding."""
+    scans = coded.count(b"\xff\xda") if coded.startswith(b"\xff\xd8") else 0  # coded pixels never contain it
     if scans > MOST_SCANS:
         raise TooLargeError(f"{whose} {scans} scans; allowed: {MOST_SCANS}")
 
 
 def open_video(path: Path | str) -> Any:
-    """PyAV's container of a video that is read, bounded; raises what `av.open` raises, and TooLargeError."""
+    """Open a video for reading with PyAV, bounded.
+
+    Raises:
+        TooLargeError: the container declares larger pictures. Errors of `av.open` are passed on.
+    """
     import av
 
     container = av.open(str(path), options=dict(DECODING), metadata_errors="replace")
@@ -53,12 +58,13 @@ def open_video(path: Path | str) -> Any:
 
 
 def bound(container: Any) -> None:
-    """Let the decoders of an open container, which have decoded nothing yet, refuse larger pictures.
+    """Make the decoders of an open container, which have decoded nothing yet, refuse larger pictures.
 
-    TooLargeError where the container says already that they are.
+    Raises:
+        TooLargeError: the container already declares larger pictures.
     """
     for stream in container.streams.video:
-        if stream.codec_context is None:  # nobody can decode it
+        if stream.codec_context is None:  # there is no decoder for it
             continue
         require_size(stream.width, stream.height)
         stream.codec_context.options = {**stream.codec_context.options, **DECODING}

@@ -1,4 +1,4 @@
-"""Variants of a part, each a module that is imported by name, and only where a deployment names its kind."""
+"""Plug-ins: modules that are imported by name, and only if a deployment names their kind."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from runtime.core.errors import ConfigurationError
 
 
 class Variants(Mapping[str, ModuleType]):
-    """The modules of a package by their `kind`, as its table KINDS names them; each is imported when it is asked for.
+    """The modules of a package by `kind`, from its table KINDS; each is imported on first access.
 
-    Raises ConfigurationError, which names file and cause, for one that cannot be imported.
+    Raises:
+        ConfigurationError: a module cannot be imported; names file and cause.
     """
 
     def __init__(self, package: str) -> None:
@@ -31,7 +32,7 @@ class Variants(Mapping[str, ModuleType]):
         name = self._modules[kind]
         try:
             return importlib.import_module(name)
-        except (Exception, SystemExit) as error:  # of anybody's code: it is told where a deployment names it
+        except (Exception, SystemExit) as error:  # third-party code: reported with the deployment's key
             file = self._folder / f"{name.rpartition('.')[2]}.py"
             raise ConfigurationError(
                 f"{self._package.rpartition('.')[2]}: the kind {kind!r} cannot be loaded: {file}: "
@@ -50,12 +51,12 @@ class Variants(Mapping[str, ModuleType]):
 
 @functools.cache  # cache: of tables in the code
 def variants(package: str) -> Variants:
-    """The variants that `package` names in its table KINDS."""
+    """Return the variants in the table KINDS of `package`."""
     return Variants(package)
 
 
 class UnreadSection(BaseModel):
-    """A table that this process has no use for: as it was written, by its kind, with nothing of it loaded."""
+    """Table that this process does not use: unchanged, with its kind, and without an import."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -63,23 +64,23 @@ class UnreadSection(BaseModel):
 
 
 class KindUnion:
-    """The type of a table of one of a package's kinds, told apart by `kind`.
+    """Type of a table that is of one of a package's kinds, distinguished by `kind`.
 
-    A kind is imported when a table names it. A package that the context of the validation has under `unread` is
-    left alone: its tables become an UnreadSection each.
+    A kind is imported when a table names it. Tables of a package that the validation context lists under `unread` are
+    not checked: each becomes an UnreadSection.
     """
 
     package: ClassVar[str]
 
     @classmethod
     def config(cls, kind: str) -> type[BaseModel]:
-        """The model of the tables of a kind."""
+        """Return the model of the tables of a kind."""
         found: type[BaseModel] = variants(cls.package)[kind].Config
         return found
 
     @classmethod
     def configs(cls) -> tuple[type[BaseModel], ...]:
-        """The models of all kinds: imports them all."""
+        """Return the models of all kinds, which imports them all."""
         return tuple(cls.config(kind) for kind in variants(cls.package))
 
     @classmethod
@@ -109,12 +110,12 @@ class KindUnion:
 
 
 def kind_union(package: str) -> Any:
-    """The type of a table of one of the package's kinds."""
+    """Return the type of a table of one of the package's kinds."""
     return type("OneOf", (KindUnion,), {"package": package, "__doc__": KindUnion.__doc__})
 
 
 def union_members(annotation: Any) -> tuple[Any, ...]:
-    """Parts of an annotation: the models of all kinds of a table that has kinds, else its arguments."""
+    """Return the members of an annotation: the models of all kinds for a KindUnion, else its type arguments."""
     if isinstance(annotation, type) and issubclass(annotation, KindUnion):
         return annotation.configs()
     return get_args(annotation)

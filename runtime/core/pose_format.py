@@ -1,4 +1,4 @@
-"""Format of poses in a row of numbers, as a deployment declares it."""
+"""Declared format of poses as rows of numbers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class PoseFormat(Settings):
 
     @model_validator(mode="after")
     def _mean_something(self) -> PoseFormat:
-        """A key that this orientation has no use for is a mistake, and would be none to notice."""
+        """Reject keys that the chosen orientation does not use: such a mistake would go unnoticed."""
         chosen = self.orientation
         strange = {
             "euler_order": self.euler_order != "xyz" and chosen != "euler",
@@ -67,7 +67,7 @@ CANONICAL = PoseFormat()
 
 
 def reject_pose_format(pose: PoseFormat, key: str) -> None:
-    """ConfigurationError where a format is declared for a space that is joints: it would mean nothing."""
+    """Raise ConfigurationError if a pose format is declared for the space "joint", which has no poses."""
     given = pose.model_dump(exclude_defaults=True)
     if given:
         raise ConfigurationError(

@@ -1,4 +1,4 @@
-"""Asks Linux for a steady control tick, and for what it sees: real-time class, locked memory, a quiet gc."""
+"""Real-time settings of Linux for control, reception and guard: scheduling class, locked memory, garbage collection."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 _SLICE_NS = 100_000
-_LARGE = 8 << 20  # bytes of one mapping
-LOCKSTEP = "lockstep"  # the class of ticks that keep no time
+_LARGE = 8 << 20  # [bytes] of one mapping
+LOCKSTEP = "lockstep"  # class of ticks without real time
 
 
 def enter_realtime(priority: int) -> str:
-    """Make this process as punctual as permitted; returns what it got, for the status.
+    """Make this process as punctual as permitted; return the class obtained, for the status.
 
-    SCHED_FIFO at `priority`, or at the highest that the user's rtprio limit permits; else a scheduler slice of
-    0.1 ms (Linux 6.12 and later); else the ordinary class. "unlocked": its memory may be paged out.
+    SCHED_FIFO at `priority`, or at the highest that the user's rtprio limit permits; else a scheduler slice of 0.1 ms
+    (Linux 6.12 and later); else the ordinary class. "unlocked" is appended if its memory may be paged out.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     _fine_timers(libc)
@@ -43,10 +43,11 @@ def enter_realtime(priority: int) -> str:
 
 
 def enter_realtime_below(priority: int) -> str:
-    """The same for a process that is next after the one at `priority`, and has threads and large, sparse memory.
+    """Make this process punctual with the priority below `priority`; return the class obtained.
 
-    Threads that are started from now on are of the class that it got, unless they `leave` it. What is mapped by now
-    is locked as it is used, nothing that comes later: that could be refused in the middle of the work.
+    For a process with threads and large, sparse memory. Threads started later inherit the class, unless they call
+    `leave_realtime`. Memory mapped so far is locked page by page on first use; later mappings are not locked, because
+    that could be refused in the middle of the work.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     _fine_timers(libc)
@@ -57,27 +58,27 @@ def enter_realtime_below(priority: int) -> str:
 
 
 def leave_realtime(thread: int = 0) -> None:
-    """That thread, 0: the calling one, leaves a real-time class; those that it starts from now on are in none."""
-    with contextlib.suppress(ProcessLookupError):  # it has ended
+    """Remove thread `thread` (0: the calling one) from a real-time class; its later threads are in none either."""
+    with contextlib.suppress(ProcessLookupError):  # the thread has ended
         if os.sched_getscheduler(thread) in (os.SCHED_FIFO, os.SCHED_RR):
             os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
 
 
 def leave_realtime_all() -> None:
-    """All threads of this process leave it."""
+    """Remove all threads of this process from a real-time class."""
     for thread in os.listdir("/proc/self/task"):
         leave_realtime(int(thread))
 
 
 def advice(scheduling: str, priority: int) -> str:
-    """Advice to make a station punctual, for control that got `scheduling`; "" where it need not be."""
+    """Return advice to make a station punctual if control got the class `scheduling`; "" if not needed."""
     if scheduling.startswith("FIFO") or scheduling == LOCKSTEP:
         return ""
     return _NOT_PERMITTED(scheduling=scheduling, priority=priority)
 
 
 def _fine_timers(libc: ctypes.CDLL) -> None:
-    """Wake up when asked, and not up to 50 us later together with others (the real-time class always does)."""
+    """Wake up on time, not up to 50 us later together with others (a real-time class always does)."""
     libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
 
 
@@ -86,10 +87,10 @@ def _locked_memory(libc: ctypes.CDLL, what: int) -> bool:
 
 
 def _read_in(libc: ctypes.CDLL) -> None:
-    """Have what is mapped by now in memory: code that has not run yet would come from the disk in the middle of a tick.
+    """Load mapped files into memory: code that has not run yet would be read from disk in the middle of a tick.
 
-    Large memory without a file is locked as it is used, which takes a microsecond a page and no disk: of the buffers of
-    BLAS (32 MB each) and the stacks of threads (8 MB) hardly any ever is.
+    Large anonymous memory is locked on first use, at a microsecond per page and without disk access: of BLAS buffers
+    (32 MB each) and thread stacks (8 MB) hardly any is ever used.
     """
     with open("/proc/self/maps", encoding="utf-8") as maps:
         for line in maps:
@@ -101,7 +102,7 @@ def _read_in(libc: ctypes.CDLL) -> None:
 
 
 def _quiet_gc() -> None:
-    """Never look through again what is imported; the loop collects by itself, between two ticks."""
+    """Exclude imported objects from collection and disable it; the loop collects between two ticks."""
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -113,19 +114,22 @@ def _class(libc: ctypes.CDLL, priority: int, locked: bool, below: int = 0) -> st
 
 
 def _fifo(priority: int, below: int = 0) -> str:
-    """`below` what another process gets that asks for `priority`."""
+    """Enter SCHED_FIFO and return the class, "" if not permitted.
+
+    The priority is `below` less than that of a process that requests `priority` itself.
+    """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     for wanted in (priority - below, min(priority, limit) - below):
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(wanted))
-        except OSError:  # not permitted, or no priority of this kernel: what is next best is asked for
+        except OSError:  # not permitted, or an invalid priority: try the next best
             continue
         return f"FIFO {wanted}"
     return ""
 
 
 def _short_slice(libc: ctypes.CDLL) -> bool:
-    """A slice of its own (sched_setattr(2)): who asks for less at a time is let in sooner by EEVDF."""
+    """Request a short scheduler slice (sched_setattr(2)): EEVDF schedules such a process sooner."""
     number = _SYS_SCHED_SETATTR.get(os.uname().machine)
     if number is None:
         return False

@@ -1,7 +1,7 @@
-"""Sentences that people read, with an id and arguments beside the English: what a translation is made from.
+"""Sentences for people, with an id and arguments from which a translation is made.
 
-A module declares its sentences as `Pattern`s beside where they are used, and calls one to say it. What comes out is
-a `str`, so that logs, records and whoever compares go on with the English.
+A module declares its sentences as `Pattern`s next to their use, and calls one to create a `Sentence`. That is a
+`str`, so logs, records and comparisons use the English text.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Argument = str | int | float  # a str may be another Sentence
 
 _ID = re.compile(r"[a-z][a-z0-9_]*(\.[a-z0-9_]+)+")
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
-_SPEC = re.compile(r"(\.\d)?[fg]|d|\.\d{1,3}|")  # pages read the same ones: static/site/sentences.js
+_SPEC = re.compile(r"(\.\d)?[fg]|d|\.\d{1,3}|")  # pages have the same rule: static/site/sentences.js
 _LONGEST_ID, _MOST, _DEEPEST = 100, 24, 8
 _LARGEST = 2**53
 
@@ -26,12 +26,12 @@ _KNOWN: dict[str, Pattern] = {}  # state: the patterns of the modules that were 
 
 
 class Sentence(str):
-    """An English sentence that knows its `id` and `arguments`. Concatenated or formatted it is a plain str."""
+    """An English sentence with `id` and `arguments`. Concatenated or formatted it is a plain str."""
 
     __slots__ = ("arguments", "depth", "id")
     id: str
     arguments: Mapping[str, Argument]
-    depth: int  # 1 where no argument is a sentence
+    depth: int  # 1 if no argument is a sentence
 
     def __new__(cls, text: str, id: str, arguments: Mapping[str, Argument]) -> Sentence:
         made = super().__new__(cls, text)
@@ -40,7 +40,7 @@ class Sentence(str):
         return made
 
     def __str__(self) -> str:
-        return self  # so that str() of an exception is the sentence that it was raised with
+        return self  # so that str() of an exception is the original Sentence
 
     def __getnewargs__(self) -> tuple[str, str, Mapping[str, Argument]]:  # type: ignore[override]
         return plain(self), self.id, self.arguments
@@ -53,7 +53,10 @@ class Sentence(str):
 
 
 class Pattern:
-    """A sentence before its arguments are known; a second one of the same id that says something else is an error."""
+    """A sentence with placeholders. Call it with the arguments to create a `Sentence`.
+
+    A second pattern with the same id and another text is an error.
+    """
 
     def __init__(self, id: str, english: str) -> None:
         if not _ID.fullmatch(id):
@@ -75,17 +78,21 @@ class Pattern:
 
 
 def fixed(id: str, english: str) -> Sentence:
-    """A sentence without arguments, declared and said at once."""
+    """Declare a sentence without arguments and return it."""
     return Pattern(id, english)()
 
 
 def known() -> Iterator[Pattern]:
-    """The patterns of all modules that were imported, in the order of their ids."""
+    """Return the patterns of all imported modules, sorted by id."""
     return (_KNOWN[id] for id in sorted(_KNOWN))
 
 
 def names_of(pattern: str) -> frozenset[str]:
-    """Names of the arguments in a pattern; ValueError where it asks for more than a name and a simple format."""
+    """Return the names of the arguments in a pattern.
+
+    Raises:
+        ValueError: a placeholder has more than a name, !r and a simple format.
+    """
     names = set()
     for _, name, spec, conversion in Formatter().parse(pattern):
         if name is None:
@@ -99,19 +106,19 @@ def names_of(pattern: str) -> frozenset[str]:
 
 
 def plain(text: str) -> str:
-    """The text as an exact str."""
+    """Return the text as an exact str."""
     return str.__str__(text)
 
 
 def identity(text: str) -> dict[str, Any]:
-    """Id and arguments of a sentence as they travel; "" and {} for any other text."""
+    """Return id and arguments of a sentence in wire form; "" and {} for another text."""
     if not isinstance(text, Sentence):
         return {"id": "", "arguments": {}}
     return {"id": text.id, "arguments": {name: _told(value) for name, value in text.arguments.items()}}
 
 
 def rewritten(text: str, change: Callable[[str], str]) -> str:
-    """The text and all that it is made of, each through `change`; it keeps its id."""
+    """Return the text with `change` applied to it and to all nested texts; the id is kept."""
     if not isinstance(text, Sentence):
         return change(text)
     parts = {
@@ -121,7 +128,7 @@ def rewritten(text: str, change: Callable[[str], str]) -> str:
 
 
 def shows(text: str, arguments: Mapping[str, Any]) -> bool:
-    """True if all that arguments say, as they travel, stands in the text: who may read it may have them."""
+    """Return True if all arguments (wire form) appear in the text: a reader of the text may then get them."""
     for value in arguments.values():
         if isinstance(value, Mapping):
             nested = str(value.get("text"))
@@ -133,17 +140,17 @@ def shows(text: str, arguments: Mapping[str, Any]) -> bool:
 
 
 def told(text: str) -> dict[str, Any]:
-    """A sentence as it travels: {"id", "arguments", "text"}."""
+    """Return a sentence in wire form: {"id", "arguments", "text"}."""
     return {**identity(text), "text": plain(text)}
 
 
 def within(tree: object) -> dict[str, dict[str, Any]]:
-    """Ids and arguments of the sentences in maps and lists, by where they stand."""
+    """Return ids and arguments of the sentences in nested maps and lists, by path."""
     return {path: identity(text) for path, text in texts(tree).items() if isinstance(text, Sentence)}
 
 
 def texts(tree: object) -> dict[str, str]:
-    """The texts in maps and lists, by where they stand: the keys that lead there, with dots between them."""
+    """Return the texts in nested maps and lists by path: the keys to them, joined by dots."""
     return dict(_texts(tree, ""))
 
 
@@ -156,7 +163,11 @@ def _texts(tree: object, path: str) -> Iterator[tuple[str, str]]:
 
 
 def heard(text: str, id: object, arguments: object, depth: int = 0) -> str:
-    """What another process said, a Sentence where it has an id; ValueError for what is none."""
+    """Return a text from another process, as a Sentence if it has an id.
+
+    Raises:
+        ValueError: id or arguments are invalid.
+    """
     if id == "":
         return text
     if not isinstance(id, str) or len(id) > _LONGEST_ID or not _ID.fullmatch(id):
@@ -167,14 +178,14 @@ def heard(text: str, id: object, arguments: object, depth: int = 0) -> str:
 
 
 def checked(said: object) -> dict[str, dict[str, Any]]:
-    """Ids and arguments by where their texts stand, as another process has said them; without those that are none."""
+    """Return ids and arguments by path, as another process sent them, without invalid entries."""
     said = said if isinstance(said, Mapping) else {}
     found = {path: _checked(one) for path, one in said.items() if isinstance(one, Mapping)}
     return {str(path): one for path, one in found.items() if one}
 
 
 def checked_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row as another process has said it; without its id and arguments where they are none."""
+    """Return a row that another process sent, without its id and arguments if they are invalid."""
     return {key: of for key, of in row.items() if key not in ("id", "arguments")} | _checked(row)
 
 
@@ -210,9 +221,9 @@ def _told(value: Argument) -> Argument | dict[str, Any]:
 
 
 def _argument(value: object) -> Argument:
-    """The value as it may travel: JSON knows no NaN, pages count to 2**53, and nobody takes what is nested too deep.
+    """Return the value in a form that can be sent: no NaN (JSON), at most 2**53 (browsers), limited depth.
 
-    Of an enumeration that has a sentence, it is that.
+    An enumeration with a `sentence` becomes that sentence.
     """
     if isinstance(value, Sentence):
         return value if value.depth < _DEEPEST else plain(value)
@@ -220,7 +231,7 @@ def _argument(value: object) -> Argument:
         return _argument(getattr(value, "sentence", value.value))
     if isinstance(value, str):
         return str.__str__(value)
-    if isinstance(value, float):  # asked before the numbers of others, which take longer to tell
+    if isinstance(value, float):  # before Real: isinstance of an abstract number class is slower
         return float(value) if isfinite(value) else str(value)
     if isinstance(value, bool):
         return str(value)
@@ -236,7 +247,7 @@ _JOINED = {
 
 
 def series(texts: Sequence[str], mark: Literal[";", ","] = ";") -> str:
-    """All of them in one sentence, with such marks between; "" for none."""
+    """Join texts to one sentence with `mark` between them; "" if there are none."""
     made, *others = reversed(texts or [""])
     for text in others:
         made = _JOINED[mark](first=text, rest=made)

@@ -1,4 +1,4 @@
-"""A table of settings, the base of every part of a deployment file, and what is wrong with one in sentences."""
+"""Base class of all tables of a deployment file, and messages for invalid tables."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from pydantic_core import ErrorDetails
 from runtime.core.plugins import KindUnion, variants
 
 Key = tuple[str, ...]
-_SECRET = re.compile(
-    r"pass|secret|token|private", re.IGNORECASE
-)  # keys whose values nobody is to read in a message
+_SECRET = re.compile(r"pass|secret|token|private", re.IGNORECASE)  # keys whose values are not printed
 _NO_ORIGIN: Mapping[Key, str] = MappingProxyType({})
 
 
@@ -26,7 +24,7 @@ class Settings(BaseModel):
     Unknown keys, wrong types, NaN and infinity are errors.
     """
 
-    # A limit of infinity or NaN would be no limit at all, and neither is valid in a manifest's JSON.
+    # A limit of infinity or NaN would not limit, and neither is valid in a manifest's JSON.
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
@@ -37,9 +35,9 @@ def explain_validation_error(
     source: str,
     origin: Mapping[Key, str] = _NO_ORIGIN,
 ) -> str:
-    """One line per error of `tree` as a `root`: which key, what was given, what is allowed.
+    """Return one line per error of `tree` as a `root`: the key, the given value, what is allowed.
 
-    `origin` names where a key came from, `source` all the others.
+    `origin` maps keys to the file that they came from, `source` is that of all others.
     """
     return "\n".join(_sentence(error, root, tree, source, origin) for error in invalid.errors())
 
@@ -77,7 +75,7 @@ def _sentence(
 
 
 def _plain(loc: tuple[int | str, ...], tree: Mapping[str, Any]) -> Key:
-    """The key as it stands in the file: without the tags that pydantic adds for unions."""
+    """Return the key as in the file, without the tags that pydantic adds for unions."""
     key: list[str] = []
     at: Any = tree
     for index, part in enumerate(loc):
@@ -94,12 +92,12 @@ def _plain(loc: tuple[int | str, ...], tree: Mapping[str, Any]) -> Key:
 
 
 def _allowed(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[str]:
-    """The keys that the table at `key` may have."""
+    """Return the keys that the table at `key` may have."""
     return sorted({name for model in _tables(key, tree, root) for name in model.model_fields})
 
 
 def _tables(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[type[BaseModel]]:
-    """Models that the table at `key` may be: one where its kind says so, else each it could be."""
+    """Return the models that the table at `key` may be: a single one if its kind is known, else all candidates."""
     annotations: list[Any] = [root]
     at: Any = tree
     for name in key:
@@ -114,7 +112,7 @@ def _tables(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[ty
 
 
 def _under(name: str, annotation: Any) -> list[Any]:
-    """The annotations of what stands under `name` in something of type `annotation`."""
+    """Return the annotations of the value under `name` in a value of type `annotation`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(name)
         return [field.annotation] if field else []
@@ -124,7 +122,7 @@ def _under(name: str, annotation: Any) -> list[Any]:
 
 
 def _chosen(annotation: Any, table: Any) -> list[Any]:
-    """The annotation, that of the kind that `table` names where there are several; [] where it names none."""
+    """Return the annotation or, for a union, that of the kind that `table` names; [] if it names none."""
     if isinstance(annotation, type) and issubclass(annotation, KindUnion):
         kind = table.get("kind") if isinstance(table, Mapping) else None
         return (

@@ -15,27 +15,27 @@ _Result = TypeVar("_Result")
 
 
 def allow_two_threads(context: ssl.SSLContext) -> ssl.SSLContext:
-    """Let the sockets that `context` wraps be read by one thread while another writes; returns `context`.
+    """Make sockets wrapped by `context` usable by one reading and one writing thread; return `context`.
 
-    websockets' threaded connections do that with every socket, and OpenSSL does not allow it: one SSL object must
-    never be entered twice at a time. What comes of it is "internal error", most often just after the handshake, when
-    the reading thread takes the server's session tickets while the first request is written.
+    The threaded connections of websockets use every socket like that, but OpenSSL forbids concurrent calls on one SSL
+    object. The symptom is "internal error", most often just after the handshake, when the reader receives session
+    tickets while the first request is written.
     """
     context.sslsocket_class = _TurnTakingSocket
     return context
 
 
 class _TurnTakingSocket(ssl.SSLSocket):
-    """Enters its SSL object from one thread at a time, and never waits for the network inside it.
+    """TLS socket whose SSL object is used by one thread at a time, and never waits for the network inside.
 
-    Its file descriptor does not block after the handshake; a timeout holds for the wait outside.
+    After the handshake the descriptor is non-blocking; timeouts apply to a poll outside the lock.
     """
 
-    _turn: threading.Lock | None = None  # until the handshake is done
+    _turn: threading.Lock | None = None  # None until the handshake is done
     _patience: float | None = None
 
     def do_handshake(self, block: bool = False) -> None:
-        """Shake hands, within the timeout there is; then switch to waiting outside."""
+        """Perform the handshake within the current timeout, then switch to non-blocking mode."""
         super().do_handshake(block)
         if self._turn is None:
             self._patience = super().gettimeout()
@@ -43,37 +43,37 @@ class _TurnTakingSocket(ssl.SSLSocket):
             self._turn = threading.Lock()
 
     def settimeout(self, value: float | None) -> None:
-        """As of every socket: seconds, 0 for no wait at all, None for no end."""
+        """Set the timeout [s]; 0: do not wait, None: wait without limit."""
         if self._turn is None:
             super().settimeout(value)
         else:
             self._patience = value
 
     def setblocking(self, flag: bool) -> None:
-        """As of every socket."""
+        """Set blocking mode, as for every socket."""
         self.settimeout(None if flag else 0.0)
 
     def gettimeout(self) -> float | None:
-        """What `settimeout` was given."""
+        """Return the timeout that `settimeout` set [s]."""
         return super().gettimeout() if self._turn is None else self._patience
 
     def read(self, len: int = 1024, buffer: Any = None) -> Any:
-        """What has arrived, in bytes; their number where they went to `buffer`. Nothing once it was shut down."""
+        """Return received bytes, or their number if read into `buffer`; empty or 0 after a shutdown."""
         try:
             return self._in_turn(lambda: super(_TurnTakingSocket, self).read(len, buffer))
-        except ValueError:  # what ssl says of a read that another thread's `shutdown` has ended
+        except ValueError:  # ssl raises it if another thread's `shutdown` ended the read
             if self._sslobj is not None:  # type: ignore[attr-defined]
                 raise
             return b"" if buffer is None else 0
 
     def _real_close(self) -> None:
-        """Wake whoever waits: a descriptor that is only closed wakes nobody who polls it."""
+        """Shut down first: closing a descriptor alone does not wake a thread that polls it."""
         with contextlib.suppress(OSError):
             super().shutdown(socket.SHUT_RDWR)
         super()._real_close()  # type: ignore[misc]
 
     def send(self, data: Any, flags: int = 0) -> int:
-        """Send; returns how many bytes went."""
+        """Send; return the number of bytes sent."""
         return self._in_turn(lambda: super(_TurnTakingSocket, self).send(data, flags))
 
     def _in_turn(self, step: Callable[[], _Result]) -> _Result:

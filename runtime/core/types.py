@@ -1,4 +1,4 @@
-"""The nouns that every part of the runtime shares: observation, action chunk, command."""
+"""Data types shared by all parts of the runtime: observation, action chunk, command."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ Space = Literal["joint", "eef"]
 ActionMode = Literal["absolute", "relative", "delta"]
 RelativeFrame = Literal["base", "tool"]
 Result = Literal["success", "partial", "fail"]  # of an episode, as its operator judged it
-EEF_WIDTH = 8  # x, y, z [m], quaternion w, x, y, z, gripper: one arm's end-effector vector
+EEF_WIDTH = 8  # x, y, z [m], quaternion w, x, y, z, gripper: end-effector vector of an arm
 
 _EMPTY: Mapping[str, object] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """Knowledge of the robot at one moment: joints, poses, and the newest picture of each camera.
+    """State of the robot at one moment: joints, poses, and the newest picture of each camera.
 
-    Vectors are in the robot's group order: `qpos`, `qvel`, `effort` float32 [D] (rad, rad/s, Nm; grippers in
-    the robot's own unit), `eef` float32 [8 * arms] as measured by the robot. `pictures` are RGB uint8 [H, W, 3],
-    read-only, by observation key. All times are seconds on our own monotonic clock: `captured` holds one per
-    stream ("joints", "eef", and each camera key), `arrived` is when the newest part reached us.
+    Vectors are in the robot's group order: `qpos`, `qvel`, `effort` float32 [D] (rad, rad/s, Nm; grippers in the
+    robot's own unit), `eef` float32 [8 * arms] as measured by the robot. `pictures` are RGB uint8 [H, W, 3],
+    read-only, by observation key. All times are seconds on our own monotonic clock: `captured` has one entry per
+    stream ("joints", "eef", and each camera key), `arrived` is the arrival time of the newest part.
     """
 
     sequence: int
@@ -44,32 +44,30 @@ class Observation:
     qvel: Float32 | None = None
     effort: Float32 | None = None
     eef: Float32 | None = None
-    reported_action: Float32 | None = None  # [D] what the robot itself says it applied for this frame
-    reported_action_eef: Float32 | None = None  # [8 * arms] the same as poses
-    last: bool = False  # the source ends with this frame (a recording has played out)
-    step: int = -1  # the control tick it was assembled for; -1 until a tick has seen it
+    reported_action: Float32 | None = None  # [D] action that the robot reports for this frame
+    reported_action_eef: Float32 | None = None  # [8 * arms] the reported action as poses
+    last: bool = False  # the source ends with this frame (a replayed recording is over)
+    step: int = -1  # control tick for which it was assembled; -1: none yet
     prompt: str = ""
-    truth: Mapping[str, Any] | None = (
-        None  # what a simulated bench says of itself: JSON, never shown to a policy
-    )
-    commanded: Float64 | None = None  # [D] what the robot was told last, None where it is told nothing
-    drives: Mapping[str, Any] | None = None  # {"enabled": bool, "faults": [str]} where the node reports them
+    truth: Mapping[str, Any] | None = None  # ground truth of a simulated bench (JSON), never for policies
+    commanded: Float64 | None = None  # [D] last commanded position, None without commands
+    drives: Mapping[str, Any] | None = None  # {"enabled": bool, "faults": [str]} if the node reports them
 
 
 @dataclass(frozen=True, slots=True)
 class ActionChunk:
-    """A policy's answer: rows of actions from the step of the observation on.
+    """A policy's answer: rows of actions, row 0 for the step of the observation.
 
-    `actions` is float32 [H, W] in `space`: "joint" rows are [D] in group order, "eef" rows are poses as `pose`
-    says, None: 8 per arm. They are kept as the server gave them. `rate` is the rows' own rate [Hz], None where it is
-    the control rate. `model_actions` are the rows in the model's own normalised space where the server returned
-    them; `model_relative` says that these are relative to the observation whatever `mode` is, None that nobody
-    knows. `timing` holds the server's own figures [ms].
+    `actions` is float32 [H, W] in `space`, unchanged from the server: "joint" rows are [D] in group order, "eef" rows
+    are poses in the format `pose` (None: 8 values per arm). `rate` is the rate of the rows [Hz], None: the control
+    rate. `model_actions` are the rows in the model's normalised space, if the server returned them; `model_relative`
+    is True if they are relative to the observation whatever `mode` is, None if unknown. `timing` has the server's own
+    times [ms].
 
-    `mode` says what the numbers are: "absolute" targets; "relative" to the observation the chunk answers; "delta",
-    each row relative to the one before, the first to the observation. Grippers are absolute in every mode. `frame`
-    is that of relative poses: offsets along the frame that poses are declared in ("base"), or along the observed
-    "tool".
+    `mode`: "absolute" targets; "relative" to the observation that the chunk answers; "delta": each row relative to
+    its predecessor, the first to the observation. Grippers are absolute in every mode. `frame` is that of relative
+    poses: offsets along the axes of the frame in which poses are declared ("base"), or of the observed end effector
+    ("tool").
     """
 
     actions: Float32
@@ -85,15 +83,15 @@ class ActionChunk:
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
-    """Commitments of the robot so far, for policies that continue their own last chunk (RTC).
+    """Committed actions of the robot, for policies that continue their own last chunk (RTC).
 
-    Rows are in the policy's own space and at its own rate: absolute ones as the server gave them, others relative to
-    the observation that is asked about, as the answer will be.
+    Rows are in the policy's own space and at its own rate: absolute rows as received, other rows relative to the new
+    observation, like those of the answer.
     """
 
-    previous: Float32  # [T, W] the chunk that is being executed, whole
-    consumed_rows: int  # its rows that are for steps before the new observation
-    predicted_delay: int  # rows that will be consumed until the answer is expected to arrive
+    previous: Float32  # [T, W] the whole chunk that is being executed
+    consumed_rows: int  # rows for steps before the new observation
+    predicted_delay: int  # rows consumed until the answer is expected
     execution_horizon: int  # rows of the answer that will be executed at most
 
     @property
@@ -104,9 +102,9 @@ class Conditioning:
 
 @dataclass(frozen=True, slots=True)
 class RobotCommand:
-    """One absolute target for the whole robot: float32 [D] in group order, for control tick `step`.
+    """An absolute target for the whole robot: float32 [D] in group order, for control tick `step`.
 
-    `eef` are the poses of these joints as the deployment's `publication` wants them, None where it wants joints.
+    `eef` are the poses of these joints in the format of the deployment's `publication`, None if it publishes joints.
     """
 
     action: Float32

@@ -1,4 +1,4 @@
-"""Bells: who puts something into the shared state for a process that sleeps wakes it, and nobody looks in vain."""
+"""Wake-up signals between the station's processes, so that a reader sleeps until shared memory has something new."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import suppress
 
 
 class Bell:
-    """An eventfd that the family inherits: any process rings it, the one that it is for waits for it."""
+    """An eventfd that the station processes inherit: any process may ring it, a single process waits for it."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
@@ -17,28 +17,28 @@ class Bell:
 
     @classmethod
     def made(cls) -> Bell:
-        """A new one."""
+        """Create a new bell."""
         return cls(os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC))
 
     def ring(self) -> None:
-        """Wake who waits, or who waits next; never blocks."""
+        """Wake the process that waits now or next; never blocks."""
         os.eventfd_write(self.descriptor, 1)
 
     def wait(self, seconds: float) -> None:
-        """Return when it was rung since the last time, or after so long."""
+        """Wait until the bell rings, at most `seconds`; returns at once if it was rung since the last wait."""
         if self._poll.poll(seconds * 1000.0):
             self.hush()
 
     def hush(self) -> None:
-        """Forget that it was rung, before one looks at what for: what comes later rings again."""
-        with suppress(BlockingIOError):  # it was not
+        """Reset the bell. Call it before reading shared memory: whatever is written later rings again."""
+        with suppress(BlockingIOError):  # it was not rung
             os.eventfd_read(self.descriptor)
 
     def close(self) -> None:
-        """Let go of it; others keep theirs."""
+        """Close the descriptor in this process only."""
         os.close(self.descriptor)
 
 
 def bells(descriptors: str) -> tuple[Bell, ...]:
-    """Those of a command line: inherited descriptors, separated by commas."""
+    """Return the bells of a command line: inherited descriptors, separated by commas."""
     return tuple(Bell(int(descriptor)) for descriptor in descriptors.split(","))

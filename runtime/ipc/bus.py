@@ -1,7 +1,7 @@
-"""The station's sockets: commands in, snapshots and pictures out, numbered events.
+"""Sockets of a station: commands, snapshots, pictures and numbered events; independent of robots.
 
-Knows nothing of robots. The sockets are Unix sockets in a folder of this account's own; clients find them in the
-station's folder, where each process of the family leaves its endpoints.
+The sockets are Unix sockets in a folder that only this account can enter. Clients find their paths in the station's
+folder, to which each station process writes its endpoints.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NO_COMMAND = Pattern("bus.no_command", "expected a Command, got {kind}")
 _NO_ANSWER = Pattern("bus.no_answer", "no answer to {kind} within {seconds:g} s: outcome unknown")
 _TOO_LARGE = Pattern("bus.too_large", "{kind} has {given} bytes; allowed: {most}")
 
-# What a client needs to talk to a station, with the errors that it may meet: this module is a door.
+# What clients import to communicate with a station, with the errors that they may catch.
 __all__ = [
     "CodecError",
     "CommandClient",
@@ -49,33 +49,35 @@ __all__ = [
 ]
 
 log = logging.getLogger(__name__)
-# What a publisher queues per reader that does not keep up, beyond which ZMQ drops the newest. It counts a
-# queue as emptied only when half of it is, so it has to take two bursts: all events, all cameras at once.
+# Queue length of a publisher per slow reader, beyond which ZMQ drops the newest message. ZMQ counts a queue as
+# emptied only when half of it is, so it must hold two bursts: all events, all cameras at once.
 STREAM_HIGH_WATER = 64
 CAMERA_HIGH_WATER = 16
-# A reader that comes rarely must find everything in its own queue, else the newest is hidden behind the old.
+# A reader that polls rarely must find all messages in its own queue, or the newest stays hidden behind old
+# ones.
 _READER_HIGH_WATER = 256
 _AWAY_S = 1.0
 EVENTS_KEPT = 2000
 
 
-# Of sockets that others connect to: who connects and never says what he is, is gone after a second; one that does not
-# live is let go; nobody's message is larger than any of ours.
+# Listening sockets: a peer without a handshake is dropped after a second, a dead connection after 20 s.
 _HANDSHAKE_MS, _HEARTBEAT_MS, _SILENT_MS = 1000, 5000, 20_000
 _BACKLOG = 1024
 _LOOK_S = LOOK_S
-LARGEST = 256 << 10  # bytes of a command
-_QUEUED = 256  # commands of one connection, before it has to wait
-_UNREAD = (
-    2000  # answers that a connection has not read, beyond which it loses them: more than those of one turn
-)
-MAX_WAITING_PER_CONNECTION = 32  # requests of one connection that may wait; what is beyond is refused
-MAX_MESSAGES_PER_TURN = 1000  # messages that are taken from a socket in one turn
+LARGEST = 256 << 10  # [bytes] of a command
+_QUEUED = 256  # commands of one connection that are queued before it has to wait
+_UNREAD = 2000  # answers that a connection has not read; more than those of one turn
+MAX_WAITING_PER_CONNECTION = 32  # requests of one connection that may wait; more are refused
+MAX_MESSAGES_PER_TURN = 1000  # messages read from a socket in one turn
 TOO_MANY = _TOO_MANY(most=MAX_WAITING_PER_CONNECTION)
 
 
 class Listener:
-    """A socket that listens in the station's folder of sockets; `endpoint` says where. Raises TransportError."""
+    """A listening socket in the station's folder of sockets; `endpoint` is its address.
+
+    Raises:
+        TransportError: it cannot listen.
+    """
 
     def __init__(
         self,
@@ -110,10 +112,10 @@ class Listener:
         self._identity = file_identity(path)
 
     def rebind_if_unreachable(self) -> bool:
-        """Listen anew where clients cannot connect, or others could; True where it has another endpoint now.
+        """Listen at a new path if clients cannot connect, or others could; return True if it moved.
 
-        A session's folder goes with the last logout of its account, and its mode or owner may change. Who is connected
-        stays so. Looks five times a second.
+        The session folder ($XDG_RUNTIME_DIR) is removed at the account's last logout, and its mode or owner may
+        change. Existing connections continue. Checks at most every `LOOK_S` seconds.
         """
         if time.monotonic() - self._looked < _LOOK_S:
             return False
@@ -133,16 +135,16 @@ class Listener:
         return True
 
     def close(self) -> None:
-        """Release the socket."""
+        """Close the socket and remove its file."""
         self.socket.close()
-        self._path.unlink(missing_ok=True)  # which ZMQ leaves
+        self._path.unlink(missing_ok=True)  # ZMQ does not remove it
 
 
 @dataclass(frozen=True, slots=True)
 class IncomingMessage:
-    """One message as it came: from whom, what, signed how (empty: not at all), and of which account and process.
+    """A received message: connection, content, signature (empty: unsigned), sender's account and process.
 
-    None where the kernel does not say which.
+    `uid` and `pid` are None if the kernel does not report them.
     """
 
     address: list[bytes]
@@ -153,9 +155,9 @@ class IncomingMessage:
 
 
 def _call(frames: list[zmq.Frame]) -> IncomingMessage:
-    """A message of a ROUTER: the connection, the empty frame of those that have one, content, signature.
+    """Split the frames of a ROUTER: connection, empty frame (if any), content, signature.
 
-    What has more frames than that has a signature of all of them, which is none.
+    Surplus frames are joined to the signature, which makes it invalid.
     """
     body = 2 if len(frames) > 2 and not len(frames[1]) else 1
     address = [frame.bytes for frame in frames[:body]]
@@ -165,7 +167,7 @@ def _call(frames: list[zmq.Frame]) -> IncomingMessage:
 
 
 def _peer(frame: zmq.Frame) -> tuple[int | None, int | None]:
-    """The account and the process that connected, as the kernel told ZMQ: "localhost:UID:GID:PID"."""
+    """Return account and process of the connection, as the kernel reported to ZMQ: "localhost:UID:GID:PID"."""
     try:
         _, uid, _, pid = str(frame["Peer-Address"]).split(":")
         return int(uid), int(pid)
@@ -179,15 +181,15 @@ def _refusal(reason: str) -> bytes:
 
 
 class CommandServer(Listener):
-    """The answering end of commands: a ROUTER that never blocks its owner."""
+    """Server side of commands: a ROUTER that never blocks its owner."""
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path, name: str) -> None:
         super().__init__(context, zmq.ROUTER, station_dir, name, _QUEUED, _UNREAD)
 
     def receive(self) -> tuple[IncomingMessage, Command] | None:
-        """The next command, and how it came; None where there is none.
+        """Return the next command with its message, None if there is none.
 
-        What cannot be read is answered with a refusal that says why, and never ends the caller.
+        Unreadable messages are answered with a refusal that has the reason; no exception is raised.
         """
         while (call := self.receive_raw()) is not None:
             if (command := self.decode(call)) is not None:
@@ -195,7 +197,7 @@ class CommandServer(Listener):
         return None
 
     def receive_raw(self) -> IncomingMessage | None:
-        """The next message, unread; None where there is none."""
+        """Return the next message without decoding it, None if there is none."""
         if not readable(self.socket):
             return None
         try:
@@ -204,7 +206,7 @@ class CommandServer(Listener):
             return None
 
     def decode(self, call: IncomingMessage) -> Command | None:
-        """The command that came; where it is none, that is answered with the reason."""
+        """Return the command in a message; if there is none, send a refusal and return None."""
         try:
             message = decode(call.payload)
         except CodecError as error:
@@ -216,15 +218,15 @@ class CommandServer(Listener):
         return None
 
     def reject(self, call: IncomingMessage, reason: str) -> None:
-        """Refuse what nobody has read, so that its uuid is not known."""
+        """Refuse a message that was not decoded, so that the refusal has no uuid."""
         self._send(call, _refusal(reason))
 
     def answer(self, call: IncomingMessage, ack: Ack) -> None:
-        """Send the answer; a client that is gone, or reads none of them, loses it."""
+        """Send an answer; it is lost if the client is gone or does not read."""
         self._send(call, encode(ack))
 
     def pass_on(self, call: IncomingMessage, payload: bytes) -> None:
-        """Send an answer as another station has packed it."""
+        """Send an answer that another station has packed."""
         self._send(call, payload)
 
     def _send(self, call: IncomingMessage, payload: bytes) -> None:
@@ -232,10 +234,10 @@ class CommandServer(Listener):
 
 
 class CommandClient:
-    """The asking end: one command at a time, each with a deadline.
+    """Client side of commands: one command at a time, each with a deadline.
 
-    After a timeout the connection is dropped with all that is under way on it, in both directions: a late
-    answer is never taken for another's, and a command that was not sent is not delivered hours later.
+    After a timeout the connection is dropped with all messages in both directions: a late answer is never matched to
+    another command, and an unsent command is not delivered hours later.
     """
 
     def __init__(
@@ -245,10 +247,10 @@ class CommandClient:
         key: Key | None = None,
         owner: int | None = None,
     ) -> None:
-        """`owner` is the account whose station it is: nobody else's answer counts, but this account's and root's."""
+        """Connect; `owner` is the station's account: only answers of that account, this one and root count."""
         self._context = context
         self._believed = {os.geteuid(), 0, owner}
-        self.strangers = ""  # who answered instead
+        self.strangers = ""  # describes the sender of answers that were ignored
         self._endpoint = endpoint
         self._key = key
         self._connect()
@@ -259,14 +261,22 @@ class CommandClient:
         self._socket.connect(self._endpoint)
 
     def send(self, command: Command) -> None:
-        """Send it; its answer, if one comes, is nobody's. Raises CodecError for too large a one.
+        """Send a command without waiting for its answer. It is signed if there is a key.
 
-        It is signed where there is a key; one that is of no use keeps nothing from being sent.
+        With an unusable key the command is sent unsigned, and an error is logged.
+
+        Raises:
+            CodecError: it exceeds LARGEST bytes.
         """
         self._socket.send_multipart(self._signed(command))
 
     def request(self, command: Command, timeout: float) -> Ack:
-        """Its answer, as `post`; raises TransportError "outcome unknown" where none came in time."""
+        """Send a command and return its answer.
+
+        Raises:
+            TransportError: no answer within `timeout` [s], "outcome unknown".
+            CodecError: as in `send`.
+        """
         self.send(command)
         answer = self.receive_answer(command, timeout)
         if answer is not None:
@@ -276,7 +286,10 @@ class CommandClient:
         raise TransportError(_NO_ANSWER(kind=command.kind, seconds=timeout))
 
     def receive_answer(self, command: Command, timeout: float) -> Ack | None:
-        """The answer to what was posted; None where none came in time."""
+        """Return the answer to `command`, or None after `timeout` [s].
+
+        Answers of untrusted accounts are skipped and described in `strangers`.
+        """
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             if not self._socket.poll(int(left * 1000) + 1):
@@ -290,15 +303,15 @@ class CommandClient:
 
     @property
     def socket(self) -> zmq.Socket[Any]:
-        """For a poller: it can be read where an answer has come."""
+        """The socket, for a poller: readable when an answer has arrived."""
         return self._socket
 
     def forward(self, payload: bytes, signature: bytes) -> None:
-        """Send a command as another process has packed it, with that signature."""
+        """Send a command that another process has packed, with its signature."""
         self._socket.send_multipart([payload, signature], zmq.NOBLOCK)
 
     def packed_answer(self) -> bytes | None:
-        """The next answer that has come, unread; None where there is none, or a stranger gave it."""
+        """Return the next answer without decoding it; None if there is none or the sender is not trusted."""
         try:
             frame = self._socket.recv(zmq.NOBLOCK, copy=False)
         except zmq.Again:
@@ -329,14 +342,17 @@ class CommandClient:
 
 
 class Publisher(Listener):
-    """Sends newest-wins streams; a reader that is too slow misses some. Knows which of them anybody reads."""
+    """Publisher of streams in which only the newest message matters; a slow reader misses some.
+
+    `topics` are the subscribed prefixes.
+    """
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path, name: str, high_water: int) -> None:
         super().__init__(context, zmq.XPUB, station_dir, name, high_water, high_water)
-        self.topics: set[str] = set()  # how the names of the streams begin that somebody reads
+        self.topics: set[str] = set()  # prefixes of streams that have a subscriber
 
     def hear(self) -> list[str]:
-        """Learn who reads what by now; the topics that nobody read before."""
+        """Process subscriptions; return the topics without a subscriber before."""
         begun = []
         with suppress(zmq.Again):
             while readable(self.socket):
@@ -350,17 +366,17 @@ class Publisher(Listener):
         return begun
 
     def wanted(self, stream: str) -> bool:
-        """True if somebody reads `stream`, as far as was heard."""
+        """Return True if `stream` has a subscriber, as of the last `hear`."""
         return any(stream.startswith(topic) for topic in self.topics)
 
     def publish(self, stream: str, payload: object) -> None:
-        """Send `payload` under the name `stream`; never waits."""
+        """Send `payload` under the name `stream`; never blocks."""
         content = payload if isinstance(payload, bytes) else pack(payload)
         self.socket.send_multipart([stream.encode(), content], zmq.NOBLOCK)
 
 
 class Subscriber:
-    """Receives streams by name prefix, newest of each."""
+    """Receiver of streams by name prefix; returns the newest message of each."""
 
     def __init__(self, context: zmq.Context[Any], endpoint: str, *streams: str) -> None:
         self._context = context
@@ -377,10 +393,10 @@ class Subscriber:
         self._socket.connect(self._endpoint)
 
     def receive(self, timeout: float) -> dict[str, Any]:
-        """The newest content of every stream that had something within `timeout` seconds.
+        """Return the newest content of every stream that has a message within `timeout` seconds.
 
-        Who was away for more than a second is connected anew, which takes some milliseconds: what has piled
-        up meanwhile, here and in the kernel, is old.
+        After more than a second without a call it reconnects, which takes some milliseconds: the messages queued
+        meanwhile, here and in the kernel, are old.
         """
         if time.monotonic() - self._read_at > _AWAY_S:
             self._socket.close(linger=0)
@@ -401,14 +417,14 @@ class Subscriber:
 
 
 class EventLog:
-    """The last events, numbered from 1 without gaps, so that a client can ask for what it missed."""
+    """The last events, numbered from 1 without gaps, so that a client can request those that it missed."""
 
     def __init__(self) -> None:
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
         self.newest = 0
 
     def append(self, event: Event) -> dict[str, Any]:
-        """Number the event and keep it; returns it as a map."""
+        """Number and store the event; return it as a map."""
         self.newest += 1
         row = {
             "number": self.newest,
@@ -424,5 +440,5 @@ class EventLog:
         return row
 
     def since(self, number: int) -> list[dict[str, Any]]:
-        """Every kept event after `number`."""
+        """Return all stored events after `number`."""
         return [event for event in self._events if event["number"] > number]

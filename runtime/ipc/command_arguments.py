@@ -1,4 +1,4 @@
-"""Arguments of the session's commands: checked whole before anything is done about it."""
+"""Arguments of the session's commands: validated completely before a command has any effect."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from runtime.ipc.messages import Mode
 
 _TAKES_NONE = Pattern("commands.takes_none", "{kind} takes no arguments; given: {given}")
 
-LARGEST = 64 * 1024  # characters of JSON that a command may carry into a manifest
-_HIGHEST_SEED = 2**53 - 1  # beyond it a browser counts no more
+LARGEST = 64 * 1024  # characters of JSON that a command may add to a manifest
+_HIGHEST_SEED = 2**53 - 1  # largest integer of a browser's number
 
 
 def _small(given: dict[str, JsonValue]) -> dict[str, JsonValue]:
@@ -83,7 +83,7 @@ class SetUpRequest(Settings):
 
     @property
     def changes(self) -> dict[str, Any]:
-        """The tables that go on top of the deployment."""
+        """Tables that override the deployment's."""
         wanted = {"policy": self.policy, "strategy": self.strategy, "task": self.task}
         return {key: value for key, value in wanted.items() if value is not None}
 
@@ -104,13 +104,13 @@ class PreflightRequest(Settings):
 
     @property
     def changes(self) -> dict[str, Any]:
-        """The tables that go on top of the deployment."""
+        """Tables that override the deployment's."""
         wanted = {"policy": self.policy, "strategy": self.strategy, "task": self.task}
         return {key: value for key, value in wanted.items() if value is not None}
 
     @property
     def about(self) -> str:
-        """Name of what is looked at, for a sentence."""
+        """Name of the checked policy, for messages."""
         named = self.checkpoint and (self.checkpoint.name or str(self.checkpoint.id))
         return f"the checkpoint {named}" if named else "the deployment's policy"
 
@@ -219,7 +219,7 @@ class GripperRequest(Settings):
     action: Literal["open", "close", "lock", "unlock"]
 
 
-# What each command takes. None: whatever comes with it is not looked at, because a stop is not refused for a word.
+# Argument model of each command. None: arguments are ignored, because a stop must never be refused for them.
 ARGUMENTS: dict[str, type[Settings] | None] = {
     "setup": SetUpRequest,
     "run": RunRequest,
@@ -246,7 +246,11 @@ Request = TypeVar("Request", bound=Settings)
 
 
 def read(kind: str, model: type[Request], arguments: Mapping[str, Any]) -> Request:
-    """The arguments of a command `kind`; RuntimeFault names the key, what was given, what is allowed."""
+    """Return the validated arguments of a command `kind`.
+
+    Raises:
+        RuntimeFault: names the key, the given value and what is allowed.
+    """
     if arguments and not model.model_fields:
         raise RuntimeFault(_TAKES_NONE(kind=kind, given=", ".join(map(str, arguments))))
     try:

@@ -1,7 +1,7 @@
-"""Sockets of a station: in a folder that this account alone can enter, and in files that say where they are.
+"""Folder of a station's sockets, which only its account can enter, and files with the sockets' paths.
 
-An account that can enter the folder can speak to the station, so that no other may have made it, or
-have a right in it.
+An account that can enter the folder can command the station. So another account must not own the folder or have any
+permission for it.
 """
 
 from __future__ import annotations
@@ -25,24 +25,27 @@ from runtime.core.errors import TransportError
 
 log = logging.getLogger(__name__)
 RETRY_S = 1.0
-LOOK_S = 0.2  # between two looks whether a socket, or its file, is still there
+LOOK_S = 0.2  # [s] between two checks that a socket, or its file, still exists
 _IN_SESSION = "eva-web"
-LONGEST = 107  # bytes of the path of a Unix socket
+LONGEST = 107  # [bytes] of the path of a Unix socket
 _LONGEST_NAME = len("/commands-01234567")
 _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def socket_folder(station_dir: Path) -> Path:
-    """The folder of the station's sockets, made where it is missing; one per data folder and station.
+    """Return the folder of the station's sockets, created if missing; each data folder and station has its own.
 
-    Below $XDG_RUNTIME_DIR, else in ~/.cache. Raises TransportError where another account has a part in it.
+    It is below $XDG_RUNTIME_DIR, else in ~/.cache.
+
+    Raises:
+        TransportError: another account owns it or has permissions for it.
     """
     return _usable(next(_folders(station_dir)), station_dir)
 
 
 def _folders(station_dir: Path) -> Iterator[Path]:
-    """Folders for the sockets, best first; a station that starts takes the first, one that runs any."""
+    """Yield folders for the sockets, best first; a starting station uses the first, a running one any of them."""
     name = hashlib.sha256(os.fsencode(station_dir.resolve())).hexdigest()[:16]
     given = os.environ.get("XDG_RUNTIME_DIR", "")
     if given and not _missing(Path(given)):
@@ -54,7 +57,7 @@ def _folders(station_dir: Path) -> Iterator[Path]:
 def _missing(folder: Path) -> bool:
     try:
         return not folder.is_dir()
-    except OSError:  # it may be there, and cannot be looked at
+    except OSError:  # it may exist without being accessible
         return False
 
 
@@ -83,7 +86,7 @@ def _ensure_folder(folder: Path) -> Path:
 
 
 def _require_owned(folder: Path, forbidden: int) -> Path:
-    """`folder`, which is this account's and gives none of the rights `forbidden`; else TransportError."""
+    """Return `folder` if it belongs to this account without the permissions `forbidden`; else raise TransportError."""
     try:
         found = folder.lstat()
     except OSError as error:
@@ -106,7 +109,7 @@ def _require_owned(folder: Path, forbidden: int) -> Path:
 
 
 def account_name(uid: int) -> str:
-    """The name of the account with that number; `uid N` where it has none."""
+    """Return the name of an account, `uid N` if it has none."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
@@ -114,10 +117,13 @@ def account_name(uid: int) -> str:
 
 
 def new_socket_path(station_dir: Path, name: str) -> Path:
-    """Path for the socket `name`; what dead processes left of that name is removed.
+    """Return a new path for the socket `name`, and remove sockets of that name that dead processes left.
 
-    No two have the same path, so that an end never removes the socket of a successor. Where the first folder is of no
-    use, it is the next one, and the log says so: a station that runs is not lost for a folder. Raises TransportError.
+    Paths are unique, so a process that ends never removes the socket of its successor. If the first folder is
+    unusable, the next is used and the log has the reason: a running station must not be lost for a folder.
+
+    Raises:
+        TransportError: no folder is usable.
     """
     refusal: TransportError | None = None
     for place in _folders(station_dir):
@@ -136,7 +142,7 @@ def new_socket_path(station_dir: Path, name: str) -> Path:
 
 
 def file_identity(path: Path) -> tuple[int, int]:
-    """Which file that is; (0, 0) where it is gone, cannot be reached, or lies where others have a part."""
+    """Return device and inode of a file; (0, 0) if it is gone, unreachable, or in a folder that others can enter."""
     try:
         _require_owned(path.parent, _OTHERS)
         found = path.lstat()
@@ -146,14 +152,14 @@ def file_identity(path: Path) -> tuple[int, int]:
 
 
 def connection_problem(endpoint: str) -> str:
-    """Why nobody can connect to a socket, and what to do; "" where somebody listens there."""
+    """Return why clients cannot connect to a socket, and what to do; "" if a process listens there."""
     path = Path(endpoint.removeprefix("ipc://"))
     mend = "where the station runs, it listens elsewhere within a second: press again; else start it again"
     probe = socket.socket(socket.AF_UNIX)
     try:
         probe.setblocking(False)
         probe.connect(str(path))
-    except BlockingIOError:  # more wait there than it takes at once
+    except BlockingIOError:  # its backlog is full
         return ""
     except PermissionError:
         return f"{path} cannot be reached: give {path.parent} back to {account_name(os.geteuid())}, mode 0700; {mend}"
@@ -165,20 +171,20 @@ def connection_problem(endpoint: str) -> str:
 
 
 class Endpoints:
-    """Places of a station's sockets: one small file per process in the station's folder."""
+    """Addresses of a station's sockets: one small file per process in the station's folder."""
 
     def __init__(self, station_dir: Path) -> None:
         self._station_dir = station_dir
         self._folder = station_dir / "endpoints"
-        self._wanted: dict[str, str] = {}  # by process, what is not on disk yet
-        self._said: dict[str, set[str]] = {}  # by process, the keys of what was written
+        self._wanted: dict[str, str] = {}  # by process: content that is not on disk yet
+        self._said: dict[str, set[str]] = {}  # by process: keys that were written
         self._lock = threading.Lock()
         self._looked = time.monotonic()
 
     def is_missing(self, process: str) -> bool:
-        """True if the file that this process wrote is gone, or says nothing; looks five times a second.
+        """Return True if this process's file is gone or unreadable; checks at most every LOOK_S seconds.
 
-        What a successor wrote is left as it is.
+        A file that a successor wrote counts as present and is not replaced.
         """
         if time.monotonic() - self._looked < LOOK_S:
             return False
@@ -187,14 +193,14 @@ class Endpoints:
             return False
         try:
             return not self._said[process] <= self._content(process).keys()
-        except (OSError, ValueError, RecursionError):  # nor can anybody read it
+        except (OSError, ValueError, RecursionError):  # clients cannot read it either
             return True
 
     def write(self, process: str, endpoints: Mapping[str, str]) -> bool:
-        """Leave this process's endpoints, replacing those of its predecessor at once.
+        """Write this process's endpoints, which atomically replaces those of its predecessor.
 
-        Where the disk refuses, a line in the log says so, and a thread tries again once a second until it does
-        not: the work of the process does not depend on it. Returns whether they are there.
+        If the disk refuses, an error is logged, and a thread retries every RETRY_S seconds until it succeeds: the
+        process does not depend on it. Returns whether they are on disk.
         """
         with self._lock:
             retried = bool(self._wanted)
@@ -210,13 +216,13 @@ class Endpoints:
         return failure is None
 
     def withdraw(self, process: str) -> None:
-        """Nobody finds this process any more; what it wrote, or was about to write, is gone."""
+        """Remove this process's file, and cancel a pending write, so that clients no longer find it."""
         with self._lock:
             self._wanted.pop(process, None)
             self._said.pop(process, None)
             try:
                 self._file(process).unlink(missing_ok=True)
-            except OSError as error:  # of a disk that takes no more: what listens there ends for no file
+            except OSError as error:  # for example a full disk; the process must end all the same
                 log.error("clients still find the process %s: %s", process, error)
 
     def _retry(self) -> None:
@@ -227,7 +233,7 @@ class Endpoints:
                     return
 
     def _write_now(self) -> OSError | None:
-        """Write what is wanted; the error that kept some of it from the disk."""
+        """Write pending files; return the error if some could not be written."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             for process in list(self._wanted):
@@ -240,7 +246,11 @@ class Endpoints:
         return None
 
     def read(self, process: str) -> dict[str, Any]:
-        """The endpoints of `process`; raises TransportError where the station has none."""
+        """Return the endpoints of `process`.
+
+        Raises:
+            TransportError: the station has none; the message lists the known stations.
+        """
         path = self._file(process)
         try:
             return self._content(process)
@@ -254,10 +264,10 @@ class Endpoints:
             ) from None
 
     def served(self, process: str) -> bool:
-        """True if `process` has said where it listens, and lives."""
+        """Return True if `process` has written its endpoints and is alive."""
         try:
             os.kill(int(self._content(process)["pid"]), 0)
-        except PermissionError:  # of another account: it is there
+        except PermissionError:  # it exists, under another account
             return True
         except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError):
             return False
@@ -270,16 +280,16 @@ class Endpoints:
         return found
 
     def is_listening(self, name: str) -> bool:
-        """True if a process listens at a socket of that name, whatever the files say; False if unknown."""
+        """Return True if a process listens at a socket of that name, whatever the files contain; False if unknown."""
         for folder in _folders(self._station_dir):
-            with suppress(OSError):  # it is not there, or nobody can get at it
+            with suppress(OSError):  # missing or not accessible
                 if any(not connection_problem(f"ipc://{path}") for path in folder.glob(f"{name}-*")):
                     return True
         return False
 
     @property
     def owner(self) -> int | None:
-        """The account whose station this is; None where nobody can say."""
+        """The account of the station; None if unknown."""
         try:
             return self._folder.stat().st_uid
         except OSError:
@@ -289,18 +299,22 @@ class Endpoints:
         return self._folder / f"{process}.json"
 
     def prepare(self) -> None:
-        """As `clear`, of a station that starts; TransportError where its folder of sockets is not its own."""
+        """Clear the endpoints for a starting station.
+
+        Raises:
+            TransportError: its folder of sockets is not its own.
+        """
         socket_folder(self._station_dir)
         self.clear()
 
     def clear(self) -> None:
-        """Remove what a former family left, its sockets too, and forget what is not written yet."""
+        """Remove the files and sockets of earlier station processes, and cancel pending writes."""
         with self._lock:
             self._wanted.clear()
         for path in self._folder.glob("*.json"):
             path.unlink(missing_ok=True)
         for folder in _folders(self._station_dir):
-            with suppress(OSError):  # it is not there, or nobody can get at it
+            with suppress(OSError):  # missing or not accessible
                 for path in folder.iterdir():
                     path.unlink(missing_ok=True)
                 folder.rmdir()

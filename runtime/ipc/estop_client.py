@@ -1,4 +1,4 @@
-"""A stop that has to arrive: over a connection of its own, and after its socket wherever that goes."""
+"""Delivery of urgent commands: over a connection of their own, which follows the socket if it moves."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _AGAIN_S = 0.02
 
 
 class NotSent(TransportError):
-    """Nobody listened, all the time: it was not carried out."""
+    """No process was listening during the whole timeout: the command was not executed."""
 
 
 class NoAnswer(TransportError):
-    """It may have been carried out: nobody knows. `why`, as far as that can be told."""
+    """No answer: it is unknown whether the command was executed. `why` is the reason, as far as known."""
 
     def __init__(self, kind: str, seconds: float, why: str) -> None:
         self.why = _BECAUSE(why=why) if why else ""
@@ -43,10 +43,18 @@ def send_urgent(
     timeout: float,
     key: Key | None = None,
 ) -> Ack:
-    """The answer to it; `where` names process and socket: ("guard", "estop").
+    """Send a command until it is answered; `where` is process and socket, as in ("guard", "estop").
 
-    It is sent again wherever the socket is found meanwhile; the file that says where may come late. Raises NotSent,
-    NoAnswer, both with what to do, CodecError, and TransportError where the station has none.
+    It is sent again whenever the socket has moved; the file with its path may be updated late.
+
+    Returns:
+        The answer.
+
+    Raises:
+        NotSent: nothing listened; says what to do.
+        NoAnswer: no answer within `timeout` [s]; says what to do.
+        CodecError: the command is too large.
+        TransportError: the station has no such process or socket.
     """
     deadline = time.monotonic() + timeout
     client, place, heard, why = None, "", False, ""
@@ -57,7 +65,7 @@ def send_urgent(
             except TransportError:
                 if time.monotonic() >= deadline or not endpoints.is_listening(where[1]):
                     raise
-                time.sleep(_AGAIN_S)  # its process writes the file anew within two looks
+                time.sleep(_AGAIN_S)  # its process rewrites the file within two LOOK_S periods
                 continue
             if client is None or there != place:
                 if client is not None:
@@ -81,7 +89,7 @@ def send_urgent(
 
 
 def _current_endpoint(endpoints: Endpoints, where: tuple[str, str], before: str) -> str:
-    """Endpoint of a socket now: the one `before` as long as no file names another."""
+    """Return the current endpoint of a socket: `before` unless the file names another."""
     process, name = where
     try:
         return str(endpoints.read(process)[name])

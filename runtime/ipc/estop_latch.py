@@ -1,4 +1,4 @@
-"""The e-stop latch on disk: outlives every process, is read before the first command after a restart."""
+"""E-stop latch on disk: survives all processes, and is read before the first command after a restart."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class Latched:
-    """Press that is latched: by which user, why, when (Unix time)."""
+    """A latched press: by which user, why, when (Unix time)."""
 
     by: str
     why: str
@@ -19,13 +19,13 @@ class Latched:
 
 
 class Latch:
-    """One file; there = latched."""
+    """File whose existence means latched."""
 
     def __init__(self, station_dir: Path) -> None:
         self._path = station_dir / "estop.json"
 
     def read(self) -> Latched | None:
-        """The latch as it stands; an unreadable file counts as latched."""
+        """Return the latched press, None if not latched; an unreadable file counts as latched."""
         try:
             return Latched(**json.loads(self._path.read_text("utf-8")))
         except FileNotFoundError:
@@ -34,7 +34,7 @@ class Latch:
             return Latched("unknown", f"the latch file cannot be read ({error})", 0.0)
 
     def set(self, by: str, why: str) -> Latched:
-        """Latch on disk, synced."""
+        """Write and sync the latch."""
         latched = Latched(by, why, time.time())
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with self._path.open("w", encoding="utf-8") as file:
@@ -45,7 +45,7 @@ class Latch:
         return latched
 
     def clear(self) -> None:
-        """Release."""
+        """Remove the latch."""
         self._path.unlink(missing_ok=True)
         self._sync_folder()
 

@@ -1,7 +1,7 @@
-"""Presses of the e-stop, per wire format: a message that says so is one, whatever else is wrong with it.
+"""Detection of e-stop presses in messages of each wire format, tolerant of errors in the rest of a message.
 
-Here alone that is decided, for every door. A message that can be read is of the kind that it names itself; of one that
-cannot, or that names none, the words decide. Nothing here raises, and what is looked through is looked through once.
+All entry points use this module alone. A readable message is of the kind that it names; for an unreadable message, or
+one without a kind, a text search decides. Nothing here raises, and each message is scanned in linear time.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import msgpack  # type: ignore[import-untyped]
 from runtime.ipc.messages import Command
 
 NAME = "estop"
-DEFAULT_REASON = "pressed"  # where no reason is given
-LONGEST = 240  # characters that are kept of a reason, a name, or what was wrong
+DEFAULT_REASON = "pressed"  # if no reason is given
+LONGEST = 240  # characters of a reason, a name, or a list of defects
 _LONGEST_UUID = 64
 _TEXTS = ("uuid", "user", "holder", "role")
 _READ = frozenset(("kind", "args", *_TEXTS))
@@ -30,12 +30,12 @@ _LOOSE = r"""\b(?:%s)["']?\s{0,9}[:=]\s{0,9}["']?\s{0,9}(?:web:)?estop\b"""
 
 
 def sanitize_text(text: str) -> str:
-    """As much of it as is kept, with nothing in it that cannot be sent or written down."""
+    """Return the text cut to LONGEST characters, without characters that cannot be sent or stored."""
     return text[:LONGEST].encode("utf-8", "replace").decode().replace("\x00", "")
 
 
 def reason_of(command: Command) -> str:
-    """Why it was pressed, whatever stands there."""
+    """Return the reason of a press, DEFAULT_REASON if it is missing or no text."""
     why = command.args.get("why")
     return why if isinstance(why, str) and why else DEFAULT_REASON
 
@@ -44,7 +44,7 @@ def reason_of(command: Command) -> str:
 
 
 def kind_of(payload: bytes) -> str:
-    """Kind that a message of the bus names first, read without its arguments; "" where none is seen."""
+    """Return the first `kind` in a message of the bus, read without its arguments; "" if there is none."""
     try:
         return next((_text(value) or "" for key, value in _pairs(payload) if key == "kind"), "")
     except _UNREADABLE:
@@ -52,7 +52,7 @@ def kind_of(payload: bytes) -> str:
 
 
 def parse_packed_press(payload: bytes) -> Command | None:
-    """The press that a message of the bus is, made of what can be read of it; None where it is none."""
+    """Return the press in a message of the bus, from all readable fields; None if it is no press."""
     if b"estop" not in payload or _PACKED.search(payload) is None:
         return None
     found: dict[str, bytes] = {}
@@ -99,9 +99,9 @@ def _why(args: bytes | None, wrong: list[str]) -> str:
 
 
 def _pairs(packed: bytes, wanted: frozenset[str] | tuple[str, ...] = _READ) -> Iterator[tuple[str, bytes]]:
-    """The wanted keys of the outermost map with their values as they are packed; nothing else is made of it.
+    """Yield the wanted keys of the outermost map with their packed values; nothing else is decoded.
 
-    Raises where it is no map, cannot be read to its end, or is followed by something.
+    Raises an error of _UNREADABLE if it is no map, is incomplete, or is followed by further bytes.
     """
     reader = msgpack.Unpacker(raw=True)
     reader.feed(packed)
@@ -118,7 +118,7 @@ def _pairs(packed: bytes, wanted: frozenset[str] | tuple[str, ...] = _READ) -> I
 
 
 def _text(packed: bytes) -> str | None:
-    """A text or bytes as a text; None for anything else."""
+    """Return packed text or bytes as a text; None for another type."""
     if len(packed) > 1 << 20 or not packed or not _is_text(packed[0]):
         return None
     value: bytes = msgpack.unpackb(packed, raw=True)
@@ -133,7 +133,7 @@ def _is_text(mark: int) -> bool:
 
 
 class _Table(list[tuple[str, Any]]):
-    """An object of JSON with all that it says, also what it says twice."""
+    """A JSON object as a list of pairs, so that duplicate keys are preserved."""
 
 
 _JSON = json.JSONDecoder(object_pairs_hook=_Table)
@@ -141,16 +141,16 @@ _READ_WHOLE, _WINDOW = 8192, 4096  # characters
 
 
 def parse_json_press(said: str | bytes, *keys: str) -> dict[str, Any] | None:
-    """Fields of a press in JSON, {} where they cannot be read; None where the message is no press.
+    """Return the fields of a press in JSON, {} if they cannot be read; None if the message is no press.
 
-    `keys` are those under which such a message names what it is: {"type": "estop"}. "web:estop" and "estop:REASON" are
-    names of it too. One that is longer than a press has reason to be is looked at where it begins and where it ends.
+    `keys` are those under which such a message has its kind: {"type": "estop"}. "web:estop" and "estop:REASON" are
+    valid kinds too. A message much longer than a press is searched only at its beginning and its end.
     """
     text = said if isinstance(said, str) else said.decode(json.detect_encoding(said), "replace")
     text = text.lstrip("\ufeff \t\r\n")
     if NAME not in text and "\\u" not in text:
         return None
-    if len(text) > _READ_WHOLE:  # whoever sends a lot must not keep presses of others waiting
+    if len(text) > _READ_WHOLE:  # a large message must not delay other clients' presses
         parts = (text[:_WINDOW], text[-_WINDOW:])
         return _fields(parts) if any(_loosely(part, keys) for part in parts) else None
     try:
@@ -167,20 +167,20 @@ def parse_json_press(said: str | bytes, *keys: str) -> dict[str, Any] | None:
 
 
 def _fields(parts: Sequence[str]) -> dict[str, Any]:
-    """What of a long press is kept, as far as it stands in those parts."""
+    """Return uuid and reason of a long press, if they are in these parts."""
     pattern = r'"%s"\s{0,9}:\s{0,9}"([^"\\]{1,240})'
     found = ((key, re.search(pattern % key, part)) for part in reversed(parts) for key in ("uuid", "why"))
     return {key: match[1] for key, match in found if match}
 
 
 def _loosely(text: str, keys: Sequence[str]) -> bool:
-    """Whether it says somewhere that it is a press, however broken it is."""
+    """Return True if the text contains a press, however malformed."""
     bare = _ESCAPED.sub(lambda code: chr(int(code[1], 16)), text).replace("\\", "")
     return re.search(_LOOSE % "|".join(keys), bare) is not None
 
 
 def json_reason(said: Mapping[str, Any], default: str = DEFAULT_REASON) -> str:
-    """The reason that stands in a press in JSON, beside its name or among its arguments."""
+    """Return the reason of a press in JSON, from its top level or its arguments."""
     args = [said.get(key) for key in ("args", "arguments")]
     for table in (said, *(one for one in args if isinstance(one, dict))):
         if isinstance(why := table.get("why"), str) and why:

@@ -1,7 +1,8 @@
-"""Which of the messages that have come at a socket are looked into in one turn of a loop: all stops, a few of the rest.
+"""Fair queue of the messages at a socket: per turn of a loop all stops, and a bounded share of the rest.
 
-Nobody's flood is worth more than its share: of each connection so many wait, each connection has its turn, and what is
-beyond is refused unread. A stop is looked for in everything that comes, a press also in what cannot be read.
+Flooding gives a client no advantage: the number of waiting messages per connection is limited, connections alternate,
+and messages beyond the limit are refused without decoding. Every message is checked for a stop, unreadable messages
+also for an e-stop press.
 """
 
 from __future__ import annotations
@@ -24,12 +25,15 @@ from runtime.ipc.messages import Command
 _TOO_LONG = Pattern("bus.too_long", "{given} bytes; allowed here: {allowed}")
 
 QueuedCommand = tuple[IncomingMessage, Command]
-LONGEST_STOP = 4096  # bytes; what is longer is no stop of our clients, and waits its turn
-TURN_BYTES = 16 << 20  # that are taken from a socket in one turn
+LONGEST_STOP = 4096  # [bytes] longer messages are no stops of our clients, and wait
+TURN_BYTES = 16 << 20  # [bytes] read from a socket in one turn
 
 
 def _press_in(call: IncomingMessage) -> Command | None:
-    """The press that a message is; where its content is nothing of its own, also one in or over what follows."""
+    """Return the press in a message, None if there is none.
+
+    If the content has no kind, the press may also be in the following frames, or span both.
+    """
     press, rest = parse_packed_press(call.payload), call.signature
     if press is not None or not rest or kind_of(call.payload):
         return press
@@ -37,25 +41,25 @@ def _press_in(call: IncomingMessage) -> Command | None:
 
 
 class FairQueue:
-    """Messages at a server's socket, in turns; `urgent` are the kinds that wait for nothing.
+    """Fair queue in front of a command server; messages of the kinds `urgent` never wait.
 
-    A press of the e-stop is urgent everywhere. Of all else what has more than `longest` bytes is refused unread.
+    An e-stop press is always urgent. Other messages with more than `longest` bytes are refused without decoding.
     """
 
     def __init__(
         self, server: CommandServer, urgent: Collection[str], share: int, longest: int = LARGEST
     ) -> None:
         self._server, self._urgent, self._share, self._longest = server, urgent, share, longest
-        self._waiting: dict[bytes, deque[IncomingMessage]] = {}  # by connection, who waits longest first
-        self.refused: IncomingMessage | None = None  # one that asked for too much in the last turn
+        self._waiting: dict[bytes, deque[IncomingMessage]] = {}  # by connection, longest waiting first
+        self.refused: IncomingMessage | None = None  # in the last turn, for too many of its connection
 
     @property
     def has_waiting(self) -> bool:
-        """True if there is something to look into, without any further message."""
+        """True if messages are waiting, even if no further one arrives."""
         return bool(self._waiting)
 
     def take_turn(self) -> tuple[list[QueuedCommand], list[QueuedCommand]]:
-        """Everything urgent that has come, and of the rest what this turn has time for."""
+        """Return all urgent commands that have arrived, and this turn's share of the others."""
         self.refused = None
         urgent = [asked for call in self._received() if (asked := self._take_if_urgent(call)) is not None]
         return urgent, self._take_share()
@@ -73,7 +77,7 @@ class FairQueue:
         return calls
 
     def _take_if_urgent(self, call: IncomingMessage) -> QueuedCommand | None:
-        """The command if it is urgent; all else waits its turn, or is refused."""
+        """Return the command if it is urgent; other messages are queued or refused."""
         press = _press_in(call)
         if press is not None:
             return call, press
@@ -81,7 +85,7 @@ class FairQueue:
             self._server.reject(call, _TOO_LONG(given=len(call.payload), allowed=self._longest))
             return None
         if len(call.payload) <= LONGEST_STOP and kind_of(call.payload) in self._urgent:
-            command = self._server.decode(call)  # what cannot be read is answered here
+            command = self._server.decode(call)  # refuses it if it cannot be decoded
             if command is None or command.kind in self._urgent:
                 return None if command is None else (call, command)
         if self._may_wait(call):
@@ -96,7 +100,7 @@ class FairQueue:
 
     def _take_share(self) -> list[QueuedCommand]:
         found: list[QueuedCommand] = []
-        for _ in range(self._share):  # of what cannot be read, too
+        for _ in range(self._share):  # unreadable messages count too
             if not self._waiting:
                 break
             connection = next(iter(self._waiting))

@@ -1,7 +1,7 @@
-"""Givers of commands: the user that the web signs, the account that connects, or one that cannot be verified.
+"""Identity of a command's sender: a user signed by the web, a local account, or unverified.
 
-What a command says of itself is never believed. The web signs the whole message, so that user and role go with
-this one command and no other.
+A command's own claims are never trusted. The web signs the whole message, so that user and role are valid for this
+command only.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ _FORGED = Pattern(
     "refused; stops are obeyed",
 )
 
-SIGNED = "web:"  # how the names of holders begin that only a signature may use
-PANEL = "panel:"  # of holders at the station's own panel, which this account's program serves
-SCRIPTS = "channel:"  # of holders who are scripts: the channel passes on what they say, and cannot know who they are
-# Roles of those who have none of the web's: programs of this account, scripts that these pass on, everybody else.
+SIGNED = "web:"  # prefix of holder names that require a signature
+PANEL = "panel:"  # prefix of holders at the station's own panel, a program of this account
+SCRIPTS = "channel:"  # prefix of scripts' holders; the channel forwards them without knowing who they are
+# Roles outside the web: programs of this account, scripts that these forward, all others.
 LOCAL, SCRIPT, UNVERIFIED = "local", "script", "unverified"
 _ROLE_COMMANDS = ("operator", "admin", LOCAL, SCRIPT)
-# For which no role is needed: what changes nothing, and what keeps or ends what a role was needed for.
+# Commands without a required role: they change nothing, or only hold or end what needed a role.
 _OPEN = (
     *("status", "events_since", "aim", "preflight_report", "policy_server"),
     *("lease_renew", "lease_give_up"),
@@ -44,15 +44,19 @@ _DOMAIN = b"eva-web command 1\0"
 
 
 class Key:
-    """The secret that web and station share: DATA/stations/NAME/bus.key, which this account alone can read."""
+    """The secret that web and station share: DATA/stations/NAME/bus.key, readable by this account only."""
 
     def __init__(self, station_dir: Path) -> None:
         self.path = station_dir / "bus.key"
         self._secret = b""
-        self._seen = (0, 0)  # which file that was
+        self._seen = (0, 0)  # inode and modification time of the file that was read
 
     def secret(self) -> bytes:
-        """The key, made where there is none; ConfigurationError says what is wrong with its file."""
+        """Return the key; create it if there is none.
+
+        Raises:
+            ConfigurationError: its file is unusable; the message has the reason.
+        """
         try:
             return self._read()
         except FileNotFoundError:
@@ -61,11 +65,15 @@ class Key:
             raise ConfigurationError(f"the key {self.path} cannot be read: {error.strerror}") from None
 
     def sign(self, payload: bytes) -> bytes:
-        """The signature of a message; raises ConfigurationError where there is no key to sign it with."""
+        """Return the signature of a message.
+
+        Raises:
+            ConfigurationError: there is no usable key.
+        """
         return hmac.digest(self.secret(), _DOMAIN + payload, "sha256")
 
     def verifies(self, payload: bytes, signature: bytes) -> bool:
-        """True if the web has signed just this; False whatever is wrong with the key."""
+        """Return True if the web signed exactly this message; False also if the key is unusable."""
         try:
             return hmac.compare_digest(self.sign(payload), signature)
         except ConfigurationError:
@@ -93,7 +101,7 @@ class Key:
         return secret
 
     def _make(self) -> bytes:
-        """Whoever is first, station or web, makes it; nobody ever sees a part of it."""
+        """Create the key, whichever of station and web comes first; the link makes it appear complete."""
         draft = self.path.with_name(f".bus.key.{secrets.token_hex(4)}")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -111,10 +119,11 @@ class Key:
 
 
 def authenticate(command: Command, payload: bytes, signature: bytes, uid: int | None, key: Key) -> Command:
-    """The command with user and role as they are known, whatever it says of itself.
+    """Return the command with user and role as verified, whatever it claims.
 
-    `signature` is empty where there is none, `uid` the account that connects, None where nobody knows it. The role is
-    the web's, "local" for a program of this account, "script" for what one passes on, else "unverified".
+    `signature` is empty if unsigned; `uid` is the connecting account, None if unknown. The role is the one that the
+    web signed, "local" for a program of this account, "script" for a command that such a program forwards, else
+    "unverified".
     """
     if signature:
         return command if key.verifies(payload, signature) else _unverified(command, UNVERIFIED)
@@ -127,31 +136,31 @@ def authenticate(command: Command, payload: bytes, signature: bytes, uid: int | 
 
 
 def at_the_panel(command: Command) -> bool:
-    """True if what was `authenticate` comes from the station's own panel."""
+    """Return True if an authenticated command comes from the station's own panel."""
     return command.role == LOCAL and command.holder.startswith(PANEL)
 
 
 def _unverified(command: Command, role: str) -> Command:
-    """Named as it names itself, and marked wherever that name is written down."""
+    """Return the command with its claimed name, marked as unverified for all records."""
     name = command.user or command.holder or "somebody"
     return replace(command, user=f"{name} (unverified)", role=role)
 
 
 def unverified_reason(command: Command) -> str:
-    """Why what was `authenticate` is obeyed in nothing but stops; "" where it may be."""
+    """Return the reason to refuse an authenticated command, unless it is a stop; "" if its sender is verified."""
     if command.role != UNVERIFIED:
         return ""
     return _FORGED(kind=command.kind)
 
 
 def missing_role(command: Command) -> str:
-    """Why the role of who gave the command is too little for it; "" where it will do."""
+    """Return why the sender's role does not permit the command; "" if it does."""
     if command.kind in _OPEN or command.role in _ROLE_COMMANDS:
         return ""
     return _NEEDS_OPERATOR(kind=command.kind, user=command.user, role=command.role or _WITHOUT_ROLE)
 
 
 def display_name(command: Command) -> str:
-    """Name of the command's giver, for the record: with the role that the web has signed."""
+    """Return the sender's name for the record, with the role that the web signed."""
     name = command.user or command.holder or "unknown"
     return name if command.role in ("", LOCAL, SCRIPT, UNVERIFIED) else f"{name} ({command.role})"

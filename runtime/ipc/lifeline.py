@@ -1,4 +1,4 @@
-"""Tells a process that its parent has ended, however that came."""
+"""Detection of the end of a parent process, however it ended."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import select
 
 
 class Lifeline:
-    """Standard input, held open by the supervisor; its end is the supervisor's end, however it came."""
+    """Standard input, which the supervisor holds open: end of file means that the supervisor has ended."""
 
     def __init__(self, descriptor: int = 0) -> None:
         self.descriptor = descriptor
 
     @property
     def is_cut(self) -> bool:
-        """True if the supervisor is gone."""
+        """True if the supervisor has ended."""
         readable, _, _ = select.select([self.descriptor], [], [], 0)
         return bool(readable) and os.read(self.descriptor, 4096) == b""

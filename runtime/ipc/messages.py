@@ -1,9 +1,8 @@
-"""Every message between our processes: inside the family, and between the runtime and its clients.
+"""Messages between the station's processes, and between the runtime and its clients.
 
-A message is a frozen dataclass; on the wire it is a map of its fields with its class name under "type". What
-comes in is checked against the fields' annotations, so that nothing behind `decode` meets what it cannot use.
-Those that say a sentence have its `id` and `arguments` beside it, which follow from it; behind `decode` it is a
-`Sentence` again.
+A message is a frozen dataclass; on the wire it is a map of its fields with its class name under "type". Received
+messages are checked against the fields' annotations, so code behind `decode` gets valid types only. Messages with a
+sentence also carry its `id` and `arguments`, which are derived from it; after `decode` it is a `Sentence` again.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ from runtime.core.errors import CodecError
 from runtime.core.msgpack_arrays import pack, unpack
 from runtime.core.types import Float32, Float64, UInt8
 
-# Kinds of events that control gives and the coordinator reads: whether anybody listens to commands.
+# Kinds of control's events about subscribers of commands.
 NO_SUBSCRIBER, ALL_SUBSCRIBED = "commands_unheard", "commands_heard"
 
 
 def _complete(message: Any, name: str) -> None:
-    """Say the sentence in that field by its id, or make one of it that another process has told with its id."""
+    """Complete a message's sentence: fill `id` and `arguments` from it, or rebuild it from a received id."""
     text = getattr(message, name)
     if not isinstance(text, sentences.Sentence):
         text = sentences.heard(text, message.id, message.arguments)
@@ -39,33 +38,31 @@ def _complete(message: Any, name: str) -> None:
 
 OrderKind = Literal[
     "silent", "hold", "meet", "follow", "motion", "yield"
-]  # "meet": hold, and lead what is held to where joints are read; "yield": the node drives, by its own leader
-PolicyMode = Literal[
-    "continuous", "step", "preview", "sim", "manual"
-]  # of a station that was set up with a policy
+]  # "meet": hold, and converge to measured; "yield": node-driven, by its own leader
+PolicyMode = Literal["continuous", "step", "preview", "sim", "manual"]  # of a station set up with a policy
 Mode = Literal[PolicyMode, "collect"]
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Order to control, from its next tick on."""
+    """Order to control, valid from its next tick."""
 
     number: int
     kind: OrderKind
-    run: int = 0  # the run that is open, 0 where none is; chunks of another run are ignored
-    goal: Float64 | None = None  # [D] end of a "motion"; NaN: where it comes to a stand
+    run: int = 0  # the open run, 0: none; chunks of another run are ignored
+    goal: Float64 | None = None  # [D] end of a "motion"; NaN: where the joint stops when it brakes
     reason: str = ""
     mode: Mode = "continuous"  # of a "follow"
-    speed: float = 1.0  # part of the speed of motions of ours that a "motion" may use
+    speed: float = 1.0  # share of the speed of generated motions that a "motion" may use
 
 
 @dataclass(frozen=True, slots=True)
 class PostedChunk:
     """A chunk in command space at control rate, not yet merged: float64 [H, D].
 
-    Row 0 is for `observation_step`; where it `waited`, the robot stood while the policy was asked (or while a
-    person looked), and row 0 is for the first tick that is still free. `meant` [D] is where the policy means to
-    begin, however far that is; None where row 0 says so.
+    Row 0 is for `observation_step`. If `requested_while_stopped`, the robot was at rest during the request (or while
+    a person reviewed the chunk), and row 0 is for the first free tick. `intended_start` [D] is where the policy
+    intends to begin, at any distance; None: row 0.
     """
 
     chunk_id: int
@@ -78,15 +75,17 @@ class PostedChunk:
 
 @dataclass(frozen=True, slots=True)
 class Tune:
-    """The strategy to go on with from the next tick on: its whole section, as in a deployment."""
+    """The strategy from the next tick on: its whole section, as in a deployment."""
 
     strategy: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyAway:
-    """The policy of `run` is lost and asked again until `until` [s, monotonic clock]; an empty plan holds nothing till
-    then."""
+    """The policy of `run` is lost, and is retried until `until` [s, monotonic clock].
+
+    Until then an empty plan does not lead to holding.
+    """
 
     run: int
     until: float
@@ -94,14 +93,14 @@ class PolicyAway:
 
 @dataclass(frozen=True, slots=True)
 class LockGrippers:
-    """Positions at which grippers stay whatever is asked of them: float64 [D], NaN for what is not locked."""
+    """Positions at which grippers are locked whatever is commanded: float64 [D], NaN for unlocked dimensions."""
 
     values: Float64
 
 
 @dataclass(frozen=True, slots=True)
 class NodeRequest:
-    """A control word for the execution node, passed on at once beside the commands; `data` are its fields."""
+    """A control word for the execution node, sent at once in addition to commands; `data` are its fields."""
 
     word: str
     data: Mapping[str, Any] = field(default_factory=dict)
@@ -112,7 +111,7 @@ class NodeRequest:
 
 @dataclass(frozen=True, slots=True)
 class TickDone:
-    """One tick as control did it; times on our monotonic clock."""
+    """Record of one tick of control; times on our monotonic clock."""
 
     step: int
     run: int
@@ -127,12 +126,12 @@ class TickDone:
     weights: list[float]
     notes: list[str]
     refused: bool
-    woke: float | None = None  # when the loop woke for it: woke - planned is how late; None in lockstep
+    woke: float | None = None  # wake-up time; woke - planned is the lateness; None in lockstep
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkMerged:
-    """Place that control gave a chunk; fields as in strategies.base.Merged."""
+    """Placement of a chunk by control; fields as in strategies.base.MergeResult."""
 
     chunk_id: int
     run: int
@@ -142,13 +141,13 @@ class ChunkMerged:
     mistimed: int
     dropped: str
     strategy: str = ""  # the kind that merged it
-    overlap: int = 0  # steps from the arrival on that were blended with what was planned before
+    overlap: int = 0  # steps from the arrival on that were blended with an earlier plan
     contributions: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened, in one sentence; `kind` is what programs look at."""
+    """An event, described in one sentence; programs use `kind`."""
 
     kind: str
     text: str
@@ -167,20 +166,20 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class BeginEpisode:
-    """Open an episode and let the source play from its start; `run` 0 records whatever control does."""
+    """Open an episode and let the source play from its start; `run` 0 records all that control does."""
 
     run: int
-    manifest: Mapping[str, Any] | None  # None: a run that is not recorded
-    generation: int = 0  # of the coordinator that asks: what one asked for ends with it
+    manifest: Mapping[str, Any] | None  # None: the run is not recorded
+    generation: int = 0  # of the requesting coordinator, with which its episode ends
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyAnswer:
-    """A chunk as the policy gave it; `source_rows` [H'] says which row each posted row was made from.
+    """A chunk as received from the policy; `source_rows` [H'] is the row that each posted row was made from.
 
-    Where its rows are poses, the errors float64 [H', arms] in m and rad and the flags uint8 [H', arms] (bits of
-    kinematics.base.IkFlag) say how the posted rows meet them. `eef` is where the poses come from that the policy was
-    shown, or that its rows are relative to: "measured" or "fk".
+    For poses, the errors float64 [H', arms] in m and rad, and the flags uint8 [H', arms] (bits of
+    kinematics.base.IkFlag), describe how well the posted rows reach them. `eef` is the origin of the poses in the
+    observation: "measured" or "fk".
     """
 
     chunk_id: int
@@ -215,7 +214,7 @@ class EndEpisode:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeOpened:
-    """The recorder is ready (or could not be: `error`)."""
+    """The recorder is ready, or failed with `error`."""
 
     run: int
     uuid: str
@@ -230,7 +229,7 @@ class EpisodeOpened:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeClosed:
-    """An episode is on disk, or what there is of it."""
+    """An episode is on disk, as far as it was recorded."""
 
     uuid: str
     path: str
@@ -238,7 +237,7 @@ class EpisodeClosed:
     reason: str
     rows: int
     error: str = ""
-    waits: bool = False  # for room on the disk: told again when it is closed
+    waits: bool = False  # waits for room on the disk; sent again when closed
     id: str = ""
     arguments: Mapping[str, Any] = field(default_factory=dict)
 
@@ -248,13 +247,13 @@ class EpisodeClosed:
 
 @dataclass(frozen=True, slots=True)
 class MediaReport:
-    """Report of what media writes, a few times a second."""
+    """Report of the recording, a few times a second."""
 
     time: float
     rows: int
-    recording: str  # uuid of the open episode, "" where none is
+    recording: str  # uuid of the open episode, "" if there is none
     repeated: int
-    unclosed: Mapping[str, str] = field(default_factory=dict)  # episodes that wait for room, and why
+    unclosed: Mapping[str, str] = field(default_factory=dict)  # episodes that wait for room, with the reason
 
 
 # --- reception -> media, and back --------------------------------------------------------------------------
@@ -262,7 +261,7 @@ class MediaReport:
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """An observation as in runtime.core.types.Observation, its pictures by the numbers of their slots."""
+    """An observation as runtime.core.types.Observation, with the slot numbers of its pictures."""
 
     sequence: int
     arrived: float
@@ -280,15 +279,15 @@ class Observed:
 
 @dataclass(frozen=True, slots=True)
 class BeginRun:
-    """The source begins the run with that number: a recording plays from its start."""
+    """Begin a run of the source: a recording plays from its start."""
 
     run: int
-    generation: int = 0  # of the coordinator whose run it is: the next one counts anew
+    generation: int = 0  # of the coordinator whose run it is; its successor numbers runs anew
 
 
 @dataclass(frozen=True, slots=True)
 class RunBegun:
-    """It has begun, and its first frame was handed on before this."""
+    """The source's run has begun; its first frame was passed on before this message."""
 
     run: int
     generation: int = 0
@@ -296,7 +295,7 @@ class RunBegun:
 
 @dataclass(frozen=True, slots=True)
 class EndRun:
-    """The source's run is over."""
+    """The source's run has ended."""
 
 
 # --- reception -> the coordinator -------------------------------------------------------------------------------------
@@ -304,22 +303,19 @@ class EndRun:
 
 @dataclass(frozen=True, slots=True)
 class ReceptionReport:
-    """Report of what reception sees, a few times a second."""
+    """Report of reception, a few times a second."""
 
     time: float
     rates: Mapping[str, float] = field(default_factory=dict)  # measured [Hz] per stream
     faults: Mapping[str, int] = field(default_factory=dict)
-    truth: Mapping[str, Any] = field(default_factory=dict)  # of a simulated bench, as its node last said it
-    drives: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # {"enabled": bool, "faults": [str]}, {} where unsaid
-    cameras: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # of the deployment's own, as by Source.camera_health
-    age_ms: Mapping[str, float] = field(
-        default_factory=dict
-    )  # of joints when they came into shared state: p50, p99, max of the newest
-    scheduling: str = ""  # the class of the process, as by runtime.core.realtime
+    truth: Mapping[str, Any] = field(default_factory=dict)  # of a simulated bench, from its node
+    # {"enabled": bool, "faults": [str]}, {} if not reported
+    drives: Mapping[str, Any] = field(default_factory=dict)
+    # of the deployment's own, as from Source.camera_health
+    cameras: Mapping[str, Any] = field(default_factory=dict)
+    # age of joints on arrival in shared state: p50, p99, max of the newest
+    age_ms: Mapping[str, float] = field(default_factory=dict)
+    scheduling: str = ""  # scheduling class of the process, see runtime.core.realtime
 
 
 # --- clients <-> runtime -----------------------------------------------------------------------------------
@@ -327,12 +323,12 @@ class ReceptionReport:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A discrete request of a person or a program.
+    """A request of a person or a program.
 
-    `boot` and `sequence` are those of the snapshot it was decided by; `valid_until` is in the runtime's own
-    clock, as counted on from that snapshot. `holder` and `epoch` say under which lease it is given. `user` and `role`
-    are what the sender says, and are believed where runtime.ipc.identity has verified them; `vouched` names arguments
-    that an administrator wrote.
+    `boot` and `sequence` are those of the snapshot on which the decision was based; `valid_until` is in the runtime's
+    own clock, extrapolated from that snapshot. `holder` and `epoch` identify the lease. `user` and `role` are the
+    sender's claims, trusted only after runtime.ipc.identity has verified them; `vouched` names arguments that an
+    administrator wrote.
     """
 
     uuid: str
@@ -362,7 +358,7 @@ class Ack:
     boot: str = ""
     sequence: int = 0
     data: Mapping[str, Any] = field(default_factory=dict)
-    kind: str = ""  # of the command that this answers
+    kind: str = ""  # of the answered command
     id: str = ""
     arguments: Mapping[str, Any] = field(default_factory=dict)
 
@@ -397,7 +393,7 @@ Message = (
 _TYPES: dict[str, type[Any]] = {kind.__name__: kind for kind in Message.__args__}
 _FIELDS = {kind: tuple(f.name for f in fields(kind)) for kind in _TYPES.values()}
 
-# What stands on the wire for an annotation: numpy's scalars are numbers, a whole number will do for a float.
+# Wire types of an annotation: numpy scalars count as numbers, integers are valid floats.
 _INTEGERS: tuple[type, ...] = (int, np.integer)
 _ON_THE_WIRE: dict[Any, tuple[type, ...]] = {
     str: (str,),
@@ -413,7 +409,7 @@ _ON_THE_WIRE: dict[Any, tuple[type, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class _Expected:
-    """Values that a field may have: one of `classes`, and where `words` are given, one of these."""
+    """Valid values of a field: of one of `classes` and, if `words` are given, one of these."""
 
     classes: tuple[type, ...]
     words: tuple[str, ...] = ()
@@ -442,13 +438,17 @@ _EXPECTED = {
 
 
 def encode(message: Message) -> bytes:
-    """The message as bytes."""
+    """Return the message as bytes."""
     kind = type(message)
     return pack({"type": kind.__name__} | {name: getattr(message, name) for name in _FIELDS[kind]})
 
 
 def decode(payload: bytes) -> Message:
-    """The message in `payload`; raises CodecError naming what does not fit. Unknown fields are ignored."""
+    """Return the message in `payload`; unknown fields are ignored.
+
+    Raises:
+        CodecError: names what is invalid.
+    """
     content = unpack(payload)
     name = content.get("type") if isinstance(content, dict) else type(content).__name__
     if not isinstance(content, dict) or not isinstance(name, str) or name not in _TYPES:
@@ -467,7 +467,7 @@ def decode(payload: bytes) -> Message:
 
 
 def event_row(event: Event) -> dict[str, Any]:
-    """An event as a line of the episode's log."""
+    """Return an event as a line of the episode's log."""
     return {
         "kind": event.kind,
         "text": event.text,
@@ -479,5 +479,5 @@ def event_row(event: Event) -> dict[str, Any]:
 
 
 def told_by(message: Event | Ack) -> dict[str, Any]:
-    """Id and arguments of what it says, for a row that keeps its text; {} where it has none."""
+    """Return id and arguments of a message's sentence, for a row that contains its text; {} without an id."""
     return {"id": message.id, "arguments": message.arguments} if message.id else {}

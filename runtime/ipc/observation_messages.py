@@ -1,4 +1,4 @@
-"""Observations from reception to media: numbers in a message, pictures in their slots until they are used."""
+"""Observations from reception to media: numbers in a message, pictures in shared memory until they are used."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SAME = (
 
 
 class SlotPictures(Mapping[str, UInt8]):
-    """Pictures by camera, copied out of their slots when they are asked for: one that was overwritten is a KeyError."""
+    """Pictures by camera, copied from their slots on access; KeyError if a picture was overwritten."""
 
     def __init__(self, shared: SharedState, numbers: Mapping[str, int]) -> None:
         self._shared_state = shared
@@ -28,7 +28,7 @@ class SlotPictures(Mapping[str, UInt8]):
         return picture
 
     def __contains__(self, camera: object) -> bool:
-        """True if there was a picture of it, overwritten or not."""
+        """Return True if the observation has a picture of the camera, overwritten or not."""
         return camera in self._numbers
 
     def __iter__(self) -> Iterator[str]:
@@ -39,14 +39,14 @@ class SlotPictures(Mapping[str, UInt8]):
 
 
 def as_message(observation: Observation, numbers: Mapping[str, int]) -> Observed:
-    """Message to media about an observation whose pictures are in the slots of these numbers."""
+    """Return the message for media about an observation whose pictures are in the slots `numbers`."""
     told = {name: getattr(observation, name) for name in _SAME}
     told["captured"] = dict(observation.captured)
     return Observed(**told, pictures={camera: numbers[camera] for camera in observation.pictures})
 
 
 def as_observation(message: Observed, shared: SharedState) -> Observation:
-    """The observation that a message tells of."""
+    """Return the observation in a message."""
     return Observation(
         **{name: getattr(message, name) for name in _SAME}, pictures=SlotPictures(shared, message.pictures)
     )

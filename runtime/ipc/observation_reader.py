@@ -1,4 +1,4 @@
-"""The newest observation as control's tick judges by it; pictures stay where they are."""
+"""Newest observation for the control tick, without pictures."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from runtime.ipc.shared_state import SharedState
 
 @dataclass(frozen=True, slots=True)
 class LatestObservation:
-    """Newest state of the robot: joints [D], and when each part was captured on our monotonic clock [s]."""
+    """Newest state of the robot: joints [D], and capture times on our monotonic clock [s]."""
 
     sequence: int  # 0 before the first observation
-    qpos: Float32  # as it was measured
-    joints: Float64  # the same, to calculate with
+    qpos: Float32  # as measured
+    joints: Float64  # qpos in double precision
     joints_captured: float
-    pictures_captured: tuple[tuple[str, float], ...]  # by camera; NaN for a picture that never came
-    measured: bool  # there is a number for every joint
-    implausible_reason: str = ""  # why these numbers cannot be true
+    pictures_captured: tuple[tuple[str, float], ...]  # by camera; NaN if it never sent a picture
+    measured: bool  # every joint has a finite number
+    implausible_reason: str = ""  # why the joints cannot be true
 
     def is_fresh(self, now: float, allowed: float) -> bool:
-        """True if the joints are known, believed, and not older than `allowed` seconds."""
+        """Return True if the joints are known, plausible, and at most `allowed` seconds old."""
         return self.measured and not self.implausible_reason and now - self.joints_captured <= allowed
 
     def picture_ages(self, now: float) -> dict[str, float]:
-        """Age of each camera's newest picture [s]."""
+        """Return the age of each camera's newest picture [s]."""
         return {camera: now - captured for camera, captured in self.pictures_captured}
 
 
 class ObservationReader:
-    """Reads the shared state; an observation that is still the newest is not read again."""
+    """Reader of the newest observation in shared state; decodes each observation once."""
 
     def __init__(self, shared: SharedState) -> None:
         self._shared_state = shared
@@ -40,7 +40,7 @@ class ObservationReader:
         self._seen: LatestObservation
 
     def read_latest(self) -> LatestObservation:
-        """The newest observation."""
+        """Return the newest observation."""
         version = self._shared_state.observation.version
         if version != self._version:
             self._seen, self._version = self._read(), version

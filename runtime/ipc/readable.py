@@ -1,4 +1,4 @@
-"""Whether a ZMQ socket has a message: the error that `recv` raises where it has none costs ten times as much."""
+"""Check whether a ZMQ socket has a message: ten times faster than the exception of an unsuccessful `recv`."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ import zmq
 
 
 def readable(socket: zmq.Socket[Any]) -> bool:
-    """True if there is a message."""
+    """Return True if the socket has a message."""
     return bool(int(socket.get(zmq.EVENTS)) & zmq.POLLIN)

@@ -1,4 +1,4 @@
-"""The states of a station's session, and what each means: one row a state, for all who read a snapshot."""
+"""States of a station's session and their meaning, one row per state, for all readers of a snapshot."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from typing import Any, Literal
 
 from runtime.core.sentences import Sentence, checked, fixed
 
-Tone = Literal["neutral", "ok", "active", "warn", "danger"]  # the colours of pages
+Tone = Literal["neutral", "ok", "active", "warn", "danger"]  # colours of pages
 
 
 @dataclass(frozen=True, slots=True)
 class StateMeaning:
-    """What a state says: clients ask these, so that a state that they have never heard of is read right."""
+    """Meaning of a session state. Clients use it instead of names, so that unknown states are handled correctly."""
 
-    label: str  # a Sentence where it is one of ours
+    label: str  # a Sentence if it is a known state
     tone: Tone
     connected: bool = True  # complete observations arrive, or did until it was stopped
-    preparing: bool = False  # a set-up or a way home goes on, which Stop cancels
-    set_up: bool = False  # with a policy, or to collect, and where it is to begin
+    preparing: bool = False  # a set-up or homing is in progress, which Stop cancels
+    set_up: bool = False  # ready with a policy or to collect, at the start pose
     run_open: bool = False  # Stop ends it
     moving: bool = False  # the robot may move by itself
     latched: bool = False  # nothing moves until the e-stop is released
 
     @property
     def at_work(self) -> bool:
-        """Whether the policy is used, or may be in a moment."""
+        """Whether the policy is in use, or may be in a moment."""
         return self.preparing or self.run_open
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is set up, and nothing keeps a set-up from beginning."""
+        """Whether nothing is set up, and a set-up could begin."""
         return self.connected and not (self.set_up or self.preparing or self.latched)
 
     @property
@@ -42,7 +42,7 @@ class StateMeaning:
 
     @property
     def going(self) -> bool:
-        """Whether a run goes on."""
+        """Whether a run is being executed."""
         return self.run_open and self.moving
 
     @property
@@ -51,14 +51,14 @@ class StateMeaning:
         return self.run_open and not self.moving
 
     def to_dict(self) -> dict[str, Any]:
-        """The row and what follows from it, as the snapshot has it under "state_is"."""
+        """Return fields and properties, as in a snapshot under "state_is"."""
         return asdict(self) | {
             name: getattr(self, name) for name in ("at_work", "idle", "ready", "going", "held")
         }
 
 
 class SessionState(StrEnum):
-    """The session's state; one word each, the same everywhere."""
+    """State of the session; the same word everywhere."""
 
     DISCONNECTED = "disconnected"
     IDLE = "idle"
@@ -70,21 +70,21 @@ class SessionState(StrEnum):
 
     @property
     def sentence(self) -> Sentence:
-        """Its name in sentences."""
+        """Name of the state in sentences."""
         return _NAMES[self]
 
     @property
     def meaning(self) -> StateMeaning:
-        """Its row."""
+        """Meaning of the state."""
         return MEANINGS[self]
 
     def meaning_dict(self) -> dict[str, Any]:
-        """What it means, as the snapshot has it under "state_is"."""
+        """Return the meaning, as in a snapshot under "state_is"."""
         return self.meaning.to_dict()
 
     @classmethod
     def meaning_of(cls, word: str) -> StateMeaning | None:
-        """What a state of that name means; None for one that there is not."""
+        """Return the meaning of the state `word`; None if there is no such state."""
         return cls(word).meaning if word in cls._value2member_map_ else None
 
 
@@ -106,10 +106,10 @@ _NAMES = {state: fixed(f"state.{state}", state.value) for state in SessionState}
 
 
 def complete_state_meaning(said: Mapping[str, Any]) -> dict[str, Any]:
-    """`said` of a station of whatever version, its "state_is" whole: what it leaves out follows from its "state".
+    """Return a snapshot `said`, of a station of any version, with a complete "state_is".
 
-    Of its "sentences" those are kept that are some.
-    A state that is not known here is neutral: nothing goes on, and that it is idle only the station may say.
+    Missing entries are derived from its "state"; invalid "sentences" are removed. An unknown state is neutral:
+    nothing is in progress, and it counts as idle only if the station itself reports that.
     """
     word, told = str(said["state"]), said.get("state_is") or {}
     row = SessionState.meaning_of(word)

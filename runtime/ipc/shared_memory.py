@@ -1,7 +1,7 @@
-"""Shared memory of the family: double-buffered records and byte rings, each with one writer.
+"""Shared memory of the station processes: double-buffered records and byte rings, each with one writer.
 
-Knows nothing of robots. The memory is an anonymous file (memfd) whose descriptor the supervisor hands to its
-children: it has no name that could be left behind, and vanishes with the last process that holds it.
+Independent of robots. The memory is an anonymous file (memfd) whose descriptor the supervisor passes to its children:
+it has no name that could remain, and vanishes with the last process that has it open.
 """
 
 from __future__ import annotations
@@ -19,49 +19,49 @@ from runtime.core.errors import RuntimeFault
 from runtime.ipc.bells import Bell
 
 _LENGTH_CRC = struct.Struct("<II")
-_ALIGN = 64  # one cache line, so that two writers never share one
+_ALIGN = 64  # [bytes] one cache line, so that two writers never share one
 
 
 def int64_view(memory: mmap.mmap, offset: int) -> memoryview[int]:
-    """One aligned 8-byte integer that is always seen whole.
+    """Return a view of one aligned 8-byte integer, which is read and written atomically.
 
-    Not struct.pack_into: it clears the bytes before it writes them, and a reader can see the zeros.
+    Not struct.pack_into: it clears the bytes before it writes them, and a reader could get the zeros.
     """
     return memoryview(memory)[offset : offset + 8].cast("q")
 
 
 def float64_view(memory: mmap.mmap, offset: int) -> memoryview[float]:
-    """One aligned 8-byte float, likewise."""
+    """Return a view of one aligned 8-byte float, which is read and written atomically."""
     return memoryview(memory)[offset : offset + 8].cast("d")
 
 
 def align_size(size: int) -> int:
-    """`size` rounded up to whole cache lines."""
+    """Return `size` rounded up to whole cache lines."""
     return (size + _ALIGN - 1) // _ALIGN * _ALIGN
 
 
 def create(size: int) -> int:
-    """A new anonymous shared file of `size` bytes; returns its descriptor, inheritable."""
+    """Create an anonymous shared file of `size` bytes; return its inheritable descriptor."""
     descriptor = os.memfd_create("eva", 0)
     os.ftruncate(descriptor, size)
     return descriptor
 
 
 def attach(descriptor: int, size: int = 0) -> mmap.mmap:
-    """The shared file behind an inherited descriptor, mapped for reading and writing: its first `size` bytes or all."""
+    """Map an inherited shared file for reading and writing: its first `size` bytes, or all if 0."""
     return mmap.mmap(descriptor, size or os.fstat(descriptor).st_size)
 
 
 class TornReadError(RuntimeFault):
-    """A record changed under the reader several times in a row; its writer is far faster than expected."""
+    """A record changed during many successive reads; its writer is far faster than expected."""
 
 
 class Record:
-    """One structured record, double-buffered: a preempted writer never leaves it unreadable.
+    """One structured record, double-buffered: a preempted writer never makes it unreadable.
 
-    One process writes, any number read. The checksum, which begins with the version, makes a read right also where
-    memory is weakly ordered, and where a reader was kept waiting between version and content: what is written over it
-    is another version's, and not published yet.
+    One process writes, any number read. The checksum is seeded with the version, so that a read is correct also with
+    weakly ordered memory, and if the reader was delayed between version and content: the bytes then belong to another
+    version, and their checksum does not match.
     """
 
     def __init__(self, memory: mmap.mmap, offset: int, dtype: np.dtype[np.void]) -> None:
@@ -73,25 +73,30 @@ class Record:
 
     @staticmethod
     def size(dtype: np.dtype[np.void]) -> int:
-        """Bytes that a record of `dtype` takes in the shared file."""
+        """Return the bytes that a record of `dtype` needs in the shared file."""
         return _ALIGN + 2 * align_size(dtype.itemsize + 4)
 
     @property
     def version(self) -> int:
-        """Number of times that the record was written; 0 = never."""
+        """Number of writes of the record; 0: never written."""
         return int(self._version[0])
 
     def write(self, value: np.void | np.ndarray[Any, np.dtype[np.void]]) -> None:
-        """Make `value` the record's content; visible to readers whole or not at all."""
+        """Replace the record's content; readers get it completely or not at all."""
         version = self.version + 1
         start = self._offset + _ALIGN + (version & 1) * self._slot
         payload = value.tobytes()
         self._memory[start + 4 : start + 4 + len(payload)] = payload
         self._memory[start : start + 4] = _checksum(payload, version)
+        # The version is published last: a reader uses the new buffer only when it is complete.
         self._version[0] = version
 
     def read(self) -> np.void:
-        """The newest content, zeros if it was never written."""
+        """Return the newest content, zeros if it was never written.
+
+        Raises:
+            TornReadError: it changed during each of 100 attempts.
+        """
         for _ in range(100):
             version = self.version
             if version == 0:
@@ -114,10 +119,10 @@ def _only(records: np.ndarray[Any, np.dtype[np.void]]) -> np.void:
 
 
 class Ring:
-    """A queue of byte messages with one writer and one reader; a full ring refuses, it never overwrites.
+    """Queue of byte messages with one writer and one reader; a full ring refuses and never overwrites.
 
-    Messages become visible when the head moves, so a writer killed in the middle of one leaves no trace of it.
-    A restarted writer or reader goes on where the positions in the memory say.
+    A message becomes visible when the head moves, so a writer killed in the middle leaves no trace. A restarted
+    writer or reader continues at the positions in the memory.
     """
 
     def __init__(self, memory: mmap.mmap, offset: int, capacity: int) -> None:
@@ -127,25 +132,25 @@ class Ring:
         self._data = offset + 2 * _ALIGN
         self._capacity = capacity
         self.refused = 0
-        self.bell: Bell | None = None  # rung after each message, where its reader sleeps
+        self.bell: Bell | None = None  # rung after each message if the reader sleeps
 
     @staticmethod
     def size(capacity: int) -> int:
-        """Bytes that a ring for `capacity` bytes of messages takes in the shared file."""
+        """Return the bytes that a ring for `capacity` bytes of messages needs in the shared file."""
         return 2 * _ALIGN + align_size(capacity)
 
     @property
     def waiting(self) -> bool:
-        """True if there is a message that has not been taken yet."""
+        """True if there is an unread message."""
         return int(self._head[0]) != int(self._tail[0])
 
     @property
     def fill(self) -> float:
-        """Part of the capacity that is taken, 0 to 1."""
+        """Share of the capacity in use, 0 to 1."""
         return (int(self._head[0]) - int(self._tail[0])) / self._capacity
 
     def push(self, payload: bytes) -> bool:
-        """Append one message; False (and counted in `refused`) where there is no room."""
+        """Append a message; return False, and count it in `refused`, if there is no room."""
         head, tail = int(self._head[0]), int(self._tail[0])
         needed = _LENGTH_CRC.size + len(payload)
         if head - tail + needed > self._capacity:
@@ -158,7 +163,10 @@ class Ring:
         return True
 
     def drain(self) -> Iterator[bytes]:
-        """Every message there is, oldest first; each is consumed when the next is asked for or the loop ends."""
+        """Yield all messages, oldest first.
+
+        A message is consumed before it is yielded, so a reader that fails on it does not get it again.
+        """
         while True:
             head, tail = int(self._head[0]), int(self._tail[0])
             if head == tail:
@@ -166,7 +174,7 @@ class Ring:
             length, checksum = _LENGTH_CRC.unpack(self._read(tail, _LENGTH_CRC.size))
             payload = self._read(tail + _LENGTH_CRC.size, length)
             if zlib.crc32(payload) != checksum:
-                return  # the bytes are not all visible yet on a weakly ordered machine: next time
+                return  # not all bytes are visible yet on a weakly ordered machine: retry at the next call
             self._tail[0] = tail + _LENGTH_CRC.size + length
             yield payload
 

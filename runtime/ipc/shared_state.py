@@ -1,6 +1,7 @@
-"""Shared state of the family: newest observation, control's status, heartbeats, e-stop flag, rings, pictures.
+"""Shared state of the station processes: observation, control's status, heartbeats, e-stop flag, rings, pictures.
 
-Every part has exactly one writer; the table in docs/architecture.md says which.
+Every part has one writer, see the table in docs/architecture.md; the e-stop flag may also be raised by the
+coordinator.
 """
 
 from __future__ import annotations
@@ -27,20 +28,20 @@ _SINCE_RESTART = fixed("shared.since_restart", "since it was restarted")
 _JOINTS_NOT_SEEN = fixed("shared.joints_not_seen", "control has not seen the joints for long enough yet")
 
 _LINE = 64
-PICTURE_SLOTS = 12  # 0.4 s of a camera at 30 Hz: for so long may media be late
+PICTURE_SLOTS = 12  # 0.4 s of a camera at 30 Hz: the longest that media may be late
 RING_BYTES = {
     "orders": 1 << 20,  # the coordinator -> control: orders and chunks
     "minutes": 4 << 20,  # the coordinator -> media: begin, raw chunks, events, end
     "ticks": 4 << 20,  # control -> media: one record per tick
-    "observations": 2 << 20,  # reception -> media: observations and events in their order
-    "source": 1 << 12,  # media -> reception: a run of the source begins, or is over
+    "observations": 2 << 20,  # reception -> media: observations and events in order
+    "source": 1 << 12,  # media -> reception: begin and end of a run of the source
     "control_events": 1 << 19,  # control -> the coordinator
     "reception_events": 1 << 19,  # reception -> the coordinator
     "media_events": 1 << 19,  # media -> the coordinator
-    "presses": 1 << 14,  # the coordinator -> guard: presses of the e-stop that came to the coordinator
+    "presses": 1 << 14,  # the coordinator -> guard: e-stop presses that reached the coordinator
 }
-# Processes that sleep until there is something for them, and the rings that wake each. Control and reception wake by
-# themselves; what control records of its ticks is read with what is observed.
+# Processes that sleep, with the rings that wake each. Control and reception have their own timing; media reads
+# the ring of ticks whenever it reads observations.
 WOKEN = {
     "coordinator": ("control_events", "reception_events", "media_events"),
     "media": ("minutes", "observations"),
@@ -51,7 +52,7 @@ PROCESSES = ("control", "coordinator", "reception", "media", "guard")
 
 
 class RecorderStage(IntEnum):
-    """What the recorder is at, for whoever wonders why it is silent."""
+    """Current work of the recorder, to explain a missing heartbeat."""
 
     WAITING = 0
     OPENING = 1
@@ -67,7 +68,7 @@ _STAGES = {
 
 
 class EStop(IntEnum):
-    """The guard's word: nothing may be sent before it has read its latch."""
+    """State of the e-stop, from the guard: UNKNOWN until it has read its latch, and nothing is sent unless CLEAR."""
 
     UNKNOWN = 0
     CLEAR = 1
@@ -101,7 +102,7 @@ def _observation_dtype(d: int, e: int, c: int) -> np.dtype[np.void]:
 
 @dataclass(frozen=True, slots=True)
 class SharedStateLayout:
-    """The sizes everything in the shared state follows from; equal in all of the family."""
+    """Sizes that determine the shared state; the same in all station processes."""
 
     dim: int
     eef_dim: int
@@ -109,21 +110,21 @@ class SharedStateLayout:
     picture_bytes: int = 1920 * 1080 * 3
 
     def observation_dtype(self) -> np.dtype[np.void]:
-        """The newest observation without its pictures: which slot of each camera holds them."""
+        """Return the type of the newest observation, with the slot numbers of its pictures."""
         return _observation_dtype(self.dim, max(self.eef_dim, 1), max(len(self.cameras), 1))
 
     def control_dtype(self) -> np.dtype[np.void]:
-        """Fields of control's status: what it last did and how well it keeps time."""
+        """Return the type of control's status: its last tick and its timing."""
         return np.dtype(
             [
                 ("step", "i8"),
                 ("planned", "f8"),
-                ("sequence", "i8"),  # Observation.sequence that tick `step` saw
+                ("sequence", "i8"),  # Observation.sequence used by tick `step`
                 ("order", "i8"),  # number of the newest order obeyed
                 ("run", "i8"),
                 ("behaviour", "S12"),
                 ("remaining", "i8"),  # steps on the timeline after this one
-                ("engaged", "u1"),  # commands are being sent each tick
+                ("engaged", "u1"),  # commands are sent each tick
                 ("moving", "u1"),
                 ("estop_obeyed", "u1"),
                 ("commanded", "f4", self.dim),
@@ -132,19 +133,19 @@ class SharedStateLayout:
                     "smoothed",
                     "f4",
                     self.dim,
-                ),  # what was wanted at `step` before safety; NaN where nothing was
-                ("chunk", "i8"),  # the chunk that has the largest part in this step, -1 where none has
-                ("chunks", "i8"),  # how many chunks this step was made of
+                ),  # action before safety; NaN if there was none
+                ("chunk", "i8"),  # chunk with the largest weight in this step, -1 if there is none
+                ("chunks", "i8"),  # number of chunks that contribute to this step
                 ("limited", "u1"),  # safety changed or refused the action of this step
-                ("waiting", "u1"),  # a run is open, nothing is planned, and that is as it should be
-                ("starved", "u1"),  # a run is open, nothing is planned, and something should be
-                ("simulated", "f4", self.dim),  # the robot of a run in simulation; NaN where there is none
+                ("waiting", "u1"),  # a run is open, nothing is planned, and that is expected
+                ("starved", "u1"),  # a run is open, nothing is planned, and that is not expected
+                ("simulated", "f4", self.dim),  # the robot of a simulated run; NaN if there is none
                 ("believed", "u1"),  # the joints are measured, fresh and plausible
                 (
                     "doubt",
                     f"S{JOINT_PROBLEM_BYTES}",
-                ),  # why they cannot be true, or are not where they are held
-                ("locked", "f4", self.dim),  # grippers that are locked, and where; NaN for the rest
+                ),  # why they are implausible, or away from the commanded position
+                ("locked", "f4", self.dim),  # positions of locked grippers; NaN elsewhere
                 ("ticks", "i8"),
                 ("missed", "i8"),
                 ("refused_in_row", "i8"),
@@ -159,12 +160,12 @@ class SharedStateLayout:
 
 
 class SharedState:
-    """The shared memory of one station's family, or of a lockstep run in one process."""
+    """Shared memory of a station's processes, or of a lockstep run in one process."""
 
     def __init__(self, layout: SharedStateLayout, shared: mmap.mmap) -> None:
         self.layout = layout
         self._shared = shared
-        self.bells: dict[str, Bell] = {}  # of processes that sleep; none where all of them are one
+        self.bells: dict[str, Bell] = {}  # by process that sleeps; empty if all run in one process
         offset = 0
         self._beats = {
             name: memory.float64_view(shared, _LINE * index) for index, name in enumerate(PROCESSES)
@@ -193,7 +194,7 @@ class SharedState:
 
     @classmethod
     def size(cls, layout: SharedStateLayout) -> int:
-        """Bytes of the shared file; pictures are sparse, so only what is used takes memory."""
+        """Return the size of the shared file [bytes]; picture slots are sparse, so memory is used on first write."""
         pictures = len(layout.cameras) * PictureSlots.size(layout.picture_bytes)
         return cls._size_of_numbers(layout) + pictures
 
@@ -205,17 +206,20 @@ class SharedState:
 
     @classmethod
     def create(cls, layout: SharedStateLayout) -> tuple[SharedState, int]:
-        """A new page and the descriptor that children inherit to attach to it."""
+        """Create a shared state; return it and the descriptor that children inherit."""
         descriptor = memory.create(cls.size(layout))
         return cls(layout, memory.attach(descriptor)), descriptor
 
     @classmethod
     def attach(cls, layout: SharedStateLayout, descriptor: int, pictures: bool = True) -> SharedState:
-        """The page behind an inherited descriptor; without `pictures` for who locks its memory (control)."""
+        """Attach to the shared state behind an inherited descriptor.
+
+        `pictures` False maps everything but the picture slots, for a process that locks its memory (control).
+        """
         return cls(layout, memory.attach(descriptor, 0 if pictures else cls._size_of_numbers(layout)))
 
     def hang(self, bells: Sequence[Bell]) -> None:
-        """Wake by these who sleeps, in the order of WOKEN."""
+        """Install the bells of sleeping processes, in the order of WOKEN."""
         self.bells = dict(zip(WOKEN, bells, strict=True))
         for process, rings in WOKEN.items():
             for ring in rings:
@@ -226,19 +230,19 @@ class SharedState:
             bell.ring()
 
     def beat(self, process: str, now: float) -> None:
-        """Say that `process` is alive at `now` (our monotonic clock)."""
+        """Record a heartbeat of `process` at `now` (our monotonic clock)."""
         self._beats[process][0] = now
 
     def last_beat(self, process: str) -> float:
-        """When `process` last said that it is alive; 0 = never."""
+        """Return the time of the last heartbeat of `process`; 0 = never."""
         return float(self._beats[process][0])
 
     def alive(self, process: str, now: float, within: float) -> bool:
-        """True if `process` has said so in the last `within` seconds."""
+        """Return True if the last heartbeat of `process` is at most `within` seconds old."""
         return now - self.last_beat(process) <= within
 
     def describe_silence(self, process: str, now: float) -> str:
-        """For how long `process` has given no sign of life at `now`, as a sentence ends with it."""
+        """Return for how long `process` has had no heartbeat at `now`, as the end of a sentence."""
         beat = self.last_beat(process)
         if not beat:
             return _SINCE_RESTART
@@ -249,7 +253,7 @@ class SharedState:
 
     @contextmanager
     def recorder_stage(self, stage: RecorderStage) -> Iterator[None]:
-        """What the recorder is at meanwhile; written by media alone."""
+        """Publish the recorder's current work during the context; for media only."""
         before = self._stage[0]
         self._stage[0] = stage
         try:
@@ -258,53 +262,56 @@ class SharedState:
             self._stage[0] = before
 
     def generation(self, process: str) -> int:
-        """Number of starts of `process` by the supervisor; a change means that it died and was restarted."""
+        """Return the number of starts of `process`; a change means that it died and was restarted."""
         return int(self._generations[process][0])
 
     def set_generation(self, process: str, count: int) -> None:
-        """Written by the supervisor alone."""
+        """Set the number of starts of `process`; for the supervisor only."""
         self._generations[process][0] = count
-        if process == "media":  # what the one before was at is over
+        if process == "media":  # the stage of its predecessor is void
             self._stage[0] = RecorderStage.WAITING
 
     @property
     def releases(self) -> int:
-        """Number of times that the coordinator has asked the guard to release the latch."""
+        """Number of times that the coordinator has requested a release of the latch."""
         return int(self._release[0])
 
     def request_release(self) -> None:
-        """The coordinator's half of a release; the guard does it and clears the flag."""
+        """Request a release of the latch; the guard clears latch and flag. For the coordinator only."""
         self._release[0] = self.releases + 1
         self._wake("guard")
 
     @property
     def unrecorded(self) -> bool:
-        """True while media has no use for records of ticks."""
+        """True while media does not need tick records."""
         return bool(self._unrecorded[0])
 
     def set_unrecorded(self, unrecorded: bool) -> None:
-        """Written by media alone."""
+        """Set `unrecorded`; for media only."""
         self._unrecorded[0] = unrecorded
 
     @property
     def estop(self) -> EStop:
-        """The guard's flag; control reads it before every send."""
+        """State of the e-stop; control reads it before every send."""
         return _ESTOPS[self._shared[self._estop]]
 
     def set_estop(self, state: EStop) -> None:
-        """Lowered by the guard alone; the coordinator raises it for a press that came to the coordinator's socket."""
+        """Set the e-stop flag.
+
+        Only the guard clears it; the coordinator may latch it for a press that reached its own socket.
+        """
         self._shared[self._estop] = int(state)
         self._wake("coordinator")
 
     @property
     def joint_problem(self) -> str:
-        """Why nothing may begin to move, by what control says of the joints; "" where it may."""
+        """Reason why no motion may begin, according to control's status of the joints; "" if it may."""
         status = self.control.read()
         doubt = bytes(status["doubt"]).decode(errors="ignore")
         return doubt or ("" if status["believed"] else _JOINTS_NOT_SEEN)
 
     def publish_observation(self, observation: Observation, pictures: Mapping[str, int]) -> None:
-        """Reception's half: the observation's numbers, and for each camera the number of its newest picture."""
+        """Publish an observation with the number of each camera's newest picture; for reception only."""
         record = np.zeros((), self.layout.observation_dtype())
         record["sequence"], record["arrived"] = observation.sequence, observation.arrived
         record["joints_captured"] = observation.captured.get("joints", observation.arrived)
@@ -322,9 +329,12 @@ class SharedState:
         self.observation.write(record)
 
     def read_observation(self, cameras: Sequence[str]) -> Observation | None:
-        """The newest observation with the pictures of `cameras`, copied; None before the first one.
+        """Return the newest observation with copies of the pictures of `cameras`; None before the first.
 
-        Where a picture was overwritten while it was copied, the newest observation is read again.
+        If a picture was overwritten during the copy, the newest observation is read again.
+
+        Raises:
+            TornReadError: this happened five times.
         """
         for _ in range(5):
             record = self.observation.read()
@@ -370,7 +380,7 @@ class SharedState:
 
 
 class PictureSlots:
-    """The newest pictures of one camera; a reader notices when its slot was written again meanwhile."""
+    """The newest pictures of one camera; a reader detects that its slot was overwritten during a read."""
 
     _SHAPE = struct.Struct("@iii")  # height, width, channels
 
@@ -384,19 +394,25 @@ class PictureSlots:
 
     @staticmethod
     def size(picture_bytes: int) -> int:
-        """Bytes that the slots of one camera take in the shared file."""
+        """Return the bytes that the slots of one camera need in the shared file."""
         return PICTURE_SLOTS * (_LINE + align_size(picture_bytes))
 
     @property
     def newest(self) -> int:
-        """The largest number that a picture was begun with, whole or not; 0 before the first."""
+        """Largest picture number whose write has begun, complete or not; 0 before the first."""
         return max(int(begun[0]) for begun in self._begun)
 
     def write(self, number: int, picture: UInt8) -> None:
-        """Store `picture` as number `number` (counted from 1); raises ValueError where it is too large."""
+        """Store `picture` as number `number` (counted from 1).
+
+        Raises:
+            ValueError: it is too large for a slot.
+        """
         if picture.nbytes > self._bytes:
             raise ValueError(f"picture of {picture.nbytes} bytes {picture.shape}; at most {self._bytes} fit")
         slot = number % PICTURE_SLOTS
+        # `_begun` is set before the pixels and `_done` after them; a reader accepts a picture only if `_done`
+        # has its number before the copy, and `_begun` still has it after the copy.
         self._begun[slot][0] = number
         self._SHAPE.pack_into(self._shared, self._at[slot] + 16, *picture.shape)
         view = np.frombuffer(self._shared, np.uint8, picture.nbytes, self._at[slot] + _LINE)
@@ -404,7 +420,7 @@ class PictureSlots:
         self._done[slot][0] = number
 
     def shape(self, number: int) -> tuple[int, int] | None:
-        """Height and width of picture `number`, or None where it has been overwritten."""
+        """Return height and width of picture `number`; None if it has been overwritten."""
         slot = number % PICTURE_SLOTS
         if self._done[slot][0] != number:
             return None
@@ -412,7 +428,7 @@ class PictureSlots:
         return (height, width) if self._begun[slot][0] == number else None
 
     def read(self, number: int) -> UInt8 | None:
-        """A copy of picture `number`, or None where it has been overwritten."""
+        """Return a copy of picture `number`; None if it has been overwritten."""
         slot = number % PICTURE_SLOTS
         if self._done[slot][0] != number:
             return None

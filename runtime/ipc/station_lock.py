@@ -1,4 +1,4 @@
-"""The lock of a station's folder: of each name there is one in a data folder, whether it runs here or elsewhere."""
+"""Lock of a station's folder: a station name runs at most once per data folder, on this machine or another."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import IO
 
 
 class Taken(Exception):
-    """Another process has the folder; `by` is what it says of itself."""
+    """Another process has locked the folder; `by` is its description in the lock file."""
 
     def __init__(self, by: str) -> None:
         self.by = by
@@ -17,7 +17,14 @@ class Taken(Exception):
 
 
 def take(station_dir: Path, what: str = "") -> IO[str]:
-    """The lock, for as long as it is open; raises Taken, or OSError. `what` is said beside the process's number."""
+    """Lock the folder; the lock lasts as long as the returned file is open.
+
+    `what` is written after the process number.
+
+    Raises:
+        Taken: another process has the lock.
+        OSError: the lock file cannot be opened.
+    """
     station_dir.mkdir(parents=True, exist_ok=True)
     lock = (station_dir / "lock").open("a+", encoding="utf-8")
     try:

@@ -1,6 +1,6 @@
-"""Forward and inverse kinematics: one file per backend. Each declares `Config` and `build`."""
+"""Forward and inverse kinematics, one file per backend, which declares `Config` and `build`."""
 
-# Each kind with its module, which is imported where a deployment names it.
+# Module of each kind; imported only if a deployment names the kind.
 KINDS = {
     "compiled": "runtime.kinematics.compiled",
     "pyroki": "runtime.kinematics.pyroki",

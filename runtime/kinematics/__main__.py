@@ -1,4 +1,4 @@
-"""python -m runtime.kinematics: compiles what solvers of robots need, so that no start and no command waits for it."""
+"""Compile the kinematics of robots in advance, so that no start of a station and no command waits for it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.kinematics import compiled
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compiles for the named robots, else for all that there are; returns 1 where one cannot be."""
+    """Compile for the named robots, else for all; return 1 if that fails for one of them."""
     parser = argparse.ArgumentParser(prog="python -m runtime.kinematics", description=__doc__)
     parser.add_argument("robots", metavar="ROBOT", nargs="*", help="a robot's name or a folder")
     wanted = parser.parse_args(arguments).robots or robots.robot_names()
@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for robot in (
                 robots.load_robot(name),
                 robots.load_robot_with_optional_groups(name),
-            ):  # another torso is another solver
+            ):  # another torso needs another solver
                 compiled.build(compiled.Config(), robot)
             print(f"{name}: ready after {time.perf_counter() - begun:.1f} s")
     except (robots.RobotError, RuntimeFault) as error:

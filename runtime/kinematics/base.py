@@ -1,4 +1,4 @@
-"""Interface of kinematics: poses of the end effectors, and joints that put them somewhere."""
+"""Interface of kinematics backends: forward kinematics of end effectors, and inverse kinematics."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class KinematicsError(RuntimeFault):
-    """Joints, poses or a seed of the wrong shape, or numbers that no pose can have."""
+    """Invalid shape of joints, poses or seed, or numbers that are no pose."""
 
 
 class IkFlag(IntFlag):
-    """Findings on a solved frame; bits of IkResult.flags."""
+    """Properties of a solved frame; bits of IkResult.flags."""
 
     OVER_TOLERANCE = 1
-    AT_LIMIT = 2  # a joint rests on its limit
-    AT_VELOCITY = 4  # a joint moves as fast as it may
-    NEAR_SINGULAR = 8  # some direction of the end effector can hardly be moved in
+    AT_LIMIT = 2  # a joint is at its limit
+    AT_VELOCITY = 4  # a joint moves at its velocity limit
+    NEAR_SINGULAR = 8  # the end effector can hardly move in some direction
 
 
 class KinematicsSettings(Settings):
@@ -56,10 +56,10 @@ class KinematicsSettings(Settings):
 
 @dataclass(frozen=True, slots=True)
 class IkResult:
-    """Joints for a sequence of targets.
+    """Joints for a sequence of target poses.
 
-    `q` float64 [T, D] full robot vectors; `position_error` [T, arms] in m, `rotation_error` [T, arms] in rad, of
-    the joints that are returned; `flags` uint8 [T, arms], bits of IkFlag.
+    `q` float64 [T, D] are full robot vectors; `position_error` [T, arms] in m and `rotation_error` [T, arms] in rad
+    are those of `q`; `flags` uint8 [T, arms] are bits of IkFlag.
     """
 
     q: Float64
@@ -69,24 +69,24 @@ class IkResult:
 
     @property
     def reached(self) -> NDArray[np.bool_]:
-        """bool [T, arms]: both errors within tolerance."""
+        """Whether both errors are within tolerance, bool [T, arms]."""
         within: NDArray[np.bool_] = (self.flags & IkFlag.OVER_TOLERANCE) == 0
         return within
 
 
 class Forward(ABC):
-    """Poses of the end effectors of one robot: arms in its order, poses in each arm's declared frame."""
+    """Forward kinematics of a robot: arms in its order, poses in each arm's declared frame."""
 
     @abstractmethod
     def forward(self, q: Float64) -> Float64:
-        """Poses [..., arms, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) for joint vectors [..., D]."""
+        """Return poses [..., arms, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) of joint vectors [..., D]."""
 
 
 class Kinematics(Forward):
-    """Forward and inverse kinematics of one robot."""
+    """Forward and inverse kinematics of a robot."""
 
     def prepare(self) -> bool:
-        """Begin what `solve` needs, where nobody has; whether `solve` would not have to wait for it."""
+        """Start to load what `solve` needs; return True if `solve` would not have to wait for it."""
         return True
 
     @abstractmethod
@@ -98,12 +98,17 @@ class Kinematics(Forward):
         anchor: Float64 | None = None,
         anchor_row: int = 0,
     ) -> IkResult:
-        """Joints for poses [T, arms, 7], each frame started from the one before, the first from `seed` [D].
+        """Solve for poses [T, arms, 7]: each frame starts from its predecessor, the first from `seed` [D].
 
-        Dimensions of `seed` that no arm's chain uses (grippers, head) are passed through, and carriers (a torso)
-        stand as in `seed`. No joint leaves its limits. Where `dt` [s] between frames is given, none moves faster than
-        its velocity limit from one frame to the next; `anchor` [D] is what is commanded in the step before row
-        `anchor_row`, the first that will be executed: that row is bound to it by the same velocity, and the rows
-        before it, which are stale, by joint limits alone. Without an anchor the first row is bound by joint limits
-        alone. What is not reached is flagged, never hidden. What a pose leaves open is the backend's.
+        Dimensions of `seed` outside the arms' chains (grippers, head) are copied, and carriers (a torso) are assumed
+        to be as in `seed`. No joint leaves its limits. Poses that are not reached are flagged. Redundant joints are
+        resolved by the backend.
+
+        Args:
+            targets: poses in each arm's declared frame.
+            seed: joints [D] from which the first frame is solved.
+            dt: time between frames [s]; if given, no joint exceeds its velocity limit between frames.
+            anchor: commanded position [D] in the step before row `anchor_row`; the velocity limit binds that row to
+                it. Without it, the first row is bound by joint limits only.
+            anchor_row: first row that will be executed; rows before it are stale, and bound by joint limits only.
         """

@@ -1,4 +1,4 @@
-"""Kinematics in compiled loops: forward over the robot's chains, inverse by damped least squares in a hard box."""
+"""Compiled kinematics: forward over the robot's chains, inverse by damped least squares in a hard box."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from runtime.kinematics.replanning import (
 )
 from runtime.kinematics.tables import POSED, ChainSequence, Record, Records, chain_records
 
-_WRONG = {  # by what runtime.kinematics.kernels.chunks says
+_WRONG = {  # by return value of kernels.chunks.solve_chunk
     1: "a target, the seed or the anchor holds a number that is not finite",
     2: "a target's quaternion has length zero; allowed: any other",
 }
-_ROOM = 0.8  # rad (m) that joints with a choice keep from limits, where home does
-_TRIED = 24  # postures, besides home, from which the end of a missed chunk is solved
+_ROOM = 0.8  # [rad, m] distance of redundant joints from their limits, if home has it
+_TRIED = 24  # postures, besides home, from which the last pose of a missed chunk is solved
 _log = logging.getLogger(__name__)
 
 
@@ -43,19 +43,19 @@ class Config(KinematicsSettings):
 
 
 def build(config: Config, robot: Robot) -> CompiledKinematics:
-    """The kinematics of the robot's arms, with everything compiled or loaded that a solve needs."""
+    """Return the kinematics of the robot's arms, with everything compiled or loaded that `solve` needs."""
     made = CompiledKinematics(robot, config)
     made.warm_up()
     return made
 
 
 def is_compiled(robot: Robot) -> bool:
-    """True if nothing is left to compile for the robot."""
+    """Return True if all kernels for the robot are compiled."""
     return kernel_cache.is_compiled(robot)
 
 
 class CompiledKinematics(Kinematics):
-    """Forward and inverse kinematics in float64; each arm is solved by itself, frame after frame."""
+    """Forward and inverse kinematics in float64; arms are solved separately, frame by frame."""
 
     def __init__(self, robot: Robot, config: Config | None = None) -> None:
         try:
@@ -87,9 +87,9 @@ class CompiledKinematics(Kinematics):
         )
 
     def warm_up(self) -> None:
-        """Compiles what is not on disk yet and loads the rest, so that nothing of it is left for a command.
+        """Compile kernels that are not cached and load the others, so that no command waits for them.
 
-        What is kept on disk and cannot be read, after a full disk or a loss of power, is compiled again.
+        A cached kernel that cannot be read (a full disk, a power failure) is compiled again.
         """
         if not kernel_cache.is_compiled(self._robot):
             _log.info("compiling the kinematics for this processor, once; this takes some seconds")
@@ -111,7 +111,11 @@ class CompiledKinematics(Kinematics):
         self.solve(self.forward(seed)[None], seed)
 
     def forward(self, q: Float64) -> Float64:
-        """Poses [..., arms, 7] for joint vectors [..., D]; KinematicsError for another width."""
+        """Return poses [..., arms, 7] of joint vectors [..., D].
+
+        Raises:
+            KinematicsError: another width.
+        """
         q = np.array(q, dtype=np.float64, order="C")
         if q.shape[-1:] != (self._dim,):
             raise KinematicsError(f"joints of shape {q.shape} were given; allowed: [..., {self._dim}]")
@@ -129,10 +133,13 @@ class CompiledKinematics(Kinematics):
         anchor: Float64 | None = None,
         anchor_row: int = 0,
     ) -> IkResult:
-        """Joints for poses [T, arms, 7]; the errors are measured on the joints that are returned.
+        """Solve for poses [T, arms, 7], see Kinematics.solve; errors are measured on the returned joints.
 
-        Quaternions may have any length above zero. Raises KinematicsError for wrong shapes, numbers that are not
-        finite, a quaternion of length zero, a `dt` that is not above zero or an `anchor_row` below it.
+        Quaternions may have any length above zero.
+
+        Raises:
+            KinematicsError: wrong shapes, numbers that are not finite, a quaternion of length zero, a `dt` of zero or
+                less, or a negative `anchor_row`.
         """
         targets, seed = self._targets(targets), self._vector("a seed", seed)
         if dt is not None and not 0 < dt < np.inf:
@@ -151,9 +158,9 @@ class CompiledKinematics(Kinematics):
     def _replan_missed(
         self, found: IkResult, targets: Float64, seed: Float64, dt: float, held: Float64, row: int
     ) -> None:
-        """Puts another plan into `found` for arms that meet the first pose, and miss a later one or end cramped.
+        """Replan in `found` the arms that reach the first pose but miss a later one or end near limits.
 
-        The next chunk may go on towards a limit that this one ends by, and nothing else is known of it.
+        The next chunk is unknown, and may continue towards a limit near which this chunk ends.
         """
         begin = row if row >= 0 else 1
         if begin >= len(targets):
@@ -173,7 +180,7 @@ class CompiledKinematics(Kinematics):
             sweep = partial(self._solve_rows, self._arms[index : index + 1])
             plan = replan(sweep, poses, start, dt, dims, self._postures[index], room, least)
             if plan is None and index in late and arm["joints"] > POSED:
-                # Going home may be what leads away from later poses: the posture stays as it is.
+                # The pull towards home may lead away from later poses: solve once more without it.
                 plan = sweep(poses, start, dt, start, 0, home_rate=0.0)
                 plan = plan if plan.reached.all() else None
             if plan is not None:
@@ -193,7 +200,7 @@ class CompiledKinematics(Kinematics):
         guide: Float64 | None = None,
         home_rate: float | None = None,
     ) -> IkResult:
-        """One call of the loop, for some of the arms; contiguous arrays, anchor_row -1: no anchor."""
+        """Call the kernel for some of the arms; arrays must be contiguous, anchor_row -1: no anchor."""
         costs = self._costs if home_rate is None else self._costs._replace(home_rate=home_rate)
         frames = (len(targets), len(arms))
         q, away, astray = np.empty((len(targets), self._dim)), np.empty(frames), np.empty(frames)
@@ -234,14 +241,14 @@ class CompiledKinematics(Kinematics):
 
 
 def _full_chain(group: Group, chain: Chain) -> ChainSequence:
-    """From the arm's frame to its end effector, driven by the robot's vector."""
+    """Return the chain from the arm's frame to its end effector, driven by the robot's vector."""
     if group.carrier is None:
         return ChainSequence([chain], [group.joint_dims.tolist()])
     return ChainSequence([group.carrier, chain], [group.carrier_dims.tolist(), group.joint_dims.tolist()])
 
 
 def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: float) -> Records:
-    """The arms as records; where they differ in length, shorter ones are filled up with what stands still."""
+    """Return the arms as records; shorter arms are padded with fixed joints."""
     from runtime.kinematics.kernels.chunks import arm_type
 
     chains = chain_records([ChainSequence([chain], [range(chain.size)]) for _, chain in own])
@@ -263,9 +270,9 @@ def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: f
 
 
 def _limit_margin(arm: Record, q: Float64) -> float:
-    """Distance of joints [D] to the nearest limit, as a part of what is kept; inf without a choice.
+    """Return the distance of joints [D] to the nearest limit, relative to _ROOM; inf for an arm without redundancy.
 
-    Sides to which home itself is nearer do not count: there is no more room to go to.
+    Limits to which home itself is nearer than _ROOM do not count: no posture is better there.
     """
     count = arm["joints"]
     if count <= POSED:
@@ -283,7 +290,7 @@ def _carrier_chain(group: Group) -> ChainSequence:
 
 
 def _lengths(arms: Records) -> tuple[int, int, int]:
-    """Moving joints of the arms' own chains, of those that carry them, and numbers that drive them."""
+    """Return the number of joints of the arms' own chains, of their carriers, and of the driving numbers."""
     return (
         arms["own"]["drive"].shape[1],
         arms["carrier"]["drive"].shape[1],

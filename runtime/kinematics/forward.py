@@ -1,4 +1,4 @@
-"""Forward kinematics alone, in numpy: for processes that never solve, which then load no compiler."""
+"""Forward kinematics in numpy, for processes that never solve and so need no compiler."""
 
 from __future__ import annotations
 
@@ -10,14 +10,18 @@ from runtime.kinematics.base import Forward, KinematicsError
 
 
 class ChainForward(Forward):
-    """By the robot's own chains: tens of microseconds for one vector, and nothing to compile."""
+    """Forward kinematics by the robot's own chains: tens of microseconds per vector, nothing to compile."""
 
     def __init__(self, robot: Robot) -> None:
         self._arms = robot.arms
         self._dim = robot.dim
 
     def forward(self, q: Float64) -> Float64:
-        """Poses [..., arms, 7] for joint vectors [..., D]; KinematicsError for another width."""
+        """Return poses [..., arms, 7] of joint vectors [..., D].
+
+        Raises:
+            KinematicsError: another width.
+        """
         q = np.asarray(q, dtype=np.float64)
         if q.shape[-1:] != (self._dim,):
             raise KinematicsError(f"joints of shape {q.shape} were given; allowed: [..., {self._dim}]")

@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept, and for which robots they are there; loads no compiler to say so."""
+"""Cache of compiled kernels on disk, and a record of the robots for which it is complete; loads no compiler."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _KERNELS = Path(__file__).resolve().parent / "kernels"
 
 @functools.cache  # cache: one process compiles into one folder
 def folder() -> Path | None:
-    """The first folder that can be written: below $NUMBA_CACHE_DIR, beside the sources, in the user's cache."""
+    """Return the first writable folder: below $NUMBA_CACHE_DIR, or next to the sources, or in the user's cache."""
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
     roots = [Path(chosen)] if chosen else [_KERNELS / "__pycache__", home / "eva-web"]
@@ -39,7 +39,7 @@ def folder() -> Path | None:
 
 
 def is_compiled(robot: Robot) -> bool:
-    """True if the robot's kernels are on disk: a solve loads them within a second, instead of compiling them."""
+    """Return True if the robot's kernels are on disk: they load within a second, without compilation."""
     kept = folder()
     if kept is None:
         return False
@@ -52,7 +52,7 @@ def is_compiled(robot: Robot) -> bool:
 
 
 def note_compiled(robot: Robot) -> None:
-    """Remember that the robot's kernels are on disk, and which files they are."""
+    """Record that the robot's kernels are on disk, with names and sizes of their files."""
     if (kept := folder()) is not None:
         part = kept / f"{_name(robot)}.{os.getpid()}"
         part.write_text(json.dumps(_kernels(kept)), "utf-8")
@@ -60,7 +60,7 @@ def note_compiled(robot: Robot) -> None:
 
 
 def forget() -> bool:
-    """Remove what is kept on disk, so that it is compiled again; False where nothing is."""
+    """Remove all cached files, so that they are compiled again; return False if there were none."""
     kept = folder()
     files = [] if kept is None else [file for file in kept.rglob("*") if file.is_file()]
     for file in files:
@@ -69,7 +69,7 @@ def forget() -> bool:
 
 
 def _kernels(kept: Path) -> dict[str, int]:
-    """Sizes of the files with machine code; numba's index of each function is there, or it has none."""
+    """Return the sizes of the files with machine code that have an index file of numba."""
     return {
         file.relative_to(kept).as_posix(): file.stat().st_size
         for file in sorted(kept.rglob("*.nbc"))
@@ -78,12 +78,12 @@ def _kernels(kept: Path) -> dict[str, int]:
 
 
 def _function(file: Path) -> str:
-    """Name of a kernel's function as numba begins its files with it: MODULE.FUNCTION-LINE.PYTHON.NUMBER.nbc."""
+    """Return the function's part of a file name of numba: MODULE.FUNCTION-LINE.PYTHON.NUMBER.nbc."""
     return file.name.rpartition(".nbc")[0].rpartition(".")[0]
 
 
 def _digest() -> str:
-    """Of all kernels: numba looks at a loop's own file alone, and would go on using what an old callee was."""
+    """Return a digest of all kernels: numba compares only a function's own file, and would use outdated callees."""
     found = hashlib.sha256()
     for file in sorted(_KERNELS.glob("*.py")):
         found.update(file.read_bytes())
@@ -91,7 +91,7 @@ def _digest() -> str:
 
 
 def _name(robot: Robot) -> str:
-    """Of the mark for such a robot with this compiler on this processor."""
+    """Return the name of the record for such a robot with this compiler on this processor."""
     found = hashlib.sha256(robot.urdf.read_bytes())
     for part in (robot.joint_names, _numba(), _processor()):
         found.update(repr(part).encode())

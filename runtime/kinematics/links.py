@@ -1,4 +1,4 @@
-"""Poses of all parts of a robot, in the form that the 3D scene reads, in microseconds."""
+"""Poses of all links of a robot in the format of the 3D scene, in microseconds."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 
 
 class LinkPoses:
-    """The parts of a body, in its order; compiled or loaded from disk when it is made.
+    """Calculator of link poses of a body, in its order; compiled or loaded from disk on construction.
 
-    Raises KinematicsError where numba is not installed.
+    Raises:
+        KinematicsError: numba is not installed.
     """
 
     def __init__(self, body: Body) -> None:
@@ -32,7 +33,11 @@ class LinkPoses:
         self.poses(np.zeros(self._dim))
 
     def poses(self, q: ArrayLike) -> Float32:
-        """Scene <- part for joints [..., D] as float32 [..., P, 16], each matrix column by column."""
+        """Return the transforms scene <- link for joints [..., D]: float32 [..., P, 16], column by column.
+
+        Raises:
+            KinematicsError: another width.
+        """
         joints = np.array(q, dtype=np.float64, order="C")
         if joints.shape[-1:] != (self._dim,):
             raise KinematicsError(f"joints of shape {joints.shape} were given; allowed: [..., {self._dim}]")

@@ -1,4 +1,4 @@
-"""A backend that is loaded when something is first to be solved, beside whoever goes on meanwhile."""
+"""Kinematics whose backend is loaded in the background on first use."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Make = Callable[[], Kinematics]
 
 
 class LazyKinematics(Kinematics):
-    """The kinematics that `make` makes, once and where `aside` has it done; joints become poses from the start.
+    """Kinematics with a backend that `make` builds once, run in the background by `aside`; `forward` works at once.
 
-    A station whose policy speaks joints starts without a compiler, and never loads one.
+    A station with a policy in joint space starts without a compiler and never loads one.
     """
 
     def __init__(
@@ -26,24 +26,28 @@ class LazyKinematics(Kinematics):
         aside: Callable[[Make], Future[Kinematics]],
         compiled: Callable[[], bool] = lambda: True,
     ) -> None:
-        """`compiled`: whether `make` would have nothing to compile."""
-        self._forward = forward  # until it is there
+        """`compiled` returns whether `make` would have nothing to compile."""
+        self._forward = forward  # used until the backend is loaded
         self._make, self._aside, self._compiled = make, aside, compiled
         self._made: Future[Kinematics] | None = None
         self._once = Lock()
 
     def prepare(self) -> bool:
-        """Begin to load, where nobody has; whether `solve` would not have to wait for that."""
+        """Start to load the backend, once; return True if `solve` would not have to wait for it."""
         return self._start_loading().done()
 
     def compile(self) -> Future[Kinematics] | None:
-        """Begin to compile what a run could need; None where there is nothing to compile, and nothing is loaded."""
+        """Start to compile what a run may need; None, without loading anything, if all is compiled."""
         if self._made is None and self._compiled():
             return None
         return self._start_loading()
 
     def forward(self, q: Float64) -> Float64:
-        """Poses [..., arms, 7] for joint vectors [..., D]; KinematicsError for another width. Waits for nothing."""
+        """Return poses [..., arms, 7] of joint vectors [..., D], without waiting for the backend.
+
+        Raises:
+            KinematicsError: another width.
+        """
         made = self._made
         if made is None or not made.done() or made.exception() is not None:
             return self._forward.forward(q)
@@ -57,7 +61,11 @@ class LazyKinematics(Kinematics):
         anchor: Float64 | None = None,
         anchor_row: int = 0,
     ) -> IkResult:
-        """As the backend's, once it is there; SetupError where it cannot be made."""
+        """Solve with the backend, after waiting for it.
+
+        Raises:
+            SetupError: the backend cannot be built.
+        """
         return self._start_loading().result().solve(targets, seed, dt, anchor, anchor_row)
 
     def _start_loading(self) -> Future[Kinematics]:
@@ -71,5 +79,5 @@ class LazyKinematics(Kinematics):
             return self._make()
         except RuntimeFault:
             raise
-        except Exception as error:  # of a compiler or a library: it must not end the coordinator
+        except Exception as error:  # of a compiler or library; the coordinator must survive it
             raise SetupError(f"kinematics cannot be made: {type(error).__name__}: {error}") from error

@@ -1,4 +1,4 @@
-"""Accuracy of solved joints, whichever backend solved them: errors and flags of every frame."""
+"""Errors and flags of solved joints, independent of the backend."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from robots.rotations import rotation_vector, transform_of
 from runtime.core.types import Float64
 from runtime.kinematics.base import IkFlag, IkResult, KinematicsSettings
 
-_RESTS = 1e-6  # rad (m) within which a joint rests on a bound
+_RESTS = 1e-6  # [rad, m] distance from a bound that counts as on it
 
 
 def evaluate_solution(
     robot: Robot, settings: KinematicsSettings, q: Float64, targets: Float64, bounds: tuple[Float64, Float64]
 ) -> IkResult:
-    """The result for joints q [T, D] that were solved for poses [T, arms, 7].
+    """Return the result for joints q [T, D] that were solved for poses [T, arms, 7].
 
-    `bounds` are the lowest and the highest joints [T, D] that each frame could have: the joint limits, and what
-    the velocities allowed.
+    `bounds` are the lowest and highest joints [T, D] of each frame, from joint limits and velocities.
     """
     shape = (len(q), len(robot.arms))
     position, rotation, flags = np.empty(shape), np.empty(shape), np.zeros(shape, dtype=np.uint8)

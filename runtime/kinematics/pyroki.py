@@ -1,7 +1,7 @@
-"""Kinematics by PyRoki (Kim et al. 2025, arXiv:2505.03728), for users who have it: the same problem, solved in JAX.
+"""Kinematics by PyRoki (Kim et al. 2025, arXiv:2505.03728): the same problem solved in JAX, for its users.
 
-PyRoki is on no package index; it and jaxls are installed from their repositories. Nothing of it is imported before
-a deployment asks for it.
+PyRoki is on no package index: install it and jaxls from their repositories. They are imported only if a deployment
+selects this kind.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from runtime.kinematics import compiled
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsSettings
 from runtime.kinematics.measuring import evaluate_solution
 
-_BUCKET = 64  # rows: chunks are filled up to a multiple, so that few lengths are compiled
-_BOX_WEIGHT = 100.0  # per rad beyond the box; what is left beyond it is cut off
+_BUCKET = 64  # [rows] chunks are padded to a multiple, so that few lengths are compiled
+_BOX_WEIGHT = 100.0  # per rad beyond the box; the remaining excess is clipped
 
 
 class Config(KinematicsSettings):
@@ -36,7 +36,7 @@ class Config(KinematicsSettings):
 
 
 def build(config: Config, robot: Robot) -> PyrokiKinematics:
-    """The kinematics of the robot's arms, compiled for chunks of up to 64 rows: that takes some ten seconds."""
+    """Return the kinematics of the robot's arms, compiled for chunks of up to 64 rows, which takes some ten seconds."""
     made = PyrokiKinematics(robot, config)
     home = robot.poses["home"]
     made.solve(made.forward(home)[None], home)
@@ -44,14 +44,14 @@ def build(config: Config, robot: Robot) -> PyrokiKinematics:
 
 
 def is_compiled(robot: Robot) -> bool:
-    """False: what JAX compiles is kept in memory alone."""
+    """Return False: JAX caches compiled functions in memory only."""
     return False
 
 
 class PyrokiKinematics(Kinematics):
-    """Inverse kinematics in float32 by Levenberg-Marquardt, frame after frame in one compiled scan per arm.
+    """Inverse kinematics in float32 by Levenberg-Marquardt, frame by frame in one compiled scan per arm.
 
-    Joint limits and velocities are a cost of their own and a cut: PyRoki's variables know no hard box. Forward
+    Joint limits and velocities are a cost term, and the result is clipped: PyRoki has no hard bounds. Forward
     kinematics and the errors of a result are those of the default backend, in float64.
     """
 
@@ -65,7 +65,11 @@ class PyrokiKinematics(Kinematics):
         self._arms = [_Arm(libraries, robot, arm, self._config) for arm in robot.arms]
 
     def forward(self, q: Float64) -> Float64:
-        """Poses [..., arms, 7] for joint vectors [..., D]; KinematicsError for another width."""
+        """Return poses [..., arms, 7] of joint vectors [..., D].
+
+        Raises:
+            KinematicsError: another width.
+        """
         return self._default.forward(q)
 
     def solve(
@@ -76,11 +80,12 @@ class PyrokiKinematics(Kinematics):
         anchor: Float64 | None = None,
         anchor_row: int = 0,
     ) -> IkResult:
-        """Joints for poses [T, arms, 7]; the errors are measured on the joints that are returned.
+        """Solve for poses [T, arms, 7], see Kinematics.solve; errors are measured on the returned joints.
 
-        Raises KinematicsError as the default backend does.
+        Raises:
+            KinematicsError: as in the default backend.
         """
-        # The default backend checks every argument, in one row; what it solves is not used.
+        # The default backend checks all arguments, with one row; its solution is not used.
         self._default.solve(targets[:1], seed, dt, anchor, anchor_row)
         targets, seed = np.asarray(targets, np.float64), np.asarray(seed, np.float64)
         q = np.repeat(seed[None], len(targets), axis=0)
@@ -93,7 +98,7 @@ class PyrokiKinematics(Kinematics):
 
 
 class _Asked(NamedTuple):
-    """One arm's part of a chunk: poses [T, 7] in its frame, and what bounds its rows."""
+    """One arm's part of a chunk: poses [T, 7] in its frame, and the bounds of its rows."""
 
     targets: Float64
     seed: Float64
@@ -103,7 +108,7 @@ class _Asked(NamedTuple):
 
 
 class _Arm:
-    """One arm as PyRoki sees it: the serial chain of its own joints, and the scan over a chunk."""
+    """One arm for PyRoki: the serial chain of its own joints, and the scan over a chunk."""
 
     def __init__(self, libraries: _Libraries, robot: Robot, group: Group, config: Config) -> None:
         assert group.chain is not None  # it is an arm
@@ -115,7 +120,7 @@ class _Arm:
         self._scan = _scan_of(libraries, config)
 
     def follow(self, asked: _Asked) -> tuple[Float64, Float64, Float64]:
-        """Joints [T, n], and the lowest and highest that each row could have."""
+        """Return joints [T, n], and the lower and upper bounds of each row."""
         rows = len(asked.targets)
         goals = np.linalg.inv(self._group.carried(asked.seed)) @ transform_of(_unit(asked.targets))
         poses = np.concatenate([quaternion_of_matrix(goals[:, :3, :3]), goals[:, :3, 3]], axis=-1)
@@ -140,7 +145,7 @@ class _Arm:
         return self._cut(q, asked, steps[:rows], held), low, high
 
     def _bounds(self, asked: _Asked, rows: int) -> tuple[Float64, Float64]:
-        """Joints held before the anchor's row [n], and each row's largest step from the last [rows, n]."""
+        """Return the joints before the anchor's row [n], and each row's largest step from its predecessor [rows, n]."""
         steps = np.full((rows, len(self.dims)), np.inf)
         held = (asked.seed if asked.anchor is None else np.asarray(asked.anchor, np.float64))[self.dims]
         if asked.dt is not None:
@@ -149,7 +154,7 @@ class _Arm:
         return held, steps
 
     def _cut(self, q: Float64, asked: _Asked, steps: Float64, held: Float64) -> Float64:
-        """The rows [T, n] within limits and velocities to the last digit of float64."""
+        """Return the rows [T, n] clipped to limits and velocities in float64."""
         cut = np.clip(q, self._lower, self._upper)
         for row in range(len(cut)):
             anchored = asked.anchor is not None and row == asked.anchor_row
@@ -161,7 +166,7 @@ class _Arm:
 
 
 class _Libraries(NamedTuple):
-    """Libraries of PyRoki, imported."""
+    """Imported libraries of PyRoki."""
 
     jax: ModuleType
     jaxlie: ModuleType
@@ -178,15 +183,17 @@ def _libraries() -> _Libraries:
             f'kinematics.kind = "pyroki": {error}; install PyRoki (chungmin99/pyroki) and jaxls (brentyi/jaxls) from '
             'their repositories, the jaxls of the package index is another project; or use kind = "compiled"'
         ) from error
-    importlib.import_module("loguru").logger.disable("jaxls")  # it tells of every problem that it builds
+    importlib.import_module("loguru").logger.disable("jaxls")  # it logs every problem that it builds
     return made
 
 
 def _robot_of(libraries: _Libraries, robot: Robot, group: Group) -> Any:
-    """PyRoki's robot for the group's chain: its moving joints outwards and what is fixed behind them, each once.
+    """Return PyRoki's robot for the group's chain: its moving joints and the fixed parts between them.
 
-    Arms with as many joints differ in numbers alone, so that one compiled function serves them all. SetupError where a
-    mimic lies on the chain.
+    Arms with equally many joints differ only in numbers, so one compiled function serves them all.
+
+    Raises:
+        SetupError: the chain has a mimic joint.
     """
     assert group.chain is not None  # it is an arm
     describe = libraries.yourdfpy.urdf
@@ -225,7 +232,7 @@ def _robot_of(libraries: _Libraries, robot: Robot, group: Group) -> Any:
 
 @functools.cache  # cache: what is compiled is bound to it
 def _variable_of(libraries: _Libraries, size: int) -> Any:
-    """The variable of as many joints: PyRoki makes one for each robot, and what is compiled is bound to it."""
+    """Return the variable type for `size` joints: compiled functions depend on it, and PyRoki makes one per robot."""
     zeros = libraries.jax.numpy.zeros(size)
     return new_class(
         "Joints", (libraries.jaxls.Var[libraries.jax.Array],), {"default_factory": lambda: zeros}
@@ -234,7 +241,7 @@ def _variable_of(libraries: _Libraries, size: int) -> Any:
 
 @functools.cache  # cache: to compile it takes longer than a thousand chunks
 def _scan_of(libraries: _Libraries, config: Config) -> Any:
-    """The function from an arm, poses and bounds of a chunk to joints and the boxes they were solved in.
+    """Return the function from an arm, poses and bounds of a chunk to its joints and their bounds.
 
     It is compiled with the first arm of each number of joints, which takes longer than a thousand chunks.
     """
@@ -290,7 +297,7 @@ def _scan_of(libraries: _Libraries, config: Config) -> Any:
 
 
 def _unit(poses: Float64) -> Float64:
-    """The poses [T, 7] with quaternions of length 1."""
+    """Return the poses [T, 7] with unit quaternions."""
     unit = poses.copy()
     unit[:, 3:] /= np.linalg.norm(unit[:, 3:], axis=-1, keepdims=True)
     return unit

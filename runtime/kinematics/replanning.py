@@ -1,4 +1,4 @@
-"""Another plan for a chunk of which poses are missed, or that ends cramped, found from its end."""
+"""Replanning of a chunk that misses poses or ends near limits, backwards from its end."""
 
 from __future__ import annotations
 
@@ -11,36 +11,32 @@ from numpy.typing import NDArray
 from runtime.core.types import Float64
 from runtime.kinematics.base import IkResult
 
-_SAME = 0.01  # rad (m) within which two ends are one
-_HOPELESS = 4  # postures without a solution after which the last pose is taken to have none
-_FOLLOWED = 12  # ends at most that are followed back
-_ENDLESS = np.pi  # rad to either side in which joints without limits are tried
+_SAME = 0.01  # [rad, m] distance within which two ends are the same
+_HOPELESS = 4  # failed postures after which the last pose counts as unreachable
+_FOLLOWED = 12  # ends from which a plan is tried at most
+_ENDLESS = np.pi  # [rad] range to either side in which joints without limits are sampled
 
-# Share of the range that redundant joints keep: a solution with less may leave none for the next chunk.
+# Least margin of redundant joints at the end, as a share: with less the next chunk may have no solution.
 MIN_LIMIT_MARGIN = 0.3
-ROOMIER = 0.1  # of it that another posture must have more
+ROOMIER = 0.1  # share by which another posture's margin must be larger
 
-SolveRows = Callable[
-    ..., IkResult
-]  # poses [T, 1, 7], seed [D], dt, anchor [D], anchor_row, guide [T, D]: frame by frame
+SolveRows = Callable[..., IkResult]  # poses [T, 1, 7], seed [D], dt, anchor [D], anchor_row, guide [T, D]
 
 
-LimitMargin = Callable[
-    [Float64], float
-]  # joints [D]: how far the one nearest to a limit is from it, where it has a choice
+LimitMargin = Callable[[Float64], float]  # joints [D] -> margin to the nearest limit of redundant joints
 
 
 def sample_postures(home: Float64, lower: Float64, upper: Float64, count: int) -> Float64:
-    """Joints [1 + count, n] to look for ends from: home, and others anywhere within the limits.
+    """Return joints [1 + count, n] from which ends are searched: home, and random ones within the limits.
 
-    The same ones each time, so that the same question has the same answer.
+    The sample is always the same, so that equal problems have equal solutions.
     """
     low, high = np.maximum(lower, -_ENDLESS), np.minimum(upper, _ENDLESS)
     return np.vstack([home, np.random.default_rng(1).uniform(low, high, (count, len(home)))])
 
 
 def arms_missing_targets(result: IkResult, begin: int) -> NDArray[np.intp]:
-    """The arms that meet the pose of row `begin`, and not all of those behind it."""
+    """Return the indices of arms that reach row `begin` but miss a later row."""
     reached = result.reached[begin:]
     return np.flatnonzero(reached[0] & ~reached.all(axis=0)) if len(reached) else np.empty(0, np.intp)
 
@@ -55,13 +51,13 @@ def replan(
     room: LimitMargin,
     least: float = -np.inf,
 ) -> IkResult | None:
-    """A plan for poses [T, 1, 7] of the arm at `dims`, from `start` [D] on, that misses none; None if none is found.
+    """Return a plan for poses [T, 1, 7] of the arm at `dims`, from `start` [D]; None if none is found.
 
-    At its end the joints [D] have more than the `least` room.
+    The plan reaches all poses, and its last joints [D] have more than `least` margin.
 
-    Frames that are solved one after the other may take a branch, or a posture, that ends before the poses do. So the
-    last pose is solved from `starts` [S, n], each solution is followed back to the first pose, and what that gives
-    guides a plan forwards: it comes as close to its guide as half of the velocities let it, the nearest end first.
+    Frames solved in sequence may follow a branch, or a posture, that ends before the poses do. So the last pose is
+    solved from `starts` [S, n], each solution is followed back to the first pose, and the result guides a plan
+    forwards, which approaches its guide with half of the joint velocities. The end nearest to `start` is tried first.
     """
     ends = (end for end in _ends(sweep, poses[-1:], start, dims, starts) if room(end) > least)
     for end in islice(ends, _FOLLOWED):
@@ -75,7 +71,7 @@ def replan(
 def _ends(
     sweep: SolveRows, last: Float64, start: Float64, dims: NDArray[np.intp], starts: Float64
 ) -> Iterator[Float64]:
-    """Joints [D] for the last pose [1, 1, 7], the nearest to `start` first, none twice."""
+    """Yield distinct joints [D] for the last pose [1, 1, 7], the nearest to `start` first."""
     found: list[Float64] = []
     for tried, posture in enumerate(starts):
         if tried == _HOPELESS and not found:

@@ -1,6 +1,6 @@
-"""Kinematic chains as records of numbers, in the form that compiled loops read.
+"""Kinematic chains as numeric records for compiled loops.
 
-A record's fields have their lengths in their type: the compiler knows every address and unrolls every small loop.
+Array lengths are part of a record's type: the compiler knows all addresses and unrolls small loops.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 from robots import Chain
 from runtime.core.types import Float64
 
-Record = Any  # one element of an array of the types below: fields by name, lengths known to the compiler
+Record = Any  # element of an array of the types below: named fields of fixed length
 Records = NDArray[np.void]
-POSED = 6  # numbers that a pose holds: joints beyond them are free
+POSED = 6  # degrees of freedom of a pose: joints beyond them are redundant
 
 
 def chain_type(moving: int) -> np.dtype[np.void]:
-    """A chain of up to so many moving joints; shorter ones are filled up with joints that stand still.
+    """Return the type of a chain of up to `moving` joints; shorter chains are padded with fixed joints.
 
-    `fixed` is what lies before each joint, and behind the last: a rotation row by row, then the origin [m]. Each
-    joint turns about the z that this leads to, or slides along it where `slides` is 1, by factor * q[drive] +
-    offset; drive is -1 where it stands still.
+    `fixed` are the transforms before each joint and after the last: a rotation row by row, then the origin [m]. Each
+    joint turns about the resulting z axis, or slides along it if `slides` is 1, by factor * q[drive] + offset; drive
+    is -1 for a fixed joint.
     """
     return np.dtype(
         [
@@ -40,14 +40,14 @@ def chain_type(moving: int) -> np.dtype[np.void]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainSequence:
-    """Chains one behind the other, each driven by its `dims` of a vector."""
+    """Consecutive chains, each driven by its `dims` of a vector."""
 
     chains: Sequence[Chain]
     dims: Sequence[Sequence[int]]
 
 
 def chain_records(ways: Sequence[ChainSequence]) -> Records:
-    """Records [A] of ways of any length, all as long as the longest."""
+    """Return records [A] of the sequences, all as long as the longest."""
     longest = max((sum(len(chain.moving) for chain in way.chains) for way in ways), default=0)
     records = np.zeros(len(ways), dtype=chain_type(max(1, longest)))
     records["fixed"] = _flat(np.eye(4))
@@ -74,7 +74,7 @@ def _fill(record: Record, way: ChainSequence) -> None:
 
 
 def _basis(axis: Float64) -> Float64:
-    """A rotation [4, 4] that takes z to the unit vector `axis`; the identity where that is z."""
+    """Return a rotation [4, 4] from z to the unit vector `axis`; the identity if that is z."""
     across = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = np.cross(across, axis)
     x /= np.linalg.norm(x)

@@ -1,1 +1,1 @@
-"""Execution over time: timeline and trajectories, as mathematics on arrays."""
+"""Execution over time: timeline, resampling and trajectories, as mathematics on arrays."""

@@ -1,4 +1,4 @@
-"""Rows of one rate as rows of another: linear, on the arc, or held, as each number's kind wants it."""
+"""Resampling of rows from one rate to another, by column kind: linear, spherical, or held."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.core.types import Float64
 
 
 def resampled_length(count: int, rate: float, wanted_rate: float) -> int:
-    """Number of rows at `wanted_rate` Hz for `count` rows of `rate` Hz: first to last, at least 1."""
+    """Return the number of rows at `wanted_rate` [Hz] that `count` rows at `rate` [Hz] become, at least 1."""
     return math.floor((count - 1) * wanted_rate / rate + 1e-9) + 1
 
 
@@ -24,11 +24,15 @@ def resample(
     held: Sequence[int] = (),
     quaternions: Sequence[int] = (),
 ) -> tuple[Float64, NDArray[np.int64]]:
-    """`rows` [H, W] of `rate` Hz at `wanted_rate` Hz, and the row each one was made from (the one not after it).
+    """Resample `rows` [H, W] from `rate` to `wanted_rate` [Hz].
 
-    Numbers are linear between rows; the columns `held` (binary grippers) keep their row's value, and four
-    columns from each of `quaternions` on (unit) turn on the shorter arc. Nothing is made beyond the last row: to
-    hold it on would say what the policy did not, and pull the mean of chunks that agree towards the past.
+    Columns are interpolated linearly, with two exceptions: `held` columns (binary grippers) repeat the earlier row's
+    value, and the four columns from each index in `quaternions` (unit) are interpolated on the shorter arc. The
+    result ends at or before the last row: rows beyond it would be invented, and would pull the mean of agreeing
+    chunks towards the past.
+
+    Returns:
+        The resampled rows [H', W], and for each the index int64 [H'] of the last input row that is not later.
     """
     if rate == wanted_rate or not len(rows):
         return rows, np.arange(len(rows), dtype=np.int64)

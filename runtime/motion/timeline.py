@@ -1,4 +1,4 @@
-"""Timeline of what is to be executed, by absolute control step, and which chunks made each step."""
+"""Timeline of the actions to be executed, by absolute control step, with the chunks that made each of them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 
 from runtime.core.types import Float64
 
-Contributions = tuple[tuple[int, float], ...]  # (chunk id, weight), the weights of a step sum to 1
-HELD = 0  # the chunk id of a held target
+Contributions = tuple[tuple[int, float], ...]  # (chunk id, weight); the weights of a step sum to 1
+HELD = 0  # chunk id of a held target
 _TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True, slots=True)
 class DimensionKinds:
-    """Dimensions that do not blend as numbers do."""
+    """Dimensions that must not be blended linearly."""
 
-    switched: tuple[int, ...] = ()  # binary grippers: they switch where the new chunk switches
+    switched: tuple[int, ...] = ()  # binary grippers: follow the new chunk at once
     wrapping: tuple[int, ...] = ()  # angles without limits: blended on the circle
 
 
@@ -27,7 +27,7 @@ _PLAIN = DimensionKinds()
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """The action meant for one step: float64 [D], and the chunks it was made from."""
+    """The action planned for one step, float64 [D], and the chunks that it was made from."""
 
     action: Float64
     contributions: Contributions
@@ -35,7 +35,7 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class PlacedChunk:
-    """A chunk as it was placed: float64 [N, D], row 0 for step `first`."""
+    """A chunk on the timeline: float64 [N, D]; row 0 is for step `first`."""
 
     chunk_id: int
     first: int
@@ -43,13 +43,16 @@ class PlacedChunk:
 
     @property
     def end(self) -> int:
-        """The first step after its last row."""
+        """The first step after the last row."""
         return self.first + len(self.rows)
 
 
 @dataclass(frozen=True, slots=True)
 class Fade:
-    """Actions from `first` on that the plan is blended over from: [L, D], their makers, their weights [L]."""
+    """Outgoing actions, from step `first` on, that the plan takes over from.
+
+    `rows` are float64 [L, D], `contributions` those of each row, `weights` [L] the share of each row in the blend.
+    """
 
     first: int
     rows: Float64
@@ -58,7 +61,7 @@ class Fade:
     dims: DimensionKinds
 
     def blend(self, step: int, plan: Planned) -> Planned:
-        """`plan` for `step`, as far as it has taken over by then."""
+        """Return the action of `step`: `plan`, blended with the outgoing action if the fade covers that step."""
         index = step - self.first
         if not 0 <= index < len(self.rows) or not self.weights[index] > 0.0:
             return plan
@@ -70,11 +73,11 @@ class Fade:
 
 
 class Timeline:
-    """A contiguous run of planned actions from `first` on; empty where nothing is planned.
+    """Contiguous planned actions from step `first` on; empty if nothing is planned.
 
-    What is executed (`at`, `span`) is the strategy's own `plan` with a `fade` over it while one is under way: a
-    chunk that is merged meanwhile changes the plan, and the fade goes on. `laid` are the chunks that a strategy
-    which averages them still needs. Nothing of the past is kept once a chunk has been merged.
+    The executed actions (`at`, `executed_rows`) are the strategy's `plan`, blended with `fade` as long as one is
+    active: a chunk merged meanwhile changes the plan, and the fade continues over the new plan. `laid` are the placed
+    chunks that an averaging strategy still needs. A merge discards all steps before it.
     """
 
     def __init__(self, dim: int) -> None:
@@ -82,7 +85,7 @@ class Timeline:
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove the plan, the placed chunks and the fade."""
         self.first = 0
         self.rows: Float64 = np.empty((0, self._dim))
         self.makers: list[Contributions] = []
@@ -90,7 +93,7 @@ class Timeline:
         self.fade: Fade | None = None
 
     def at(self, step: int) -> Planned | None:
-        """Action to be executed at `step`, with its makers; None where nothing is planned."""
+        """Return the action to execute at `step` with its contributions; None if nothing is planned."""
         index = step - self.first
         if not 0 <= index < len(self.rows):
             return None
@@ -98,18 +101,18 @@ class Timeline:
         return plan if self.fade is None else self.fade.blend(step, plan)
 
     def remaining(self, step: int) -> int:
-        """Number of steps planned from `step` on."""
+        """Return the number of steps planned from `step` on."""
         return max(0, self.first + len(self.rows) - max(step, self.first))
 
     def plan(self, step: int) -> tuple[Float64, list[Contributions]]:
-        """The strategy's plan from `step` on: rows [N, D] and makers; nothing if the plan starts later."""
+        """Return the plan without the fade from `step` on: rows [N, D] and contributions; empty if it starts later."""
         index = step - self.first
         if index < 0:
             return self.rows[:0], []
         return self.rows[index:], self.makers[index:]
 
     def executed_rows(self, step: int) -> tuple[Float64, list[Contributions]]:
-        """Actions to be executed from `step` on: rows [N, D] and their makers."""
+        """Return the actions to execute from `step` on, fade included: rows [N, D] and their contributions."""
         rows, makers = self.plan(step)
         if self.fade is None:
             return rows, makers
@@ -122,7 +125,7 @@ class Timeline:
     def replace(
         self, step: int, rows: Float64, makers: Sequence[Contributions], laid: tuple[PlacedChunk, ...] = ()
     ) -> None:
-        """Let `rows` be the whole plan from `step` on; what was planned before `step` is over."""
+        """Replace the whole plan by `rows`, which begin at `step`; a fade that has ended by then is removed."""
         self.first = step
         self.rows = np.array(rows, np.float64)
         self.makers = list(makers)
@@ -131,18 +134,18 @@ class Timeline:
             self.fade = None
 
     def begin_fade(self, fade: Fade) -> None:
-        """Plan nothing, and let what is planned next be blended over from `fade`, and from nothing else."""
+        """Clear the plan and start `fade`: the next plan takes over from it and from nothing else."""
         self.clear()
         self.fade = fade
 
 
 def single_contribution(chunk_id: int, count: int) -> list[Contributions]:
-    """The makers of `count` rows that come from one chunk alone."""
+    """Return the contributions of `count` rows that come from one chunk alone."""
     return [((chunk_id, 1.0),)] * count
 
 
 def mix_contributions(old: Contributions, new: Contributions, weight: float) -> Contributions:
-    """The makers of one step that is `weight` of `old` and the rest of `new`."""
+    """Return the contributions of a step blended from `weight` of `old` and 1 - `weight` of `new`."""
     shares: dict[int, float] = {}
     for makers, part in ((old, weight), (new, 1.0 - weight)):
         for maker, share in makers if part > 0.0 else ():
@@ -151,7 +154,7 @@ def mix_contributions(old: Contributions, new: Contributions, weight: float) -> 
 
 
 def difference(old: Float64, new: Float64, wrapping: Sequence[int] = ()) -> Float64:
-    """old - new [..., D], in dimensions that wrap the shorter way round."""
+    """Return old - new [..., D], for the `wrapping` dimensions along the shorter arc."""
     apart: Float64 = old - new
     if len(wrapping):
         turning = list(wrapping)
@@ -160,7 +163,7 @@ def difference(old: Float64, new: Float64, wrapping: Sequence[int] = ()) -> Floa
 
 
 def unwrap_onto(rows: Float64, before: Float64 | None, wrapping: Sequence[int]) -> Float64:
-    """`rows` [N, D] with angles that wrap made continuous, and starting within half a turn of `before` [D]."""
+    """Return `rows` [N, D] with continuous wrapping angles that start within half a turn of `before` [D]."""
     if not len(wrapping) or not len(rows):
         return rows
     turning = list(wrapping)
@@ -172,10 +175,13 @@ def unwrap_onto(rows: Float64, before: Float64 | None, wrapping: Sequence[int]) 
 
 
 def fade_weights(count: int, shape: str = "linear") -> Float64:
-    """Weights [count] of what is blended over from: 1 at the first row, 0 at the last; of one row 0.
+    """Return the weights [count] of the outgoing plan: 1 at the first row, 0 at the last; 0 for a single row.
 
-    "linear", "cosine" (no kink at either end), or "exponential": c (e^c - 1) / (e - 1) of the linear weight c,
-    the soft mask of real-time chunking (arXiv 2506.07339, eq. 5), which goes over sooner.
+    Shapes: "linear"; "cosine" (no kink at either end); "exponential": c (e^c - 1) / (e - 1) of the linear weight c,
+    the soft mask of real-time chunking (arXiv 2506.07339, eq. 5), which takes over sooner.
+
+    Raises:
+        ValueError: `shape` is none of these.
     """
     if count < 2:
         return np.zeros(count)
@@ -192,11 +198,11 @@ def fade_weights(count: int, shape: str = "linear") -> Float64:
 def overlap_blend(
     old: Float64, new: Float64, window: int | None, dims: DimensionKinds = _PLAIN, shape: str = "linear"
 ) -> tuple[Float64, Float64]:
-    """`new` with its first rows blended over from `old`, and the weight of `old` in each blended row.
+    """Blend the first rows of `new` with `old`; return the blended rows [N, D] and the weights [L] of `old`.
 
-    `old` [M, D] and `new` [N, D] start at the same step. L = min(M, N, window) rows are blended with the weights
-    of `fade_weights`; `window` None is the whole overlap. Binary grippers take the new value at once. Written as
-    new + w (old - new), so that equal inputs stay equal.
+    `old` [M, D] and `new` [N, D] start at the same step. L = min(M, N, `window`) rows are blended with the weights of
+    `fade_weights`; None blends the whole overlap. Binary grippers take the new value at once. Computed as new + w
+    (old - new), so that equal inputs stay exactly equal.
     """
     weights = fade_weights(min(len(old), len(new), len(new) if window is None else window), shape)
     blended, count, switched = new.copy(), len(weights), list(dims.switched)

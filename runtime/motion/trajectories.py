@@ -1,4 +1,4 @@
-"""Motions of our own: going somewhere within limits, and coming to a stand."""
+"""Generated motions: trajectories between two poses within limits, and braking to rest."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from runtime.core.types import Float64
 
 
 class Motion(ABC):
-    """A position for every moment since its start, ending at rest."""
+    """A position for each time since its start; at rest at the end."""
 
     duration: float  # [s]
 
     @abstractmethod
     def at(self, elapsed: float) -> Float64:
-        """The position [D] `elapsed` seconds after the start; the end position from `duration` on."""
+        """Return the position [D] `elapsed` seconds after the start; the end position from `duration` on."""
 
 
 class Brake(Motion):
-    """Constant deceleration of every joint from its velocity to rest, never beyond `lower` and `upper`.
+    """Constant deceleration of each joint to rest, never beyond `lower` and `upper`.
 
-    The numbers at `speeds` are speeds themselves: they go to 0 at the rate `slowing` [D].
+    Dimensions in `speeds` are themselves speeds: each goes to 0 at its rate in `slowing` [D].
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Brake(Motion):
     ) -> None:
         self._q, self._velocity = q, velocity
         self._deceleration = deceleration
-        # A joint that is outside already may stay there.
+        # A joint that is outside its limits already must not jump back to them.
         self._lower, self._upper = np.minimum(lower, q), np.maximum(upper, q)
         self._stop = np.abs(velocity) / deceleration
         self._speeds = list(speeds)
@@ -56,7 +56,7 @@ class Brake(Motion):
         return position
 
     def velocity(self, elapsed: float) -> Float64:
-        """Velocity of each number then [D]: less than on average since the tick before."""
+        """Return the velocity [D] at `elapsed` [s]; lower than the mean over the tick that ends there."""
         velocity = np.sign(self._velocity) * np.maximum(
             np.abs(self._velocity) - self._deceleration * elapsed, 0.0
         )
@@ -66,16 +66,19 @@ class Brake(Motion):
         return np.asarray(velocity)
 
     def sample_path(self, spacing: float, most: int) -> Float64:
-        """Positions [N, D] on the way to the stand, which ends it, `spacing` apart at most and `most` of them."""
+        """Return positions [N, D] along the braking path, the last one at rest.
+
+        No joint moves more than `spacing` between two of them, unless that would need more than `most` positions.
+        """
         farthest = np.abs(0.5 * self._velocity * self._stop).max(initial=0.0)
         count = int(min(max(np.ceil(farthest / spacing), 1), most))
         return np.array([self.at(self.duration * (i + 1) / count) for i in range(count)])
 
 
 class Trajectory(Motion):
-    """A straight line in joint space from rest to rest, all joints in step, on a trapezoidal speed profile.
+    """Straight line in joint space from rest to rest, all joints synchronised, with a trapezoidal speed profile.
 
-    No joint exceeds its velocity [rad/s] or acceleration [rad/s2]; the slowest joint sets the time.
+    No joint exceeds its velocity [rad/s] or acceleration [rad/s2]; the slowest joint determines the duration.
     """
 
     def __init__(self, start: Float64, goal: Float64, velocity: Float64, acceleration: Float64) -> None:
@@ -88,7 +91,7 @@ class Trajectory(Motion):
             return
         self._speed = float((velocity[moving] / distance[moving]).min())  # of the path parameter 0..1 [1/s]
         self._rate = float((acceleration[moving] / distance[moving]).min())  # [1/s2]
-        self._speed = min(self._speed, float(np.sqrt(self._rate)))  # a short way never reaches full speed
+        self._speed = min(self._speed, float(np.sqrt(self._rate)))  # a short path never reaches full speed
         self._ramp = self._speed / self._rate
         self._cruise = 1.0 / self._speed - self._ramp
         self.duration = 2.0 * self._ramp + self._cruise

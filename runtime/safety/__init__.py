@@ -1,1 +1,1 @@
-"""Checks of an action before it is sent: limits, workspace, collision, the last check."""
+"""Checks of an action before it is sent: limits, workspace boxes, collisions, and the command limiter."""

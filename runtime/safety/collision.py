@@ -1,4 +1,4 @@
-"""Collisions of a robot with itself or the table: its own rule about what a step, or a way, may do."""
+"""Collision checks of a robot with itself and the table, for single actions and whole paths."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from runtime.core.types import Float64
 _WOULD_COLLIDE = Pattern("safety.would_collide", "{one} and {other} would collide ({mm:.0f} mm deep)")
 _WOULD_BE_NEAR = Pattern("safety.would_be_near", "{one} and {other} would be {mm:.0f} mm apart")
 
-_NEARER = 1e-6  # [m] that is rounding
+_NEARER = 1e-6  # [m] rounding tolerance
 
 
 @dataclass(frozen=True, slots=True)
 class Collision:
-    """Two links ("left_arm/link5"), or a link and "table", that touch or nearly do.
+    """Two links ("left_arm/link5"), or a link and "table", that touch or nearly touch.
 
-    `distance` is that of the capsules that stand for them [m], below zero where they overlap.
+    `distance` is that between the capsules that model them [m], negative if they overlap.
     """
 
     first: str
@@ -37,10 +37,10 @@ class Collision:
 
 
 class Collisions:
-    """Judges postures float64 [D] of a robot: pairs of links within `margin` [m] of each other count as touching.
+    """Collision checker for joint vectors float64 [D]: links closer than `margin` [m] count as touching.
 
-    Who touches already may stay, and may part; only coming nearer is forbidden. Grippers open and close freely: it
-    is arms that are kept apart, and an object must be let go of wherever it is.
+    A pair that touches already may hold its distance or separate; only a further approach is forbidden. Grippers are
+    not restricted: the purpose is to separate arms, and releasing an object must be possible everywhere.
     """
 
     def __init__(self, robot: Robot, margin: float) -> None:
@@ -49,12 +49,12 @@ class Collisions:
         self._grippers = np.array(robot.gripper_dims, dtype=np.intp)
 
     def nearest(self, q: Float64) -> Collision | None:
-        """The nearest pair within the margin; None where there is none."""
+        """Return the closest pair within the margin, None if there is none."""
         apart = self._clearance.distances(q)
         return self._worst(apart, apart < self._least)
 
     def closer_pair(self, q: Float64, before: Float64) -> Collision | None:
-        """The nearest pair that touches at `q` and came nearer since `before`; None where nothing does."""
+        """Return the closest pair that touches at `q` and has approached since `before`, None if there is none."""
         apart = self._clearance.distances(q)
         touching = apart < self._least
         if not touching.any():
@@ -64,9 +64,9 @@ class Collisions:
         )
 
     def first_on_path(self, way: Float64) -> tuple[Collision, int] | None:
-        """The first pair that comes nearer while it touches, and at which posture of `way` [T, D]; None where none.
+        """Return the first pair that approaches while touching, and its row in `way` [T, D]; None if there is none.
 
-        Judged with the grippers of the beginning and with those of the end all along: they may move at any time.
+        The path is checked with the grippers of its first row and with those of its last: they may move at any time.
         """
         found = [hit for end in self._ends(way) if (hit := self._hit(self._gripping(way, end))) is not None]
         return min(found, key=lambda hit: hit[1], default=None)
@@ -87,7 +87,7 @@ class Collisions:
         return worst, at
 
     def _gripping(self, q: Float64, like: Float64) -> Float64:
-        """Postures `q` with the grippers of `like`."""
+        """Return `q` with the gripper positions of `like`."""
         if not len(self._grippers):
             return q
         gripping = q.copy()

@@ -1,4 +1,4 @@
-"""The filter that every action passes before it is sent."""
+"""Safety filter: checks and limits every action before it is sent."""
 
 from __future__ import annotations
 
@@ -38,33 +38,32 @@ __all__ = [
 ]
 
 _TOLERANCE = 1e-6
-_BOX_STEP, _BOX_POINTS = 0.005, 48  # [rad] of a way that is looked at: between them it bends by micrometres
+_BOX_STEP, _BOX_POINTS = 0.005, 48  # [rad] path sampling: deviation between samples is micrometres
 _COLLISION_STEP, _COLLISION_POINTS = 0.1, 4
 _MARGIN = 1.05
 
 
 @dataclass(frozen=True, slots=True)
 class RobotState:
-    """State that an action is judged against: vectors float64 [D], times in seconds."""
+    """State that an action is checked against: vectors float64 [D], times in seconds."""
 
     previous: Float64  # last command sent
     velocity: Float64  # of the commands
     measured: Float64
-    elapsed: float  # since the last command, capped by the caller at 1.5 periods
+    elapsed: float  # since the last command; the caller caps it at 1.5 periods
     joint_age: float = 0.0
-    implausible_reason: str = ""  # why `measured` cannot be true
+    implausible_reason: str = ""  # why `measured` cannot be true, "" if it can
     picture_ages: dict[str, float] = field(default_factory=dict)
-    previous_target: Float64 | None = (
-        None  # the action that was wanted at the last tick; None: none was, `previous` counts
-    )
+    previous_target: Float64 | None = None  # action requested at the previous tick; None: use `previous`
 
 
 @dataclass(frozen=True, slots=True)
 class SafetyVerdict:
-    """Verdict: `action` float64 [D] may be sent, None where refused; `notes` say what changed or why.
+    """Verdict: `action` float64 [D] may be sent, None if refused; `notes` are changes or the reason.
 
-    `most` is the note on what was changed most, and `change` by how much [rad, or a gripper's worth of them]. `near`
-    are links that it brings near each other, where that is only warned of.
+    `largest_change_note` describes the dimension that was changed most, `change` is that change [rad; a gripper's
+    scaled by `Limits.radian_scale`]. `near_collision` is a pair of links that the action brings near each other, if
+    this is only warned of.
     """
 
     action: Float64 | None
@@ -82,11 +81,12 @@ Path = Literal["policy", "motion"]
 
 
 class SafetyFilter:
-    """Judges actions in a fixed order: finite, ages, workspace, collision, following error, jump, reachability, limits.
+    """Filter of actions, in a fixed order of checks.
 
-    Reachability makes the command satisfy velocity, acceleration and joint limits in one step: the velocity
-    is bounded so that the joint can still stop before its limit with the same acceleration, also at changing
-    tick lengths (v dt + v^2 / 2a <= distance), so that no limit undoes another.
+    The order: finite, ages, workspace, collision, following error, jump, reachability, limits. Reachability makes the
+    command satisfy velocity, acceleration and joint limits in one step: the velocity is bounded so that the joint can
+    still stop before its limit with the same acceleration, also if tick lengths vary (v dt + v^2 / 2a <= distance),
+    so that no limit contradicts another.
     """
 
     def __init__(
@@ -98,16 +98,16 @@ class SafetyFilter:
     ) -> None:
         self._settings = settings
         self._limits = limits
-        self._outside = outside  # names the arms whose end effector is outside its box anywhere in q [..., D]
+        self._outside = outside  # returns the arms that are outside their box anywhere in q [..., D]
         self._collisions = collisions
         self._angles = limits.position_mask
         self._switching = bool(limits.binary.any())
         self._reach = limits.radian_scale
-        self._room = np.zeros((2, len(limits.lower)))  # scratch: to the upper and from the lower limit
+        self._room = np.zeros((2, len(limits.lower)))  # scratch: distance to the upper, from the lower limit
         self._stopping = settings.acceleration * self._reach
         self._top = {
             "policy": limits.velocity * settings.velocity_scale,
-            # A motion is planned at its limits; the margin keeps rounding from counting as excess.
+            # A motion is planned at its limits; the margin prevents that rounding counts as excess.
             "motion": limits.velocity * settings.motion_velocity_scale * _MARGIN,
         }
         self._rate = {
@@ -116,7 +116,10 @@ class SafetyFilter:
         }
 
     def judge(self, action: Float64, state: RobotState, path: Path = "policy") -> SafetyVerdict:
-        """The verdict on `action` [D]; with report-only the action comes back unchanged, with the notes."""
+        """Check and limit `action` [D]; return the verdict. With `report_only` the action is unchanged, with the notes.
+
+        `path` selects the limits: "policy" for a policy's actions, "motion" for generated motions such as homing.
+        """
         if not _usable(action, state):
             return SafetyVerdict(None, (_unusable(action, self._limits),))
         refusal = self._refusal(action, state, path)
@@ -137,7 +140,7 @@ class SafetyFilter:
 
     def _refusal(self, action: Float64, state: RobotState, path: Path) -> str:
         blind = self.unknown_state_reason(state)
-        if path == "motion":  # of ours: needs no pictures
+        if path == "motion":  # a generated motion needs no pictures
             return blind or self._place(action, state, path) or self._exceeds_following_error(action, state)
         return (
             blind
@@ -148,11 +151,11 @@ class SafetyFilter:
         )
 
     def unknown_state_reason(self, state: RobotState) -> str:
-        """Why nobody knows where the robot is, "" where that is known."""
+        """Return why the robot's position is unknown, "" if it is known."""
         return state.implausible_reason or self.unseen(state)
 
     def unseen(self, state: RobotState) -> str:
-        """How old the joints are where they are too old, and nothing speaks against the last ones; else ""."""
+        """Return a message if the last plausible joint readings are too old, else ""."""
         allowed = self._settings.joint_age_s
         if state.implausible_reason or state.joint_age <= allowed:
             return ""
@@ -161,16 +164,19 @@ class SafetyFilter:
     def _stale(self, state: RobotState) -> str:
         allowed = self._settings.picture_age_s
         for camera, age in state.picture_ages.items():
-            if not age <= allowed:  # also refuses NaN: a picture that never came
+            if not age <= allowed:  # also refuses NaN: no picture was ever received
                 return _PICTURE_OLD(camera=camera, seconds=age, allowed=allowed)
         return ""
 
     def _place(self, action: Float64, state: RobotState, path: Path) -> str:
-        """Why the robot must not be there, "" where it may: a workspace box, a collision."""
+        """Return why `action` is at a forbidden place (outside a box, in collision), "" if it is allowed."""
         return self._leaves_box(action, state, path) or self._collides(action, state, path)
 
     def _leaves_box(self, action: Float64, state: RobotState, path: Path) -> str:
-        """A policy has no business outside; a motion of ours may come from there, and only not go there."""
+        """Return which arms leave their box, "" if none.
+
+        A policy's action must be inside; a motion may start outside, and is refused only if an arm leaves its box.
+        """
         arms = self._outside(action) if self._outside else ()
         if arms and self._outside and path == "motion":
             before = self._outside(state.previous)
@@ -184,7 +190,7 @@ class SafetyFilter:
         return "" if found is None else str(found)
 
     def _warned(self, verdict: SafetyVerdict, path: Path) -> SafetyVerdict:
-        """The verdict, with what the action brings near each other where that is no reason to refuse it."""
+        """Return `verdict` with the pair that the action brings near each other, if that is only warned of."""
         if self._collisions is None or path == "motion" or self._settings.collision != "warn":
             return verdict
         assert verdict.action is not None
@@ -198,10 +204,10 @@ class SafetyFilter:
     def _exceeds_following_error(self, action: Float64, state: RobotState) -> str:
         allowed = self._settings.following_error
         error = np.abs(action - state.measured)
-        if ((error <= allowed) | ~self._angles).all():  # NaN, a joint that is measured nowhere, is not
+        if ((error <= allowed) | ~self._angles).all():  # NaN (an unmeasured joint) compares as False
             return ""
         error = np.where(self._angles, error, 0.0)
-        # A blocked arm must still be allowed to come back towards where it is measured.
+        # A blocked arm must still be allowed to return towards its measured position.
         returning = error < np.abs(state.previous - state.measured)
         excess = np.where(returning | (error <= allowed), 0.0, error)
         if not excess.any():
@@ -218,16 +224,19 @@ class SafetyFilter:
         return _JUMPS(joint=self._limits.names[worst], distance=jump[worst], allowed=self._settings.jump)
 
     def _arrival(self, action: Float64, reachable: Float64, state: RobotState, path: Path) -> str:
-        """The same of what is really sent, and of the way on which the robot would come to a stand after it."""
+        """Check the place of the command that will be sent, and the path on which it would brake from there."""
         if self._outside is None and self._collisions is None:
             return ""
         velocity = (reachable - state.previous) / state.elapsed
         brake = braking(reachable, velocity, self._limits, self._settings)
-        changed = reachable is not action  # an action that was not changed has been looked at already
+        changed = reachable is not action  # an unchanged action has been checked already
         return (self._place(reachable, state, path) if changed else "") or self._on_way(brake, state, path)
 
     def _on_way(self, brake: Brake, state: RobotState, path: Path) -> str:
-        """Why the robot must not be on the way that it brakes on; a box is left between points that are far apart."""
+        """Return why the braking path is forbidden, "" if it is allowed.
+
+        The path is sampled: finely for boxes, coarsely for collisions.
+        """
         if self._outside is not None:
             left = self._leaves_box(brake.sample_path(_BOX_STEP, _BOX_POINTS), state, path)
             if left:
@@ -236,7 +245,10 @@ class SafetyFilter:
         return next(filter(None, (self._collides(point, state, path) for point in ends)), "")
 
     def reachable(self, action: Float64, state: RobotState, path: Path = "policy") -> Float64:
-        """The action next to `action` [D] that velocity, acceleration and joint limits allow; itself where they do."""
+        """Return the action closest to `action` [D] within velocity, acceleration and joint limits.
+
+        Returns the same array if nothing has to change.
+        """
         dt, now = state.elapsed, state.velocity
         gain = self._rate[path] * dt
         room = self._room
@@ -247,8 +259,8 @@ class SafetyFilter:
         slowest = np.maximum(-most[1], now - gain)
         crossed = slowest > fastest
         if crossed.any():
-            # The limit of a joint is too near for the path's own deceleration (a limit was changed, a stall):
-            # what stops before it wins, as hard as any path may brake.
+            # The joint limit is too near for this path's own deceleration (the limit was changed, or a tick was
+            # late): stop before it, with up to the hardest deceleration that any path may use.
             hard = self._stopping * dt
             stops = np.where(now > 0, most[0], -most[1])
             braking = np.minimum(np.maximum(stops, now - hard), now + hard)
@@ -267,10 +279,10 @@ class SafetyFilter:
         return reachable
 
     def _catch_up_velocity(self, wanted: Float64, action: Float64, state: RobotState, path: Path) -> Float64:
-        """Velocities that catch up with a target so that they can be in step with it when they reach it.
+        """Return velocities that catch up with a target without overshooting it.
 
-        Who is behind a target that jumped must not arrive with all the speed gathered on the way: beside the
-        target's own velocity there may be as much as can still be braked away within the distance.
+        After a jump of the target, the command must not arrive with all the speed gathered on the way: its speed
+        relative to the target is limited to one that can still be braked within the remaining distance.
         """
         aim = state.previous if state.previous_target is None else state.previous_target
         behind = aim - state.previous
@@ -318,7 +330,10 @@ class SafetyFilter:
 
 
 def braking(position: Float64, velocity: Float64, limits: Limits, settings: SafetySettings) -> Brake:
-    """A stop from `position` at `velocity` [D], as hard as needed to stay within the joint limits."""
+    """Return a stop from `position` at `velocity` [D], as hard as necessary to stay within the joint limits.
+
+    Between `brake_acceleration` and `acceleration` of `settings`, scaled for grippers.
+    """
     ahead = np.where(velocity > 0, limits.upper - position, position - limits.lower)
     needed = velocity * velocity / (2.0 * np.maximum(ahead, 1e-9))
     softest = settings.brake_acceleration * limits.radian_scale
@@ -340,6 +355,6 @@ def _unusable(action: Float64, limits: Limits) -> str:
 
 
 def _stopping_speed(distance: Float64, acceleration: Float64, dt: float) -> Float64:
-    """The largest v with v dt + v^2 / (2 a) <= distance: after this step the joint can still stop in time."""
+    """Return the largest v with v dt + v^2 / (2 a) <= distance, at which the joint can still stop after this step."""
     d = np.maximum(distance, 0.0)
     return np.asarray(acceleration * (np.sqrt(dt * dt + 2.0 * d / acceleration) - dt))

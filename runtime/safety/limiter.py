@@ -1,4 +1,4 @@
-"""The last check of a command: whatever wanted it sent, the robot is told nothing that it cannot follow."""
+"""Command limiter: the last check, which applies to every command whatever its origin."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from runtime.safety.settings import SafetySettings
 
 _LAST_CHECK = Pattern("safety.last_check", "last check: {joint} {wanted:.4f} was to be sent, {sent:.4f} is")
 
-_MARGIN = 1.05  # rounding, and ticks that are not alike, are no excess
-_TOLERANCE = 1e-6  # [rad, or what a gripper's travel is worth]
+_MARGIN = 1.05  # for rounding and unequal ticks
+_TOLERANCE = 1e-6  # [rad, or a gripper's equivalent]
 
 
 class LimitedCommand(NamedTuple):
-    """Command that may be sent, float64 [D], and what was changed: a sentence each joint."""
+    """Command that may be sent, float64 [D], and a note for each number that was changed."""
 
     action: Float64
     notes: tuple[str, ...] = ()
 
 
 class CommandLimiter:
-    """Keeps each number finite, within its limits, its velocity and its acceleration, counted from the last command.
+    """Limiter of each number to finite values, its limits, its velocity and its acceleration.
 
-    Safety and all motions of ours keep to less; it is the last one to notice where one of them does not. Where limits
-    contradict each other, position comes before velocity before acceleration. A joint that is outside may stay there,
-    and come back. Grippers that switch have no velocity. A stop may take away any velocity at once.
+    Velocity and acceleration are counted from the last command. The safety filter and all generated motions stay
+    within tighter limits: this check catches their defects. If limits contradict each other, position has priority
+    over velocity, and velocity over acceleration. A joint that is outside its limits may stay there or come back.
+    Binary grippers have no velocity limit. A stop may remove any velocity at once.
     """
 
     def __init__(self, limits: Limits, settings: SafetySettings) -> None:
@@ -44,9 +45,9 @@ class CommandLimiter:
     def __call__(
         self, action: Float64, previous: Float64, velocity: Float64, elapsed: float, stop: bool
     ) -> LimitedCommand:
-        """Part of `action` [D] that may follow `previous`, moving at `velocity`, `elapsed` seconds later.
+        """Limit `action` [D], `elapsed` seconds after `previous`, which moved at `velocity`.
 
-        `stop`: the e-stop sends it.
+        `stop`: the command is that of the e-stop.
         """
         wanted = np.where(np.isfinite(action), action, previous)
         low, high = self._velocities(velocity, elapsed, stop)

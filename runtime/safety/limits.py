@@ -1,4 +1,4 @@
-"""Limits of a robot: the bounds of each of its numbers, and what kind of number it is."""
+"""Limits of a robot: bounds and kind of each dimension."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 
 from runtime.core.types import Float64
 
-# At the default 60 rad/s2 a gripper then covers its travel from rest to rest in 0.1 s, as real ones do.
+# At the default 60 rad/s2 a gripper covers its travel from rest to rest in 0.1 s, as real grippers do.
 GRIPPER_TRAVEL = 6.7
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The robot's bounds, float64 [D] each; `binary` marks dimensions that switch between two values.
+    """Bounds of a robot, float64 [D] each; `binary` marks dimensions that switch between two values.
 
-    `speeds` are the places of numbers that are speeds (of a base): the robot stands where they are 0, and what is
-    their `velocity` is an acceleration.
+    `speeds` are the indices of dimensions that are speeds (of a mobile base): 0 is standstill, and their `velocity`
+    is an acceleration.
     """
 
     names: tuple[str, ...]
@@ -30,13 +30,13 @@ class Limits:
 
     @property
     def position_mask(self) -> np.ndarray:
-        """Which dimensions are places of joints, bool [D]: neither grippers nor speeds."""
+        """Mask of the dimensions that are joint positions, bool [D]: neither grippers nor speeds."""
         places = ~self.grippers
         places[list(self.speeds)] = False
         return places
 
     def with_zero_speeds(self, position: Float64) -> Float64:
-        """`position` [D] with everything that is a speed at 0."""
+        """Return `position` [D] with all speeds set to 0."""
         if not self.speeds:
             return position
         standing = position.copy()
@@ -44,14 +44,14 @@ class Limits:
         return standing
 
     def excess(self, position: Float64) -> Float64:
-        """Distance of `position` [..., D] beyond its bounds, 0 within them."""
+        """Return the distance of `position` [..., D] beyond its bounds, 0 within them."""
         return np.maximum(np.maximum(self.lower - position, position - self.upper), 0.0)
 
     @property
     def radian_scale(self) -> Float64:
-        """Worth of one radian in each dimension [D]: 1 for angles.
+        """Equivalent of one radian in each dimension [D]; 1 for angles.
 
-        A gripper's accelerations are scaled so that its whole travel counts as much as GRIPPER_TRAVEL radians,
-        whatever its unit: metres, 0..1, 0..100.
+        A gripper's accelerations are scaled so that its whole travel counts as GRIPPER_TRAVEL radians, whatever its
+        unit: metres, 0..1, 0..100.
         """
         return np.where(self.grippers, (self.upper - self.lower) * GRIPPER_TRAVEL, 1.0)

@@ -9,8 +9,8 @@ from pydantic import Field
 from robots.clearance import MARGIN
 from runtime.core.settings import Settings
 
-_NOISE = 0.02  # [rad] beyond a servo error that is set
-_BESIDE = 0.1  # [rad] that an arm may be off where less is set
+_NOISE = 0.02  # [rad] margin on a configured `steady_error`
+_BESIDE = 0.1  # [rad] least permitted offset of an arm
 
 
 class WorkspaceBox(Settings):
@@ -74,5 +74,5 @@ class SafetySettings(Settings):
 
     @property
     def sagged(self) -> float:
-        """How far an arm may be off by its servo error alone [rad]."""
+        """Offset of an arm that its servo error alone may cause [rad]."""
         return _BESIDE if self.steady_error <= _BESIDE else self.steady_error + _NOISE

@@ -1,4 +1,4 @@
-"""The boxes that end effectors must stay in."""
+"""Workspace boxes that end effectors must not leave."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from runtime.safety.filter import WorkspaceBox
 
 
 class Workspace:
-    """Which arms' end effectors are outside their boxes, by the robot's own forward kinematics.
+    """Check of arms against their workspace boxes, by the robot's forward kinematics.
 
-    `arms` are those that have a box, in the robot's order.
+    `arms` are the names of the arms that have a box, in the robot's order.
     """
 
     def __init__(self, robot: Robot, boxes: Mapping[str, WorkspaceBox]) -> None:
@@ -25,16 +25,16 @@ class Workspace:
         self._upper = np.array([boxes[name].upper for name in self.arms]).reshape(-1, 3)
 
     def __call__(self, q: Float64) -> tuple[str, ...]:
-        """The names of the arms that are outside with any of the joints q [..., D]."""
+        """Return the names of the arms that are outside for any of the joints q [..., D]."""
         outside = self.is_outside(q)
         return tuple(name for index, name in enumerate(self.arms) if outside[..., index].any())
 
     def is_outside(self, q: Float64) -> NDArray[np.bool_]:
-        """True for each of `arms` that is outside, bool [..., arms], with the joints q [..., D]."""
+        """Return which of `arms` are outside, bool [..., arms], for joints q [..., D]."""
         return np.asarray(self.excess(q) > 0.0)
 
     def excess(self, q: Float64) -> Float64:
-        """Distance of each of `arms` outside [..., arms], on the worst axis [m], with joints q [..., D]."""
+        """Return the distance of each arm outside its box on the worst axis [m], [..., arms], 0 inside."""
         if not self._groups:
             return np.zeros((*q.shape[:-1], 0))
         points = np.stack([arm.transform(q)[..., :3, 3] for arm in self._groups], axis=-2)
@@ -42,9 +42,9 @@ class Workspace:
         return np.maximum(beyond, 0.0)
 
     def arm_leaving_on(self, way: Float64) -> str:
-        """The arm that leaves its box somewhere on a `way` [T, D] in joints; "" where none does.
+        """Return the name of an arm that leaves its box along `way` [T, D] (joints), "" if none does.
 
-        Who begins outside may go anywhere until it is inside.
+        An arm that starts outside is not restricted until it is inside.
         """
         outside = self.is_outside(way)
         left = (~outside[:-1] & outside[1:]).any(axis=0)

@@ -1,1 +1,1 @@
-"""Joints, poses, formats and frames, as mathematics on arrays."""
+"""Action spaces as mathematics on arrays: joints, poses, orientation formats, frames, binary grippers."""

@@ -1,4 +1,4 @@
-"""Binary grippers: which of its two numbers a wish means, and how soon one may switch again."""
+"""Binary grippers: snapping of numbers to open or closed, and the least interval between two switches."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from robots import Robot
 from runtime.core.types import Float64
 from runtime.safety.limits import Limits
 
-MIN_SWITCH_INTERVAL_S = 0.2  # between two switches of one gripper
-_SAME = 1e-3  # of its travel
-_ROUNDING = 1.0 - 1e-9  # an end of the travel may be the edge of the hysteresis, and must count
-_EARLY_S = 1e-6  # moments are sums of floats
+MIN_SWITCH_INTERVAL_S = 0.2  # [s] between two switches of one gripper
+_SAME = 1e-3  # share of the gripper's travel
+_ROUNDING = 1.0 - 1e-9  # an end of the travel may coincide with the edge of the hysteresis, and must count
+_EARLY_S = 1e-6  # [s] rounding tolerance of summed times
 
 
 @dataclass(frozen=True, slots=True)
 class BinaryGripper:
-    """One binary gripper: its place in the robot's vector, its two numbers, and where it goes from one to the other.
+    """A binary gripper: its index in the robot's vector, its two values, its threshold and hysteresis.
 
-    A number farther than half the `hysteresis` from the `threshold` opens or closes it, one nearer leaves it as it
-    was. One at the threshold opens it where there is no hysteresis.
+    A number farther than half the `hysteresis` from the `threshold` opens or closes the gripper; a nearer number does
+    not switch it. Without hysteresis a number at the threshold opens it.
     """
 
     dim: int
@@ -31,23 +31,23 @@ class BinaryGripper:
     hysteresis: float  # in the gripper's own unit
 
     def is_open(self, number: float) -> bool:
-        """On which side of the threshold `number` is."""
+        """Return True if `number` is on the open side of the threshold."""
         return number >= self.threshold if self.open > self.close else number <= self.threshold
 
     def snap(self, wanted: float, before: float) -> float:
-        """`wanted` as `open` or `close`; `before` is what it was told to be until then."""
+        """Snap `wanted` to the open or closed value, with hysteresis around the previous command `before`."""
         beyond = (wanted - self.threshold) * (1.0 if self.open > self.close else -1.0)
         half = 0.5 * self.hysteresis * _ROUNDING
         opens = beyond >= half or (beyond > -half and self.is_open(before))
         return self.open if opens else self.close
 
     def snap_sequence(self, wanted: Float64, before: float) -> Float64:
-        """The same of `wanted` [H], one after the other."""
+        """Snap the numbers `wanted` [H] in order, each with the result before it as previous command."""
         return np.array([before := self.snap(number, before) for number in wanted.tolist()], np.float64)
 
 
 def binary_grippers_of(robot: Robot) -> tuple[BinaryGripper, ...]:
-    """Those of all its binary grippers."""
+    """Return the binary grippers of a robot."""
     made = []
     for group in robot.groups:
         gripper, dim = group.gripper, group.gripper_dim
@@ -59,7 +59,10 @@ def binary_grippers_of(robot: Robot) -> tuple[BinaryGripper, ...]:
 
 
 def snap_grippers(switches: tuple[BinaryGripper, ...], action: Float64, commanded: Float64) -> Float64:
-    """`action` [D] with every binary gripper open or closed, after it was `commanded` [D]; what is no number stays."""
+    """Return `action` [D] with every binary gripper snapped, given the previous command `commanded` [D].
+
+    Numbers that are not finite are not changed, nor is an action of another shape.
+    """
     if action.shape != commanded.shape:
         return action
     numbers = [switch for switch in switches if np.isfinite(action[switch.dim])]
@@ -72,16 +75,16 @@ def snap_grippers(switches: tuple[BinaryGripper, ...], action: Float64, commande
 
 
 class Dwell:
-    """Keeps each binary gripper of one robot from switching again within DWELL_S, whoever wants it to."""
+    """Hold of each binary gripper for MIN_SWITCH_INTERVAL_S after a switch, for commands of any origin."""
 
     def __init__(self, limits: Limits) -> None:
         self._names = limits.names
         self._binary = limits.binary
         self._same = _SAME * (limits.upper - limits.lower)
-        self._switched = np.full(len(limits.binary), -np.inf)  # when [s]
+        self._switched = np.full(len(limits.binary), -np.inf)  # time of the last switch [s]
 
     def apply(self, action: Float64, commanded: Float64, now: float) -> tuple[Float64, tuple[str, ...]]:
-        """`action` [D] with grippers that would switch too soon where they are `commanded` [D], and notes on these."""
+        """Return `action` [D] with grippers that would switch too soon held at `commanded` [D], and notes on them."""
         early = now - self._switched < MIN_SWITCH_INTERVAL_S - _EARLY_S
         if not early.any() or action.shape != commanded.shape:
             return action, ()
@@ -96,7 +99,7 @@ class Dwell:
         return np.where(kept, commanded, action), notes
 
     def record_command(self, before: Float64, now_sent: Float64, now: float) -> None:
-        """The robot was told `now_sent` [D] after `before` [D]."""
+        """Record that `now_sent` [D] was sent after `before` [D]: a gripper that switched is held from `now` [s] on."""
         self._switched[self._switches(now_sent, before)] = now
 
     def _switches(self, action: Float64, before: Float64) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""From the space a policy speaks to the one the robot is commanded in; end-effector vectors."""
+"""Conversion of chunks from a policy's action space to joint commands."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from runtime.spaces.pose_rows import PoseRows, continuous_quaternions
 from runtime.spaces.relative_poses import to_absolute
 
 _GRIPPER = EEF_WIDTH - 1
-_SAME_PLACE, _SAME_TURN = 0.02, 5.0  # [m, degrees] within which a measured pose is that of the described link
-_LONGEST = 2000  # rows of a chunk, given and at control rate: they are solved one by one, and fit the ring to control
+_SAME_PLACE, _SAME_TURN = 0.02, 5.0  # [m, degrees] tolerance between measured and computed poses
+_LONGEST = 2000  # rows per chunk, as received and at control rate: IK is sequential, and the ring to control is finite
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkStart:
     """Point at which a chunk takes over from the present command; vectors float64 [D].
 
-    `held` is what is commanded: grippers and joints of which a row says nothing stay there. `anchor` is the command
-    of the step before row `row`, the first that will be executed: from it on no joint that is solved for is faster
-    than its limit. A robot that stands is anchored where it is measured.
+    `commanded` is the present command: grippers and joints that the rows do not contain hold it. `previous_command`
+    is the command of the step before row `first_row`, the first row that will be executed: from there on the solved
+    joints respect their velocity limits. For a robot at rest it is the measured position.
     """
 
     commanded: Float64
@@ -43,9 +43,9 @@ class ChunkStart:
 class CommandRows:
     """A chunk in command space at control rate.
 
-    `rows` float64 [H', D] are absolute joint targets; `source` int64 [H'] is the policy's row that each was made
-    from; `solved` says how well poses were met, and `targets` [H', arms, 7] are these, None for a joint chunk. `first`
-    [D] is where the first pose would have the robot however far that is, None where rows[0] says so.
+    `rows` float64 [H', D] are absolute joint targets; `source_rows` int64 [H'] is the policy's row that each was made
+    from; `ik_result` has the errors of the solved poses and `targets` [H', arms, 7] the poses, both None for a joint
+    chunk. `first` [D] are the joints of the first pose without velocity limits, None if rows[0] is already that.
     """
 
     rows: Float64
@@ -56,15 +56,15 @@ class CommandRows:
 
     @property
     def intended_start(self) -> Float64:
-        """Joints at which the policy means to begin [D], even if the robot cannot be there in one step."""
+        """Joints at which the policy intends to begin [D], even if the robot cannot reach them in one step."""
         return self.rows[0] if self.first is None else self.first
 
 
 class ActionSpaces(EndEffectors):
-    """One robot's action spaces: joint rows [H, D], and rows of poses that become joints by kinematics.
+    """A robot's action spaces: joint rows [H, D], and pose rows, which inverse kinematics converts to joints.
 
     An arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper, in the arm's declared frame, whatever the
-    format of the rows that it comes from. `control_rate` [Hz] is that of commands, and of chunks that name none.
+    format of the rows. `control_rate` [Hz] is the rate of commands, and that of chunks that declare none.
     """
 
     def __init__(self, robot: Robot, kinematics: Kinematics, control_rate: float) -> None:
@@ -91,16 +91,17 @@ class ActionSpaces(EndEffectors):
     def to_command(
         self, chunk: ActionChunk, observation: Observation, onset: ChunkStart | None = None
     ) -> CommandRows:
-        """The chunk, which answers `observation`, as absolute joint rows at control rate.
+        """Convert a chunk that was computed from `observation` to absolute joint rows at control rate.
 
-        In this order: checked; poses decoded from their format; made absolute against the observation (poses
-        against those that it holds, else those of its joints, in the frame in which they are declared); resampled;
-        poses solved, the first row from the observed joints, each further one from the row before within velocity
-        limits, from `onset` on (without one the robot stands where it was observed); joints without limits
-        unwrapped from the observed ones on. Grippers are taken as they are, but binary ones are snapped before rows
-        are resampled, and the hysteresis begins with what is commanded; what the rows say nothing of stays as in
-        `onset`. Raises PolicyError for a wrong width, a number that is not finite, or numbers that determine no
-        orientation.
+        The steps, in order: check; decode poses from their format; make them absolute with the observation (poses
+        with its poses, or those of its joints, in the declared frame); snap binary grippers, with hysteresis from the
+        present command; resample; solve poses, row 0 from the observed joints, each further row from its predecessor,
+        with velocity limits from `onset` on (without it the robot is assumed to be at rest where it was observed);
+        unwrap joints without limits from the observed joints on. Other grippers are copied. Joints that the rows do
+        not contain hold `onset.commanded`.
+
+        Raises:
+            PolicyError: wrong width, a number that is not finite, or numbers that determine no orientation.
         """
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         rate = chunk.rate or self._control_rate
@@ -123,9 +124,10 @@ class ActionSpaces(EndEffectors):
     def _snap_grippers(
         self, rows: Float64, columns: Mapping[int, int], onset: ChunkStart, rate: float
     ) -> list[int]:
-        """Let binary grippers in `rows` [H, W] be open or closed; `columns` by dimension. Returns their columns.
+        """Snap binary grippers in `rows` [H, W] in place; `columns` by dimension. Return their columns.
 
-        What is commanded now is what the first row that can still be executed follows, and not rows before it.
+        The hysteresis starts from the present command twice: the first executable row follows that command, and not
+        the rows before it, which will never be executed.
         """
         first = int(onset.first_row * rate / self._control_rate + 1e-9)
         found = [(switch, columns[switch.dim]) for switch in self._switches if switch.dim in columns]
@@ -137,7 +139,7 @@ class ActionSpaces(EndEffectors):
         return [column for _, column in found]
 
     def pose_mismatch(self, measured: ArrayLike, q: ArrayLike) -> str:
-        """Sentence on the gap of measured poses [8 * arms] to those of q [D], worst arm; "" if they agree."""
+        """Describe by how much measured poses [8 * arms] differ from those of q [D], worst arm; "" if equal."""
         joints = np.asarray(q, dtype=np.float64)
         expected = self.vectors(joints)
         given = np.asarray(measured, dtype=np.float64).reshape(self._count, EEF_WIDTH)
@@ -156,7 +158,7 @@ class ActionSpaces(EndEffectors):
         )
 
     def _layout_of(self, pose: PoseFormat | None) -> PoseRows:
-        """The rows of that format; the last one is kept, because a policy speaks one format."""
+        """Return the row layout of a format; the last one is cached, because a policy uses a single format."""
         wanted = CANONICAL if pose is None else pose
         if self._layout is None or self._layout.pose != wanted:
             self._layout = PoseRows(wanted, self._robot, "the policy's pose format")
@@ -165,7 +167,7 @@ class ActionSpaces(EndEffectors):
     def _absolute_joints(
         self, rows: Float64, chunk: ActionChunk, qpos: Float64, dims: NDArray[np.intp]
     ) -> Float64:
-        """Rows [H, n] of the joints `dims` as absolute ones, turns counted on; grippers are that in every mode."""
+        """Return rows [H, n] of the joints `dims` as absolute, unwrapped; grippers are absolute in all modes."""
         rows = rows.copy()
         if chunk.mode != "absolute":
             moving = np.isin(dims, self._moving)
@@ -177,7 +179,7 @@ class ActionSpaces(EndEffectors):
     def _absolute_poses(
         self, rows: Float64, layout: PoseRows, chunk: ActionChunk, observation: Observation
     ) -> Float64:
-        """Absolute vectors in each arm's own frame, flat, and the joints that follow: [H, 8 * arms + n]."""
+        """Return absolute vectors in each arm's own frame, flat, and the following joints: [H, 8 * arms + n]."""
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         vectors, joints = layout.decode(rows)
         joints = self._absolute_joints(joints, chunk, qpos, layout.dims)
@@ -193,13 +195,13 @@ class ActionSpaces(EndEffectors):
         return np.concatenate([vectors.reshape(len(rows), -1), joints], axis=1)
 
     def _reference_vectors(self, layout: PoseRows, chunk: ActionChunk, observation: Observation) -> Float64:
-        """The vectors [1, arms, 8] that a chunk is relative to."""
+        """Return the vectors [1, arms, 8] to which a chunk is relative."""
         seen = self.eef_of(observation.qpos) if observation.eef is None else observation.eef
         vectors = np.asarray(seen, dtype=np.float64).reshape(1, self._count, EEF_WIDTH)
         return layout.normalize_quaternions(vectors, f"the chunk is {chunk.mode} to an observation with")
 
     def _with_joints(self, qpos: Float64, layout: PoseRows, joints: Float64) -> Float64:
-        """`qpos` [D], row by row with the joints that follow the poses: [H, D]."""
+        """Return `qpos` [D] repeated for each row, with the joints that follow the poses: [H, D]."""
         made = np.tile(qpos, (len(joints), 1))
         made[:, layout.dims] = joints
         return made
@@ -214,14 +216,14 @@ class ActionSpaces(EndEffectors):
         solved = self._kinematics.solve(targets, qpos, 1.0 / self._control_rate, onset.previous_command, row)
         commands = self._assembled(solved.q, poses, layout, joints, onset)
         first = None
-        if row == 0 and len(rows):  # the velocity box would hide from everybody that it begins far away
+        if row == 0 and len(rows):  # velocity limits would hide that the chunk begins far away
             free = self._kinematics.solve(targets[:1], qpos)
             alone = self._assembled(free.q, poses[:1], layout, joints[:1], onset)
             first = self._unwrapped(alone, qpos, self._all)[0]
         return CommandRows(self._unwrapped(commands, qpos, self._all), source, solved, first, targets)
 
     def meet(self, made: CommandRows, row: int) -> tuple[IkResult, float]:
-        """The pose of a row as joints near that row's would meet it however fast, and how far those are away [rad]."""
+        """Solve row `row` without velocity limits; return the result and its distance from the row's joints [rad]."""
         assert made.ik_result is not None
         assert made.targets is not None
         free = self._kinematics.solve(made.targets[row : row + 1], made.ik_result.q[row])
@@ -230,10 +232,10 @@ class ActionSpaces(EndEffectors):
     def _assembled(
         self, solved: Float64, poses: Float64, layout: PoseRows, joints: Float64, onset: ChunkStart
     ) -> Float64:
-        """Solved arms, grippers and joints of the rows, and everything else held; a base stands."""
+        """Combine solved arms, grippers and appended joints; all other joints hold, and a base stops."""
         commands = solved.copy()
         commands[:, self._still] = onset.commanded[self._still]
-        commands[:, self._speeds] = 0.0  # a base of which the rows say nothing stands
+        commands[:, self._speeds] = 0.0  # a base without commands in the rows stops
         if layout.pose.gripper:
             commands[:, self._grippers] = poses[:, self._gripped, _GRIPPER]
         commands[:, layout.dims] = joints
@@ -242,9 +244,10 @@ class ActionSpaces(EndEffectors):
     def _compensate_carrier(
         self, poses: Float64, layout: PoseRows, joints: Float64, qpos: Float64
     ) -> Float64:
-        """Poses [H, arms, 7] as they are to be solved for, while what carries the arms stands as observed.
+        """Return poses [H, arms, 7] for a solver that assumes the arms' carrier (a torso) at `qpos`.
 
-        Where the rows move a torso, each pose is taken along: the arm's joints are those that it will need there.
+        If the rows move the carrier, each pose is moved with it, so that the solved joints are right when it has
+        moved.
         """
         made = poses
         for index, arm in enumerate(self._robot.arms):
@@ -258,7 +261,7 @@ class ActionSpaces(EndEffectors):
         return made
 
     def _unwrap_start(self, onset: ChunkStart, qpos: Float64) -> ChunkStart:
-        """The onset with endless joints on the branch that they were observed on."""
+        """Return `onset` with endless joints on the branch on which they were observed."""
 
         def on_branch(joints: Float64) -> Float64:
             made = np.array(joints, dtype=np.float64)
@@ -269,7 +272,7 @@ class ActionSpaces(EndEffectors):
         return ChunkStart(on_branch(onset.commanded), on_branch(onset.previous_command), onset.first_row)
 
     def _unwrapped(self, rows: Float64, qpos: Float64, dims: NDArray[np.intp]) -> Float64:
-        """Rows of the joints `dims`, endless ones on the branch that is nearest to `qpos`, without jumps from there."""
+        """Return rows of the joints `dims`; endless joints start on the branch nearest `qpos` and do not jump."""
         endless = np.flatnonzero(np.isin(dims, self._wrapping))
         turning = np.concatenate([qpos[dims[endless]][None], rows[:, endless]])
         rows[:, endless] = np.unwrap(turning, axis=0)[1:]

@@ -1,4 +1,4 @@
-"""The end-effector vectors that joints amount to."""
+"""End-effector vectors of joints, by forward kinematics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ _GRIPPER = EEF_WIDTH - 1
 
 
 class EndEffectors:
-    """Those of one robot's arms: x, y, z [m], unit quaternion w, x, y, z in the arm's declared frame, gripper."""
+    """End-effector vectors of a robot's arms: x, y, z [m], unit quaternion w, x, y, z, gripper.
+
+    Poses are in each arm's declared frame.
+    """
 
     def __init__(self, robot: Robot, forward: Forward) -> None:
         arms = robot.arms
@@ -24,10 +27,10 @@ class EndEffectors:
         self._grippers = [arm.gripper_dim for arm in arms if arm.gripper_dim is not None]
 
     def eef_of(self, q: ArrayLike, previous: ArrayLike | None = None) -> Float32:
-        """End-effector vectors float32 [..., 8 * arms] that joints [..., D] and their grippers amount to.
+        """Return end-effector vectors float32 [..., 8 * arms] of joints [..., D].
 
-        Rows [T, D] come out sign-continuous. The (first) quaternion has w >= 0, or the sign nearer to
-        `previous` [8 * arms] where that is given, so that a stream of single calls is continuous too.
+        Quaternions of rows [T, D] have continuous signs. The (first) quaternion has w >= 0 or, if `previous` [8 *
+        arms] is given, the sign closer to it, so that a sequence of single calls is continuous too.
         """
         joints = np.asarray(q, dtype=np.float64)
         vectors = self.vectors(joints)
@@ -41,7 +44,7 @@ class EndEffectors:
         return vectors.reshape(*joints.shape[:-1], -1).astype(np.float32)
 
     def vectors(self, joints: Float64) -> Float64:
-        """The same as float64 [..., arms, 8], each quaternion with w >= 0; 0 for a gripper that an arm has not."""
+        """Return the vectors as float64 [..., arms, 8]; w >= 0, and 0 for the gripper of an arm without one."""
         vectors = np.zeros((*joints.shape[:-1], self._count, EEF_WIDTH))
         vectors[..., :_GRIPPER] = self._forward.forward(joints)
         vectors[..., self._gripped, _GRIPPER] = joints[..., self._grippers]

@@ -1,4 +1,4 @@
-"""Poses in a frame that a deployment declares: the robot's mount frame, or a link of its URDF."""
+"""Pose frames that a deployment declares: the robot's mount frame, or a link of its URDF."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ _POSITION, _QUATERNION = slice(0, 3), slice(3, 7)
 class Frame:
     """One declared frame for all arms of a robot; "" is the frame that each arm declares itself.
 
-    A link is looked for in the copy of the URDF that the arm belongs to: the base of an arm is its own base. What
-    other groups move (a torso) between that link and the arm's frame stands as in the joints that are given.
-    ConfigurationError for a name that is no frame, or a link that an arm with an end effector moves itself.
+    A link is found in the copy of the URDF to which the arm belongs: the base of an arm is its own base. Joints of
+    other groups (a torso) between that link and the arm's frame have the values of the given joints.
+
+    Raises:
+        ConfigurationError: an unknown frame, or a link that is moved by an arm itself.
     """
 
     def __init__(self, robot: Robot, name: str, key: str) -> None:
@@ -41,7 +43,7 @@ class Frame:
         self._frames = [self._body.link_of(arm.name, str(arm.frame)) for arm in robot.arms]
 
     def express(self, vectors: Float64, joints: Float64) -> Float64:
-        """Vectors [T, arms, 7 or more] in each arm's frame as they are in the declared one, at joints [T or 1, D]."""
+        """Transform vectors [T, arms, 7 or more] from each arm's frame to this frame, at joints [T or 1, D]."""
         if self.own:
             return vectors
         turn, shift = self._relation(joints)
@@ -51,7 +53,7 @@ class Frame:
         return made
 
     def resolve(self, vectors: Float64, joints: Float64) -> Float64:
-        """The way back: vectors in the declared frame as they are in each arm's own."""
+        """Transform vectors from this frame to each arm's own frame; the inverse of `express`."""
         if self.own:
             return vectors
         turn, shift = self._relation(joints)
@@ -62,7 +64,7 @@ class Frame:
         return made
 
     def _relation(self, joints: Float64) -> tuple[Float64, Float64]:
-        """The arms' frames in the declared one: rotations [T or 1, arms, 3, 3], positions [T or 1, arms, 3]."""
+        """Return the arms' frames in this frame: rotations [T or 1, arms, 3, 3], positions [T or 1, arms, 3]."""
         poses = self._body.poses(joints)
         below = poses[..., self._frames, :, :]
         if self._mounted:
@@ -76,12 +78,12 @@ class Frame:
 
 
 def frame_names(robot: Robot) -> list[str]:
-    """The frames that may be declared for a robot."""
+    """Return the frames that may be declared for a robot."""
     return [robot.mount_frame, *sorted(urdf.read(robot.urdf).links)]
 
 
 def _require_standing(tree: Urdf, robot: Robot, arm: Group, link: str, key: str) -> None:
-    """The link is there, and does not move with an arm: a pose in it would depend on what is to be solved for."""
+    """Raise ConfigurationError if `link` is unknown or moved by `arm`: its poses would depend on the IK solution."""
     try:
         above = tree.between(tree.root, link)
     except RobotError:

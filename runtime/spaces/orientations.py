@@ -1,6 +1,6 @@
-"""Orientations as the numbers that policies and transports speak, to and from unit quaternions w, x, y, z.
+"""Orientation formats of policies and transports, converted to and from unit quaternions w, x, y, z.
 
-Arrays are float64 [T, arms, n]: rows of a chunk, one orientation per arm. Nothing here knows of robots.
+Arrays are float64 [T, arms, n]: rows of a chunk, one orientation per arm. Independent of robots.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from runtime.core.types import Float64
 
 Bools = NDArray[np.bool_]
 _WHOLE = 2.0 * np.pi
-_LOCKED = 1e-10  # half the turn that is lost where the free angle of a gimbal lock is chosen
+_LOCKED = 1e-10  # half the rotation that is neglected by fixing the free angle in a gimbal lock
 _NO_AXIS = 1e-12
-SHORTEST = 1e-3  # what a network predicts is off by per cents, never by this much
+SHORTEST = 1e-3  # shortest usable vector: a network's error is per cents, never this much
 
 
 class Orientation(ABC):
-    """One way to write an orientation down: `fields` name its numbers, `allowed` says what determines one."""
+    """An orientation format: `fields` names its numbers, `allowed` describes the valid ones."""
 
     fields: tuple[str, ...]
     allowed: str
 
     @abstractmethod
     def encode(self, quaternions: Float64, previous: Float64 | None = None) -> Float64:
-        """Numbers [T, arms, n] of unit quaternions, each as near to those of the row before as they can be written.
+        """Encode unit quaternions as numbers [T, arms, n], each row as close to its predecessor as possible.
 
-        The first row continues `previous` [arms, n]; without it, it is written in the usual range.
+        The first row continues `previous` [arms, n]; without it, it is in the usual range.
         """
 
     @abstractmethod
     def decode(self, numbers: Float64) -> tuple[Float64, Bools]:
-        """Unit quaternions, and where [T, arms] the numbers determine one; elsewhere they are the identity."""
+        """Return unit quaternions, and whether [T, arms] the numbers determine them; if not, they are the identity."""
 
 
 class QuaternionOrientation(Orientation):
-    """Four numbers, the scalar first or last; a sign is kept from row to row, as it comes at the first."""
+    """Four numbers, scalar first or last; signs are continuous from the first row on."""
 
     def __init__(self, scalar_first: bool) -> None:
         self.fields = ("qw", "qx", "qy", "qz") if scalar_first else ("qx", "qy", "qz", "qw")
@@ -59,7 +59,7 @@ class QuaternionOrientation(Orientation):
 
 
 class RotationVector(Orientation):
-    """Axis times angle, the angle in [0, pi] at the first row and beyond where a chunk turns on."""
+    """Axis times angle; the angle is in [0, pi] at the first row, and beyond if a chunk turns further."""
 
     fields = ("rx", "ry", "rz")
     allowed = "any three numbers"
@@ -68,7 +68,7 @@ class RotationVector(Orientation):
         self._unit = np.pi / 180.0 if degrees else 1.0
 
     def encode(self, quaternions: Float64, previous: Float64 | None = None) -> Float64:
-        """Of all turns by whole circles, which are the same orientation, the one nearest to the row before."""
+        """Encode; of all vectors of the same orientation the closest to the previous row is chosen."""
         upright = quaternions * np.where(quaternions[..., :1] < 0, -1.0, 1.0)
         imaginary = upright[..., 1:]
         sine = np.linalg.norm(imaginary, axis=-1, keepdims=True)
@@ -92,10 +92,10 @@ class RotationVector(Orientation):
 
 
 class EulerAngles(Orientation):
-    """Three angles in one of the twelve orders: "xyz" about fixed axes, "XYZ" about those that turn along.
+    """Three angles in one of the twelve orders: "xyz" about fixed axes, "XYZ" about moving axes.
 
-    Angles of a quaternion after Bernardes and Viollet, PLoS ONE 17 (2022) e0276302. In a gimbal lock, where one
-    angle is free, the third is kept (0 at the first row).
+    Angles of a quaternion by Bernardes and Viollet, PLoS ONE 17 (2022) e0276302. In a gimbal lock one angle is free:
+    the third is then left unchanged (0 at the first row).
     """
 
     allowed = "any three angles"
@@ -105,7 +105,7 @@ class EulerAngles(Orientation):
         self._unit = np.pi / 180.0 if degrees else 1.0
         self._fixed = order.islower()
         axes = ["xyz".index(axis) for axis in order.lower()]
-        self._axes = axes if self._fixed else axes[::-1]  # in the sense of fixed axes
+        self._axes = axes if self._fixed else axes[::-1]  # as an order of fixed axes
         i, j, k = self._axes
         self._proper = i == k
         self._third = 3 - i - j if self._proper else k
@@ -131,7 +131,7 @@ class EulerAngles(Orientation):
         return quaternions, np.ones(quaternions.shape[:-1], dtype=np.bool_)
 
     def _terms(self, quaternions: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """Half sum and half difference of the outer angles, and the two lengths that they are read off."""
+        """Return half sum and half difference of the outer angles, and two lengths that determine the middle angle."""
         i, j, _ = self._axes
         w, x = quaternions[..., 0], quaternions[..., 1 + i]
         y, z = quaternions[..., 1 + j], quaternions[..., 1 + self._third] * self._sign
@@ -141,7 +141,7 @@ class EulerAngles(Orientation):
     def _angles(
         self, total: Float64, apart: Float64, along: Float64, across: Float64, before: Float64 | None
     ) -> Float64:
-        """The angles [arms, 3] about fixed axes, nearest to those `before` [arms, 3]."""
+        """Return the angles [arms, 3] about fixed axes that are closest to `before` [arms, 3]."""
         third = np.zeros(len(total)) if before is None else self._raw(before[:, 2])
         total = np.where(along <= _LOCKED, third - apart, total)
         apart = np.where(across <= _LOCKED, third - total, apart)
@@ -160,10 +160,10 @@ class EulerAngles(Orientation):
 
 
 class SixD(Orientation):
-    """The first two columns of the rotation matrix, one after the other, or its first two rows.
+    """The first two columns, or the first two rows, of the rotation matrix in sequence.
 
-    Decoded by Gram-Schmidt, so that any two vectors that are not in line will do. Zhou et al., On the Continuity
-    of Rotation Representations in Neural Networks, CVPR 2019.
+    Decoded by Gram-Schmidt: any two vectors that are not parallel are valid. Zhou et al., On the Continuity of
+    Rotation Representations in Neural Networks, CVPR 2019.
     """
 
     allowed = (
@@ -175,7 +175,7 @@ class SixD(Orientation):
         self.fields = tuple(f"{vector}{axis}" for vector in ("a", "b") for axis in "xyz")
 
     def encode(self, quaternions: Float64, previous: Float64 | None = None) -> Float64:
-        del previous  # each orientation is written in one way only
+        del previous  # the encoding is unique
         matrices = matrix_of_quaternion(quaternions)
         if self._columns:
             matrices = np.swapaxes(matrices, -1, -2)
@@ -193,7 +193,7 @@ class SixD(Orientation):
 
 
 def continuous_signs(quaternions: Float64) -> Float64:
-    """The factors +-1 [T, arms, 1] that turn each quaternion [T, arms, 4] to its predecessor's side."""
+    """Return factors +-1 [T, arms, 1] that make the signs of quaternions [T, arms, 4] continuous along T."""
     dots = np.sum(quaternions[1:] * quaternions[:-1], axis=-1, keepdims=True)
     signs = np.ones((*quaternions.shape[:-1], 1))
     signs[1:] = np.cumprod(np.where(dots < 0, -1.0, 1.0), axis=0)
@@ -217,9 +217,9 @@ def _directions(vectors: Float64, otherwise: list[float]) -> tuple[Float64, Bool
 
 
 def _nearest_turns(before: Float64, axis: Float64, angle: Float64) -> Float64:
-    """Whole turns about `axis` [arms, 3] to add to `angle` [arms, 1], such that it is near to the vector `before`.
+    """Return whole turns about `axis` [arms, 3] that bring rotation vectors of `angle` [arms, 1] closest to `before`.
 
-    Where there is no axis, because nothing is turned, the whole turns of `before` are kept.
+    If there is no axis, because the rotation is zero, the whole turns of `before` are repeated.
     """
     along = np.sum(before * axis, axis=-1, keepdims=True)
     length = np.linalg.norm(before, axis=-1, keepdims=True)
@@ -230,5 +230,5 @@ def _nearest_turns(before: Float64, axis: Float64, angle: Float64) -> Float64:
 
 
 def _in_one_turn(angles: Float64) -> Float64:
-    """The angles in [-pi, pi]; what is there already is not touched."""
+    """Return the angles wrapped to [-pi, pi]; those already inside are unchanged, bit for bit."""
     return np.asarray(angles - _WHOLE * np.round(angles / _WHOLE))

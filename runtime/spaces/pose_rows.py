@@ -1,6 +1,6 @@
-"""Rows of poses as a deployment declares them, converted at the borders alone.
+"""Pose rows in a deployment's format, converted only at the interfaces.
 
-Inside, an arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper, in the arm's own frame; vectors are
+Internally an arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper, in the arm's own frame; vectors are
 float64 [T, arms, 8].
 """
 
@@ -31,7 +31,7 @@ _POSITION, _QUATERNION, _GRIPPER = slice(0, 3), slice(3, 7), EEF_WIDTH - 1
 
 
 def orientation_of(pose: PoseFormat) -> Orientation:
-    """The codec of the format's orientation."""
+    """Return the codec of the format's orientation."""
     if pose.orientation == "euler":
         return EulerAngles(pose.euler_order, pose.degrees)
     if pose.orientation == "rotation_vector":
@@ -42,10 +42,13 @@ def orientation_of(pose: PoseFormat) -> Orientation:
 
 
 class PoseRows:
-    """Rows of poses for one robot in one format: their `width`, the `names` of their numbers, and the way both ways.
+    """Pose rows of a robot in one format: `width`, `names` of the numbers, `encode` and `decode`.
 
-    `dims` are the places in the robot's vector of the joints that follow the poses. `key` names the table of the
-    deployment in errors. ConfigurationError where the format does not fit the robot.
+    `dims` are the indices, in the robot's vector, of the joints that follow the poses. `key` names the deployment's
+    table in error messages.
+
+    Raises:
+        ConfigurationError: the format does not fit the robot.
     """
 
     def __init__(self, pose: PoseFormat, robot: Robot, key: str = "pose") -> None:
@@ -74,24 +77,26 @@ class PoseRows:
 
     @property
     def commanded(self) -> list[tuple[int, int]]:
-        """(place in a row, place in the robot's vector) of what is commanded as it stands there."""
+        """Pairs (index in a row, index in the robot's vector) of the numbers that are commanded unchanged."""
         grippers = enumerate(self._grippers if self.pose.gripper else [])
         appended = enumerate(self.dims.tolist(), len(self._arms) * self._each)
         return [((arm + 1) * self._each - 1, dim) for arm, dim in grippers if dim is not None] + [*appended]
 
     def encode(self, vectors: Float64, joints: Float64, previous: Float64 | None = None) -> Float64:
-        """Rows float64 [T, width] of vectors [T, arms, 8] at the joints [T or 1, D], which place the frame.
+        """Return rows float64 [T, width] of vectors [T, arms, 8] at joints [T or 1, D], which determine the frame.
 
-        Each row is as near to the one before as its orientations can be written, the first to `previous` [width]; to
-        its own one of `previous` [T, width] where there are as many.
-        Raises PolicyError for a quaternion without direction.
+        Each row is written as close to its predecessor as its orientation format permits. With `previous` [width] the
+        first row is written close to it; with `previous` [T, width] each row close to the corresponding row.
+
+        Raises:
+            PolicyError: a quaternion has no direction.
         """
         upright = self.normalize_quaternions(vectors)
         appended = np.broadcast_to(joints, (len(vectors), joints.shape[-1]))[:, self.dims]
         return self.written(self.frame.express(upright, joints), appended, previous)
 
     def written(self, vectors: Float64, appended: Float64, previous: Float64 | None = None) -> Float64:
-        """Rows of vectors with unit quaternions as they are in the declared frame, and of what follows them [T, n]."""
+        """Return rows of vectors (unit quaternions, this frame) and of the joints [T, n] that follow them."""
         poses = np.empty((len(vectors), len(self._arms), self._each))
         poses[..., _POSITION] = vectors[..., _POSITION]
         poses[..., self._turning] = self._turned(vectors[..., _QUATERNION], previous)
@@ -109,10 +114,12 @@ class PoseRows:
         return each.reshape(before.shape)
 
     def decode(self, rows: Float64, whose: str = "the policy answered with") -> tuple[Float64, Float64]:
-        """Vectors [T, arms, 8] in the declared frame and the joints [T, n] that follow them, of rows [T, width].
+        """Return vectors [T, arms, 8] in the declared frame and the joints [T, n] that follow, of rows [T, width].
 
-        Quaternions are unit, w >= 0 in the first row, their signs continuous; a gripper that is not in the row is
-        0. PolicyError names arm and row of numbers that determine no orientation; `whose` begins its sentence.
+        Quaternions are unit, w >= 0 in the first row, with continuous signs; a gripper that is not in the row is 0.
+
+        Raises:
+            PolicyError: numbers determine no orientation; the message begins with `whose` and names arm and row.
         """
         poses = self._poses_of(rows)
         vectors = np.zeros((len(rows), len(self._arms), EEF_WIDTH))
@@ -129,9 +136,10 @@ class PoseRows:
         return rows[:, : len(self._arms) * self._each].reshape(len(rows), len(self._arms), self._each)
 
     def normalize_quaternions(self, vectors: Float64, whose: str = "the robot measured") -> Float64:
-        """The vectors [T, arms, 8] with unit quaternions; signs are kept: those that a robot measures are its own.
+        """Return the vectors [T, arms, 8] with unit quaternions; signs are unchanged, as a robot chooses its own.
 
-        Raises PolicyError for a quaternion without direction.
+        Raises:
+            PolicyError: a quaternion has no direction; the message begins with `whose`.
         """
         codec = QuaternionOrientation(scalar_first=True)
         made = vectors.copy()
@@ -154,14 +162,14 @@ class PoseRows:
 
 
 def continuous_quaternions(quaternions: Float64) -> Float64:
-    """Unit quaternions [T, arms, 4] with w >= 0 in the first row and signs continuous along T."""
+    """Return unit quaternions [T, arms, 4] with w >= 0 in the first row and continuous signs along T."""
     made = quaternions.copy()
     made[:1] *= np.where(made[:1, :, :1] < 0, -1.0, 1.0)
     return made * continuous_signs(made)
 
 
 def _dims(pose: PoseFormat, robot: Robot, key: str) -> NDArray[np.intp]:
-    """The places of the appended groups' joints in the robot's vector, in the order in which they are named."""
+    """Return the indices of the appended groups' joints in the robot's vector, in the declared order."""
     others = [group.name for group in robot.groups if group.chain is None]
     for place, name in enumerate(pose.groups):
         if name not in others or name in pose.groups[:place]:

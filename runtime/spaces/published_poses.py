@@ -1,4 +1,4 @@
-"""The poses that a joint command amounts to, as a transport takes them."""
+"""Conversion of joint commands to the pose rows that a transport publishes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from runtime.spaces.pose_rows import PoseRows
 
 
 class PosePublisher:
-    """Called with every joint command [D] that is sent: float32 [W], each row continuing the one before."""
+    """Converter of each sent joint command [D] to a pose row float32 [W], which continues the previous row."""
 
     def __init__(self, rows: PoseRows, end_effectors: EndEffectors) -> None:
         self._rows = rows

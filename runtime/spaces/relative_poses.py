@@ -1,4 +1,4 @@
-"""Poses that are relative to others, placed where those are.
+"""Conversion between relative and absolute poses.
 
 An arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper; arrays are float64 [T, arms, 8].
 """
@@ -15,11 +15,11 @@ _POSITION, _QUATERNION = slice(0, 3), slice(3, 7)
 
 
 def to_absolute(vectors: Float64, start: Float64, mode: ActionMode, frame: RelativeFrame) -> Float64:
-    """`vectors` with unit quaternions as absolute poses, from the pose `start` [arms, 8] that they are relative to.
+    """Return absolute poses of relative `vectors` (unit quaternions), relative to the pose `start` [arms, 8].
 
-    "relative": each from `start`; "delta": each from the one before. "base": p0 + dp, dq q0; "tool":
-    p0 + R0 dp, q0 dq. Grippers are absolute in every mode and stay. Quaternions come out unit and sign-continuous,
-    w >= 0 in the first row.
+    Mode "relative": each row from `start`; "delta": each from its predecessor. Frame "base": p0 + dp, dq q0; "tool":
+    p0 + R0 dp, q0 dq. Grippers are absolute in every mode and are copied. Quaternions are returned unit and
+    sign-continuous, w >= 0 in the first row.
     """
     if mode == "absolute":
         return vectors
@@ -43,7 +43,7 @@ def to_absolute(vectors: Float64, start: Float64, mode: ActionMode, frame: Relat
 
 
 def relative(vectors: Float64, start: Float64, mode: ActionMode, frame: RelativeFrame) -> Float64:
-    """The way back: absolute `vectors` with unit quaternions, as `mode` has them from the pose `start` [arms, 8] on."""
+    """Return absolute `vectors` (unit quaternions) relative to `start` [arms, 8]; the inverse of `to_absolute`."""
     if mode == "absolute":
         return vectors
     before = np.broadcast_to(start, vectors.shape)
@@ -62,14 +62,14 @@ def relative(vectors: Float64, start: Float64, mode: ActionMode, frame: Relative
 
 
 def _after(before: Float64, turns: Float64, frame: RelativeFrame) -> Float64:
-    """Unit quaternions that `before` comes to by `turns`, about its own axes ("tool") or those that it is given in."""
+    """Return unit quaternions `before` rotated by `turns`, about their own axes ("tool") or the frame's axes."""
     made = quaternion_product(before, turns) if frame == "tool" else quaternion_product(turns, before)
     unit: Float64 = made / np.linalg.norm(made, axis=-1, keepdims=True)
     return unit
 
 
 def _cumulative_products(turns: Float64, frame: RelativeFrame) -> Float64:
-    """Running products of the turns [T, arms, 4], by doubling (Hillis and Steele, 1986): log2 T products."""
+    """Return cumulative products of the turns [T, arms, 4], by doubling (Hillis and Steele, 1986): log2 T products."""
     made, span = turns, 1
     while span < len(made):
         made = np.concatenate([made[:span], _after(made[:-span], made[span:], frame)])

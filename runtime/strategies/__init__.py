@@ -1,6 +1,6 @@
-"""One file per inference strategy. Each declares `Config`, `query` and `merge`."""
+"""Inference strategies, one file each, which declares `Config`, `USES`, `query` and `merge`."""
 
-# Each kind with its module, which is imported where a deployment names it.
+# Module of each kind; imported only if a deployment names the kind.
 KINDS = {
     "ensemble": "runtime.strategies.ensemble",
     "naive": "runtime.strategies.naive",

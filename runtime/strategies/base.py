@@ -1,4 +1,4 @@
-"""A strategy has two halves: when to ask the policy (coordinator), how an answer joins the timeline (control)."""
+"""Interface of strategies: when to query the policy (coordinator), and how to merge its chunk (control)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from runtime.motion.timeline import (
 )
 
 BlendShape = Literal["linear", "cosine", "exponential"]
-JOIN_WINDOW = 8  # steps over which a chunk takes over from what it does not continue
-_MOST_SHARES = 4096  # that are told of a chunk: they pass the ring to the coordinator
+JOIN_WINDOW = 8  # steps of the fade if a chunk does not continue the executed motion
+_MOST_SHARES = 4096  # contributions reported per chunk at most: they pass the ring to the coordinator
 
 
 class StrategyParameters(Settings):
@@ -52,18 +52,19 @@ class StrategyParameters(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Facts that the asking half may decide by."""
+    """Facts from which a `Query` decides."""
 
     remaining: int  # steps still planned
-    in_flight: bool  # a request is out, or its answer has not been merged yet
-    since_request: float  # [s] since the last request was sent; inf before the first
+    in_flight: bool  # a request is pending, or its chunk is not merged yet
+    since_request: float  # [s] since the last request; inf before the first
 
 
 @dataclass(frozen=True, slots=True)
 class ArrivedChunk:
-    """A chunk at the control loop: rows [H, D] in command space and control rate.
+    """A chunk at the control loop: rows [H, D] in command space and at control rate.
 
-    Row 0 is for `observation_step`; where it `waited` nothing of it is stale, and row 0 is for the first free step.
+    Row 0 is for `observation_step`. If the chunk was `requested_while_stopped`, no row is stale: row 0 is for the
+    first free step.
     """
 
     chunk_id: int
@@ -74,13 +75,13 @@ class ArrivedChunk:
 
 @dataclass(frozen=True, slots=True)
 class MergeResult:
-    """Place of a chunk on the timeline.
+    """Result of a merge: which rows of a chunk are planned for which steps.
 
-    `arrival_step` is the first tick not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H]
-    is the step each row was planned for, -1 where it was dropped. `mistimed` is how many steps later than meant
-    its rows are executed (k_max); negative where it arrived before the step it is for. `dropped` says why nothing
-    of the chunk was used, "" where something was. `shares` [N, 3] are step, chunk id and weight of what makes steps
-    that are not the chunk's alone; None where `Merge.continues` is false, or there are too many.
+    `arrival_step` is the first step not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H] is
+    the step that each row was planned for, -1 if it was dropped. `mistimed` is the number of steps by which rows are
+    executed later than intended (see `k_max`), negative if the chunk arrived before the step that it is for.
+    `dropped` is the reason why no row is used, "" if any is. `contributions` [N, 3] are step, chunk id and weight for
+    all steps that the chunk does not make alone; None if `Merge.uses_rtc` is false or if there are too many.
     """
 
     chunk_id: int
@@ -89,17 +90,15 @@ class MergeResult:
     targets: NDArray[np.int64]
     mistimed: int = 0
     dropped: str = ""
-    overlap: int = (
-        0  # steps from arrival_step on that more than one chunk makes, or a chunk and a held target
-    )
+    overlap: int = 0  # steps from arrival_step on made by several chunks, or by a chunk and a held target
     contributions: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Which rows of a chunk are used: [N, D], row 0 for step `merged.arrival_step`; none where it is dropped.
+    """The rows of a chunk that are used, [N, D]; row 0 is for step `first`; empty if the chunk is dropped.
 
-    `before` [D] is the row before them, None where there is none.
+    `before` [D] is the chunk's row before them, None if there is none.
     """
 
     rows: Float64
@@ -113,20 +112,18 @@ class Placement:
 
 
 class Query(ABC):
-    """Decides when the policy is asked."""
+    """The half of a strategy that decides when to query the policy."""
 
-    requests_while_stopped: bool = (
-        False  # it asks while the robot stands, so that nothing of the answer is stale
-    )
-    uses_rtc: bool = False  # its requests carry what the robot is committed to (RTC)
+    requests_while_stopped: bool = False  # queries only while the robot stands, so that no row is stale
+    uses_rtc: bool = False  # requests carry the committed rows (RTC)
 
     @abstractmethod
     def should_request(self, progress: Progress) -> bool:
-        """True if the policy is to be asked now."""
+        """Return True if the policy should be queried now."""
 
 
 class Paced(Query):
-    """Asks while the robot moves: back to back, or at a rate [Hz], never with a request in flight."""
+    """Query during motion, back to back or at a rate [Hz], with at most one request in flight."""
 
     def __init__(self, inference_rate: float | None) -> None:
         self._period = 0.0 if inference_rate is None else 1.0 / inference_rate
@@ -136,23 +133,21 @@ class Paced(Query):
 
 
 class Merge(ABC):
-    """Lets a chunk join the timeline; a pure function of timeline, chunk and first free step."""
+    """The half of a strategy that merges chunks: a function of timeline, chunk and first free step only."""
 
-    requests_while_stopped: bool = (
-        False  # an empty timeline is this strategy's way of waiting, not starvation
-    )
-    uses_rtc: bool = False  # its chunks are continued (RTC): what makes each step is told
+    requests_while_stopped: bool = False  # an empty timeline is waiting, not starvation
+    uses_rtc: bool = False  # reports contributions, because requests continue the chunks (RTC)
 
     @abstractmethod
     def place(self, timeline: Timeline, arrival: ArrivedChunk, free_step: int) -> Placement:
-        """Which rows fall on which steps, or why none does; changes nothing."""
+        """Return the rows to use and their first step, or the reason to drop the chunk; changes nothing."""
 
     @abstractmethod
     def apply(self, timeline: Timeline, placed: Placement) -> None:
-        """Change what is planned from `placed.first` on; never called for a chunk that is dropped."""
+        """Change the plan from `placed.first` on; not called for a dropped chunk."""
 
     def __call__(self, timeline: Timeline, arrival: ArrivedChunk, free_step: int) -> MergeResult:
-        """Change `timeline` from `free_step` on and say where the rows went; nothing is joined to."""
+        """Merge `arrival` into `timeline` from `free_step` on, without a fade from anything before it."""
         return join(self, timeline, arrival, free_step, None, DimensionKinds())
 
 
@@ -167,23 +162,29 @@ def join(
     joining: bool = False,
     commanded: Float64 | None = None,
 ) -> MergeResult:
-    """Merge a chunk; where it does not continue what came before it, fade over from that: no strategy may jump.
+    """Merge a chunk; if it does not continue the motion before it, fade over from that: no strategy may cause a jump.
 
-    `held` [D] is the target that is held because nothing was planned (starvation, a run's far first chunk): the
-    chunk takes over from it within JOIN_WINDOW steps, or its own length if it is shorter. `joining` says that the
-    strategy's kind was switched since the last chunk that was merged: the new plan takes over from the old one,
-    whose last target is held as long as needed, or from `commanded` where nothing is planned; keep it set until a
-    chunk is not dropped. Where neither is given the strategy alone decides. Chunks may be merged while a fade is
-    under way: it goes on over their plan. `commanded` [D] is the last target sent: angles that wrap stay on its
-    branch where nothing is planned. Nothing is changed where the chunk is dropped. The makers of every step sum
-    to 1; chunk id 0 (timeline.HELD) is a held target.
+    Nothing is changed if the chunk is dropped. Chunks may be merged while a fade is active: it continues over the new
+    plan. The contributions of every step sum to 1; chunk id HELD is a held target.
+
+    Args:
+        merge: the strategy's merge.
+        timeline: the timeline to change.
+        arrival: the chunk.
+        free_step: first step not yet sent.
+        held: target [D] that is held because nothing was planned (starvation, a distant first chunk of a run). The
+            chunk takes over from it within JOIN_WINDOW steps, or its own length if that is shorter.
+        dims: dimensions that do not blend linearly.
+        joining: True if the kind of strategy was changed since the last merged chunk; leave it set until a chunk is
+            not dropped. The new plan then takes over from the old plan, whose last target is held as long as needed,
+            or from `commanded` if nothing is planned. Without `held` and `joining` the strategy alone decides.
+        commanded: last target sent [D]; if nothing is planned, wrapping angles continue from it without a whole turn.
     """
     placed = merge.place(timeline, arrival, free_step)
     if placed.merged.dropped:
         return placed.merged
-    joining = (
-        joining or placed.merged.mistimed > 0
-    )  # its rows are for other steps: nothing says that they continue
+    # Mistimed rows are for other steps, so they need not continue the plan.
+    joining = joining or placed.merged.mistimed > 0
     planned = timeline.at(free_step)
     standing = commanded if held is None and joining and planned is None else held
     going_on = commanded if planned is None else planned.action
@@ -218,7 +219,7 @@ def _fade(
     count: int,
     dims: DimensionKinds,
 ) -> None:
-    """Let what is planned next take over from `rows` within `count` steps; the last row is held where they end.
+    """Let the next plan take over from `rows` within `count` steps; the last row is held if they end earlier.
 
     Rows beyond `makers` are held targets.
     """

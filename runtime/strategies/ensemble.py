@@ -1,4 +1,4 @@
-"""`ensemble`: ask while moving; every chunk that covers a step has a say in it (ACT, arXiv 2304.13705)."""
+"""Strategy `ensemble`: query during motion, average all chunks that cover a step (ACT, arXiv 2304.13705)."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Config(StrategyParameters):
 
 
 class EnsembleMerge(Merge):
-    """Averages, step by step, the chunks that cover it, with weights exp(-m * rank), rank 0 the oldest.
+    """Weighted mean, step by step, of the chunks that cover it; weight exp(-m * rank), rank 0 the oldest.
 
-    Chunks are whole, uncropped, each on the steps it was meant for; at most `horizon` of them, the newest, count.
-    The timeline keeps those that still cover something. It is the mean as the newest plus what the others differ,
-    so that equal chunks average to themselves exactly.
+    Chunks are not cropped, and each row is used at its intended step; at most `horizon` chunks, the newest, take
+    part. The timeline stores the chunks that still cover a step. The mean is computed as the newest chunk plus
+    weighted differences, so that equal chunks average to themselves exactly.
     """
 
     def __init__(self, k_max: int | None, m: float, horizon: int, dims: DimensionKinds) -> None:
@@ -58,7 +58,7 @@ class EnsembleMerge(Merge):
         timeline.replace(step, np.concatenate(rows), makers, laid)
 
     def _average(self, chunks: Sequence[PlacedChunk], part: slice) -> tuple[Float64, Contributions]:
-        """The rows `part` that `chunks`, oldest first, make together, and the weights of each."""
+        """Return the weighted mean of the rows `part` of `chunks` (oldest first), and their contributions."""
         weights = np.exp(-self._m * np.arange(len(chunks)))
         weights /= weights.sum()
         newest = chunks[-1].rows[part]
@@ -72,10 +72,10 @@ class EnsembleMerge(Merge):
 
 
 def query(config: Config) -> Query:
-    """The asking half."""
+    """Return the query half of the strategy."""
     return Paced(config.inference_rate)
 
 
 def merge(config: Config, dims: DimensionKinds) -> Merge:
-    """The merging half; `dims` says what does not average as numbers do."""
+    """Return the merge half; `dims` are the dimensions that must not be averaged linearly."""
     return EnsembleMerge(config.k_max, config.ensemble_m, config.ensemble_horizon, dims)

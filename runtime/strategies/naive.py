@@ -1,4 +1,4 @@
-"""`naive`: ask while moving; the newest chunk replaces the rest of the old one."""
+"""Strategy `naive`: query during motion; the newest chunk replaces the plan."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Config(StrategyParameters):
 
 
 class NaiveMerge(Merge):
-    """Drops what is stale; from the first free step on the newest chunk is the whole plan."""
+    """Merge that drops stale rows and replaces the whole plan from the first free step on."""
 
     def __init__(self, execution_horizon: int | None, k_max: int | None) -> None:
         self._horizon = execution_horizon
@@ -34,10 +34,10 @@ class NaiveMerge(Merge):
 
 
 def query(config: Config) -> Query:
-    """The asking half."""
+    """Return the query half of the strategy."""
     return Paced(config.inference_rate)
 
 
 def merge(config: Config, dims: DimensionKinds) -> Merge:
-    """The merging half."""
+    """Return the merge half of the strategy."""
     return NaiveMerge(config.execution_horizon, config.k_max)

@@ -1,7 +1,7 @@
-"""`async`: ask while moving, blend the new chunk over the rest of the old one.
+"""Strategy `async`: query during motion, blend each new chunk with the remaining plan.
 
-The linear overlap blend over the whole overlap ("all") is the published scheme of asynchronous chunk execution;
-the default window is shorter because "all" takes over 30 steps to follow a change of mind.
+A linear blend over the whole overlap ("all") is the published scheme of asynchronous chunk execution; the default
+window is shorter, because with "all" a change of the policy's intention takes effect only after 30 steps.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Config(StrategyParameters):
 
 
 class OverlapMerge(Merge):
-    """Drops what is stale, puts every row on the step it was meant for, blends over the overlap."""
+    """Merge that drops stale rows, uses every row at its intended step, and blends over the overlap."""
 
     def __init__(self, parameters: StrategyParameters, dims: DimensionKinds) -> None:
         self._horizon = parameters.execution_horizon
@@ -50,10 +50,10 @@ class OverlapMerge(Merge):
 
 
 def query(config: Config) -> Query:
-    """The asking half."""
+    """Return the query half of the strategy."""
     return Paced(config.inference_rate)
 
 
 def merge(config: Config, dims: DimensionKinds) -> Merge:
-    """The merging half; `dims` says what does not blend as numbers do."""
+    """Return the merge half; `dims` are the dimensions that must not be blended linearly."""
     return OverlapMerge(config, dims)

@@ -1,4 +1,4 @@
-"""Which rows of a chunk fall on which steps: the one rule of every strategy."""
+"""Placement rule of all strategies: which row of a chunk is for which step."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from runtime.strategies.base import ArrivedChunk, MergeResult, Placement
 def place(
     arrival: ArrivedChunk, free_step: int, horizon: int | None = None, k_max: int | None = None
 ) -> Placement:
-    """Row i is for observation_step + i; rows for steps before `free_step` are stale and dropped.
+    """Place row i at observation_step + i; drop rows for steps before `free_step` as stale.
 
-    The chunk is cropped to `horizon` rows. With `k_max` at most that many rows are dropped and the rest is shifted,
-    which is mistimed. A chunk that `waited` begins at `free_step` whole. One that lies in the past is dropped,
-    whatever k_max says. A chunk that is early, by an observation whose step was taken too high, begins at once.
+    Only the first `horizon` rows are used. At most `k_max` rows are dropped as stale: if more are due, the chunk is
+    shifted to later steps, which counts as mistimed. A chunk that was requested while the robot was stopped starts at
+    `free_step` with row 0. A chunk whose rows are all in the past is dropped, whatever `k_max` is. A chunk that
+    arrives before its observation's step (the step was estimated too high) starts at once.
     """
     delay = free_step - arrival.observation_step
     count = len(arrival.rows) if horizon is None else min(horizon, len(arrival.rows))
@@ -30,7 +31,7 @@ def place(
 
 
 def drop(arrival: ArrivedChunk, free_step: int, why: str) -> Placement:
-    """A chunk that is not used."""
+    """Return the placement of a chunk that is not used, with the reason `why`."""
     nowhere = np.full(len(arrival.rows), -1, np.int64)
     delay = free_step - arrival.observation_step
     return Placement(arrival.rows[:0], MergeResult(arrival.chunk_id, free_step, delay, nowhere, dropped=why))

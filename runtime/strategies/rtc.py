@@ -1,8 +1,8 @@
-"""`rtc`: ask while moving, telling the policy what the robot is committed to, so that the answer continues it.
+"""Strategy `rtc`: query during motion, with the committed rows in the request, so that the chunk continues them.
 
-Real-time chunking (arXiv 2506.07339). The conditioning is made by whoever asks. An answer that continues what is
-executed is laid as it is; a seam, because the answer came later than predicted or the policy did not keep to the
-prefix, passes the overlap blend of `async`.
+Real-time chunking (arXiv 2506.07339). The requester builds the conditioning. A chunk that continues the executed
+actions replaces the plan as it is; otherwise (it arrived later than predicted, or the policy ignored the prefix) it
+is blended as in `async`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from runtime.motion.timeline import DimensionKinds, Timeline, difference, single
 from runtime.strategies.base import Merge, Paced, Placement, Query, StrategyParameters
 from runtime.strategies.overlap import OverlapMerge
 
-_CONTINUED = 1e-3  # [rad] that a model's arithmetic and inverse kinematics may be off by
+_CONTINUED = 1e-3  # [rad] tolerance for the arithmetic of a model and of IK
 USES = frozenset(
     {"execution_horizon", "inference_rate", "k_max", "blend_window", "blend_shape", "delay_quantile"}
 )
@@ -28,13 +28,13 @@ class Config(StrategyParameters):
 
 
 class RtcQuery(Paced):
-    """Asks back to back, or at a rate; its requests carry what the robot is committed to."""
+    """Query during motion, back to back or at a rate; requests carry the committed rows."""
 
     uses_rtc = True
 
 
 class RtcMerge(OverlapMerge):
-    """Lays a chunk as it is where it passes through the step that is executed last before it, else blended."""
+    """Merge that uses a chunk unchanged if it passes through the last executed step, else blends it."""
 
     uses_rtc = True
 
@@ -42,7 +42,7 @@ class RtcMerge(OverlapMerge):
         if not self._continues(timeline, placed):
             super().apply(timeline, placed)
             return
-        timeline.fade = None  # the chunk continues what was made of it
+        timeline.fade = None  # a chunk that continues the blended actions needs no further fade
         timeline.replace(
             placed.first, placed.rows, single_contribution(placed.merged.chunk_id, len(placed.rows))
         )
@@ -57,10 +57,10 @@ class RtcMerge(OverlapMerge):
 
 
 def query(config: Config) -> Query:
-    """The asking half."""
+    """Return the query half of the strategy."""
     return RtcQuery(config.inference_rate)
 
 
 def merge(config: Config, dims: DimensionKinds) -> Merge:
-    """The merging half; `dims` says what does not blend as numbers do."""
+    """Return the merge half; `dims` are the dimensions that must not be blended linearly."""
     return RtcMerge(config, dims)

@@ -1,4 +1,4 @@
-"""`sync`: ask, execute the answer in order, ask again; the robot stands while it waits."""
+"""Strategy `sync`: query, execute the chunk in order, query again; the robot holds while it waits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Config(StrategyParameters):
 
 
 class SyncQuery(Query):
-    """Asks when nothing is left to execute."""
+    """Query when no planned step remains."""
 
     requests_while_stopped = True
 
@@ -27,7 +27,7 @@ class SyncQuery(Query):
 
 
 class SyncMerge(Merge):
-    """Executes what was asked while the robot stood, whole; refuses what was asked while it moved."""
+    """Merge that executes a chunk completely if it was requested while the robot was stopped, else drops it."""
 
     requests_while_stopped = True
 
@@ -50,10 +50,10 @@ class SyncMerge(Merge):
 
 
 def query(config: Config) -> Query:
-    """The asking half."""
+    """Return the query half of the strategy."""
     return SyncQuery()
 
 
 def merge(config: Config, dims: DimensionKinds) -> Merge:
-    """The merging half."""
+    """Return the merge half of the strategy."""
     return SyncMerge(config.execution_horizon)

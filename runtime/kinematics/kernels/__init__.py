@@ -1,1 +1,1 @@
-"""Compiled loops of kinematics; importing one of them imports numba, so nothing does before a robot is built."""
+"""Compiled loops of kinematics. They import numba, so import them only when a robot is built."""

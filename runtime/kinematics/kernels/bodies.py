@@ -1,4 +1,4 @@
-"""Poses of all parts of a robot, as a drawing wants them."""
+"""Poses of all links of a robot, for the 3D scene."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from runtime.kinematics.kernels.sines import compute_sincos
 
 
 class LinkTable(NamedTuple):
-    """Parts [P], parents first: where each is behind the one above it, for the value of its joint.
+    """Links [P], parents first: the transform of each relative to its parent, as a function of its joint value.
 
-    `motions` [P, 4, 12] are weighted by 1, the cosine and sine of that value, and the value, and added: a rotation
-    row by row, then the origin. The value is factor * q[drive] + offset (drive -1: the offset) within low and high.
+    `motions` [P, 4, 12] are weighted by 1, the cosine, the sine and the value itself, and added: a rotation row by
+    row, then the origin. The value is factor * q[drive] + offset (drive -1: the offset) within `low` and `high`;
+    `above` is the parent's index.
     """
 
     motions: Float64
@@ -30,7 +31,7 @@ class LinkTable(NamedTuple):
 
 @kernel
 def compute_link_poses(parts: LinkTable, q: Float64, placed: Float32) -> None:
-    """Into placed [T, P, 16] the transforms scene <- part, column by column, for q [T, D]."""
+    """Write to placed [T, P, 16] the transforms scene <- link, column by column, for q [T, D]."""
     count = len(parts.drive)
     frames, turns, own = np.empty((count, 12)), np.empty((3, count)), np.empty(12)
     for row in range(len(q)):

@@ -1,4 +1,4 @@
-"""The step that minimises a small quadratic in a box."""
+"""Minimisation of a small quadratic function in a box."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from runtime.kinematics.kernels.compiling import device_function
 from runtime.kinematics.tables import Record
 
-_DEFINITE = 1e-13  # of its diagonal must be left of a row
+_DEFINITE = 1e-13  # share of the diagonal that a pivot must exceed
 
 
 def box_qp_type(size: int) -> np.dtype[np.void]:
-    """A quadratic in `size` numbers, the walls around 0, the step that is found, and what finding it overwrites."""
+    """Return the type of a quadratic problem in `size` variables: data, box around 0, solution, and scratch."""
     vector, square = (size,), (size, size)
     return np.dtype(
         [
@@ -30,11 +30,12 @@ def box_qp_type(size: int) -> np.dtype[np.void]:
 
 @device_function
 def solve_box_qp(box: Record, damping: float) -> bool:
-    """Into box.step the d in [low, high], which holds 0, that minimises gradient . d + d . damped system . d / 2.
+    """Minimise gradient . d + d . damped system . d / 2 for d in [low, high], which contains 0; write it to box.step.
 
-    Primal active set for a strictly convex problem (Nocedal and Wright, Numerical Optimization, 16.5): walk to the
-    first wall, hold that joint, solve again for the others; let go of a wall that the slope leaves. Each part lowers
-    the value, so a step that is cut short still descends. False where the system is not positive definite.
+    Primal active set for a strictly convex problem (Nocedal and Wright, Numerical Optimization, 16.5): move to the
+    first bound, fix that variable, solve again for the others; release a bound if the slope points inwards. Each move
+    lowers the value, so an incomplete solution is still a descent step. Returns False if the system is not positive
+    definite.
     """
     gradient, low, high, step, move, held = box.gradient, box.low, box.high, box.step, box.move, box.held
     n = len(gradient)
@@ -51,7 +52,7 @@ def solve_box_qp(box: Record, damping: float) -> bool:
             if not held[i] and room < share * abs(move[i]):
                 first, share = i, room / abs(move[i])
         for i in range(n):
-            step[i] += share * move[i]  # a held joint's move is 0
+            step[i] += share * move[i]  # the move of a fixed variable is 0
         if first >= 0:
             step[first] = high[first] if move[first] > 0 else low[first]
             held[first] = 1
@@ -73,7 +74,7 @@ def _set_slope(box: Record, damping: float) -> None:
 
 @device_function
 def _release_bound(box: Record, damping: float) -> bool:
-    """Frees the held joint that the slope pulls hardest from its wall; whether there was one."""
+    """Release the fixed variable with the largest inward slope; return whether there was one."""
     n = len(box.step)
     holding = 0
     for i in range(n):
@@ -93,10 +94,10 @@ def _release_bound(box: Record, damping: float) -> bool:
 
 @device_function
 def _solve(box: Record, damping: float) -> bool:
-    """Into box.move what takes the slope to zero in all joints that are not held, by Cholesky's L D L^T.
+    """Write to box.move the step that makes the slope of all free variables zero, by Cholesky's L D L^T.
 
-    Column by column; below the diagonal stands what is left of the system, on it 1 / D, above it L transposed.
-    A held joint is a row of the identity: it moves by nothing.
+    Column by column: below the diagonal is the rest of the system, on it 1 / D, above it L transposed. A fixed
+    variable is a row of the identity: its move is zero. Returns False if the system is not positive definite.
     """
     factors, move, held = box.factors, box.move, box.held
     n = len(move)

@@ -1,7 +1,7 @@
-"""Pose of a chain's tip, and its motion with the joints.
+"""Forward kinematics and Jacobian of a chain.
 
-Chains are records of chain_type: every joint turns about, or slides along, the z of its own frame. Frames are twelve
-numbers: a rotation row by row, then the origin. `reach` is a record of reach_type, which these functions overwrite.
+Chains are records of chain_type: every joint turns about, or slides along, the z axis of its own frame. Frames are
+twelve numbers: a rotation row by row, then the origin. `reach` is a record of fk_buffer_type, a scratch buffer.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from runtime.kinematics.tables import Record, Records
 
 
 def fk_buffer_type(moving: int) -> np.dtype[np.void]:
-    """Values, sines and cosines of a chain's joints; the frames of its joints and, last, of its tip."""
+    """Return the type of: values, sines and cosines of a chain's joints; frames of its joints and, last, its tip."""
     return np.dtype([("turns", np.float64, (3, moving)), ("frames", np.float64, (moving + 1, 12))])
 
 
 @device_function
 def compute_fk(chain: Record, q: Float64, row: int, reach: Record) -> None:
-    """Fills `reach` for the chain and the numbers that drive it, q[row]."""
+    """Compute joint frames and tip of the chain for the driving numbers q[row], in `reach`."""
     turns, frames = reach.turns, reach.frames
     for i in range(len(chain.drive)):
         drive = chain.drive[i]
@@ -47,7 +47,7 @@ def compute_fk(chain: Record, q: Float64, row: int, reach: Record) -> None:
 
 @device_function
 def _compose_frame(chain: Record, index: int, frames: Float64) -> None:
-    """frames[index], which the chain's `fixed` places behind the one before."""
+    """Set frames[index] from its predecessor and the chain's `fixed` transform."""
     fixed = chain.fixed
     for i in range(3):
         a, b, c = frames[index - 1, 3 * i], frames[index - 1, 3 * i + 1], frames[index - 1, 3 * i + 2]
@@ -62,7 +62,7 @@ def _compose_frame(chain: Record, index: int, frames: Float64) -> None:
 def compute_jacobian(
     chain: Record, reach: Record, position: float, rotation: float, jacobian: Float64
 ) -> None:
-    """Into jacobian [6, n] d(position, rotation vector)/dq of the tip, each times its weight."""
+    """Write to jacobian [6, n] d(position, rotation vector)/dq of the tip, multiplied by the weights."""
     frames, last = reach.frames, len(chain.drive)
     for k in range(6):
         for i in range(jacobian.shape[1]):
@@ -93,7 +93,10 @@ def compute_jacobian(
 
 @kernel
 def compute_poses(chains: Records, q: Float64, reaches: Records, poses: Float64) -> None:
-    """Into poses [T, A, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) the tips for q [T, D]; needs one reach."""
+    """Write to poses [T, A, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) the tips for q [T, D].
+
+    `reaches` needs one element, as scratch.
+    """
     reach = reaches[0]
     frames, last = reach.frames, len(reach.frames) - 1
     for row in range(len(q)):

@@ -1,4 +1,4 @@
-"""A whole chunk: all frames of all arms, each frame from the one before."""
+"""Inverse kinematics of a chunk: all frames of all arms, each frame from its predecessor."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from runtime.kinematics.kernels.rotations import matrix_of
 from runtime.kinematics.tables import POSED, Record, Records, chain_type
 
 FINE, NOT_FINITE, NO_QUATERNION = 0, 1, 2
-_OVER_TOLERANCE, _AT_LIMIT, _AT_VELOCITY, _NEAR_SINGULAR = 1, 2, 4, 8  # runtime.kinematics.base.IkFlag
-_TOUCHING = 1e-9  # rad (m) from a limit: on it
-_WITHIN = 1 - 1e-9  # of the way that a velocity allows is used, so that rounding never exceeds it
-_FAST = 1 - 1e-6  # of that way: as fast as it may
-_FOLLOWED = 1e-6  # weighted squared error (20 um) up to which a frame's motion is worth going on with
-_KEPT = 0.9  # of a motion is what a frame rests on: what poses leave open dies away within some ten frames
-_GUIDED = 0.5  # of the way that a velocity allows is used to come closer to a guide
-_SHORTEST = 1e-12  # square of a quaternion's length
+_OVER_TOLERANCE, _AT_LIMIT, _AT_VELOCITY, _NEAR_SINGULAR = 1, 2, 4, 8  # as in runtime.kinematics.base.IkFlag
+_TOUCHING = 1e-9  # [rad, m] distance from a limit that counts as on it
+_WITHIN = 1 - 1e-9  # share of the velocity limit used: rounding must not exceed it
+_FAST = 1 - 1e-6  # share of it that counts as at the limit
+_FOLLOWED = 1e-6  # weighted squared error (20 um) up to which a frame's motion is extrapolated
+_KEPT = 0.9  # share of the motion in the next rest position: null-space motion decays within about ten frames
+_GUIDED = 0.5  # share of the velocity limit used to approach a guide
+_SHORTEST = 1e-12  # square of the shortest valid quaternion
 
 
 def arm_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
-    """An arm whose own chain, of so many moving joints, `size` numbers drive, at the end of the chain that carries it.
+    """Return the type of an arm with `moving` joints driven by `size` numbers, on a carrier of `carrying` joints.
 
-    Of these numbers the first `joints` are its own, at the places `dims` of the robot's vector, within `lower` and
-    `upper`, no faster than `speed`; the others stand still at 0. Their limits push where they are nearer than `below`
+    Of the numbers the first `joints` are the arm's own, at the indices `dims` of the robot's vector, within `lower`
+    and `upper`, not faster than `speed`; the rest is padding at 0. Limits repel joints that are nearer than `below`
     and `above`.
     """
     return np.dtype(
@@ -50,12 +50,12 @@ def arm_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
 
 
 def scratch_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
-    """Type of the memory that solving a chunk overwrites."""
+    """Return the type of the scratch memory of `solve_chunk`."""
     return np.dtype([("frame", frame_type(moving, size)), ("carried", fk_buffer_type(carrying))])
 
 
 class Tolerances(NamedTuple):
-    """When a frame counts as reached, and when as near singular."""
+    """Errors [m, rad] within which a frame is reached, and singular value below which it is near singular."""
 
     position: float
     rotation: float
@@ -79,10 +79,10 @@ def solve_chunk(
     rotation_error: Float64,
     flags: UInt8,
 ) -> int:
-    """Joints q [T, D], errors and flags [T, A] for targets [T, A, 7] from seed [1, D].
+    """Compute joints q [T, D], errors and flags [T, A] for targets [T, A, 7], from seed [1, D].
 
-    dt [s] 0: no velocity limit; anchor [D]; anchor_row -1: no anchor; guide [T, D] is what rows are to come close
-    to, [0, D]: nothing; one scratch is needed. FINE, or what is wrong with the numbers given.
+    dt [s], 0: no velocity limit; anchor [D], ignored if anchor_row is -1; guide [T, D] are joints that rows should
+    approach, [0, D]: none; `scratches` needs one element. Returns FINE, NOT_FINITE or NO_QUATERNION.
     """
     wrong = _wrong(targets, seed, anchor)
     if wrong != FINE:
@@ -145,7 +145,7 @@ def _wrong(targets: Float64, seed: Float64, anchor: Float64) -> int:
 
 @device_function
 def _set_first_seed(arm: Record, seed: Float64, frame: Record) -> None:
-    """The joints that the first frame begins with: the seed, within limits."""
+    """Set the start of the first frame: the seed, clipped to the limits."""
     for i in range(len(frame.q)):
         there = seed[0, arm.dims[i]] if i < arm.joints else 0.0
         frame.q[i] = min(max(there, arm.lower[i]), arm.upper[i])
@@ -154,7 +154,7 @@ def _set_first_seed(arm: Record, seed: Float64, frame: Record) -> None:
 
 @device_function
 def _set_bounds(arm: Record, dt: float, frame: Record) -> None:
-    """The box of a frame: its limits, and, where dt is given, what velocities leave of them around `before`."""
+    """Set the box of a frame: joint limits and, if dt is given, the reach of each joint's velocity from `before`."""
     for i in range(len(frame.q)):
         frame.lower[i], frame.upper[i] = arm.lower[i], arm.upper[i]
         if dt > 0:
@@ -166,10 +166,10 @@ def _set_bounds(arm: Record, dt: float, frame: Record) -> None:
 
 @device_function
 def _set_start(going: bool, frame: Record) -> None:
-    """Set the start of a frame's search, and the joints it rests on.
+    """Set the start of a frame's search and its rest position.
 
-    Where the one before met its target, that is where its motion leads, and most of that motion: on a smooth path
-    one step is then enough, and where branches meet (a singularity) it goes straight on.
+    If the previous frame reached its target, the start extrapolates its motion, and the rest position most of it: on
+    a smooth path one iteration then suffices, and where branches meet (a singularity) the motion continues straight.
     """
     for i in range(len(frame.q)):
         begin = min(max(frame.q[i], frame.lower[i]), frame.upper[i])
@@ -181,7 +181,7 @@ def _set_start(going: bool, frame: Record) -> None:
 
 @device_function
 def _follow_guide(arm: Record, guide: Float64, row: int, dt: float, frame: Record) -> None:
-    """Has the frame begin at, and rest on, what is closest to the guide's row and not too far from the frame before."""
+    """Set start and rest position to the joints closest to the guide's row within reach of the previous frame."""
     for i in range(arm.joints):
         way = _GUIDED * arm.speed[i] * dt
         there = min(max(guide[row, arm.dims[i]], frame.before[i] - way), frame.before[i] + way)
@@ -191,7 +191,7 @@ def _follow_guide(arm: Record, guide: Float64, row: int, dt: float, frame: Recor
 
 @device_function
 def _set_goal(targets: Float64, row: int, index: int, carried: Float64, goal: Float64) -> None:
-    """Into `goal` [12] the target as it is seen from where the arm's own chain begins, the last of `carried`."""
+    """Write to `goal` [12] the target relative to the base of the arm's own chain, the last frame of `carried`."""
     base = len(carried) - 1
     matrix = matrix_of(
         targets[row, index, 3], targets[row, index, 4], targets[row, index, 5], targets[row, index, 6]
@@ -208,7 +208,7 @@ def _set_goal(targets: Float64, row: int, index: int, carried: Float64, goal: Fl
 
 @device_function
 def _errors(costs: Costs, frame: Record) -> tuple[float, float]:
-    """Errors of the joints found, in m and rad."""
+    """Return position [m] and rotation error [rad] of the solution."""
     away, astray = 0.0, 0.0
     for k in range(3):
         away += frame.error[k] ** 2
@@ -218,7 +218,7 @@ def _errors(costs: Costs, frame: Record) -> tuple[float, float]:
 
 @device_function
 def _flags(arm: Record, dt: float, costs: Costs, tolerances: Tolerances, frame: Record) -> int:
-    """Flags of the joints found: limits that they touch, and freedom of the tip there."""
+    """Return the flags of the solution: limits, velocity limits, singularity."""
     flags = 0
     if is_near_singular(arm.joints, tolerances.singular_below, costs, frame):
         flags |= _NEAR_SINGULAR

@@ -1,4 +1,4 @@
-"""Compilation of loops by numba, for this processor, kept on disk so that a later process only loads them."""
+"""Compilation of loops by numba for this processor, cached on disk for later processes."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ except ImportError as missing:
     ) from missing
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
-_FAST = {"contract", "nsz"}  # fused multiply-add; no reordering, so that range reduction keeps its digits
+_FAST = {"contract", "nsz"}  # fused multiply-add; no reordering, which would spoil the range reduction
 
 
 def kernel(loop: Loop) -> Loop:
-    """A loop that Python calls: compiled at its first call with each set of types, kept if a folder can be written."""
+    """Compile a loop that Python calls, at its first call with each set of types; cached if a folder is writable."""
     made = numba.njit(cache=CACHE is not None, nogil=True, fastmath=_FAST, error_model="numpy")(loop)
     return cast(Loop, made)
 
 
 def device_function(function: Loop) -> Loop:
-    """Compiled function that is part of a kernel, compiled with it."""
+    """Compile a function that is inlined into kernels."""
     made = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy", forceinline=True)(function)
     return cast(Loop, made)
 

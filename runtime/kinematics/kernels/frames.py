@@ -1,4 +1,4 @@
-"""The joints that bring one chain's tip to one pose: damped least squares in a hard box."""
+"""Inverse kinematics of one chain for one pose: damped least squares in a hard box."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from runtime.kinematics.kernels.compiling import device_function
 from runtime.kinematics.kernels.rotations import relative_rotation, rotation_vector
 from runtime.kinematics.tables import Record
 
-_LARGEST_STEP = 0.5  # rad (m) of one iteration: linearisation is worth nothing farther out
+_LARGEST_STEP = 0.5  # [rad, m] per iteration: the linearisation is invalid farther out
 _CLOSE_ENOUGH = 1e-9  # weighted squared error: below 1 um and 5 urad
-_STALLED = 1e-4  # a relative fall of the cost below which another iteration is not worth its time
-_FIRST_DAMPING = 1e-4  # part of the diagonal that is added once a step has failed
-_GREATEST_DAMPING = 1e6  # with which any system is positive definite
-_LEAST_DAMPING = 1e-8  # below it there is none
+_STALLED = 1e-4  # relative decrease of the cost below which another iteration is not worthwhile
+_FIRST_DAMPING = 1e-4  # share of the diagonal that is added after a failed step
+_GREATEST_DAMPING = 1e6  # any system is positive definite with it
+_LEAST_DAMPING = 1e-8  # smaller values become 0
 
 
 class Costs(NamedTuple):
-    """Costs of a solve: a metre and a radian beside the pose, a radian (m) away from what a frame rests on.
+    """Weights of a solve: position and rotation errors [per m, rad], and distance from the rest position [per rad, m].
 
-    `home_rate` [1/s] is the rate at which what the pose leaves open goes home.
+    `home_rate` [1/s] is the rate at which redundant joints return to home.
     """
 
     position: float
@@ -34,7 +34,7 @@ class Costs(NamedTuple):
 
 
 def frame_type(moving: int, size: int) -> np.dtype[np.void]:
-    """One frame while it is solved, for a chain of so many moving joints that `size` numbers drive."""
+    """Return the type of one frame during its solution, for a chain of `moving` joints that `size` numbers drive."""
     vector = (size,)
     return np.dtype(
         [
@@ -43,31 +43,33 @@ def frame_type(moving: int, size: int) -> np.dtype[np.void]:
             ("goal", np.float64, (12,)),
             ("q", np.float64, vector),
             ("tried", np.float64, (1, size)),
-            ("lower", np.float64, vector),  # the box that q may not leave
+            ("lower", np.float64, vector),  # bounds of q
             ("upper", np.float64, vector),
-            ("begin", np.float64, vector),  # where it begins: the frame before, within the box
-            ("centre", np.float64, vector),  # what it rests on
-            ("before", np.float64, vector),  # what its velocity counts from
-            ("motion", np.float64, vector),  # of the frame before
+            ("begin", np.float64, vector),  # start: the previous frame, within the bounds
+            ("centre", np.float64, vector),  # rest position
+            ("before", np.float64, vector),  # reference of the velocity limit
+            ("motion", np.float64, vector),  # of the previous frame
             ("jacobian", np.float64, (6, size)),  # weighted
             ("error", np.float64, (6,)),  # weighted: position, then rotation vector from goal to tip
-            ("attempt", np.float64, (6,)),  # that of `tried`
+            ("attempt", np.float64, (6,)),  # error of `tried`
             ("normal", np.float64, (6, 6)),
-            ("free", np.float64, (2, size)),  # steps that are to move no pose: towards home, and on as before
-            ("stiffness", np.float64, vector),  # of what pulls towards home
-            ("moved", np.float64, (2, 6)),  # what they would move
+            ("free", np.float64, (2, size)),  # null-space steps: towards home, and the continued motion
+            ("stiffness", np.float64, vector),  # second derivative of the potential towards home
+            ("moved", np.float64, (2, 6)),  # tip motion of the steps in `free`
         ]
     )
 
 
 @device_function
 def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
-    """Into frame.q the joints in [lower, upper] whose tip comes closest to `goal`, found from frame.tried on.
+    """Solve IK for one frame: write to frame.q the joints in [lower, upper] with the tip closest to `goal`.
 
-    Levenberg-Marquardt, undamped until a step fails, then damped by the gain ratio (Nielsen 1999, IMM-REP-1999-05);
-    every step is a small quadratic problem in the box. Ends when the error is negligible or its cost has stopped
-    falling, which bounds what an unreachable target takes. Gives the weighted squared error of q; `error` and
-    `jacobian` are its.
+    Starts from frame.tried. Levenberg-Marquardt, undamped until a step fails, then damped by the gain ratio (Nielsen
+    1999, IMM-REP-1999-05); every step is a small quadratic problem in the box. Ends when the error is negligible or
+    the cost no longer falls, which bounds the time for an unreachable target.
+
+    Returns:
+        Weighted squared error at frame.q; `error` and `jacobian` belong to it.
     """
     n = len(frame.q)
     q, tried, box = frame.q, frame.tried, frame.box
@@ -111,9 +113,9 @@ def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
 
 @device_function
 def _evaluate(costs: Costs, frame: Record) -> float:
-    """Into frame.attempt the weighted error of the tip; its square.
+    """Write to frame.attempt the weighted error of the tip; return its square.
 
-    The derivative of its rotation vector is taken as the geometric one, which leaves the gradient exact.
+    The geometric Jacobian is used as derivative of the rotation vector; the gradient remains exact.
     """
     frames, goal = frame.reach.frames, frame.goal
     last = len(frames) - 1
@@ -128,7 +130,7 @@ def _evaluate(costs: Costs, frame: Record) -> float:
 
 @device_function
 def _set_quadratic(rest: float, frame: Record) -> None:
-    """The system, the gradient of half the cost at q, and how far a step may go."""
+    """Set system and gradient of half the cost at q, and the bounds of the step."""
     box, jacobian = frame.box, frame.jacobian
     for i in range(len(frame.q)):
         slope = rest * (frame.q[i] - frame.centre[i])
@@ -146,7 +148,7 @@ def _set_quadratic(rest: float, frame: Record) -> None:
 
 @device_function
 def _predicted_decrease(box: Record) -> float:
-    """By how much the step would lower the cost if that were the undamped quadratic."""
+    """Return by how much the step lowers the cost according to the undamped quadratic."""
     total = 0.0
     for i in range(len(box.step)):
         across = 2 * box.gradient[i] + box.system[i, i] * box.step[i]
@@ -158,9 +160,9 @@ def _predicted_decrease(box: Record) -> float:
 
 @device_function
 def is_near_singular(joints: int, below: float, costs: Costs, frame: Record) -> bool:
-    """True if the smallest singular value of the unweighted Jacobian of so many joints lies below `below`.
+    """Return True if the smallest singular value of the unweighted Jacobian of `joints` joints is less than `below`.
 
-    It does where J J^T - below^2 (J^T J with fewer than six joints) has a pivot that is not positive.
+    That is so if J J^T - below^2 I (J^T J with fewer than six joints) has a pivot that is not positive.
     """
     normal = frame.normal
     set_normal_matrix(joints, costs, frame)
@@ -179,7 +181,7 @@ def is_near_singular(joints: int, below: float, costs: Costs, frame: Record) -> 
 
 @device_function
 def set_normal_matrix(joints: int, costs: Costs, frame: Record) -> None:
-    """J J^T below its diagonal; J^T J, filled up with an identity, where there are fewer than six joints."""
+    """Set the lower triangle of J J^T; with fewer than six joints, of J^T J, padded."""
     normal, jacobian = frame.normal, frame.jacobian
     metre, radian = 1 / (costs.position * costs.position), 1 / (costs.rotation * costs.rotation)
     mixed = 1 / (costs.position * costs.rotation)

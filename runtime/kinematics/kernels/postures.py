@@ -1,4 +1,4 @@
-"""Which of the postures that meet a pose: what more than six joints leave open leads home, and away from limits."""
+"""Redundancy resolution: with more than six joints, null-space motion towards home and away from limits."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from runtime.kinematics.kernels.compiling import device_function
 from runtime.kinematics.kernels.frames import Costs, set_normal_matrix
 from runtime.kinematics.tables import POSED, Record
 
-_FARTHEST = 0.6  # rad (m) from home beyond which the pull no longer grows, so that limits outweigh it
-_REPELLED = 4.0  # rad (m) that a limit pushes where the room is half of what it is kept at
-_TOUCHING = 0.01  # rad (m) of room below which that no longer grows
-_UNHURRIED = 0.2  # of the joints' velocities is the most that is used for it
-_SINGULAR = 0.002  # smallest singular value, about, at which the pull has half its strength
-_DEFINITE = 1e-9  # of a pivot must be left
+_FARTHEST = 0.6  # [rad, m] from home beyond which the pull is constant, so that limits outweigh it
+_REPELLED = 4.0  # [rad, m] push of a limit at half of the required distance
+_TOUCHING = 0.01  # [rad, m] distance below which the push is constant
+_UNHURRIED = 0.2  # share of the joint velocities that is used at most
+_SINGULAR = 0.002  # approximate smallest singular value at which the pull is halved
+_DEFINITE = 1e-9  # least pivot
 
 
 @device_function
 def update_jacobian(chain: Record, costs: Costs, frame: Record) -> None:
-    """Into frame.jacobian that of frame.q, before a frame is solved."""
+    """Write to frame.jacobian that of frame.q, before a frame is solved."""
     for i in range(len(frame.q)):
         frame.tried[0, i] = frame.q[i]
     compute_fk(chain, frame.tried, 0, frame.reach)
@@ -28,12 +28,12 @@ def update_jacobian(chain: Record, costs: Costs, frame: Record) -> None:
 
 @device_function
 def add_nullspace_bias(arm: Record, costs: Costs, dt: float, going: bool, frame: Record) -> None:
-    """Adds to where a frame is searched from and to what it rests on a step in the null space of frame.jacobian.
+    """Add to a frame's start and rest position a step in the null space of frame.jacobian.
 
-    The step goes down a potential of distance from home and of nearness to limits (gradient projection, Liegeois
-    1977), and takes the place of the null space's share of the motion that goes on: it depends on the posture alone,
-    so that a path that closes closes in the joints as well. It moves no pose, and fades out by singularities, where
-    what is open is a branch, not a posture.
+    The step descends a potential of the distance from home and the nearness to limits (gradient projection, Liegeois
+    1977), and replaces the null-space part of the continued motion: it depends on the posture only, so that a closed
+    path is closed in joint space too. It does not move the tip, and fades out at singularities, where the freedom is
+    a choice of branches and not of postures.
     """
     free = frame.free
     for i in range(len(frame.q)):
@@ -54,9 +54,9 @@ def add_nullspace_bias(arm: Record, costs: Costs, dt: float, going: bool, frame:
 
 @device_function
 def _potential_gradient(arm: Record, joint: int, frame: Record) -> float:
-    """Down the potential, in rad (m): home, and off a limit that is nearer than it is kept at home.
+    """Return the negative gradient of the potential [rad, m]: towards home, and away from near limits.
 
-    Into frame.stiffness how fast that changes with the joint.
+    Write to frame.stiffness its derivative with respect to the joint.
     """
     value = frame.begin[joint]
     away = arm.home[joint] - value
@@ -76,10 +76,10 @@ def _potential_gradient(arm: Record, joint: int, frame: Record) -> float:
 
 @device_function
 def _project_nullspace(joints: int, costs: Costs, frame: Record) -> float:
-    """Takes out of both rows of frame.free what moves the tip; how far that is from a singularity, 0 to 1.
+    """Project both rows of frame.free to the null space; return the distance from a singularity, 0 to 1.
 
-    free - J^T (J J^T)^-1 J free, by L D L^T: of J J^T stays L D below the diagonal and D on it, above it comes L
-    transposed.
+    free - J^T (J J^T)^-1 J free, by L D L^T: in `normal`, L D of J J^T remains below the diagonal and D on it, and L
+    transposed is written above it.
     """
     normal, jacobian, free, moved = frame.normal, frame.jacobian, frame.free, frame.moved
     set_normal_matrix(joints, costs, frame)

@@ -1,4 +1,4 @@
-"""Rotations between quaternions (w, x, y, z), matrices and rotation vectors, one at a time, in plain numbers."""
+"""Conversions between quaternions (w, x, y, z), matrices and rotation vectors, on scalars."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from runtime.core.types import Float64
 from runtime.kinematics.kernels.compiling import device_function
 
 _SMALL = 0.02  # sine below which four terms of the arc sine's series are exact to the last digit
-_TURNED = -0.5  # cosine below which a matrix no longer shows its axis as a difference
+_TURNED = -0.5  # cosine below which the antisymmetric part no longer determines the axis
 
 Quaternion = tuple[float, float, float, float]
 Vector = tuple[float, float, float]
@@ -17,7 +17,7 @@ Matrix = tuple[float, float, float, float, float, float, float, float, float]  #
 
 @device_function
 def matrix_of(w: float, x: float, y: float, z: float) -> Matrix:
-    """The rotation that a quaternion of any length above zero stands for."""
+    """Return the rotation matrix of a quaternion of any length above zero."""
     scale = 2.0 / (w * w + x * x + y * y + z * z)
     return (
         1 - scale * (y * y + z * z),
@@ -34,7 +34,7 @@ def matrix_of(w: float, x: float, y: float, z: float) -> Matrix:
 
 @device_function
 def quaternion_of(matrix: Matrix) -> Quaternion:
-    """The unit quaternion with w >= 0, from the largest of its four squares (Shepperd 1978)."""
+    """Return the unit quaternion with w >= 0, from the largest of its four squares (Shepperd 1978)."""
     a, b, c = matrix[0], matrix[4], matrix[8]
     x, y, z = matrix[7] - matrix[5], matrix[2] - matrix[6], matrix[3] - matrix[1]
     xy, xz, yz = matrix[3] + matrix[1], matrix[2] + matrix[6], matrix[7] + matrix[5]
@@ -53,7 +53,7 @@ def quaternion_of(matrix: Matrix) -> Quaternion:
 
 @device_function
 def rotation_vector(matrix: Matrix) -> Vector:
-    """Axis times angle, the angle in [0, pi] rad."""
+    """Return axis times angle; the angle is in [0, pi] rad."""
     x, y, z = 0.5 * (matrix[7] - matrix[5]), 0.5 * (matrix[2] - matrix[6]), 0.5 * (matrix[3] - matrix[1])
     square = x * x + y * y + z * z
     cosine = 0.5 * (matrix[0] + matrix[4] + matrix[8] - 1)
@@ -71,7 +71,7 @@ def rotation_vector(matrix: Matrix) -> Vector:
 
 @device_function
 def relative_rotation(frames: Float64, row: int, wanted: Float64) -> Matrix:
-    """The rotation of frames[row] [12] times the transpose of that of `wanted` [12]: from `wanted` to the frame."""
+    """Return the rotation of frames[row] [12] times the transpose of that of `wanted` [12]."""
     a, b, c = frames[row, 0], frames[row, 1], frames[row, 2]
     d, e, f = frames[row, 3], frames[row, 4], frames[row, 5]
     g, h, i = frames[row, 6], frames[row, 7], frames[row, 8]

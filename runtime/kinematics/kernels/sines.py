@@ -1,4 +1,4 @@
-"""Sine and cosine of several angles at once: a polynomial that the compiler spreads over the lanes of a vector unit."""
+"""Sine and cosine of several angles at once, by polynomials that the compiler can vectorise."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import numpy as np
 from runtime.core.types import Float64
 from runtime.kinematics.kernels.compiling import device_function
 
-# A quarter turn in three parts, the first two of 33 bits, so that multiples of them are exact (Cody and Waite 1980).
+# A quarter turn in three parts, the first two of 33 bits, so that multiples of them are exact (Cody and Waite
+# 1980).
 _QUARTERS = 2 / math.pi
 _FIRST = float.fromhex("0x1.921fb544p+0")
 _SECOND = float.fromhex("0x1.0b4611a6p-34")
 _THIRD = float.fromhex("0x1.3198a2e037073p-69")
-# Minimax polynomials on an eighth of a turn to either side, below 1e-16 off (those of fdlibm).
+# Minimax polynomials for an eighth of a turn to either side, with an error below 1e-16 (those of fdlibm).
 _S1, _S2, _S3 = -1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04
 _S4, _S5, _S6 = 2.75573137070700676789e-06, -2.50507602534068634195e-08, 1.58969099521155010221e-10
 _C1, _C2, _C3 = 4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015872894767294178e-05
@@ -23,7 +24,7 @@ _C4, _C5, _C6 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.1359
 
 @device_function
 def compute_sincos(turns: Float64) -> None:
-    """Into rows 1 and 2 of `turns` [3, N] the sines and cosines of row 0 [rad]; within 2e-16 up to 1e5 rad."""
+    """Write sines and cosines of row 0 of `turns` [3, N] [rad] to rows 1 and 2; within 2e-16 up to 1e5 rad."""
     for index in range(turns.shape[1]):
         angle = turns[0, index]
         quarters = np.floor(angle * _QUARTERS + 0.5)

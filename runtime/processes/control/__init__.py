@@ -1,1 +1,1 @@
-"""Process 1, the tick: merges chunks, checks them, sends commands; no policy, no camera."""
+"""Control process, the tick: merges chunks, checks actions, sends commands; without policy and cameras."""

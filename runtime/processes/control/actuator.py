@@ -1,4 +1,4 @@
-"""Actuators: the last command that a robot was told, how fast that moved, how it comes to a stand."""
+"""Actuators: last command of a robot, its velocity, and braking."""
 
 from __future__ import annotations
 
@@ -42,42 +42,40 @@ class TickSettings:
     limits: Limits
     dims: DimensionKinds
     safety: SafetySettings
-    heartbeat_timeout: Callable[[str], float]  # silence after which the process of that name counts as gone
+    heartbeat_timeout: Callable[[str], float]  # timeout of a process, by name
     starvation: FaultResponse
     starvation_hold: float  # until "slow" holds
-    moves_robot: bool = True  # commands reach something that can break
+    moves_robot: bool = True  # commands reach hardware that can break
     switches: tuple[BinaryGripper, ...] = ()
-    publication: Callable[[Float64], Float32] | None = (
-        None  # poses of a joint command, where they are published too
-    )
+    publication: Callable[[Float64], Float32] | None = None  # poses of a joint command, if published
 
     @property
     def checks_measurements(self) -> bool:
-        """True if measurements are doubted, and commands checked once more where they leave."""
+        """Whether measurements are checked for plausibility, and commands by the command limiter."""
         return self.moves_robot and not self.safety.report_only
 
     @property
     def starvation_patience(self) -> float:
-        """Time that a run may go on with nothing planned [s]."""
+        """Longest time that a run continues without a planned action [s]."""
         return self.starvation_hold if self.starvation == "slow" else 0.0
 
 
 class TickResult(NamedTuple):
-    """Result of one tick: its target, and float64 [D] of what left, None where nothing did."""
+    """Result of one tick: its target, and the sent action float64 [D], None if nothing was sent."""
 
     time: float  # our monotonic clock [s]
     target: Target | None = None
     executed: Float64 | None = None
     notes: tuple[str, ...] = ()
     refused: bool = False
-    limited: str = ""  # the joint that safety changed most, "" where it changed nothing
-    change: float = 0.0  # by how much [rad, or what a gripper's travel is worth]
-    near: Collision | None = None  # links that it brought near each other, where that is only warned of
-    corrected: str = ""  # what the last check changed
+    limited: str = ""  # joint that safety changed most, "" if it changed nothing
+    change: float = 0.0  # by how much [rad, or a gripper's equivalent]
+    near: Collision | None = None  # links that it brings near each other, if only warned of
+    corrected: str = ""  # changes by the command limiter
 
 
 class Actuator(ABC):
-    """A robot as it was last told; only an engaged one knows where it was told to be."""
+    """A robot with its last command; the command is known only while it is engaged."""
 
     def __init__(self, settings: TickSettings) -> None:
         dim = len(settings.limits.lower)
@@ -85,25 +83,25 @@ class Actuator(ABC):
         self._reach = settings.limits.radian_scale
         self._switching = bool(settings.limits.binary.any())
         self._last_planned: float | None = None
-        self._stepped: tuple[str, ...] = ()  # why the next command begins elsewhere than the last one ended
+        self._stepped: tuple[str, ...] = ()  # why the next command does not continue the last one
         self.engaged = False
         self.commanded: Float64 = np.zeros(dim)
-        self.velocity: Float64 = np.zeros(dim)  # mean, of the last tick
-        self._ends: Float64 | None = None  # at its end, where that is another
+        self.velocity: Float64 = np.zeros(dim)  # mean of the last tick
+        self._ends: Float64 | None = None  # velocity at the end of the tick, if it differs
 
     @abstractmethod
     def state(self, seen: LatestObservation, planned: float, aim: Float64 | None) -> RobotState:
-        """State that an action is judged against; `aim` is the action that was wanted before it."""
+        """Return the state for checking an action; `aim` is the action requested at the previous tick."""
 
     @abstractmethod
     def _deliver(self, step: int, action: Float64) -> float:
-        """Tell the robot; when that was."""
+        """Send `action` to the robot; return the time of sending."""
 
     def engage(self, measured: Float64) -> None:
-        """Take the robot over where it stands: from now on something is sent on every tick.
+        """Engage the robot at its measured position: from now on a command is sent on every tick.
 
-        The grippers of a robot that was engaged before keep their command: closing on an object, they measure
-        wider than they were told, and would let go. A base stands.
+        Grippers of an engaged robot keep their command: if they hold an object, the measured opening is wider than
+        the command, and they would drop it. A mobile base gets speed 0.
         """
         limits = self._settings.limits
         measured = limits.with_zero_speeds(np.where(limits.grippers & self.engaged, self.commanded, measured))
@@ -116,21 +114,22 @@ class Actuator(ABC):
         self.engaged = True
 
     def disengage(self) -> None:
-        """Leave the robot alone: nothing is sent, and where it is told to be is not known any more."""
+        """Disengage the robot: nothing is sent, and its commanded position is unknown."""
         self.engaged = False
 
     def zero_velocity(self) -> None:
-        """Count the last command as one at rest."""
+        """Set the velocity of the last command to zero."""
         self.velocity, self._ends = np.zeros(len(self.commanded)), None
 
     def snap_grippers(self) -> None:
-        """Count binary grippers as told open or closed, although they were taken over in between."""
+        """Snap the command of binary grippers, which may have been engaged between open and closed."""
         self.commanded = snap_grippers(self._settings.switches, self.commanded, self.commanded)
 
     def rebase_command(self, measured: Float64, why: str, farthest: Float64 | float = np.inf) -> None:
-        """Count from where the robot is, and not from where it was told to be, at most `farthest` [D] from there.
+        """Restart the command at `measured`, at most `farthest` [D] from the last command.
 
-        The only way in which a command may step: towards the robot, so that nothing pulls it. The record says `why`.
+        The only way in which a command may jump; it jumps towards the robot, so that nothing pulls it. The tick
+        record carries `why`.
         """
         before = self.commanded
         self.engage(before + np.clip(measured - before, -np.asarray(farthest), farthest))
@@ -146,33 +145,34 @@ class Actuator(ABC):
 
     @property
     def stopping_distance(self) -> Float64:
-        """The distance within which each joint can come to rest from the speed of its command [D]."""
+        """Distance that each joint needs to stop from its commanded speed [D]."""
         limits, safety = self._settings.limits, self._settings.safety
         return np.asarray(self.velocity**2 / (2.0 * safety.brake_acceleration * limits.radian_scale))
 
     def elapsed(self, planned: float) -> float:
-        """Time since the last tick as limits may use it: half a period to 1.5 periods."""
+        """Return the time since the last tick for use in limits, clipped to 0.5 to 1.5 periods [s]."""
         period = self._settings.period
         since = period if self._last_planned is None else planned - self._last_planned
         return min(max(since, period * 0.5), 1.5 * period)
 
     def end_tick(self, planned: float) -> None:
-        """The tick planned for `planned` is over, whether it sent anything or not."""
+        """Record that the tick planned for `planned` has ended, whether it sent a command or not."""
         self._last_planned = planned
 
     def braking_motion(self) -> Brake:
-        """A stop from the last commanded velocity, as hard as needed to stay within the joint limits."""
+        """Return a stop from the last commanded velocity, as hard as necessary for the joint limits."""
         velocity = self.velocity if self._ends is None else self._ends
         return braking(self.commanded, velocity, self._settings.limits, self._settings.safety)
 
     def send(
         self, step: int, planned: float, target: Target, action: Float64, notes: tuple[str, ...] = ()
     ) -> TickResult:
-        """Tell the robot `action`, which is what locks and safety made of `target`."""
+        """Send `action`, which locks and safety derived from `target`; return the result of the tick."""
         elapsed = self.elapsed(planned)
         stop = target.source == "estop"
         if self._estop_pressed and not stop:
-            # Since this tick looked: the next one takes over, this one repeats the last command.
+            # Pressed after this tick's check: repeat the last command, the next tick enters the e-stop
+            # behaviour.
             action, notes, stop = (
                 self._settings.limits.with_zero_speeds(self.commanded),
                 (_PRESSED_WITHIN_TICK,),
@@ -184,7 +184,7 @@ class Actuator(ABC):
         if self._switching:
             self.velocity[self._settings.limits.binary] = 0.0
         self._ends = None
-        if target.velocity is not None:  # to brake anew from the mean would brake farther than was looked at
+        if target.velocity is not None:  # braking from the mean would take longer than checked
             self._ends = np.where(action == target.action, target.velocity, self.velocity)
         self.commanded = action
         notes, self._stepped = (*self._stepped, *notes, *corrected), ()
@@ -192,16 +192,16 @@ class Actuator(ABC):
 
     @property
     def _estop_pressed(self) -> bool:
-        """True if the e-stop is pressed."""
+        """Whether the e-stop is pressed."""
         return False
 
     def _checked(self, action: Float64, elapsed: float, stop: bool) -> LimitedCommand:
-        """The part of `action` that may be sent."""
+        """Return the part of `action` that may be sent."""
         return LimitedCommand(action)
 
 
 class RobotActuator(Actuator):
-    """The robot itself, behind a transport. A restarted control goes on from the last command, at rest."""
+    """The robot itself, through a transport. A restarted control continues from the last command, at rest."""
 
     def __init__(
         self, shared: SharedState, sink: Sink, settings: TickSettings, clock: Callable[[], float]
@@ -218,7 +218,7 @@ class RobotActuator(Actuator):
         self.commanded = np.array(before["commanded"], np.float64)
 
     def measured(self, seen: LatestObservation, now: float) -> Float64 | None:
-        """Measured joint positions [D]; None if they are unknown, doubted or old."""
+        """Return the measured joint positions [D]; None if they are unknown, implausible or old."""
         return self._unwrapped_joints(seen) if seen.is_fresh(now, self._settings.safety.joint_age_s) else None
 
     def state(self, seen: LatestObservation, planned: float, aim: Float64 | None) -> RobotState:
@@ -234,16 +234,16 @@ class RobotActuator(Actuator):
         )
 
     def _unwrapped_joints(self, seen: LatestObservation) -> Float64:
-        """The joints, angles that wrap counted in the turn of the last command, as the node may not count them."""
+        """Return the joints; wrapping angles are in the turn of the last command, which the node may not count."""
         wrapping = self._settings.dims.wrapping
         if not wrapping or not self.engaged:
             return seen.joints
         return self.commanded + difference(seen.joints, self.commanded, wrapping)
 
     def send_node_request(self, word: str, data: Mapping[str, Any]) -> str:
-        """Pass a control word on to the node; why it was not, "" where it was.
+        """Send a control word to the node; return why it was not sent, "" if it was.
 
-        While the e-stop is pressed only the word that ends what the node does by itself is.
+        Unless the e-stop is clear, only END is sent: the word that ends the node's own driving.
         """
         if self._shared_state.estop is not EStop.CLEAR and word != END:
             return _NOT_PASSED_ON(word=word)
@@ -270,7 +270,7 @@ class RobotActuator(Actuator):
 
 
 class SimulatedActuator(Actuator):
-    """A robot that is at once where it is told to be. It knows of no transport: nothing of it is ever sent."""
+    """A simulated robot that reaches each command at once; it has no transport, so nothing is sent."""
 
     def __init__(self, start: Float64, settings: TickSettings, clock: Callable[[], float]) -> None:
         super().__init__(settings)
@@ -279,7 +279,7 @@ class SimulatedActuator(Actuator):
         self.snap_grippers()
 
     def state(self, seen: LatestObservation, planned: float, aim: Float64 | None) -> RobotState:
-        # Its joints are known at once; pictures come from outside and grow old as they do for the real robot.
+        # Its joints are known at once; pictures come from outside and age as for the real robot.
         return RobotState(
             previous=self.commanded,
             velocity=self.velocity,

@@ -1,4 +1,4 @@
-"""Alarms at which control holds without an order: a sibling process that is silent, an arm that was moved."""
+"""Alarms on which control holds without an order: missing heartbeats, and a robot that was displaced."""
 
 from __future__ import annotations
 
@@ -21,17 +21,20 @@ _HELD_ELSEWHERE = Pattern(
     " shown, then set up again",
 )
 
-_AGREES_S = 1.0  # that a joint reads where it is told to be, before its readings lead its command again
+_AGREES_S = 1.0  # [s] of agreement with the command before readings may move it again
 _THERE = 1e-6  # [rad]
-_LATELY_S = 1.0  # ago a command that moved went away from a joint that was blocked, and not the joint from it
-_MOVED = 0.01  # [rad] of a command that has moved
-_BESIDE = 0.02  # [rad] that an arm under the e-stop is read farther away than it hangs
-_RESTLESS, _STILL_S = 0.1, 0.3  # [rad/s], [s] of readings that rest, or slip slowly
-_VERDICTS = 3  # ways that readings said nothing of, after which a joint is not led again
+_LATELY_S = 1.0  # [s] within which a command may have moved away from a blocked joint
+_MOVED = 0.01  # [rad] least change of a command that counts as motion
+_BESIDE = 0.02  # [rad] added to `sagged` for an arm under the e-stop
+_RESTLESS, _STILL_S = 0.1, 0.3  # [rad/s], [s]: readings that are at rest, or drift slowly
+_VERDICTS = 3  # inconclusive convergences after which a joint is distrusted
 
 
 def stale_heartbeat(shared: SharedState, now: float, allowed: Callable[[str], float]) -> str:
-    """The process whose heartbeat is older than it is `allowed` to be [s], in a sentence; "" where none is."""
+    """Return a message about the process with an expired heartbeat, "" if there is none.
+
+    `allowed` is the timeout of a process [s], by name.
+    """
     for process in ("coordinator", "guard"):
         if not shared.alive(process, now, allowed(process)):
             return _SIBLING_SILENT(process=process, since=shared.describe_silence(process, now))
@@ -39,19 +42,18 @@ def stale_heartbeat(shared: SharedState, now: float, allowed: Callable[[str], fl
 
 
 class DisplacementMonitor:
-    """Notices a robot that is far from where it is told to hold, and leads what is held to where it is.
+    """Monitor of the displacement of a holding robot; it moves the hold target to the measured position.
 
-    It was moved by hand, switched off, or its node was restarted: to send the old target would make it move by
-    itself, and so would what moved it before it was not seen for a time. One sample says nothing: it is there when
-    several agree (`JointPlausibility.is_displaced`).
+    A displaced robot was moved by hand, switched off, or its node was restarted, perhaps during an outage of the
+    measurements: to send the old target would move it unexpectedly. A single sample is not enough: several must agree
+    (`JointPlausibility.is_displaced`).
 
-    An encoder that is off looks like that, but its joint follows the command, and its readings keep their distance. So
-    no command follows a joint that leapt before the two have agreed for _AGREES_S, nor one a second time that has kept
-    its distance: that one is followed again after a set-up, for the operator to look.
+    An encoder with an offset looks the same, but its joint follows the command, so that the displacement remains. So
+    the command does not follow a joint that leapt until both have agreed for _AGREES_S. If a displacement remains after
+    the command has followed it, it is not followed again before a set-up, because the operator must check the robot.
 
-    A held arm may be as far from its target as it is allowed to follow late. Under the e-stop an arm that rests
-    somewhere else is led from 0.1 rad on: one whose drive is off has sagged, and would spring back when it is switched
-    on.
+    A held arm may be displaced by the permitted following error. Under the e-stop, an arm at rest is followed from
+    0.1 rad on: if its drive is off it has sagged, and would jump back when it is switched on.
     """
 
     def __init__(self, settings: TickSettings, plausibility: JointPlausibility) -> None:
@@ -59,36 +61,35 @@ class DisplacementMonitor:
         self._plausibility = plausibility
         self._angles = settings.limits.position_mask
         dim = len(settings.limits.names)
-        self._followed = np.zeros(dim, bool)  # their command was led to where they were read
-        self._unsaid = np.zeros(dim, np.int64)  # how often readings said nothing on that way
-        self._along = np.zeros(
-            dim, np.int64
-        )  # parts in which they went along, since a hand was seen to move them
-        self._off = np.zeros(dim, bool)  # they were somewhere else again then
-        self._apart_at = np.full(dim, float("-inf"))  # when each was last read away from its command
-        self._meeting = False  # a set-up takes the robot over where it is read, and not yet there
-        self.goal: Float64 | None = None  # where the command is being led to
+        self._followed = np.zeros(dim, bool)  # joints to whose readings the command was moved
+        self._unsaid = np.zeros(dim, np.int64)  # number of such moves without a conclusion
+        # Parts in which readings moved with the command, since a hand was last proven.
+        self._along = np.zeros(dim, np.int64)
+        self._off = np.zeros(dim, bool)  # joints that were displaced again after that: distrusted
+        self._apart_at = np.full(dim, float("-inf"))  # last time that each joint was displaced
+        self._meeting = False  # a set-up converges to the measured joints, and is not finished
+        self.goal: Float64 | None = None  # position to which the command is moved
         self._goal_at_first: Float64 = np.zeros(dim)
-        self._restless_at = np.full(dim, float("-inf"))  # when the readings of each last moved
-        self._led: Led | None = None  # how far, while it is
-        self._blind = np.zeros(dim, bool)  # joints that are led there without a look whether they go along
-        self._moved_at = np.full(dim, float("-inf"))  # when each command last moved, but for being led
+        self._restless_at = np.full(dim, float("-inf"))  # last motion of each joint's readings
+        self._led: Led | None = None  # the convergence in progress
+        self._blind = np.zeros(dim, bool)  # joints that converge without checking their encoder
+        self._moved_at = np.full(dim, float("-inf"))  # last motion of each command other than by convergence
         self._moved_from: Float64 = np.full(dim, np.nan)
-        self._proven_at = np.full(dim, float("-inf"))  # when it was last seen that a hand moves each
-        self.begins = False  # whether it has been since this tick
-        self._doubt = ""  # which joints are not followed since this tick, and why
+        self._proven_at = np.full(dim, float("-inf"))  # last proof that a hand moves each joint
+        self.begins = False  # a convergence began in this tick
+        self._doubt = ""  # message about joints distrusted since the last report
 
     def pop_untrusted_reason(self) -> str:
-        """The joints that are not followed since it was asked last, and why; "" for none."""
+        """Return a message about joints distrusted since the last call; "" if there are none."""
         doubt, self._doubt = self._doubt, ""
         return doubt
 
     def __call__(
         self, robot: RobotActuator, seen: LatestObservation, now: float, held: bool, stopped: bool = False
     ) -> Float64 | None:
-        """Goal of the command [D] if the robot is too far from where it is `held`; None where all is well.
+        """Return the new command [D] if the robot is too far from where it is `held`, None if it is not.
 
-        `stopped`: by the e-stop.
+        Call once per tick. `stopped`: the e-stop holds it.
         """
         self.begins = False
         self._note_moves(robot, now)
@@ -100,7 +101,7 @@ class DisplacementMonitor:
         if not (held or (returned and robot.engaged)) or self._settings.safety.report_only:
             self.goal = None
             return None
-        if self.goal is not None:  # joints that are pushed on, past it or back, are left where they are
+        if self.goal is not None:  # joints that are pushed beyond the goal, or back, are left where they are
             on = (self.goal - robot.commanded) * (measured - robot.commanded) > 0.0
             assert self._led is not None
             along = self._angles & self._led.look(
@@ -127,7 +128,8 @@ class DisplacementMonitor:
             if self._exceeds(robot, where, allowed):
                 limits = self._settings.limits
                 goal = np.clip(self.substitute_untrusted(robot, where), limits.lower, limits.upper)
-                # What hangs by its error alone stays: it would sink by it each time that another joint is led.
+                # A joint displaced by its servo error only stays: otherwise it would sink by that error at each
+                # convergence.
                 least = np.where(still, safety.sagged, allowed) if stopped else safety.sagged
                 self.goal = np.where(np.abs(where - robot.commanded) > least, goal, robot.commanded)
                 self._goal_at_first = self.goal
@@ -136,15 +138,15 @@ class DisplacementMonitor:
         return None if self.goal is None or self._led is None else self._led.end(self.goal)
 
     def distance(self, robot: RobotActuator, measured: Float64) -> float:
-        """Distance of the farthest joint from its command [rad]."""
+        """Return the displacement of the joint that is farthest from its command [rad]."""
         return float(np.abs(measured - robot.commanded).max(where=self._angles, initial=0.0))
 
     def substitute_untrusted(self, robot: RobotActuator, measured: Float64) -> Float64:
-        """`measured` [D], and where it is told to be for a joint whose readings are not followed."""
+        """Return `measured` [D], with the commanded position of distrusted joints."""
         return np.where(self._distrusted, robot.commanded, measured)
 
     def update_target(self, robot: RobotActuator, measured: Float64) -> None:
-        """The command is about to be led to `measured` [D]: `doubt` names the joints for which it was before."""
+        """Record that the command is about to move to `measured` [D]; distrust joints that it followed before."""
         where = self.substitute_untrusted(robot, measured)
         away = self._angles & (np.abs(where - robot.commanded) > self._settings.safety.sagged)
         off = away & self._followed
@@ -160,7 +162,10 @@ class DisplacementMonitor:
         )
 
     def reason(self, robot: RobotActuator, measured: Float64 | None) -> str:
-        """Why no motion may begin from what is held, "" where one may; `measured` [D], None where not known."""
+        """Return why no motion may begin from the commanded position, "" if it may.
+
+        `measured` [D] is None if unknown.
+        """
         if measured is None or not robot.engaged or not self._settings.checks_measurements:
             return ""
         led = self._distrusted | (self._meeting or self.goal is not None)
@@ -177,24 +182,24 @@ class DisplacementMonitor:
 
     @property
     def speed(self) -> Float64:
-        """Velocity at which the command is led [D]: as motions of ours, and as a hand moves what is proven."""
+        """Velocity limit of the convergence [D]: that of generated motions, full for proven joints."""
         whole = False if self._meeting or self._led is None else self._led.whole
         return self._settings.limits.velocity * np.where(
             whole, 1.0, self._settings.safety.motion_velocity_scale
         )
 
     def converge_to_measured(self) -> None:
-        """Lead what is held to where joints are read, also those that leapt: the operator wants it there."""
+        """Move the hold target to the measured joints, including untrusted ones: the operator has asked for it."""
         self.trust_all_joints()
         self._meeting = True
 
     def stop_converging(self) -> None:
-        """Lead on no further for a set-up that is over: where the encoder is off, that would move the robot."""
+        """Stop moving the hold target when the set-up has ended; with an encoder offset it would move the robot."""
         if self._meeting:
             self._meeting, self.goal = False, None
 
     def trust_all_joints(self) -> None:
-        """Follow all joints again."""
+        """Trust all joints again."""
         for joints in (self._followed, self._off, self._plausibility.leapt):
             joints[:] = False
         self._unsaid[:], self._along[:] = 0, 0
@@ -208,8 +213,9 @@ class DisplacementMonitor:
         self._led = Led(robot.commanded, measured, speed, now, at_once=at_once, along=self._along)
 
     def _finish(self, robot: RobotActuator) -> None:
-        """The command has been led to its goal. A joint that went alone is led again, one whose readings said nothing
-        a few times.
+        """End a convergence.
+
+        A joint that was proven to move on its own may be followed again, one without a conclusion a few times.
         """
         assert self._led is not None
         verdict = np.where(self._blind, 1, self._led.verdict)
@@ -235,12 +241,12 @@ class DisplacementMonitor:
         return far and self._plausibility.is_displaced(robot.commanded, allowed, self._distrusted)
 
     def _still(self, now: float) -> np.ndarray:
-        """The joints whose readings rest, bool [D]."""
+        """Return the joints whose readings are at rest, bool [D]."""
         self._restless_at[np.abs(self._plausibility.speed()) > _RESTLESS] = now
         return now - self._restless_at >= _STILL_S
 
     def _compare(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
-        """Follow those joints again that agree with their command."""
+        """Trust those joints again that agree with their command."""
         if not robot.engaged:
             self.trust_all_joints()
             self.goal = None

@@ -1,4 +1,4 @@
-"""Behaviours of a robot that follows no plan, tick by tick: keep silent, hold, move, obey the e-stop."""
+"""Behaviours without a plan: disengaged, node-driven, hold, move, e-stop."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from runtime.safety.filter import Path
 
 
 class Target(NamedTuple):
-    """Target of a behaviour for one tick: float64 [D], and how strictly it is to be judged.
+    """Target of a behaviour for one tick, float64 [D], with the limits that apply.
 
-    `path` None is a braking or held target, which is sent as it is: refusing it would leave nothing to send.
+    `path` None marks a braking or held target, which safety does not check: a refusal would leave nothing to send.
     """
 
     action: Float64
     source: ControlSource
     path: Path | None
     contributions: Contributions = ()
-    velocity: Float64 | None = None  # at the end of the tick, where it is not that on the way there
+    velocity: Float64 | None = None  # at the end of the tick, if it differs from the mean
 
 
 class Behaviour(ABC):
-    """One way of filling ticks."""
+    """Source of targets, one per tick."""
 
     name: str
-    moving = False  # whether the robot is meant to be in motion
+    moving = False  # whether the robot should be in motion
 
     @abstractmethod
     def target(self, step: int, elapsed: float) -> Target | None:
-        """Target of tick `step`, `elapsed` seconds after the one before; None where nothing is to be sent.
+        """Return the target of tick `step`, `elapsed` seconds after its predecessor; None if nothing is sent.
 
-        `elapsed` is what limits may use: after a stall a motion goes on where it was, it does not catch up.
+        `elapsed` is clipped for limits: after a stall a motion continues where it was, and does not catch up.
         """
 
 
 class Disengaged(Behaviour):
-    """Sends nothing: before the first set-up the robot is not ours."""
+    """Behaviour that sends nothing: before the first set-up the robot is not under our control."""
 
     name = "silent"
 
@@ -51,7 +51,7 @@ class Disengaged(Behaviour):
 
 
 class NodeDriven(Behaviour):
-    """Sends nothing because the node drives the robot by its own leader; whatever stops us takes that back."""
+    """Behaviour that sends nothing, because the node drives the robot by its own leader; any stop ends that."""
 
     name = "yield"
     moving = True
@@ -61,7 +61,7 @@ class NodeDriven(Behaviour):
 
 
 class Hold(Behaviour):
-    """Comes to a stand and sends the held target on every tick: some nodes move when we fall silent."""
+    """Behaviour that brakes and then sends the held target on every tick: some nodes move if commands stop."""
 
     name = "hold"
 
@@ -71,7 +71,7 @@ class Hold(Behaviour):
 
     @property
     def at_rest(self) -> bool:
-        """True if it has come to a stand."""
+        """Whether braking has ended."""
         return self._time >= self._brake.duration
 
     def target(self, step: int, elapsed: float) -> Target:
@@ -80,9 +80,9 @@ class Hold(Behaviour):
 
 
 class MoveTo(Behaviour):
-    """Comes to a stand, then runs a trajectory of ours; its time goes on only with what was sent.
+    """Behaviour that brakes, then executes a generated trajectory; its time advances only with sent commands.
 
-    `speed` is the part of the speed of such motions that it was planned with.
+    `speed` is the share of the speed of generated motions with which it was planned.
     """
 
     name = "motion"
@@ -103,7 +103,7 @@ class MoveTo(Behaviour):
         return Target(self._motion.at(self._next - self._brake.duration), "motion", "motion")
 
     def advance(self) -> None:
-        """The newest target was sent, and not refused."""
+        """Record that the newest target was sent and not refused."""
         self._time = self._next
 
     @property
@@ -112,35 +112,35 @@ class MoveTo(Behaviour):
 
 
 class EStopHold(Behaviour):
-    """Sends where the robot comes to rest, or the last command where that is not known.
+    """Behaviour that sends the position at which the robot comes to rest, or the last command if that is unknown.
 
-    Joints that stood within their steady error keep their command. The others go along with the measurement for
-    `_FOLLOWS_S`, while the arm comes to rest, as far beside it as they last stood from their command and no farther
-    from where they were first seen than coming to rest takes, and then keep that: an arm that is sent its own
-    measurement sinks under its weight. `position` float64 [D], None before the robot was ever measured: nothing is
-    sent then. `rest` [D]: the distance within which it could come to rest.
+    Joints within their steady error keep their command. The command of the others follows the measurement for
+    `_FOLLOWS_S`, while the arm comes to rest: with the offset of their last steady error, and within the stopping
+    distance of the first measurement. After that it is constant: an arm that is sent its own measurement sinks under
+    its weight. `position` float64 [D] is None if the robot was never measured: nothing is sent then. `rest` [D] is
+    the stopping distance.
     """
 
     name = "estop"
     _FOLLOWS_S = 0.5
-    _SLACK = 0.05  # [rad] beyond the distance to rest: what a command is ahead of a robot that follows it
+    _SLACK = 0.05  # [rad] added to the stopping distance: lead of a command over the robot that follows it
 
     def __init__(self, position: Float64 | None, rest: Float64, captured: float = float("-inf")) -> None:
-        """`captured`: the newest sample of the joints when it was pressed [s]."""
+        """`captured`: capture time of the newest joints when the e-stop was pressed [s]."""
         self.position = position
         self.rest = rest
         self.captured = captured
-        self.kept: np.ndarray | None = None  # joints that keep their command, bool [D]; None until it is seen
-        self._first: Float64 | None = None  # where it was seen first since it was pressed
+        self.kept: np.ndarray | None = None  # joints that keep their command, bool [D]; None until measured
+        self._first: Float64 | None = None  # first measurement after the press
         self._time = 0.0
 
     @property
     def was_measured(self) -> bool:
-        """True if the robot was seen since the e-stop was pressed."""
+        """Whether the robot was measured after the e-stop was pressed."""
         return self._first is not None
 
     def update_measured(self, position: Float64) -> None:
-        """Take the measured position of a robot that comes to rest, no farther than it could go."""
+        """Set the position to the measurement of a robot that comes to rest, within its stopping distance."""
         self._first = position if self._first is None else self._first
         farthest = self.rest + self._SLACK
         self.position = np.clip(position, self._first - farthest, self._first + farthest)
@@ -150,12 +150,12 @@ class EStopHold(Behaviour):
         self._first = self.position = position
 
     def release(self) -> None:
-        """Nothing is sent until it is measured anew."""
+        """Send nothing until the robot is measured again."""
         self.position = None
 
     @property
     def is_settling(self) -> bool:
-        """True while the arm may still be coming to rest."""
+        """Whether the arm may still be coming to rest."""
         return self._time <= self._FOLLOWS_S
 
     def target(self, step: int, elapsed: float) -> Target | None:

@@ -1,4 +1,4 @@
-"""A run as control executes it: its plan, how chunks join it, and what it means when nothing is planned."""
+"""Execution of a run: its timeline, merging of chunks, and starvation."""
 
 from __future__ import annotations
 
@@ -38,20 +38,24 @@ _FIRST_ACTION_FAR = Pattern(
     "control.first_action_far",
     "{joint}: the first action is {distance:.2f} rad from where the robot stands",
 )
-_JOINED_AT_ONCE = 0.05  # [rad] that a run's first action may be off without being blended in
-_ONE_BY_ONE: tuple[Mode, ...] = ("step", "preview")  # a person asks for each chunk
+_JOINED_AT_ONCE = 0.05  # [rad] offset of a run's first action that is not blended in
+_ONE_BY_ONE: tuple[Mode, ...] = ("step", "preview")  # a person requests each chunk
 
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """The merging half of a strategy, and its kind."""
+    """The merge half of a strategy, with its kind."""
 
     kind: str
     merge: Merge
 
 
 def build_strategy(section: Mapping[str, Any], dims: DimensionKinds) -> Strategy:
-    """The strategy of a deployment's section `strategy`; ConfigurationError where it is none."""
+    """Return the strategy of a deployment's section `strategy`.
+
+    Raises:
+        ConfigurationError: unknown kind or invalid parameters.
+    """
     known = variants("runtime.strategies")
     kind = section.get("kind")
     if not isinstance(kind, str) or kind not in known:
@@ -67,9 +71,9 @@ def build_strategy(section: Mapping[str, Any], dims: DimensionKinds) -> Strategy
 
 
 class JoinResult(NamedTuple):
-    """Result of joining a chunk; `far` says how far from where the robot stood it began, "" where it is near.
+    """Result of joining a chunk; `distance_note` describes a distant start, "" if it was near.
 
-    `too_far`: it was not used for that.
+    `too_far`: the chunk was dropped for that reason.
     """
 
     merged: ChunkMerged
@@ -78,7 +82,7 @@ class JoinResult(NamedTuple):
 
 
 class ExecuteChunks(Behaviour):
-    """Executes the timeline of one run; None for a step that nothing is planned for."""
+    """Behaviour that executes the timeline of one run."""
 
     name = "follow"
     moving = True
@@ -90,14 +94,13 @@ class ExecuteChunks(Behaviour):
         self._source: ControlSource = "teleop" if mode == "collect" else "policy"
         self._strategy = chosen
         self._settings = settings
-        self._switched = False  # the kind of the strategy, since the last chunk that was merged
-        # For the first chunk of all, or after a wait: no starvation yet, the policy's deadline bounds it.
+        self._switched = False  # kind of strategy changed since the last merged chunk
+        # Before the first chunk, or after a wait, nothing starves: the policy's deadline limits it.
         self._expecting = True
-        self._useless = False  # the newest chunk was dropped though the robot had waited for it
+        self._useless = False  # the newest chunk was dropped, although the robot was waiting for it
         self._starved_since: float | None = None
-        self.borne_until = float(
-            "-inf"
-        )  # a lost policy is tried again: an empty plan alone holds nothing before
+        # While a lost policy is retried, an empty plan does not lead to holding.
+        self.borne_until = float("-inf")
 
     def target(self, step: int, elapsed: float) -> Target | None:
         planned = self.timeline.at(step)
@@ -106,7 +109,7 @@ class ExecuteChunks(Behaviour):
         return Target(planned.action, self._source, "policy", planned.contributions)
 
     def ran_on(self, step: int, commanded: Float64) -> bool:
-        """Whether what is planned for `step` has gone on while the robot, told to be at `commanded` [D], stood."""
+        """Return True if the plan for `step` has moved away from `commanded` [D], where the robot stopped."""
         planned = self.timeline.at(step)
         if planned is None:
             return False
@@ -114,28 +117,28 @@ class ExecuteChunks(Behaviour):
         return bool(apart.max(where=self._settings.limits.position_mask, initial=0.0) > _JOINED_AT_ONCE)
 
     def begin_anew(self) -> None:
-        """Forget what is planned: the next chunk is a first one, and the robot waits for it."""
+        """Discard the plan: the next chunk counts as the first, and the robot waits for it."""
         self.timeline.clear()
         self._expecting, self._useless, self._starved_since = True, False, None
 
     # --- chunks --------------------------------------------------------------------------------------------
 
     def tune(self, chosen: Strategy, step: int) -> None:
-        """Merge by another strategy from now on; what is planned from `step` on stays."""
+        """Merge with another strategy from now on; the plan from `step` on is kept."""
         self._switched = self._switched or chosen.kind != self._strategy.kind
         if self._starved_since is None and self.is_waiting and not self.timeline.remaining(step):
-            self._expecting = True  # what the old strategy waited for is no gap of the new one
+            self._expecting = True  # a wait of the old strategy is no gap of the new one
         self._strategy, self._useless = chosen, False
 
     def join(self, chunk: PostedChunk, step: int, commanded: Float64) -> JoinResult:
-        """Let a chunk join the plan from `step`, the first one not yet sent, on; `commanded` [D] was sent last.
+        """Merge a chunk into the plan from `step` (first step not yet sent) on; `commanded` [D] was sent last.
 
-        One that is dropped, for whatever reason, ends the wait for the first; one that the robot waited for and
-        that is of no use ends the waiting. Always dropped is starving.
+        A dropped chunk ends the wait for the first chunk; if the robot waited for it, it ends that wait too. So a
+        policy whose chunks are all dropped starves the run.
         """
         try:
             joined = self._join(chunk, step, commanded)
-        except Exception as error:  # about one chunk: it must not end what keeps the robot held
+        except Exception as error:  # of a single chunk: it must not end the process that holds the robot
             log.exception("chunk %d cannot be used", chunk.chunk_id)
             joined = JoinResult(
                 dropped_chunk(chunk, step, _CHUNK_UNUSABLE(kind=type(error).__name__, error=error))
@@ -153,7 +156,8 @@ class ExecuteChunks(Behaviour):
             chunk.chunk_id, chunk.observation_step, rows.astype(np.float64), chunk.requested_while_stopped
         )
         safety = self._settings.safety
-        # A policy that means to begin elsewhere is told by its first row; a late one has gone on by the first used.
+        # The policy's intention is its first row; if the chunk is late, the first row used is already farther
+        # on.
         begin = arrival.rows[0] if chunk.intended_start is None else chunk.intended_start.astype(np.float64)
         if begin.shape != (dim,):
             return JoinResult(dropped_chunk(chunk, step, _CHUNK_BEGIN(given=list(begin.shape), expected=dim)))
@@ -163,7 +167,7 @@ class ExecuteChunks(Behaviour):
             return JoinResult(dropped_chunk(chunk, step, reason), reason, too_far=True)
         away, where = self._first_used_distance(arrival, step, commanded)
         far, late = _BLENDED_IN(where=where) if away > safety.first_action_far else "", away > safety.jump
-        if late:  # the robot stood where the policy means to begin: no row of it is stale
+        if late:  # the robot was at rest at the policy's intended start: no row is stale
             arrival, far = replace(arrival, requested_while_stopped=True), _BEGUN_LATE(where=where)
             away, where = self._first_used_distance(arrival, step, commanded)
         if away > safety.jump:
@@ -186,14 +190,14 @@ class ExecuteChunks(Behaviour):
         return JoinResult(self._to_message(chunk, merged), far)
 
     def _first_used_distance(self, arrival: ArrivedChunk, step: int, commanded: Float64) -> tuple[float, str]:
-        """The same of the first row that is not stale."""
+        """Return distance and description of the first row that is not stale, as `_first_action_distance`."""
         if not self._expecting:
             return 0.0, ""
         placed = self._strategy.merge.place(self.timeline, arrival, step)
         return self._first_action_distance(placed.rows[0], commanded) if len(placed.rows) else (0.0, "")
 
     def _first_action_distance(self, row: Float64, commanded: Float64) -> tuple[float, str]:
-        """Distance of a run's first action from the robot [rad], and that in words; 0 for later ones."""
+        """Return the distance of a run's first action from the robot [rad], and a description; 0 for later ones."""
         settings = self._settings
         if not self._expecting or settings.safety.report_only:
             return 0.0, ""
@@ -217,7 +221,10 @@ class ExecuteChunks(Behaviour):
         )
 
     def bear(self, until: float) -> None:
-        """A lost policy is tried again until then; while nothing is planned one loss is borne, and not the next."""
+        """Tolerate an empty plan until `until`, because a lost policy is retried.
+
+        While nothing is planned, only one loss is tolerated, and not the next.
+        """
         if self._starved_since is None or self.borne_until < self._starved_since:
             self.borne_until = until
 
@@ -225,7 +232,7 @@ class ExecuteChunks(Behaviour):
 
     @property
     def is_waiting(self) -> bool:
-        """True if an empty timeline is as it should be: the operator, or the strategy, asks when it is."""
+        """Whether an empty timeline is expected: the operator or the strategy then makes the request."""
         if self._useless:
             return False
         return self._expecting or self._one_by_one or self._strategy.merge.requests_while_stopped
@@ -235,7 +242,11 @@ class ExecuteChunks(Behaviour):
         return self._starved_since is not None
 
     def update_starvation(self, now: float) -> float | None:
-        """Nothing is planned for this tick: how long that has been so, 0 when it begins, None while it waits."""
+        """Record that nothing is planned for this tick.
+
+        Returns:
+            Duration of the gap so far [s], 0 on its first tick; None while waiting is expected.
+        """
         if self.is_waiting:
             return None
         if self._starved_since is None:
@@ -243,12 +254,12 @@ class ExecuteChunks(Behaviour):
         return now - self._starved_since
 
     def end_starvation(self, now: float) -> float | None:
-        """An action was sent: how long there was none before it, None where there was no gap."""
+        """End the gap, because an action was sent; return its duration [s], or None if there was none."""
         since, self._starved_since = self._starved_since, None
         return None if since is None else now - since
 
 
 def dropped_chunk(chunk: PostedChunk, step: int, why: str) -> ChunkMerged:
-    """Report of a chunk that control has no use for."""
+    """Return the report of a chunk that control does not use."""
     nowhere = np.full(len(np.atleast_1d(chunk.rows)), -1, np.int64)
     return ChunkMerged(chunk.chunk_id, chunk.run, step, step - chunk.observation_step, nowhere, 0, why)

@@ -1,4 +1,4 @@
-"""One robot, real or simulated: what it does, and the way from what that wants to what the robot is told."""
+"""Command pipeline of a robot, real or simulated: from its behaviour to the command that is sent."""
 
 from __future__ import annotations
 
@@ -47,26 +47,26 @@ _STARVED_AT_ONCE = fixed("control.starved_at_once", "no usable chunk for this st
 _ARRIVED_THERE = fixed("control.arrived", "arrived")
 _NO_ACTION = fixed("control.no_action", "no action for this step: slowing down and holding")
 
-_ARRIVED = 1e-4  # [rad] of a motion's end: it may have been limited on its last steps
-_QUIET_S = 1.0  # without a refusal: the next one is told again
-_BELIEVED_S = 0.5  # for joints that are back to be believed again
-_GAPS, _GAPS_S = 2, 10.0  # for which a run stands within so many seconds; the next one holds
+_ARRIVED = 1e-4  # [rad] distance from the end of a motion, the last steps of which may have been limited
+_QUIET_S = 1.0  # [s] without a refusal after which the next is reported
+_BELIEVED_S = 0.5  # [s] for new joints to become trusted
+_GAPS, _GAPS_S = 2, 10.0  # gaps within so many seconds during which a run waits; at the next it holds
 
 
 @dataclass(slots=True)
 class _Gap:
-    """Gap in the joints for which a run stands."""
+    """Gap in the joint measurements during which a run waits."""
 
-    since: float  # our clock, when the last joints before it were measured [s]
-    unseen: float  # the newest tick without any that are fresh
+    since: float  # capture time of the last joints before it, our clock [s]
+    unseen: float  # newest tick without fresh joints
 
 
 class CommandPipeline:
-    """Behaviour -> target -> locked grippers, those that switch -> safety -> actuator, once per tick.
+    """Behaviour -> target -> locks and binary grippers -> safety -> actuator, once per tick.
 
-    What safety refuses is replaced by the next point of a stop, so that something is sent on every tick; too many
-    refusals, or too long with nothing planned, make it hold for that reason. A run whose joints are too old, and that
-    is all, stands for a moment longer: it goes on by itself where they are back soon, and where they were.
+    A refused action is replaced by the next point of a braking motion, so that a command is sent on every tick. Too
+    many refusals, or starvation, lead to holding for that reason. If the only problem of a run is the age of its
+    joints, it waits a moment longer: it continues by itself if they return soon, and at the same position.
     """
 
     def __init__(
@@ -79,79 +79,79 @@ class CommandPipeline:
         believed: Callable[[], bool],
         known: Callable[[], bool],
     ) -> None:
-        self._believed = believed  # whether the newest joints are
-        self._known = known  # whether any were since they were last missing
+        self._believed = believed  # whether the newest joints are trusted
+        self._known = known  # whether any joints were trusted since they were last missing
         self.actuator = actuator
         self._safety = safety
         self._locks = locks
         self._dwell = Dwell(settings.limits)
         self._settings = settings
         self._report = report
-        self._standing: Hold | None = None  # a stop in place of what could not be sent
-        self._aim: Float64 | None = None  # what was wanted, and judged, at the last tick
-        # Refusals among the last actions: every second one refused is as bad as all of them.
+        self._standing: Hold | None = None  # braking motion that replaces actions that cannot be sent
+        self._aim: Float64 | None = None  # action requested at the last tick, and not refused
+        # Refusals among the last actions: if every second action is refused, that is as bad as all of them.
         self._verdicts: deque[bool] = deque(maxlen=2 * settings.safety.refusals_to_hold)
         self._refused_at = float("-inf")
         self.refused = 0  # in a row
-        self._unseen = 0  # of these the last ones, in a run, whose only fault was the age of the joints
-        self._unseen_since = 0.0  # when the last joints before them were measured [s]
+        self._unseen = 0  # of the refusals in a row, those of a run for old joints alone
+        self._unseen_since = 0.0  # capture time of the last joints before them [s]
         self._gap: _Gap | None = None
-        self._gaps: deque[float] = deque(maxlen=_GAPS)  # when the newest of them began, in this run
+        self._gaps: deque[float] = deque(maxlen=_GAPS)  # start times of this run's last gaps
         self.behaviour: Behaviour = Disengaged()
         if actuator.engaged:
             self.hold_here()
 
-    # --- what it does --------------------------------------------------------------------------------------
+    # --- behaviours ----------------------------------------------------------------------------------------
 
     @property
     def run(self) -> ExecuteChunks | None:
-        """The run it executes, None where it does something else."""
+        """The run that is executed, None if the behaviour is another."""
         return self.behaviour if isinstance(self.behaviour, ExecuteChunks) else None
 
     @property
     def is_stationary(self) -> bool:
-        """True if the robot is to stay where it is: it holds, or its run has come to a stand."""
+        """Whether the robot should stay where it is: it holds, or its run has braked to rest."""
         waits = self.run is not None and self._standing is not None and self._standing.at_rest
         return waits or isinstance(self.behaviour, Hold)
 
     def disengage(self) -> None:
-        """Send nothing any more: the robot is not ours."""
+        """Stop sending: the robot is no longer under our control."""
         self._standing = None
         self.actuator.disengage()
         self.behaviour = Disengaged()
 
     def yield_to_node(self) -> None:
-        """Leave the robot to its node."""
+        """Disengage, and let the node drive the robot."""
         self.disengage()
         self.behaviour = NodeDriven()
 
     def hold(self) -> None:
-        """Come to a stand and stay there; who is not engaged stays silent, the node stops what it drives."""
+        """Brake and hold; a node-driven robot is disengaged, and its node then stops it."""
         if isinstance(self.behaviour, NodeDriven):
             self.disengage()
         elif self.actuator.engaged and not isinstance(self.behaviour, Hold):
             self.behaviour = self._standing or self._new_hold()
 
     def hold_here(self) -> None:
-        """Hold anew, from the last command on."""
+        """Start a new hold from the last command."""
         self._standing = None
         self.behaviour = self._new_hold()
 
     def release(self) -> None:
-        """The e-stop is over: hold, or be silent where the robot was never ours."""
+        """End the e-stop: hold, or stay disengaged if the robot was not engaged."""
         self.behaviour = self._new_hold() if self.actuator.engaged else Disengaged()
 
     def hold_because(self, kind: str, reason: str) -> None:
-        """Hold for a reason of control's own, and say so."""
+        """Hold for a reason of control's own, and emit it as an event; nothing if not moving."""
         if self.behaviour.moving:
             self.hold()
             self._report.emit(kind, reason)
 
     def move(self, goal: Float64, speed: float) -> None:
-        """Come to a stand, then go to `goal` at `speed`, a part of the speed of motions of ours.
+        """Brake, then move to `goal` [D] at `speed`, a share of the speed of generated motions.
 
-        Dimensions that are NaN stay where they come to a stand, and what is a speed ends at 0. Binary grippers are
-        open or closed at its end, and switch at its beginning.
+        Dimensions that are NaN stay where they stop, and speeds end at 0. Binary grippers end open or closed, and
+        switch at the beginning.
         """
         self._begin()
         self._start_motion(snap_grippers(self._settings.switches, goal, self.actuator.commanded), speed)
@@ -162,7 +162,7 @@ class CommandPipeline:
         self.behaviour = run
 
     def on_locks_changed(self) -> None:
-        """Locks have changed: a stop must not go on to where an unlocked gripper was before, it begins anew."""
+        """Restart the current stop or motion, so that it does not use the previous positions of grippers."""
         self._standing = None
         if isinstance(self.behaviour, Hold):
             self.hold_here()
@@ -180,7 +180,7 @@ class CommandPipeline:
         brake = self.actuator.braking_motion()
         start = brake.at(brake.duration)
         goal = limits.with_zero_speeds(np.where(np.isnan(goal), start, goal))  # a copy
-        if turning := list(self._settings.dims.wrapping):  # endless joints go the shorter way
+        if turning := list(self._settings.dims.wrapping):  # endless joints turn the shorter way
             goal[turning] = (start + difference(goal, start, turning))[turning]
         top = limits.velocity * safety.motion_velocity_scale * speed
         begin = np.where(limits.binary, goal, start)
@@ -193,7 +193,7 @@ class CommandPipeline:
     # --- one tick ------------------------------------------------------------------------------------------
 
     def tick(self, step: int, planned: float, seen: LatestObservation) -> TickResult:
-        """Tell the robot what the behaviour wants, as far as locks and safety let it pass."""
+        """Send the behaviour's target, as far as locks and safety permit."""
         before = self.actuator.commanded
         sent = self._drive(step, planned, seen)
         if sent.executed is not None:
@@ -211,7 +211,7 @@ class CommandPipeline:
             return self._nothing_planned(step, planned, seen)
         if target.path is None:
             sent = self._send_hold(step, planned, target, seen)
-            self._standing = None  # what is sent now is another stop: the old one must not go on later
+            self._standing = None  # another stop is sent now: the old one must not continue later
         else:
             sent = self._judge(step, planned, target, seen)
         if isinstance(self.behaviour, MoveTo):
@@ -234,7 +234,7 @@ class CommandPipeline:
         )
 
     def _send_hold(self, step: int, planned: float, target: Target, seen: LatestObservation) -> TickResult:
-        """Send a braking or held target as it is; a gripper that is locked elsewhere goes there within its limits."""
+        """Send a braking or held target without check; a gripper locked elsewhere moves there within its limits."""
         self._aim = None
         action = target.action
         notes: tuple[str, ...] = ()
@@ -247,14 +247,17 @@ class CommandPipeline:
         return self.actuator.send(step, planned, target, action, notes)
 
     def _to_lock(self, locked: Float64, seen: LatestObservation, planned: float) -> Float64:
-        """Towards where grippers are locked [D], as fast as motions of ours; to a stand while the robot is not seen."""
+        """Move towards the positions of locked grippers [D] within the limits of generated motions.
+
+        Stop instead if the robot's state is unknown.
+        """
         state = self.actuator.state(seen, planned, locked)
         if self._safety.unknown_state_reason(state):
             locked, state = state.previous, replace(state, previous_target=None)
         return self._safety.reachable(locked, state, "motion")
 
     def _approach(self, where: Float64, seen: LatestObservation, planned: float) -> Float64:
-        """Towards where the e-stop holds the robot, as fast as it moves; a base stands at once."""
+        """Move towards the position that the e-stop holds, within limits; a mobile base stops at once."""
         if not self._settings.checks_measurements:
             return where
         state = self.actuator.state(seen, planned, where)
@@ -263,7 +266,7 @@ class CommandPipeline:
         return reachable
 
     def _apply_locks(self, action: Float64, planned: float) -> tuple[Float64, tuple[str, ...]]:
-        """`action` [D] as far as locks, and what a gripper that switches can be, let it be; and notes on that."""
+        """Return `action` [D] with locked, snapped and dwelling grippers, and notes on the changes."""
         commanded = self.actuator.commanded
         action, locked = self._locks.apply(action)
         action = snap_grippers(self._settings.switches, action, commanded)
@@ -279,7 +282,7 @@ class CommandPipeline:
         seen: LatestObservation,
     ) -> TickResult:
         run, unseen = self.run, self._safety.unseen(self.actuator.state(seen, planned, None))
-        if self._unseen and not self._known():  # back, and not yet believed
+        if self._unseen and not self._known():  # joints are back, and not yet trusted
             unseen = notes[-1]
         self.refused += 1
         self._unseen_since = self._unseen_since if self._unseen else seen.joints_captured
@@ -307,15 +310,15 @@ class CommandPipeline:
     def _wait_for_joints(
         self, run: ExecuteChunks, gap: _Gap, step: int, planned: float, seen: LatestObservation
     ) -> TickResult:
-        """Stand until the joints are seen and believed again; then go on with the next chunk, or hold."""
+        """Brake and wait until joints are fresh and trusted; then continue with the next chunk, or hold."""
         state, why = self.actuator.state(seen, planned, None), ""
         allowed, unseen = self._settings.safety.joint_gap_s, self._safety.unseen(state)
         if unseen:
             gap.unseen = planned
-        missing = gap.unseen - gap.since  # however old those are that come meanwhile
+        missing = gap.unseen - gap.since  # however old the joints are that arrive meanwhile
         if missing > allowed:
             why = _IN_A_ROW(count=self.refused, why=unseen or _BACK_LATE(seconds=missing, allowed=allowed))
-        elif planned - gap.since > allowed + _BELIEVED_S:  # or control itself did not look for so long
+        elif planned - gap.since > allowed + _BELIEVED_S:  # or control itself was stalled for so long
             why = _NOT_BELIEVED(seconds=missing, why=state.implausible_reason or _DISAGREE)
         elif not unseen and not state.implausible_reason and self._believed():
             why = self._elsewhere(state, missing)
@@ -328,7 +331,7 @@ class CommandPipeline:
     def _look_whether_seen(
         self, run: ExecuteChunks, step: int, planned: float, seen: LatestObservation
     ) -> None:
-        """Joints are back before the run waited for them: what was planned meanwhile is not caught up either."""
+        """Discard the plan if joints are back before the run had to wait, but the plan has moved on."""
         state = self.actuator.state(seen, planned, None)
         if (
             not self._safety.unseen(state)
@@ -338,15 +341,15 @@ class CommandPipeline:
             self._go_on(run, planned - self._unseen_since)
 
     def _may_wait(self, planned: float) -> bool:
-        """Whether a run may stand for its joints: not for long ones, nor again and again."""
+        """Return True if a run may wait for its joints: neither for long nor repeatedly."""
         often = len(self._gaps) == _GAPS and planned - self._gaps[0] < _GAPS_S
         return not often and planned - self._unseen_since < self._settings.safety.joint_gap_s
 
     def _elsewhere(self, state: RobotState, missing: float) -> str:
-        """Which joint is not where it was told to stand, "" where all are."""
+        """Return a message about a joint that is not at its commanded position, "" if there is none."""
         limits, allowed = self._settings.limits, self._settings.safety.steady_error
         apart = np.where(limits.position_mask, np.abs(state.measured - state.previous), 0.0)
-        apart[np.isnan(apart)] = np.inf  # nobody knows
+        apart[np.isnan(apart)] = np.inf  # unmeasured joints count as displaced
         worst = int(apart.argmax())
         if apart[worst] <= allowed:
             return ""
@@ -354,7 +357,7 @@ class CommandPipeline:
         return _BACK_ELSEWHERE(seconds=missing, **told)
 
     def _go_on(self, run: ExecuteChunks, missing: float) -> None:
-        run.begin_anew()  # what came meanwhile was meant for joints of before
+        run.begin_anew()  # chunks that arrived meanwhile were planned from earlier joints
         self.refused, self._unseen, self._gap = 0, 0, None
         self._verdicts.clear()
         self._report.emit("joints_back", _JOINTS_BACK(seconds=missing))
@@ -364,7 +367,7 @@ class CommandPipeline:
         if run is None:
             return TickResult(planned)
         unseen = self._safety.unseen(self.actuator.state(seen, planned, None))
-        if unseen and not run.is_waiting:  # nobody can answer without joints
+        if unseen and not run.is_waiting:  # without joints a policy cannot answer
             return self._refuse(step, planned, None, (unseen,), seen)
         self._braking_hold()
         starved = run.update_starvation(planned)
@@ -376,22 +379,25 @@ class CommandPipeline:
         return self._send_braking(step, planned, seen)
 
     def _send_braking(self, step: int, planned: float, seen: LatestObservation) -> TickResult:
-        """Send the next point of a stop instead of what could not be sent."""
+        """Send the next point of a braking motion instead of a missing or refused action."""
         target = self._braking_hold().target(step, self.actuator.elapsed(planned))
         return self._send_hold(step, planned, target, seen)._replace(target=None)
 
     def _braking_hold(self) -> Hold:
-        """The stop that is under way in place of what could not be sent; `hold` goes on with it."""
+        """Return the braking motion that replaces a missing or refused action; start one if none is active.
+
+        `hold()` continues it.
+        """
         if self._standing is None:
             self._standing = self._new_hold()
         return self._standing
 
     def _finish(self, move: MoveTo, sent: TickResult) -> None:
-        """A motion is done when its end has been sent: not refused, and not limited on the way there."""
+        """Advance the motion, and end it when its end was sent without refusal or limiting."""
         if sent.executed is None:
             return
         if sent.refused:
-            self._start_motion(move.goal, move.speed)  # from where it stands, when it may go on
+            self._start_motion(move.goal, move.speed)  # from its present position, when it may continue
             return
         move.advance()
         left = np.where(self._locks.on, 0.0, np.abs(sent.executed - move.goal))

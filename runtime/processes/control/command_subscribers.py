@@ -1,4 +1,4 @@
-"""Subscribers of commands, as far as a transport knows them; a change is an event."""
+"""Check for subscribers of command topics, as far as a transport knows them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ Say = Callable[[str, str, Mapping[str, object]], None]
 
 
 class SubscriberCheck:
-    """Asks the sink now and then who does not take commands; the event has all of them under `unheard`."""
+    """Monitor of command topics without a subscriber: emits an event when they change.
+
+    The event's data lists all of them under `unheard`.
+    """
 
     def __init__(self, shared: SharedState, sink: Sink, say: Say) -> None:
         self._shared_state, self._sink, self._say = shared, sink, say
@@ -26,7 +29,7 @@ class SubscriberCheck:
         self._told: dict[str, str] = {}
 
     def poll(self, now: float) -> None:
-        """One tick; a coordinator that was started anew is told again."""
+        """Check, if due; the state is reported again to a restarted coordinator."""
         if self._shared_state.last_beat("coordinator") == 0.0:
             self._told, self._next = {}, now
             return
@@ -35,7 +38,7 @@ class SubscriberCheck:
         self._next = now + _EVERY_S
         try:
             unheard = self._sink.missing_subscribers()
-        except RuntimeFault as error:  # commands go out all the same
+        except RuntimeFault as error:  # commands are sent all the same
             unheard = {"": str(error)}
         if unheard == self._told:
             return

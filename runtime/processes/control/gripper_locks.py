@@ -1,4 +1,4 @@
-"""Grippers that stay where they are locked, whatever is asked of them."""
+"""Locks that hold grippers at a position, whatever is commanded."""
 
 from __future__ import annotations
 
@@ -21,21 +21,19 @@ _SAME = 1e-9
 
 
 class GripperLocks:
-    """Replaces locked dimensions of an action, after the plan and before safety."""
+    """Locks of grippers, applied to an action after the plan and before safety."""
 
     def __init__(self, limits: Limits, switches: tuple[BinaryGripper, ...] = ()) -> None:
         self._limits = limits
         self._switches = switches
         self._notes: dict[int, str] = {}
-        self.values: Float64 = np.full(
-            len(limits.lower), np.nan
-        )  # [D] where it is locked, NaN where it is free
+        self.values: Float64 = np.full(len(limits.lower), np.nan)  # [D] locked positions, NaN if unlocked
         self.on = np.zeros(len(limits.lower), bool)  # [D]
 
     def set(self, values: Float64, commanded: Float64) -> str:
-        """Lock grippers at `values` [D], NaN for free, within their limits; why not, "" where it was done.
+        """Lock grippers at `values` [D] within their limits, NaN: unlock. Return why not, "" if done.
 
-        Binary ones are locked open or closed, near their threshold as they are `commanded` [D].
+        Binary grippers are locked open or closed, with hysteresis around `commanded` [D].
         """
         limits = self._limits
         if values.shape != limits.lower.shape or values.dtype.kind != "f":
@@ -53,7 +51,7 @@ class GripperLocks:
         return ""
 
     def apply(self, action: Float64) -> tuple[Float64, tuple[str, ...]]:
-        """`action` [D] with its locked dimensions replaced, and a note for each lock that made a difference."""
+        """Return `action` [D] with locked dimensions replaced, and a note for each lock that changed a value."""
         if not self._notes or action.shape != self.values.shape:
             return action, ()
         replaced = np.where(self.on, self.values, action)

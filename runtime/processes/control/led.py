@@ -1,4 +1,4 @@
-"""A command that is led to where joints are read: first in parts, for an encoder that is off goes along with it."""
+"""Convergence of a command to the measured joints, in parts that reveal an encoder with an offset."""
 
 from __future__ import annotations
 
@@ -6,24 +6,21 @@ import numpy as np
 
 from runtime.core.types import Float64
 
-PART = 0.11  # rad (m) that a joint is led before its readings are looked at
-_REST_S = 0.4  # after each part: what follows a command, late as it may be, has come to a stand
-_SAY = 2  # parts that have to say the same; of three one may be wrong, where a hand stops or begins to pull
-_DRIFTS = (
-    0.1  # [rad/s] by which readings of a slipping encoder go faster or slower after a part than before it
-)
+PART = 0.11  # [rad, m] by which a joint is moved before its readings are evaluated
+_REST_S = 0.4  # [s] after each part, until a robot that follows late is at rest
+_SAY = 2  # parts with the same result; a single one may be wrong, when a hand stops or begins to pull
+_DRIFTS = 0.1  # [rad/s] change of a slipping encoder's speed across a part
 _THERE = 1e-6
 
 
 class Led:
-    """The way of a command to where joints are read, in parts with a rest after each until two of them agree.
+    """Convergence of a command to the measured joints, in parts with a rest after each, until two parts agree.
 
-    Readings of a joint that a hand moves go on as the hand does, whatever its command does. Those of a joint that
-    follows its command, and is read somewhere else by an encoder that is off, go with the command, and stand (or slip
-    on) with it. So what counts is how far readings went in a part beyond what their speeds before and after it make:
-    where that is more than half of the command's way in two parts, the encoder is off. A part after which readings go
-    on at another speed than before, as those of a hand that goes to and fro do, says nothing, but where they came
-    against the command.
+    Readings of a joint that is moved by hand do not depend on its command. Those of a joint with an encoder offset
+    follow the command, and rest (or slip on) with it. So the criterion is how far readings moved in a part beyond
+    their speed before and after it: if that is more than half of the command's motion in two parts, the encoder is
+    off. A part after which the readings' speed has changed, as with a hand that moves to and fro, is inconclusive,
+    unless the readings moved against the command.
     """
 
     def __init__(
@@ -36,11 +33,11 @@ class Led:
         at_once: np.ndarray | bool = False,
         along: np.ndarray | int = 0,
     ) -> None:
-        """From `commanded` [D], while joints are read at `measured` [D] and go at `speed` [D] by themselves.
+        """Start at `commanded` [D], with readings at `measured` [D] that move at `speed` [D] by themselves.
 
-        `at_once`, bool [D]: without parts, or an arm that was switched off and on again would be pulled back meanwhile,
-        and one that is blocked would go on pressing. `along`, int [D]: parts of former ways in which readings went
-        along.
+        `at_once`, bool [D]: joints without parts. A re-energised arm would otherwise be pulled back meanwhile, and a
+        blocked arm would press on. `along`, int [D]: parts of earlier convergences in which readings moved with the
+        command.
         """
         self.at_once = np.broadcast_to(np.asarray(at_once, bool), commanded.shape)
         self.along: np.ndarray = np.zeros(len(commanded), np.int64) + along
@@ -49,31 +46,31 @@ class Led:
 
     def _begin(self, commanded: Float64, measured: Float64, speed: Float64, now: float) -> None:
         self._from, self._read, self._speed, self._at = commanded.copy(), measured.copy(), speed, now
-        self._rests: float | None = None  # since when the command has stood at the end of the part
+        self._rests: float | None = None  # start of the rest at the end of the part
 
     @property
     def alone(self) -> np.ndarray:
-        """Joints whose readings were seen not to go along, bool [D]."""
+        """Joints proven to move independently of the command, bool [D]."""
         return np.asarray(self._alone >= _SAY)
 
     @property
     def verdict(self) -> np.ndarray:
-        """By how many parts more each joint goes along than it does not, int [D]."""
+        """Number of parts in which each joint moved with the command, less those in which it did not, int [D]."""
         return np.asarray(self.along - self._alone)
 
     @property
     def whole(self) -> np.ndarray:
-        """Joints that are led the rest of the way without a rest, bool [D]."""
+        """Joints that converge the remaining distance without a rest, bool [D]."""
         return np.asarray(self.at_once | self.alone)
 
     def end(self, goal: Float64) -> Float64:
-        """How far the command may be led to `goal` now [D]."""
+        """Return how far the command may now be moved towards `goal` [D]."""
         return np.where(self.whole, goal, np.clip(goal, self._from - PART, self._from + PART))
 
     def look(
         self, commanded: Float64, measured: Float64, goal: Float64, speed: Float64, now: float
     ) -> np.ndarray:
-        """The joints, bool [D], whose readings have gone along with the command."""
+        """Evaluate the readings after each part and its rest; return joints that moved with the command, bool [D]."""
         off = np.asarray(self.along >= _SAY)
         if np.abs(self.end(goal) - commanded).max(where=~self.whole, initial=0.0) > _THERE:
             return off

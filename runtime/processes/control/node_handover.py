@@ -1,4 +1,4 @@
-"""Control's words to a node that drives its robot by a leader of its own: begin, end, each said several times."""
+"""Control words to a node with its own leader: begin and end, each sent several times."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 BEGIN, END = "collect_start", "collect_stop"
-_TIMES = 5  # nobody acknowledges them, and the first may be lost while a node is found
+_TIMES = 5  # there is no acknowledgement, and the first may be lost during discovery
 _APART_S = 0.02
 
 
 class NodeHandover:
-    """Says `collect_start` when the robot is left to its node, `collect_stop` when it is not any more.
+    """Sender of `collect_start` when the robot is yielded to its node, and `collect_stop` when that ends.
 
-    `tell` passes a word on and returns why it could not, "" where it did; `say` is told that once per word. `before`:
-    a control that died had left the robot to its node, which is to end.
+    `tell` sends a word and returns why it could not, "" if it did; `say` emits that reason, once per word. `before`:
+    an earlier control process died while the robot was yielded, which must end.
     """
 
     def __init__(
@@ -26,11 +26,11 @@ class NodeHandover:
 
     @property
     def is_repeating(self) -> bool:
-        """True if its word is to be said again."""
+        """Whether the word must be sent again."""
         return self._left > 0
 
     def update(self, yielded: bool, now: float) -> None:
-        """One tick at `now` [s]: the robot is the node's, or is not."""
+        """Update at each tick `now` [s]: `yielded` is whether the robot is node-driven."""
         if yielded is not self._yielded:
             self._yielded = yielded
             self._word, self._left = (BEGIN if yielded else END), _TIMES

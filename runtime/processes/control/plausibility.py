@@ -1,4 +1,4 @@
-"""Plausibility of joint measurements: one bad sample must move no robot."""
+"""Plausibility of joint measurements: a single bad sample must not move the robot."""
 
 from __future__ import annotations
 
@@ -36,48 +36,48 @@ _UNMOVED = Pattern(
     "{joint} has read exactly {value:.4f} rad for {seconds:.1f} s while its command moved {distance:.2f} rad",
 )
 
-UNSEEN_S = 0.5  # without joints: whatever has happened to the robot meanwhile was not seen
-CONSISTENT_S = 0.1  # that samples agree for before they are believed against what was known
-_CONSISTENT = 3  # samples, at least, in that time
-_EXCESS = 2.0  # times its velocity that a joint may be pushed at by hand
-_NOISE = 0.02  # [rad] and [s] by which a sample and its stamp may be off
-_LONGEST_S = 0.05  # without a sample, after which no longer way is believed at once
-_STALL_S = 0.1  # between two looks of ours: it says nothing about the joints
-_BEYOND = 0.1  # [rad] that an arm may rest beyond its limits
+UNSEEN_S = 0.5  # [s] without joints, after which the robot may have been moved unobserved
+CONSISTENT_S = 0.1  # [s] of agreement after which contradicting samples are trusted
+_CONSISTENT = 3  # least number of samples in that time
+_EXCESS = 2.0  # factor on the velocity limit for a joint pushed by hand
+_NOISE = 0.02  # [rad] and [s] error of a sample and of its stamp
+_LONGEST_S = 0.05  # [s] without a sample beyond which the permitted motion does not grow
+_STALL_S = 0.1  # [s] stall of our own between two checks, which does not count as an outage
+_BEYOND = 0.1  # [rad] that an arm may be beyond its limits
 _FROZEN_S, _FROZEN_RAD = 1.0, 0.05
-_LATENCY_S = 0.3  # a robot that stood may take this long to move after its command did
-_TURNS = 3  # times that the last digits of an encoder which is never still went there and back
-_STILL = 5  # samples that are equal, of one that is
-_DIGITS = 1e-3  # [rad] that the last digits of an encoder are worth at most
-_LEAP = 0.1  # [rad] between two samples, from which no joint comes to rest within the next one
-_HARDEST = 100.0  # [rad/s2] that no joint accelerates at
-_SAME = 0.02  # [rad] within which two joints have exchanged their values
+_LATENCY_S = 0.3  # [s] by which a stationary robot may follow its command late
+_TURNS = 3  # reversals in the last digits of an encoder that never rests
+_STILL = 5  # equal samples of an encoder at rest
+_DIGITS = 1e-3  # [rad] largest value of an encoder's last digits
+_LEAP = 0.1  # [rad] between two samples, after which no joint stops within the next sample
+_HARDEST = 100.0  # [rad/s2] greater than the acceleration of any joint
+_SAME = 0.02  # [rad] tolerance for exchanged values of two joints
 _LONGEST_DOUBT_S = 2.0
-_KEPT = 512  # samples: as many that agree are enough, however short their time at a high rate
-_QUIET_S = 1.0  # without a contradiction, after which the next one is a first one
-_GAP_S = 0.15  # between two samples, in which an arm that moves has gone somewhere else
-_EPSILON = 1e-6  # stamps are sums of floats
+_KEPT = 512  # samples that suffice even if they span a short time at a high rate
+_QUIET_S = 1.0  # [s] without a contradiction after which the next counts as the first
+_GAP_S = 0.15  # [s] between two samples in which a moving arm has changed its position
+_EPSILON = 1e-6  # [s] rounding tolerance of stamps
 
 
 class _Sample(NamedTuple):
     joints: Float64  # [D]
     captured: float
-    seen: float  # when control first saw it
+    seen: float  # time at which control received it
 
 
 class _Chain:
-    """Samples each of which can follow the one before; the newest of them."""
+    """Samples, each consistent with its predecessor."""
 
     def __init__(self, first: _Sample, never: str = "") -> None:
         self.samples = deque([first], maxlen=_KEPT)
-        self.never = never  # why it is not believed, however long it lasts
+        self.never = never  # reason to distrust it forever, "" if there is none
 
     @property
     def newest(self) -> _Sample:
         return self.samples[-1]
 
     def recent(self, needed: float) -> list[_Sample]:
-        """The newest samples that span `needed` seconds, [] while there are too few."""
+        """Return the newest samples that span `needed` seconds, [] while there are too few."""
         enough: list[_Sample] = []
         for sample in reversed(self.samples):
             enough.append(sample)
@@ -87,57 +87,58 @@ class _Chain:
         return []
 
     def forget(self) -> None:
-        """Keep the newest sample alone."""
+        """Remove all samples but the newest."""
         newest = self.newest
         self.samples.clear()
         self.samples.append(newest)
 
 
 class JointPlausibility:
-    """Judges each new sample of the joints by those before it.
+    """Plausibility check of each joint sample against earlier samples.
 
-    A sample is believed where no joint is beyond its limits or has moved faster than it can since the last believed
-    one. Samples that contradict that one, and agree with each other for CONSISTENT_S, take its place, later where
-    they contradict each other again and again; a joint that jumped to exactly 0, and joints that exchanged their
-    values, never do. A joint that reads the same number for `_FROZEN_S` while its command moves is frozen. Grippers and
-    speeds are not judged. Nothing can be said of the first samples but that they agree with each other, nor of those
-    after UNSEEN_S without any.
+    A sample is trusted if no joint is beyond its limits or has moved faster than possible since the last trusted
+    sample. Contradicting samples that agree with each other for CONSISTENT_S replace the trusted ones, later if
+    contradictions repeat; never if a joint jumped to exactly 0 or joints exchanged their values. A joint with the
+    same number for `_FROZEN_S` while its command moves is frozen. Grippers and speeds are not checked. The first
+    samples, and those after an outage of UNSEEN_S, can only be checked for agreement with each other.
     """
 
     def __init__(self, limits: Limits, dims: DimensionKinds) -> None:
         self._limits = limits
         self._wrapping = dims.wrapping
         self._places = limits.position_mask
-        self._chain: _Chain | None = None  # what is believed
-        self._other: _Chain | None = None  # what contradicts it
-        self._before: Float64 | None = None  # what was believed before the joints were missing
-        self._missing = 0.0  # how long they were [s]
-        self._needed = CONSISTENT_S  # how long samples have to agree
-        self._contradicted = float("-inf")  # when they last did not
+        self._chain: _Chain | None = None  # trusted samples
+        self._other: _Chain | None = None  # samples that contradict them
+        self._before: Float64 | None = None  # last trusted joints before an outage
+        self._missing = 0.0  # duration of the outage [s]
+        self._needed = CONSISTENT_S  # for how long samples must agree [s]
+        self._contradicted = float("-inf")  # time of the last contradiction
         self._captured = float("-inf")
         self._joints: Float64 = np.zeros(0)
         self._judged: float | None = None
-        self._unseen = 0.0  # how long there has been no sample; a stall of our own counts little [s]
+        self._unseen = 0.0  # time without a sample [s]; a stall of our own is capped
         self._doubt = ""
         self._digits = _LastDigitActivity(len(limits.names))
         self._frozen = _FrozenJointDetector(limits)
-        self.leapt = np.zeros(
-            len(limits.names), bool
-        )  # were believed elsewhere, and no way was seen to there
-        self.dead = ""  # the joints that have read exactly 0 since they came back from somewhere else
+        # Joints that reached their trusted position without a measured path.
+        self.leapt = np.zeros(len(limits.names), bool)
+        self.dead = ""  # joints that read exactly 0 since they returned from elsewhere
 
     def reset_zeros(self) -> None:
-        """The robot is taken over anew: a joint that reads 0 stands there."""
+        """Accept joints at exactly 0: the robot is being engaged anew."""
         self.dead = ""
 
     def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
-        """`seen` with why its joints are not believed; `commanded` float64 [D] of a robot that is being moved."""
+        """Return `seen`, with the reason if its joints are implausible.
+
+        `commanded` float64 [D] is the command of a robot that is being moved, None otherwise.
+        """
         self._unseen += 0.0 if self._judged is None else min(now - self._judged, _STALL_S)
         self._judged = now
         if not seen.measured:
             return seen
-        # A stamp may stay: joints of several messages are as old as the oldest of them. For as long as that, some of
-        # them are not seen.
+        # A stamp may repeat: joints from several messages have the stamp of the oldest. During that time some
+        # of them are unknown.
         fresh = seen.joints_captured != self._captured
         if fresh or (self._unseen <= UNSEEN_S and not np.array_equal(seen.joints, self._joints)):
             self._captured, self._joints = seen.joints_captured, seen.joints
@@ -147,32 +148,32 @@ class JointPlausibility:
 
     @property
     def has_known_sample(self) -> bool:
-        """True if any sample was believed since joints were last missing."""
+        """Whether any sample was trusted since joints were last missing."""
         return self._chain is not None
 
     @property
     def is_settled(self) -> bool:
-        """True if samples have agreed for as long as they have to, up to the newest."""
+        """Whether samples have agreed for the required time, up to the newest."""
         return self._chain is not None and not self._doubt and bool(self._chain.recent(self._needed))
 
     def is_displaced(self, held: Float64, allowed: Float64 | float, but: np.ndarray | bool = False) -> bool:
-        """True if all samples that have to agree are farther than `allowed` [rad] or [D] from `held` [D].
+        """Return True if all samples that must agree are farther than `allowed` ([rad] or [D]) from `held` [D].
 
-        The joints `but`, bool [D], do not count.
+        The joints `but`, bool [D], are ignored.
         """
         lately = self._chain.recent(self._needed) if self._chain and not self._doubt else []
         return bool(lately) and all(self._away(sample.joints, held, allowed, but) for sample in lately)
 
     def pop_outage(self) -> float:
-        """For how long the joints were missing before those that are believed now came [s]; 0 the second time."""
+        """Return the duration of the outage before the trusted joints [s]; 0 on the second call."""
         missing, self._missing = (0.0 if self._chain is None else self._missing), 0.0
         return missing
 
     def median_joints(self, joints: Float64) -> Float64:
-        """The middle of the newest three believed samples, number by number: a spike among them does not count.
+        """Return the median of the newest three trusted samples for each joint, which removes a spike.
 
-        Angles that wrap are counted in the turn of `joints` [D]. After a gap it is `joints` until there are three:
-        those from before it say where the arm was.
+        Wrapping angles are in the turn of `joints` [D]. After a gap, `joints` are returned until there are three
+        samples: the earlier ones are from before the gap.
         """
         newest = [] if self._chain is None else list(islice(reversed(self._chain.samples), _CONSISTENT))
         gaps = [after.captured - before.captured for after, before in pairwise(newest)]
@@ -182,7 +183,7 @@ class JointPlausibility:
         return np.asarray(np.median(lately, axis=0))
 
     def speed(self) -> Float64:
-        """Median velocity [D] between the newest believed samples that have to agree: a step among them is none."""
+        """Return the median velocity [D] between the newest trusted samples; a single step does not count."""
         lately = [] if self._chain is None else self._chain.recent(CONSISTENT_S)
         steps = [
             difference(after.joints, before.joints, self._wrapping)
@@ -201,7 +202,7 @@ class JointPlausibility:
             return beyond
         if self._chain is not None and self._continues(self._chain, sample):
             self._digits.add(difference(sample.joints, self._chain.newest.joints, self._wrapping))
-            if self._other is not None:  # what was believed before does not agree with this one for that long
+            if self._other is not None:  # the trusted samples before contradict this one during that time
                 self._chain.samples.clear()
             self._chain.samples.append(sample)
             self._other = None
@@ -210,7 +211,7 @@ class JointPlausibility:
         return self._contradiction(sample)
 
     def _continues(self, chain: _Chain, sample: _Sample) -> bool:
-        """True if the sample follows what is believed, rather than what contradicts it."""
+        """Return True if the sample continues the trusted samples, rather than those that contradict them."""
         if self._faster(chain.newest, sample).any() or self._drop_to_zero(chain, sample):
             return False
         if self._has_swapped(chain, sample):
@@ -221,7 +222,7 @@ class JointPlausibility:
         )
 
     def _min_travel_time(self, before: _Sample, after: _Sample) -> float:
-        """Least time from one sample to the other, of the joint that needs longest [s]."""
+        """Return the least time between two samples, of the joint that needs longest [s]."""
         moved = np.abs(difference(after.joints, before.joints, self._wrapping)) / self._limits.velocity
         return float(moved.max(where=self._places, initial=0.0))
 
@@ -238,14 +239,14 @@ class JointPlausibility:
             self.dead = "" if self._before is None else self._zeros(self._before, other.samples[0].joints)
             if (
                 self._chain is not None
-            ):  # each was seen soon after the one before: a hand moves through samples
+            ):  # samples were continuous: a hand moves gradually, so a faster change is a leap
                 self.leapt |= self._faster(self._chain.newest, other.samples[0], np.inf)
             self._chain, self._other, self._before = other, None, None
             return ""
         return other.never or stuck or self._jump(sample)
 
     def _contradict(self, now: float) -> None:
-        """Believe less of what contradicts itself again and again."""
+        """Require longer agreement after repeated contradictions."""
         again = now - self._contradicted < max(_QUIET_S, 2.0 * self._needed)
         self._needed = min(2.0 * self._needed, _LONGEST_DOUBT_S) if again else CONSISTENT_S
         self._contradicted = now
@@ -266,14 +267,14 @@ class JointPlausibility:
         )
 
     def _faster(self, before: _Sample, after: _Sample, longest: float = _LONGEST_S) -> np.ndarray:
-        """Which joints cannot have come from one sample to the other, for which they had `longest` [s], bool [D]."""
+        """Return which joints, bool [D], cannot have moved from one sample to the other in at most `longest` [s]."""
         between = max(after.captured - before.captured, after.seen - before.seen, 0.0)
         allowed = _EXCESS * self._limits.velocity * (min(between, longest) + _NOISE) + _NOISE
         moved = np.abs(difference(after.joints, before.joints, self._wrapping))
         return self._places & (moved > allowed)
 
     def _jump(self, sample: _Sample) -> str:
-        """Contradiction of a sample to what was known, in words."""
+        """Describe the contradiction of a sample to the trusted ones."""
         if self._chain is None:
             return _NOT_SEEN_LONG_ENOUGH(seconds=CONSISTENT_S)
         before = self._chain.newest
@@ -287,7 +288,10 @@ class JointPlausibility:
         )
 
     def _permanent_reason(self, sample: _Sample) -> str:
-        """Why samples from this one on are never believed: a question, for numbers alone do not answer it."""
+        """Return why samples from this one on are never trusted, "" if they may be.
+
+        It is phrased as a question, because numbers alone do not decide it.
+        """
         if self._chain is None:
             return ""
         before = self._chain.newest
@@ -298,7 +302,7 @@ class JointPlausibility:
         return ""
 
     def _swapped_joints(self, before: _Sample, after: _Sample) -> str:
-        """The joints whose values are those of each other, as far as they can have moved meanwhile."""
+        """Return the joints that have exchanged their values, within the motion possible meanwhile."""
         away = np.abs(difference(after.joints, before.joints, self._wrapping))
         other = np.flatnonzero(self._places & (away > _SAME))
         apart = np.sort(before.joints[other]) - np.sort(after.joints[other])
@@ -310,7 +314,7 @@ class JointPlausibility:
         return " and ".join(self._limits.names[i] for i in other)
 
     def _has_swapped(self, chain: _Chain, sample: _Sample) -> bool:
-        """True if joints have leapt, no farther than they can but harder, to exactly each other's values."""
+        """Return True if joints leapt, within their velocity but beyond any acceleration, to each other's values."""
         newest, before = chain.newest, chain.samples[-2 if len(chain.samples) > 1 else -1]
         passed = max(sample.captured - newest.captured, _EPSILON)
         onwards = passed / max(newest.captured - before.captured, _EPSILON)
@@ -320,33 +324,33 @@ class JointPlausibility:
         leap = max(_LEAP, _HARDEST * passed * passed)
         if (away > leap)[self._places].sum() < 2:
             return False
-        for least in (leap, _SAME):  # others may be on their way, one of three may have read nearly the same
+        for least in (leap, _SAME):  # others may be moving; one of three may be nearly equal
             which = self._places & (away > least)
             if np.abs(np.sort(newest.joints[which]) - np.sort(sample.joints[which])).max() <= _SAME:
                 return True
         return False
 
     def _stuck(self, chain: _Chain) -> str:
-        """The first joint that has read the same number throughout, far from before, although it was never still."""
+        """Return a message on a joint that reads a constant, far from before, although its encoder never rested."""
         if self._chain is None or len(chain.samples) < _CONSISTENT:
             return ""
         joints = np.array([sample.joints for sample in chain.samples])
         moved = np.abs(difference(joints[-1], self._chain.newest.joints, self._wrapping)) > _SAME
         still = np.ptp(joints, axis=0) == 0.0
         never = self._digits.active
-        if (self._places & ~still).any():  # not all have come to rest
+        if (self._places & ~still).any():  # some are still moving
             never = never | self._digits.changing
         return self._stays(self._places & never & moved & still, joints[-1])
 
     def _stays(self, which: np.ndarray, joints: Float64) -> str:
-        """The first of the joints `which` that jumped and were still at once, "" where there are none."""
+        """Return a message on the first of the joints `which`, which jumped and were constant at once; "" if none."""
         if not which.any():
             return ""
         first = int(which.argmax())
         return _STUCK(joint=self._limits.names[first], value=joints[first])
 
     def _drop_to_zero(self, chain: _Chain, sample: _Sample) -> str:
-        """The joints that jump to exactly 0, and neither come by it on their way nor go back to it."""
+        """Return a message on joints that jump to exactly 0, without passing or returning to it; "" if none."""
         newest = chain.newest
         if not (zeros := self._zeros(newest.joints, sample.joints)) or len(chain.samples) < _CONSISTENT:
             return zeros
@@ -358,7 +362,7 @@ class JointPlausibility:
         return self._zeros(np.where(passes | returns, 0.0, newest.joints), sample.joints)
 
     def _zeros(self, before: Float64, after: Float64) -> str:
-        """The joints that read exactly 0 and were elsewhere before."""
+        """Return a message on joints that read exactly 0 and were elsewhere before; "" if there are none."""
         dead = np.flatnonzero(self._places & (after == 0.0) & (np.abs(before) > _BEYOND))
         if not len(dead):
             return ""
@@ -371,7 +375,7 @@ class JointPlausibility:
 
 
 class TrustingPlausibility(JointPlausibility):
-    """Believes each sample: what moves no robot jumps where its recording begins anew."""
+    """Plausibility that trusts each sample: if no robot moves, a recording jumps when it restarts."""
 
     def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
         if seen.measured:
@@ -387,22 +391,22 @@ class TrustingPlausibility(JointPlausibility):
 
 
 class _LastDigitActivity:
-    """Which joints are never still, in their last digits: they went there and back, and did not come to rest since."""
+    """Detector of joints whose last digits never rest: they reversed several times, and were not constant since."""
 
     def __init__(self, dim: int) -> None:
-        self._step: Float64 = np.zeros(dim)  # the last one that was any
+        self._step: Float64 = np.zeros(dim)  # the last one that was not 0
         self._turns = np.zeros(dim, np.int64)
         self._still = np.zeros(dim, np.int64)
         self._leapt = np.zeros(dim, bool)
         self._changed = np.zeros(dim, np.int64)
 
     def add_step(self, step: Float64) -> None:
-        """The difference of two samples [D], believed or not."""
+        """Add the difference of two samples [D], trusted or not."""
         self._turns += (step * self._step < 0.0) & (np.abs(step) < _DIGITS)
         self._step = np.where(step != 0.0, step, self._step)
 
     def add(self, step: Float64) -> None:
-        """That of two which are believed [D]."""
+        """Add the difference of two trusted samples [D]."""
         self._leapt = np.where(step != 0.0, self.active & (np.abs(step) > _LEAP), self._leapt)
         self.add_step(step)
         self._still = np.where(step == 0.0, self._still + 1, 0)
@@ -411,30 +415,30 @@ class _LastDigitActivity:
 
     @property
     def active(self) -> np.ndarray:
-        """Bool [D]."""
+        """Joints whose last digits never rest, bool [D]."""
         return np.asarray(self._turns >= _TURNS)
 
     @property
     def changing(self) -> np.ndarray:
-        """Which ones were no more still than that while they moved, bool [D]."""
+        """Joints that changed with each of the last samples, bool [D]."""
         return np.asarray(self._changed >= _STILL)
 
     @property
     def leapt(self) -> np.ndarray:
-        """Which ones jumped to a number and have read exactly that for as many samples as say something, bool [D]."""
+        """Joints that jumped to a number and have read exactly that in all samples since, bool [D]."""
         return np.asarray(self._leapt & (self._still >= _CONSISTENT - 1))
 
 
 class _FrozenJointDetector:
-    """Notices a joint whose number stays the same, under fresh stamps, while its command moves."""
+    """Detector of a joint with a constant number, under fresh stamps, while its command moves."""
 
     def __init__(self, limits: Limits) -> None:
         dim = len(limits.names)
         self._limits = limits
         self._last: Float64 = np.full(dim, np.nan)
-        self._since: Float64 = np.zeros(dim)  # when each number was first read
-        self._range: Float64 = np.zeros((2, dim))  # of the command since then
-        self._moved: Float64 = np.zeros(dim)  # when that was last within what says nothing
+        self._since: Float64 = np.zeros(dim)  # first time of each number
+        self._range: Float64 = np.zeros((2, dim))  # range of the command since then
+        self._moved: Float64 = np.zeros(dim)  # last time that the range was too small for a conclusion
 
     def __call__(self, joints: Float64, captured: float, commanded: Float64 | None) -> str:
         if commanded is None:

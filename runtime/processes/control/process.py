@@ -1,4 +1,4 @@
-"""The process that ticks: absolute deadlines, one thread, nothing else."""
+"""Control process: a loop with absolute deadlines in one thread."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _LATENESS_KEPT = 2000
-# Of a deployment, what others make: what is wrong with its modules costs control nothing.
+# Sections for other processes: errors in their modules must not stop control.
 _UNREAD = ("runtime.policies", "runtime.teleoperators", "runtime.cameras", "runtime.kinematics")
 
 
 def make_sink(spec: StationSpec, clock: Clock) -> Sink:
-    """The robot as the transport tells it what to do, not yet connected."""
+    """Return the transport's sink for commands, not yet connected."""
     settings = spec.deployment.transport
     sink: Sink = variants("runtime.transports")[settings.kind].sink(settings, spec.robot, clock)
     return sink
 
 
 def make_publisher(spec: StationSpec) -> PosePublisher | None:
-    """Publisher of the poses of a joint command; None where joints alone are published."""
+    """Return the converter of joint commands to published poses; None if only joints are published."""
     wanted, robot = spec.deployment.publication, spec.robot
     if wanted.space == "joint":
         return None
@@ -59,7 +59,7 @@ def make_publisher(spec: StationSpec) -> PosePublisher | None:
 
 
 def make_tick(spec: StationSpec, shared: SharedState, sink: Sink, now: Callable[[], float]) -> Tick:
-    """The tick of a deployment; the same object in real time and in lockstep."""
+    """Return the tick of a deployment; the same object in real time and in lockstep."""
     deployment, limits = spec.deployment, spec.limits
     merging = variants("runtime.strategies")[deployment.strategy.kind]
     workspace = Workspace(spec.robot, deployment.safety.workspace)
@@ -86,7 +86,7 @@ def make_tick(spec: StationSpec, shared: SharedState, sink: Sink, now: Callable[
 
 
 class Lateness:
-    """Lateness of ticks, over the last `_LATENESS_KEPT` of them."""
+    """Lateness of the last `_LATENESS_KEPT` ticks."""
 
     def __init__(self, status: StatusRecord, scheduling: str) -> None:
         self._status = status
@@ -96,14 +96,14 @@ class Lateness:
         status["scheduling"] = scheduling.encode()
 
     def add(self, lateness: float, missed: int) -> None:
-        """Count one tick."""
+        """Add one tick."""
         self._late[self._count % _LATENESS_KEPT] = lateness
         self._count += 1
         self._ticks += 1
         self._missed += missed
 
     def write(self) -> None:
-        """Renew the figures in control's status; the next tick writes them to the shared state."""
+        """Write the statistics to control's status; the next tick writes that to shared state."""
         status, late = self._status, self._late[: min(self._count, _LATENESS_KEPT)]
         status["ticks"], status["missed"] = self._ticks, self._missed
         if len(late):
@@ -113,7 +113,7 @@ class Lateness:
 
 
 class Loop:
-    """Wakes at start + n * period; a tick that was missed is skipped and counted, never caught up."""
+    """Loop with ticks at start + n * period; a missed tick is skipped and counted, never caught up."""
 
     def __init__(self, tick: Tick, shared: SharedState, clock: Clock, rate: float, scheduling: str) -> None:
         self._tick = tick
@@ -127,10 +127,12 @@ class Loop:
         self._collect_at = 0.0
 
     def tick_once(self) -> None:
-        """Wait for the next deadline and do its tick."""
+        """Wait for the next deadline and execute its tick."""
         deadline = self._start + self._n * self._period
         self._clock.sleep_until(deadline)
         now = self._clock.now()
+        # Absolute deadlines: a late wake-up does not shift later ticks. Whole periods that have passed are
+        # skipped in time and in step number, so that step k stays due at start + k / rate.
         missed = max(0, int((now - deadline) / self._period))
         self._n += missed
         self._step += missed
@@ -147,12 +149,12 @@ class Loop:
 
 
 def main() -> None:
-    """Tick until the supervisor is gone, then hold for a while, then end."""
+    """Tick until the supervisor has ended, then hold for a while, then end."""
     member = join_station("control", pictures=False, unread=_UNREAD)
     spec, shared = member.spec, member.shared
     clock = MonotonicClock()
     for _ in shared.rings["orders"].drain():
-        pass  # given to a predecessor that died: its motions are not ours to finish
+        pass  # for a predecessor that died: its motions must not be continued
     sink = make_sink(spec, clock)
     _connect(sink, clock, member.lifeline)
     tick = make_tick(spec, shared, sink, clock.now)
@@ -169,11 +171,11 @@ def main() -> None:
     )
     hold_then_end(loop, tick, shared, clock, settings.orphan_hold_s)
     sink.close()
-    shared.beat("control", 0.0)  # processes that outlive control need not find out by its silence
+    shared.beat("control", 0.0)  # shows control's end at once, not by an expired heartbeat
 
 
 def hold_then_end(loop: Loop, tick: Tick, shared: SharedState, clock: Clock, seconds: float) -> None:
-    """Take the robot back from its node, and hold what is commanded for so long; where nothing is, nothing is held."""
+    """Take the robot back from its node, and hold the commanded position for `seconds`, if it is engaged."""
     tick.hold_orphaned()
     until = clock.now() + seconds
     loop.tick_once()

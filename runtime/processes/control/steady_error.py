@@ -1,4 +1,4 @@
-"""Steady servo error: how far joints stand from their command while both rest, because of gravity and payload."""
+"""Steady servo error: displacement of joints at rest because of gravity and payload."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from runtime.core.types import Float64
 from runtime.motion.timeline import difference
 from runtime.processes.control.actuator import RobotActuator, TickSettings
 
-_EVERY_S = 0.05  # between samples
-_REST_S = 0.25  # for which command and reading rest in a joint that stands
-_STILL = 1e-3  # [rad] of a command that rests
-_QUIET = 0.01  # [rad] of a reading that rests, noise included
-_WINDOW_S = 1.0  # in which the error of a joint that stands has not grown
-_GROWN = 0.01  # [rad] more than noise
-_TOLD = 0.01  # [rad] of a command that has moved within that time
-_FOLLOWED = 0.3  # of that way, by a joint that something holds up; a free one goes twice as far at least
-_UNSEEN_S = 0.5  # without joints: whatever happened to the robot was not seen
+_EVERY_S = 0.05  # [s] between samples
+_REST_S = 0.25  # [s] for which command and reading of a stationary joint are constant
+_STILL = 1e-3  # [rad] motion of a constant command
+_QUIET = 0.01  # [rad] motion of a constant reading, with noise
+_WINDOW_S = 1.0  # [s] in which a steady error must not grow
+_GROWN = 0.01  # [rad] growth beyond noise
+_TOLD = 0.01  # [rad] least motion of a command in that time
+_FOLLOWED = 0.3  # share of it by which a blocked joint follows at most; a free one twice that at least
+_UNSEEN_S = 0.5  # [s] without joints after which the robot may have been moved
 
 
 class _Sample(NamedTuple):
@@ -30,24 +30,24 @@ class _Sample(NamedTuple):
 
 
 class SteadyError:
-    """Tells an arm that stands below its command from one that is held up by something, or moves.
+    """Distinction of an arm that sags below its command from one that is blocked or moving.
 
-    A command that follows the measurement of an arm that gravity pulls down makes it sink, tick by tick. An error that
-    has lasted is that of the servo, and says nothing about where the arm ought to be. One that has grown within the
-    last second, or came of a command that went on while its joint did not, may be something in the way.
+    A command that follows the measurement of a sagging arm makes it sink, tick by tick. A lasting error is that of
+    the servo, and no reason to move the command. An error that has grown within the last second, or arose while the
+    command moved and its joint did not, may come from an obstacle.
     """
 
     def __init__(self, settings: TickSettings, inherited: bool) -> None:
-        """`inherited`: the command is that of a control that ran before this one."""
+        """`inherited`: the command is that of an earlier control process."""
         self._settings = settings
         self._samples: deque[_Sample] = deque()
         self._inherited = inherited
-        # Of each joint, when it last stood [rad]; NaN before it was seen to stand.
+        # Error of each joint when it was last stationary [rad]; NaN before.
         self.last: Float64 = np.full(len(settings.limits.names), np.nan)
         self._presses = np.zeros(len(self.last), bool)  # joints that did not follow their command, bool [D]
 
     def look(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
-        """Take note of a tick; `measured` [D], None where the joints are not known."""
+        """Update at each tick; `measured` [D] is None if the joints are unknown."""
         if not robot.engaged:
             self._samples.clear()
             self.last[:], self._presses[:] = np.nan, False
@@ -59,14 +59,15 @@ class SteadyError:
             self.last = np.where(standing, error, self.last)
 
     def leave_out(self) -> None:
-        """The command is led to the reading now: that says nothing of how joints follow it."""
+        """Discard samples while the command is moved to the reading: they do not show how joints follow."""
         self._samples.clear()
         self._presses[:] = False
 
     def keeps(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
-        """The joints of which a stop leaves the command as it is, bool [D]: they stand within a steady error of it, or
-        it has rested for so long that nobody knows what moved their readings away. They may be those of an encoder
-        that has slipped: such a command is led (`DisplacementMonitor`).
+        """Return the joints whose command a stop does not change, bool [D].
+
+        Either their error is steady, or the command has been constant for so long that the cause of a displacement is
+        unknown, for example a slipped encoder: `DisplacementMonitor` handles these.
         """
         if self._inherited:
             error = self._error(robot, measured)
@@ -76,7 +77,7 @@ class SteadyError:
         else:
             self._note(robot, measured, now)
             standing, error = self._standing(now)
-            # One that was not seen to stand yet, just after it was taken over, and whose command rests.
+            # Joints not yet known to be stationary, just after engaging, with a constant command.
             lately = [sample.commanded for sample in self._samples if now - sample.time <= _REST_S]
             new = np.isnan(self.last) & (np.ptp(lately, axis=0) <= _STILL) & ~self._presses
             now_off = self._error(robot, measured)
@@ -88,7 +89,7 @@ class SteadyError:
         return np.asarray(standing | self._moved_at_rest(robot, measured, now))
 
     def _moved_at_rest(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
-        """Joints, bool [D], that are farther from a command than by an error, and did not come there by its moves."""
+        """Return the joints, bool [D], displaced by more than a servo error, but not by motion of the command."""
         rested = now - self._samples[0].time >= _WINDOW_S - _EVERY_S if self._samples else False
         far = np.abs(self._error(robot, measured)) > self._settings.safety.sagged
         rests = np.ptp([sample.commanded for sample in self._samples], axis=0) <= _STILL if rested else False
@@ -96,7 +97,7 @@ class SteadyError:
 
     @property
     def known(self) -> Float64:
-        """The error of each joint when it last stood [D]; 0 for one that was not seen to stand."""
+        """Error of each joint when it was last stationary [D]; 0 if it never was."""
         return np.nan_to_num(self.last)
 
     def _note(self, robot: RobotActuator, measured: Float64, now: float) -> None:
@@ -116,7 +117,7 @@ class SteadyError:
         return difference(robot.commanded, measured, self._settings.dims.wrapping)
 
     def _standing(self, now: float) -> tuple[np.ndarray, Float64]:
-        """The joints, bool [D], that stand within a steady error, and that error [D]."""
+        """Return the stationary joints with a steady error, bool [D], and the errors [D]."""
         lately = list(takewhile(lambda sample: now - sample.time <= _REST_S, reversed(self._samples)))
         commands = np.array([sample.commanded for sample in lately])
         errors = np.array([sample.error for sample in lately])

@@ -1,4 +1,4 @@
-"""Telemetry of ticks: control's status to all, events to the coordinator, a record of each tick to media."""
+"""Telemetry of ticks: control's status for all, events for the coordinator, tick records for media."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from runtime.safety.collision import Collision
 _LIMITED_SUM = Pattern("control.limited_sum", "{count} actions were limited, worst: {worst}")
 _NEAR_SUM = Pattern("control.near_sum", "{count} actions came too near, nearest: {nearest}")
 
-StatusRecord = np.ndarray[Any, np.dtype[np.void]]  # of PageLayout.control_dtype, without dimensions
-_TOLD = 1e-4  # [rad] less than that is rounding at a limit, no news
-_QUIET_S = 1.0  # without a change by safety: its sum is told, and the next change is news again
+StatusRecord = np.ndarray[Any, np.dtype[np.void]]  # of SharedStateLayout.control_dtype, without dimensions
+_TOLD = 1e-4  # [rad] smaller changes are rounding at a limit
+_QUIET_S = 1.0  # [s] without a change by safety, after which a sum is reported and the next change is new
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +33,10 @@ class TickState:
     """State of control at the end of a tick."""
 
     robot: Actuator
-    trusted_joints: bool  # where the robot is is known
-    implausible_reason: str  # why what is measured cannot be true, or is not where the robot is held
+    trusted_joints: bool  # the robot's position is known
+    implausible_reason: str  # why measurements are implausible, or not at the commanded position
     behaviour: Behaviour  # the robot's
-    simulating: bool  # the simulated robot follows a run
+    simulating: bool  # the simulated robot executes a run
     simulated: Float64 | None  # [D] the simulated robot's command
     remaining: int  # steps planned after this one
     waiting: bool
@@ -46,7 +46,7 @@ class TickState:
 
 
 class LimitingMonitor:
-    """Tells when safety begins to change what is sent, and how much it did once that is over; never once per tick."""
+    """Monitor of actions limited by safety: reports the beginning, and a sum at the end, not each tick."""
 
     def __init__(self, say: Callable[[str, str], None]) -> None:
         self._say = say
@@ -54,7 +54,7 @@ class LimitingMonitor:
         self._count, self._worst, self._most = 0, 0.0, ""
 
     def update(self, sent: TickResult, now: float) -> None:
-        """One tick."""
+        """Process the result of a tick."""
         if sent.change > _TOLD:
             if not self._count:
                 self._say("limited", sent.limited)
@@ -65,14 +65,14 @@ class LimitingMonitor:
             self.close()
 
     def close(self) -> None:
-        """Whatever was limited is over."""
+        """End the period of limiting, if any, and report its sum."""
         if self._count:
             self._say("limited_sum", _LIMITED_SUM(count=self._count, worst=self._most))
         self._count, self._worst, self._most = 0, 0.0, ""
 
 
 class ProximityMonitor:
-    """Tells when actions begin to bring links near each other, and how near once that is over; never once per tick."""
+    """Monitor of actions that bring links near each other: reports beginning and sum, not each tick."""
 
     def __init__(self, say: Callable[[str, str], None]) -> None:
         self._say = say
@@ -81,7 +81,7 @@ class ProximityMonitor:
         self._nearest: Collision | None = None
 
     def update(self, sent: TickResult, now: float) -> None:
-        """One tick."""
+        """Process the result of a tick."""
         near = sent.near
         if near is not None:
             if self._nearest is None:
@@ -93,14 +93,14 @@ class ProximityMonitor:
             self.close()
 
     def close(self) -> None:
-        """Whatever was near is apart."""
+        """End the period of proximity, if any, and report its sum."""
         if self._count:
             self._say("near_sum", _NEAR_SUM(count=self._count, nearest=self._nearest))
         self._count, self._nearest = 0, None
 
 
 class Telemetry:
-    """Gathers what a tick has to say, hands it over at its end; a full ring is counted, never waited for."""
+    """Collector of a tick's messages, sent at its end; if a ring is full, messages are lost and counted."""
 
     def __init__(self, shared: SharedState) -> None:
         self._shared_state = shared
@@ -108,29 +108,29 @@ class Telemetry:
         self._records_lost = 0
         self._step, self.planned = -1, 0.0
         self._woke: float | None = None
-        self._corrected = float("-inf")  # when the last check last changed something
-        self._smoothed: Float32 | None = None  # of this tick: what was wanted before safety
+        self._corrected = float("-inf")  # time of the last change by the command limiter
+        self._smoothed: Float32 | None = None  # this tick's action before safety
         self.status: StatusRecord = np.zeros((), shared.layout.control_dtype())  # written whole by every tick
-        self.status[()] = shared.control.read()  # counters go on from a predecessor's
+        self.status[()] = shared.control.read()  # counters continue those of a predecessor
         self.limiting = LimitingMonitor(self.emit)
         self.nearing = ProximityMonitor(self.emit)
         self.order = 0  # number of the newest order obeyed
         self.run = 0
 
     def begin_tick(self, step: int, planned: float, woke: float | None = None) -> None:
-        """The tick that everything is about from here on; planned for `planned`, begun at `woke`."""
+        """Begin the tick to which later calls belong; planned for `planned`, woken at `woke`."""
         self._step, self.planned, self._woke = step, planned, woke
 
     def emit(self, kind: str, text: str, data: Mapping[str, object] = MappingProxyType({})) -> None:
-        """An event, told at the end of the tick, with the order that control was carrying out."""
+        """Queue an event for the end of the tick, with the number of the order in force."""
         self._outbox.append(Event(kind, text, self.planned, self._step, {"order": self.order, **data}))
 
     def add_merge(self, merged: ChunkMerged) -> None:
-        """Tell where a chunk fell, at the end of the tick."""
+        """Queue the placement of a chunk for the end of the tick."""
         self._outbox.append(merged)
 
     def add_tick(self, seen: LatestObservation, sent: TickResult, simulated: bool) -> None:
-        """The tick, for the episode if there is one; `simulated`: it was the simulated robot that was told."""
+        """Send the record of the tick, if media needs it; `simulated`: it is that of the simulated robot."""
         self.limiting.update(sent, self.planned)
         self._note_corrected(sent)
         self.nearing.update(sent, self.planned)
@@ -160,9 +160,10 @@ class Telemetry:
         self._push("ticks", done)
 
     def publish(self, seen: LatestObservation, standing: TickState) -> None:
-        """Control's status, and only then the events: the coordinator decides by it, so that none may overtake it.
+        """Publish control's status, and only then its events.
 
-        The tick's record comes before either, so that whoever ends an episode by them loses no row.
+        The coordinator interprets events by the status, so an event must not arrive first. The tick's record precedes
+        both, so that an episode ended by them loses no row.
         """
         status, robot = self.status, standing.robot
         status["step"], status["planned"] = self._step, self.planned
@@ -195,7 +196,7 @@ class Telemetry:
 
     def _emit_contributions(self, makers: Contributions, sent: TickResult) -> None:
         if sent.target is not None and sent.target.source == "teleop":
-            makers = ()  # what a leader said: each message is merged like a chunk, and is none to whoever looks
+            makers = ()  # a leader's messages are merged like chunks, but must not be counted as chunks
         status = self.status
         status["chunk"] = max(makers, key=lambda made: made[1])[0] if makers else -1
         status["chunks"] = sum(maker != HELD for maker, _ in makers)

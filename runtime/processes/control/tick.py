@@ -1,4 +1,4 @@
-"""One control tick: obey orders, let chunks join the plan, look out for alarms, tell the robot, write it down."""
+"""One control tick: read orders, merge chunks, check alarms, send commands, record."""
 
 from __future__ import annotations
 
@@ -72,15 +72,15 @@ _MOVED_AWAY = Pattern(
 )
 
 __all__ = ["Tick", "TickSettings"]
-_NOW_S = 0.05  # age of joints that say where the arm is now
-_QUIET_S = 1.0  # without an implausible measurement: the next one is told again
+_NOW_S = 0.05  # [s] age of joints that show the arm's present position
+_QUIET_S = 1.0  # [s] without an implausible measurement after which the next is reported
 
 
 class Tick:
-    """The control loop's body: two lanes, the robot's and, during a run in simulation, the simulated robot's.
+    """The control loop's body, with two pipelines: the robot's and, in a simulated run, the simulated robot's.
 
-    A missed deadline is never caught up: the caller passes the step that is due now, and limits use the time
-    since the last command, capped at 1.5 periods.
+    A missed deadline is never caught up: the caller passes the step that is due now, and limits use the time since
+    the last command, capped at 1.5 periods.
     """
 
     def __init__(
@@ -106,20 +106,22 @@ class Tick:
         self._actuator = RobotActuator(shared, sink, settings, clock)
         self._steady = SteadyError(settings, self._actuator.engaged)
         self._hearing = SubscriberCheck(shared, sink, self._report.emit)
-        # A restarted control goes on holding where its predecessor stood; a new one keeps silent.
+        # A restarted control holds the last command; a new one stays disengaged.
         self._robot = self._make_pipeline(self._actuator)
         left = self._report.status["behaviour"].item() == NodeDriven.name.encode()
         self._yielding = NodeHandover(self._actuator.send_node_request, self._report.emit, left)
         self._simulated: CommandPipeline | None = None
         self._simulated_run = 0
-        self._left_run = -1  # the run during which the robot was left alone
+        self._left_run = -1  # the run during which the robot was disengaged
         self._doubted = float("-inf")
         self._orphaned = False
 
     def __call__(self, step: int, planned: float, woke: float | None = None) -> None:
-        """Do the tick `step`, planned for `planned` on our clock; the loop woke for it at `woke`."""
+        """Execute tick `step`, planned for `planned` on our clock; the loop woke at `woke`."""
         self._report.begin_tick(step, planned, woke)
         self._seen = self._plausibility.judge(self._eyes.read_latest(), planned, self._moving_command)
+        # The order is essential: measurements first, then orders, then the e-stop and the other alarms, which
+        # override orders of the same tick, and only then commands.
         for payload in self._shared_state.rings["orders"].drain():
             self._read(payload, step, planned)
         self._look_at_error(planned)
@@ -136,20 +138,20 @@ class Tick:
             lane.actuator.end_tick(planned)
 
     def hold_orphaned(self) -> None:
-        """The supervisor is gone: whatever moves is held."""
+        """Hold from the next tick on, because the supervisor has ended."""
         self._orphaned = True
 
     @property
     def is_handing_over(self) -> bool:
-        """True while the node is still being told that the robot is its own, or is not any more."""
+        """Whether a control word to the node about its driving must still be repeated."""
         return self._yielding.is_repeating
 
     @property
     def status(self) -> StatusRecord:
-        """Control's status, as the next tick will write it; the loop adds its own figures to it."""
+        """Control's status as the next tick will write it; the loop adds its own statistics."""
         return self._report.status
 
-    # --- lanes ---------------------------------------------------------------------------------------------
+    # --- pipelines -----------------------------------------------------------------------------------------
 
     @property
     def _pipelines(self) -> tuple[CommandPipeline, ...]:
@@ -157,7 +159,7 @@ class Tick:
 
     @property
     def _active_pipeline(self) -> CommandPipeline:
-        """The lane that chunks are for."""
+        """The pipeline for which chunks are intended."""
         return self._robot if self._simulated is None else self._simulated
 
     def _make_pipeline(self, actuator: Actuator) -> CommandPipeline:
@@ -171,8 +173,9 @@ class Tick:
         return CommandPipeline(actuator, *judged, believed, known)
 
     def _tick_pipelines(self, step: int, planned: float) -> TickResult:
-        """Move every lane on by a tick; what became of it on the one that is led, for the record."""
+        """Execute a tick of each pipeline; return the result of the active one, for the record."""
         sent = TickResult(planned)
+        # Nothing may be sent before the guard has read its latch (UNKNOWN).
         if self._shared_state.estop is not EStop.UNKNOWN:
             sent = self._robot.tick(step, planned, self._seen)
             if self._simulated is not None:
@@ -206,7 +209,7 @@ class Tick:
     def _read(self, payload: bytes, step: int, now: float) -> None:
         try:
             message = decode(payload)
-        except CodecError as error:  # one message that is none must not end what keeps the robot held
+        except CodecError as error:  # an unreadable message must not end the process that holds the robot
             self._report.emit("unreadable", str(error))
         else:
             self._dispatch(message, step, now)
@@ -304,12 +307,12 @@ class Tick:
             self._robot.hold()
             self._report.emit("refusals", _MOTION_SPEED(speed=order.speed))
         elif self._engage(now):
-            if not order.run:  # a set-up: where joints are believed to be is looked at anew
+            if not order.run:  # a set-up: the operator has checked the robot
                 self._displacement.trust_all_joints()
             self._robot.move(goal.astype(np.float64), order.speed)
 
     def _begin_simulation(self, order: Order, now: float) -> None:
-        """The robot holds, or stays silent; the simulated one goes on where it is, or starts where that one is."""
+        """Hold the robot, and continue the simulated run, or start it at the robot's measured position."""
         self._robot.hold()
         if self._simulated is None:
             measured = self._measured(now)
@@ -324,11 +327,11 @@ class Tick:
     # --- alarms --------------------------------------------------------------------------------------------
 
     def _measured(self, now: float) -> Float64 | None:
-        """Measured joint positions [D]; None if they are unknown, doubted or old."""
+        """Return the measured joint positions [D]; None if they are unknown, implausible or old."""
         return self._actuator.measured(self._seen, now)
 
     def _engage(self, now: float) -> bool:
-        """Take the robot over where it is measured; False, and said so, where nobody knows where it is."""
+        """Engage the robot at its measured position; return False, and emit the reason, if that is unknown."""
         if not self._actuator.engaged:
             measured = self._measured(now)
             if measured is None or not self._plausibility.is_settled:
@@ -353,13 +356,13 @@ class Tick:
         latched = self._shared_state.estop is EStop.LATCHED
         stopped = self._robot.behaviour if isinstance(self._robot.behaviour, EStopHold) else None
         if latched and stopped is None:
-            # Before it was ever engaged nothing is known to send, until the robot has been measured.
+            # Before it was ever engaged, no command is known until the robot has been measured.
             commanded = self._settings.limits.with_zero_speeds(self._actuator.commanded.copy())
             position = commanded if self._actuator.engaged else None
             stopped = EStopHold(position, self._actuator.stopping_distance, self._seen.joints_captured)
             self._actuator.zero_velocity()
             self._displacement.stop_converging()
-            # Or a gripper that is on its way to its lock would go on after the release.
+            # Otherwise a gripper on its way to its lock would continue after the release.
             self._lock(np.full(len(self._locks.on), np.nan))
             self._robot.behaviour, self._simulated = stopped, None
             self._report.emit("estopped", _ESTOP)
@@ -372,8 +375,10 @@ class Tick:
             self._stop_at(measured, stopped, now)
 
     def _shows_it_now(self, stopped: EStopHold, now: float) -> bool:
-        """False while the joints are those of before a gap in which the e-stop was pressed: the arm has gone on since,
-        and would be driven back to there.
+        """Return True if the joints show where the arm is after the press.
+
+        If the e-stop is pressed in a gap of the measurements, the last joints are older: the arm has moved on, and
+        would be driven back to them.
         """
         seen = self._seen.joints_captured
         return (
@@ -384,7 +389,7 @@ class Tick:
         )
 
     def _stop_at(self, measured: Float64, stopped: EStopHold, now: float) -> None:
-        """Send where the robot is: at once as far as it takes to come to rest, farther as fast as it moves."""
+        """Move the command to the robot: at once within the stopping distance, the rest within velocity limits."""
         actuator, limits = self._actuator, self._settings.limits
         if not actuator.engaged and (self._plausibility.dead or not self._plausibility.is_settled):
             return
@@ -402,7 +407,7 @@ class Tick:
             measured = self._displacement.substitute_untrusted(actuator, measured)
             if not stopped.was_measured:
                 actuator.rebase_command(measured, _WHAT_ESTOP, stopped.rest)
-            # An object in the gripper keeps it open: its command stays, or it would let go.
+            # An object in the gripper holds it open: the command stays, or the object would drop.
             stopped.update_measured(
                 limits.with_zero_speeds(np.where(limits.grippers, actuator.commanded, measured))
             )
@@ -421,15 +426,15 @@ class Tick:
 
     @property
     def _moving_command(self) -> Float64 | None:
-        """The command of a robot that we move, None where nothing should change."""
+        """The command of a robot that we move, None if the measurements should not change."""
         return self._actuator.commanded if self._robot.behaviour.moving and self._actuator.engaged else None
 
     def _check_plausibility(self, now: float) -> None:
-        """Hold, and name the joint, while what is measured cannot be true."""
+        """Hold, and name the joint, while measurements are implausible."""
         doubt = self._seen.implausible_reason
         if (
             not doubt or not self._plausibility.has_known_sample
-        ):  # where the joints were missing there is no contradiction
+        ):  # after an outage there is nothing to contradict
             return
         if self._robot.behaviour.moving:
             self._robot.hold_because("implausible", doubt)
@@ -438,7 +443,7 @@ class Tick:
         self._doubted = now
 
     def _check_displaced(self, now: float) -> None:
-        """Hold where the robot is, and not where it was told to hold, once these are far apart."""
+        """Hold at the robot's measured position, if it is too far from the commanded position."""
         behaviour = self._robot.behaviour
         stopped = isinstance(behaviour, EStopHold)
         held = (self._robot.is_stationary or stopped) and self._actuator.engaged
@@ -461,7 +466,7 @@ class Tick:
         self._robot.hold_here()
 
     def _report_untrusted_joints(self) -> None:
-        """Say, once, which joints are not followed any more; what moves is held."""
+        """Emit once which joints are distrusted; hold if the robot is moving."""
         doubt = self._displacement.pop_untrusted_reason()
         if doubt and self._robot.behaviour.moving:
             self._robot.hold_because("implausible", doubt)
@@ -469,7 +474,7 @@ class Tick:
             self._report.emit("implausible", doubt)
 
     def _disengage(self, why: str) -> None:
-        """Send nothing: a node that was started anew at 0 is pulled by an old target, a dead encoder by a new one."""
+        """Stop sending: an old target would pull a node that restarted at 0, a new one a joint with a dead encoder."""
         self._left_run = self._report.run
         self._report_displaced(why)
         if isinstance(self._robot.behaviour, EStopHold):

@@ -1,1 +1,1 @@
-"""Process 2, decides: commands, session, set-up, runs, when the policy is asked."""
+"""Coordinator process: commands, session, set-up, runs, and when to query the policy."""

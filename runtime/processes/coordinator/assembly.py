@@ -1,4 +1,4 @@
-"""Assembly of the coordinator from its parts; the same in a process and in lockstep."""
+"""Assembly of the coordinator from its components, for a process and for lockstep."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ def assemble(
     people: Clock | None = None,
     make_policy: MakePolicy = make_policy,
 ) -> Coordinator:
-    """The coordinator of a station; `people` is the clock of leases and commands where it is another one."""
+    """Return the coordinator of a station; `people` is the clock of leases and commands if it is another one."""
 
-    # What parts ask of the coordinator, or tell it, once it is there.
+    # Callbacks of components to the coordinator, which does not exist yet.
     def say(event: Event) -> None:
         coordinator.emit(event)
 
@@ -132,7 +132,7 @@ def _inference(
     kinematics: LazyKinematics,
     make_policy: MakePolicy,
 ) -> Inference:
-    """What asks the policy, with action spaces of its own: they are used in the thread of the call."""
+    """Return the component that queries the policy, with its own action spaces: the call's thread uses them."""
     settings = spec.deployment
     ages = StalenessLimits(spec.rate, settings.safety.joint_age_s, settings.safety.picture_age_s)
     requests = PolicyRequests(

@@ -1,4 +1,4 @@
-"""Builders of what the coordinator asks: the policy, or a leader in its place, and kinematics."""
+"""Builders of the coordinator's policy, leader and kinematics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.policies.base import Policy
 from runtime.policies.tunnel.policy import through_tunnel
 from runtime.station.spec import StationSpec
 
-# What a deployment does not name is not loaded.
+# Imports of kinds that a deployment does not name must not be loaded.
 if TYPE_CHECKING:
     from runtime.kinematics.base import Kinematics
     from runtime.teleoperators.base import Leader
@@ -23,7 +23,11 @@ MakePolicy = Callable[[StationSpec, Clock], Policy]
 
 
 def make_leader(spec: StationSpec, clock: Clock) -> Leader:
-    """The leader of a deployment that relays one, not yet connected."""
+    """Return the leader of a deployment that relays a leader, not yet connected.
+
+    Raises:
+        ConfigurationError: the deployment has no leader.
+    """
     wanted = spec.deployment.collection
     if wanted is None or wanted.leader is None:
         raise ConfigurationError("this deployment has no [collection.leader]")
@@ -38,9 +42,16 @@ def make_policy(
     build: Callable[[Any, Robot, Clock, float], Policy] | None = None,
     leader: Callable[[StationSpec, Clock], Leader] = make_leader,
 ) -> Policy:
-    """The policy, not yet connected; raises RuntimeFault where it does not fit the robot, or cannot be made.
+    """Return the policy, not yet connected.
 
-    `build` stands in for that of the policy's kind, `leader` for the deployment's.
+    Args:
+        spec: the station.
+        clock: the clock of the policy.
+        build: replaces the builder of the policy's kind.
+        leader: replaces the builder of the deployment's leader.
+
+    Raises:
+        RuntimeFault: it does not fit the robot, or cannot be built.
     """
     if spec.collecting:
         return _leader_policy(spec, clock, leader)
@@ -50,7 +61,7 @@ def make_policy(
         return through_tunnel(build(settings, spec.robot, clock, spec.rate), settings)
     except RuntimeFault:
         raise
-    except Exception as error:  # of a policy's own code: it must not end coordinator
+    except Exception as error:  # of the policy's own code; the coordinator must survive it
         logging.getLogger(__name__).exception("the policy's own code failed")
         raise ConfigurationError(
             f"policy {settings.kind!r} cannot be made: {type(error).__name__}: {error}"
@@ -58,7 +69,7 @@ def make_policy(
 
 
 def _leader_policy(spec: StationSpec, clock: Clock, leader: Callable[[StationSpec, Clock], Leader]) -> Policy:
-    """The policy that is asked while the operator drives the robot."""
+    """Return the policy that is queried while the operator drives the robot."""
     from runtime.teleoperators.relay import LeaderPolicy, NodeDrivenPolicy
 
     wanted = spec.deployment.collection
@@ -78,13 +89,13 @@ def _leader_policy(spec: StationSpec, clock: Clock, leader: Callable[[StationSpe
 
 
 def make_kinematics(spec: StationSpec) -> Kinematics:
-    """Forward and inverse kinematics of the robot, compiled or loaded when this returns."""
+    """Return forward and inverse kinematics of the robot, completely compiled and loaded."""
     settings = spec.deployment.kinematics
     made: Kinematics = variants("runtime.kinematics")[settings.kind].build(settings, spec.robot)
     return made
 
 
 def kinematics_compiled(spec: StationSpec) -> bool:
-    """True if `make_kinematics` would have nothing to compile."""
+    """Return True if `make_kinematics` would have nothing to compile."""
     backend = variants("runtime.kinematics")[spec.deployment.kinematics.kind]
     return bool(backend.is_compiled(spec.robot))

@@ -1,4 +1,4 @@
-"""Every answered command on disk, so that a repeated uuid gets its first answer also after a restart."""
+"""Journal of answered commands on disk, so that a repeated uuid gets its first answer also after a restart."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from runtime.ipc.messages import Ack, Command
 
 log = logging.getLogger(__name__)
 REMEMBERED = 5000
-_TAIL_BYTES = 16 << 20  # of a file that grows for years, enough for what is remembered
+_TAIL_BYTES = 16 << 20  # [bytes] of a file that grows for years; contains REMEMBERED lines
 
 
 class CommandJournal:
-    """An append-only file of answers, `commands.jsonl` in the station's folder."""
+    """Append-only file of answers, `commands.jsonl` in the station's folder."""
 
     def __init__(self, station_dir: Path) -> None:
         station_dir.mkdir(parents=True, exist_ok=True)
@@ -31,7 +31,7 @@ class CommandJournal:
         self._file.seek(max(0, size - _TAIL_BYTES))
         content = self._file.read() or b""
         whole, _, torn = content.rpartition(b"\n")
-        if torn:  # by a kill: its command was never answered
+        if torn:  # incomplete after a kill; its command was never answered
             self._file.truncate(size - len(torn))
         answers: dict[str, Ack] = {}
         for line in whole.split(b"\n")[-REMEMBERED:]:
@@ -39,17 +39,18 @@ class CommandJournal:
                 row = json.loads(line)
                 answers.setdefault(row["uuid"], Ack(**row["ack"]))
             except (ValueError, KeyError, TypeError):
-                continue  # damaged, or the rest of a line that begins before the tail
+                continue  # damaged, or a line cut by the start of the tail
         return answers
 
     def append(self, command: Command, ack: Ack) -> str:
-        """Write one answer before it is given; "" or why it is not on disk."""
+        """Write an answer before it is sent; return "", or why it is not on disk."""
         return self.append_all([(command, ack)])
 
     def append_all(self, answered: Sequence[tuple[Command, Ack]]) -> str:
-        """Write answers before they are given, at the price of one; "" or why they are not on disk.
+        """Write answers, with one sync, before they are sent; return "", or why they are not on disk.
 
-        A full disk must not end who carries out stops: the lines are taken back and the reason logged.
+        A full disk must not end the process that executes stops: the lines are removed again and the reason is
+        logged.
         """
         if not answered:
             return ""
@@ -63,6 +64,7 @@ class CommandJournal:
         return ""
 
     def _write(self, line: bytes) -> None:
+        # A partial line would corrupt the next one, so a failed write is truncated.
         end = self._file.seek(0, os.SEEK_END)
         try:
             if self._file.write(line) != len(line):
@@ -92,7 +94,7 @@ def _row(command: Command, ack: Ack) -> dict[str, Any]:
 
 
 def _json_arguments(arguments: Mapping[str, Any]) -> object:
-    """The arguments as JSON can say them; those of no JSON were refused, and must not end who refused them."""
+    """Return the arguments as JSON values; arguments that are not were refused, and must not raise here."""
     try:
         json.dumps(arguments, default=str)
     except (TypeError, ValueError, RecursionError) as error:

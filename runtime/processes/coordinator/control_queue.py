@@ -1,4 +1,4 @@
-"""The coordinator's side of the ring to control: numbered orders and chunks."""
+"""Coordinator's end of the ring to control: numbered orders and chunks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _CONTROL_DOES_NOT_READ = fixed(
 
 
 class ControlQueue:
-    """Writes orders and chunks; only the thread that owns the coordinator's loop may call it."""
+    """Sender of orders and chunks; only the thread of the coordinator's loop may call it."""
 
     def __init__(self, shared: SharedState) -> None:
         self._shared_state = shared
@@ -48,43 +48,41 @@ class ControlQueue:
         mode: Mode = "continuous",
         speed: float = 1.0,
     ) -> int:
-        """Tell control what to do; returns the order's number, which control's status shows once obeyed."""
+        """Send an order; return its number, which control's status contains once it is obeyed."""
         self._number += 1
         try:
             self._push(Order(self._number, kind, run, goal, reason, mode, speed))
         except RuntimeFault as error:
-            log.error(
-                "order %s is lost: %s", kind, error
-            )  # the coordinator goes on: it notices that control hangs
+            log.error("order %s is lost: %s", kind, error)  # the health monitor detects a control that hangs
         return self._number
 
     def is_obeyed(self, number: int) -> bool:
-        """True if control has come to order `number`."""
+        """Return True if control has obeyed order `number`."""
         return int(self._shared_state.control.read()["order"]) >= number
 
     def next_chunk(self) -> int:
-        """A new chunk number."""
+        """Return a new chunk number."""
         self._chunk += 1
         return self._chunk
 
     def send_chunk(self, chunk: PostedChunk) -> None:
-        """Hand a chunk over, unmerged."""
+        """Send a chunk, which control merges."""
         self._push(chunk)
 
     def tune(self, strategy: Mapping[str, Any]) -> None:
-        """Have control merge by another strategy, or other parameters of it, from its next tick on."""
+        """Change the strategy with which control merges, from its next tick on."""
         self._push(Tune(strategy))
 
     def bear(self, run: int, until: float) -> None:
-        """Have control stand, and not hold, where nothing is planned before `until` on the monotonic clock [s]."""
+        """Let control wait instead of hold if nothing is planned before `until` [s, monotonic clock]."""
         self._push(PolicyAway(run, until))
 
     def lock_grippers(self, values: Float64) -> None:
-        """Lock grippers at these values [D]; NaN for what is not locked."""
+        """Lock grippers at these values [D]; NaN: unlocked."""
         self._push(LockGrippers(values))
 
     def send_node_request(self, word: str, data: Mapping[str, Any]) -> None:
-        """Have control pass a control word on to the node."""
+        """Send a control word to the node, through control."""
         self._push(NodeRequest(word, data))
 
     def _push(self, message: Message) -> None:

@@ -1,4 +1,4 @@
-"""The coordinator decides: commands, session, set-up, inference, events; it never touches 30 Hz pictures."""
+"""The coordinator: commands, session, set-up, inference, events; it never processes 30 Hz pictures."""
 
 from __future__ import annotations
 
@@ -56,14 +56,17 @@ _ESTOP_FLAG_RAISED = fixed(
 
 @dataclass(eq=False)
 class Coordinator:
-    """One `pump` does everything that is due; lockstep calls it tick by tick. `assembly.assemble` puts it together."""
+    """Owner of the session and its components; `poll` does everything that is due.
+
+    Lockstep calls `poll` tick by tick. `assembly.assemble` builds a coordinator.
+    """
 
     boot: str
     shared: SharedState
     clock: Clock
-    client_clock: Clock  # of leases, and of how long commands are valid: lockstep has another
-    deployment_spec: Resolved  # as the station was started with
-    facts: Mapping[str, Any]  # what a snapshot says of a station that does not change
+    client_clock: Clock  # of leases and of command validity; lockstep has another
+    deployment_spec: Resolved  # as at the station's start
+    facts: Mapping[str, Any]  # constants of the station for snapshots
     events: EventLog
     lease: Lease
     orders: ControlQueue
@@ -85,7 +88,7 @@ class Coordinator:
 
     @property
     def spec(self) -> StationSpec:
-        """As it was last set up or tuned."""
+        """Specification of the last set-up or tuning."""
         return self.operations.spec
 
     @property
@@ -95,7 +98,7 @@ class Coordinator:
 
     @property
     def rests(self) -> bool:
-        """True while nothing goes on, and nobody is there to command it: what comes wakes the coordinator."""
+        """Whether nothing is in progress and there is no lease holder, so that messages alone need to wake it."""
         return not (
             self.session.state.meaning.at_work
             or self.setup.active
@@ -106,7 +109,7 @@ class Coordinator:
         )
 
     def poll(self) -> None:
-        """Hear the family, notice what happened, advance set-up and inference."""
+        """Read messages, check health, advance set-up and inference."""
         self.shared.beat("coordinator", self.clock.now())
         self.inbox.poll()
         for noticed in self.health.poll(self.session.state, self.runs.open):
@@ -121,25 +124,25 @@ class Coordinator:
         self.preflights.poll()
 
     def snapshot(self) -> dict[str, Any]:
-        """The station's state at this moment."""
+        """Return the current snapshot of the station."""
         return build_snapshot(self)
 
     def end_source_run(self, reason: str) -> None:
-        """The run is over, says who simulates what it is about."""
+        """End the run on request of its simulator."""
         self.handle_event(SessionEvent.RUN_ENDED, reason)
 
     def emit(self, event: Event) -> None:
-        """An event of the coordinator's own: to the log, to clients, into the episode."""
+        """Emit an event of the coordinator: to log, clients and episode."""
         self.record_event(event)
         self.runs.record_event(event)
 
     def record_event(self, event: Event) -> None:
-        """An event of another process, which it writes into the episode itself."""
+        """Record an event of another process, which writes it to the episode itself."""
         self.events.append(event)
         log.info("%s: %s", event.kind, event.text)
 
     def handle_event(self, happening: SessionEvent, reason: str, process: str = "") -> None:
-        """Tell the session; `process` is the one that was restarted."""
+        """Pass an event to the session and its components; `process` is the one that was restarted."""
         if happening is SessionEvent.FAMILY_DIED:
             self.emit(Event("family_died", reason, self.clock.now()))
             self.inbox.reset_subscribers()
@@ -157,17 +160,17 @@ class Coordinator:
             self.emit(Event("state", text, self.clock.now(), data=data))
 
     def _unbegun(self, run: Run | None) -> dict[str, Any]:
-        """Data for the event of a `run` that is over and never began; {} for any other."""
+        """Return data for the event about a `run` that ended before it began; {} for any other run."""
         return {} if run is None or run is self.runs.open else run.never_began_data
 
     def _unlock(self) -> None:
-        """A control that was restarted, or obeys the e-stop, knows of no locks, another may: none, in any case."""
+        """Remove all locks: a restarted control has none, and one under the e-stop may have them."""
         try:
             self.manual.unlock()
         except RuntimeFault as error:
             log.error("grippers may still be locked: %s", error)
 
-    # --- what goes on ----------------------------------------------------------------------------------------
+    # --- set-up and inference --------------------------------------------------------------------------------
 
     def _advance_setup(self) -> None:
         if not self.setup.active:
@@ -198,10 +201,10 @@ class Coordinator:
         self.inference.pending_notes.clear()
 
     def _answer_fault(self, error: RuntimeFault) -> None:
-        """Do what the deployment says of a policy that fails: hold, try again for a while, or end the run."""
+        """Hold, retry for a while, or end the run, as configured for a failing policy."""
         faults, lost = self.spec.deployment.faults, isinstance(error, PolicyLostError)
         answer = faults.policy_lost if lost else faults.policy_error
-        if self.spec.collecting:  # a leader is not asked again by itself: who holds it arms anew
+        if self.spec.collecting:  # a leader is not retried: its operator must arm again
             answer = "hold"
         if answer == "slow" and self.inference.should_retry(error):
             return
@@ -211,7 +214,7 @@ class Coordinator:
     # --- commands ------------------------------------------------------------------------------------------
 
     def handle(self, command: Command) -> Ack:
-        """The answer to a command or a query of a client."""
+        """Return the answer to a command or query of a client."""
         if command.kind == "estop":
             return self._press_estop(command)
         if command.kind == "status":
@@ -226,7 +229,7 @@ class Coordinator:
         ack = self.session.handle(command)
         if ack.status == "accepted" and command.kind in ("setup", "run"):
             self.preflights.cancel(_WANTED(command=command.kind, who=display_name(command)))
-        # A lease that is kept is a stream; only its changes and refusals are worth a line.
+        # Renewals of a lease are a stream; only its changes and refusals are worth an event.
         kept = command.kind in LEASE_COMMANDS and ack.status == "accepted" and ack.sequence == sequence
         if not kept:
             self.collecting.record_activity()
@@ -238,7 +241,7 @@ class Coordinator:
         return ack
 
     def _press_estop(self, command: Command) -> Ack:
-        """Raise the flag, whatever goes on and whoever it is; the guard latches it, now or when it is there again."""
+        """Set the e-stop flag in any state, for any sender; the guard latches it, at once or when it is restarted."""
         self.shared.rings["presses"].push(encode(command))
         self.shared.set_estop(EStop.LATCHED)
         told = {"uuid": command.uuid, "user": command.user, "role": command.role, "holder": command.holder}
@@ -247,7 +250,7 @@ class Coordinator:
         return Ack(command.uuid, "accepted", _ESTOP_FLAG_RAISED, boot=self.boot, kind=command.kind)
 
     def _permission_problem(self, command: Command) -> str:
-        """Why who gives it may not bring what it brings; "" where it may, or was answered before."""
+        """Return why the sender may not use these arguments; "" if it may, or if it was answered before."""
         if self.session.answered(command) is not None:
             return ""
         try:
@@ -257,7 +260,7 @@ class Coordinator:
         return ""
 
     def close(self) -> None:
-        """Let go of the policy."""
+        """Close preflights, policy and runner."""
         self.preflights.close()
         self.inference.policy.close()
         self.inference.runner.close()

@@ -1,4 +1,4 @@
-"""The coordinator's side of collecting demonstrations: arm switch, leading side, demonstrations and their labels."""
+"""Collection of demonstrations in the coordinator: arm switch, leader, episodes and their labels."""
 
 from __future__ import annotations
 
@@ -68,10 +68,10 @@ _NO_DEMONSTRATION = Pattern(
     "episode = {episode!r} is a {kind}; allowed: demonstrations",
 )
 
-IDLE_S = 300.0  # of nothing, after which the arm falls
-_REMEMBERED = 64  # episodes that may be spoken of before they are on disk
-NODE_SILENT_S = 2.0  # for a node to report an action
-# What takes the arm away, whatever state it finds the station in.
+IDLE_S = 300.0  # [s] without activity until it is disarmed
+_REMEMBERED = 64  # episodes that can be labelled before they are on disk
+NODE_SILENT_S = 2.0  # [s] for a node to report an action
+# Events that disarm, in any state of the session.
 DISARMING = frozenset(
     {
         SessionEvent.HELD,
@@ -86,7 +86,7 @@ DISARMING = frozenset(
 
 
 class Demonstrations:
-    """At most one episode is open; `armed` is a person's word that the next may begin."""
+    """Demonstrations of a station; `armed` is a person's permission to begin the next one."""
 
     def __init__(
         self,
@@ -103,24 +103,24 @@ class Demonstrations:
         self._data = spec.deployment.data
         self._shared_state, self._clock = shared, clock
         self._inference, self._setup = inference, setup
-        self._opened = opened  # the run that is open
+        self._opened = opened  # the open run
         self._say = say
         self.set_up = False
         self.armed = False
         self.why_not: str = _NOT_SET_UP
-        self.task = ""  # of the newest episode, where its command said one
+        self.task = ""  # of the newest episode, if its command had one
         self.last: dict[str, Any] | None = None
         self._asked: deque[str] = deque(maxlen=_REMEMBERED)  # uuids of the newest episodes
         self._touched = clock.now()
-        self._reported_at: float | None = None  # when the node's newest action was captured
-        self._reported: list[float] = []  # these times, for their rate
-        self._seen: dict[str, Any] | None = None  # the fingerprint as it was last known
+        self._reported_at: float | None = None  # capture time of the node's newest action
+        self._reported: list[float] = []  # latest capture times, for their rate
+        self._seen: dict[str, Any] | None = None  # the last known fingerprint
 
-    # --- the arm ---------------------------------------------------------------------------------------------
+    # --- arm switch ------------------------------------------------------------------------------------------
 
     @property
     def declared(self) -> bool:
-        """True if the deployment says how to collect."""
+        """Whether the deployment configures collection."""
         return self._settings is not None
 
     @property
@@ -134,49 +134,49 @@ class Demonstrations:
 
     @property
     def run(self) -> Run | None:
-        """The open run that collects."""
+        """The open run if it collects."""
         run = self._opened()
         return run if run is not None and run.mode == "collect" else None
 
     @property
     def _newest(self) -> str:
-        """The uuid of the newest demonstration since the station started, "" where there was none."""
+        """The uuid of the newest demonstration since the station started, "" if there was none."""
         return self._asked[-1] if self._asked else ""
 
     @property
     def leader_problem(self) -> str:
-        """Why the leader cannot be followed just now; "" where it can, or nobody can know before it is asked to."""
+        """Reason why the leader cannot be followed now; "" if it can, or if that is unknown before a request."""
         relay = self._relay
         return "" if relay is None else relay.leader_problem()
 
     def begin_setup(self, collects: bool) -> None:
-        """A set-up begins, to collect or with a policy."""
+        """Begin a set-up, to collect or with a policy."""
         self.disarm(_SETUP_BEGUN)
         self.set_up = collects
         self.why_not = _NOT_YET if collects else _NOT_SET_UP
 
     def arm(self) -> None:
-        """Switch it on."""
+        """Arm: permit the next demonstration."""
         self.armed, self.why_not = True, ""
         self._event("collect_armed", _ARMED)
 
     def disarm(self, why: str) -> None:
-        """Switch it off; nothing where it is off."""
+        """Disarm; nothing if not armed."""
         if self.armed:
             self.armed, self.why_not = False, why
             self._event("collect_disarmed", _DISARMED(why=why))
 
     def record_activity(self) -> None:
-        """A person has done something."""
+        """Record that a person was active."""
         self._touched = self._clock.now()
 
     def on_session_event(self, happening: SessionEvent, reason: str) -> None:
-        """Disarm at an event of the session after which no demonstration may begin."""
+        """Disarm if no demonstration may begin after this event of the session."""
         if happening in DISARMING:
             self.disarm(reason)
 
     def poll(self, state: SessionState) -> tuple[SessionEvent, str] | None:
-        """Once per pump: what is to be told to the session; an arm that nobody uses falls by itself."""
+        """Check leader, node and activity; return an event for the session, or None."""
         now, run = self._clock.now(), self.run
         self._poll_node()
         if self.set_up and state is SessionState.READY:
@@ -192,7 +192,7 @@ class Demonstrations:
         return None
 
     def _update_first_goal(self) -> None:
-        """Renew where the first action would have the robot, as the leader moves on."""
+        """Update the first action of the set-up, because the leader moves."""
         relay = self._relay
         if relay is not None:
             qpos = np.array(self._shared_state.observation.read()["qpos"], np.float64)
@@ -200,7 +200,7 @@ class Demonstrations:
             commanded = np.array(status["commanded"], np.float64) if status["engaged"] else None
             self._setup.set_first_action(relay.first_goal(qpos, commanded))
 
-    # --- what the node reports ---------------------------------------------------------------------------------
+    # --- reports of the node -----------------------------------------------------------------------------------
 
     def _poll_node(self) -> None:
         if not self._node_leads:
@@ -212,7 +212,7 @@ class Demonstrations:
             self._reported = [*self._reported[-39:], at]
 
     def _node_silence(self, run: Run, state: SessionState) -> tuple[SessionEvent, str] | None:
-        """A node that was told to drive, and reports no action."""
+        """Return an event if a node that should drive the robot reports no action, else None."""
         if not self._node_leads or run.begun_at is None or state is not SessionState.RUNNING:
             return None
         since = max(self._reported_at or -math.inf, run.followed_at)
@@ -227,7 +227,7 @@ class Demonstrations:
     # --- episodes --------------------------------------------------------------------------------------------
 
     def manifest(self, asked: RunRequest) -> dict[str, Any]:
-        """Fields of a demonstration's manifest that differ from those of a run with a policy."""
+        """Return the manifest fields of a demonstration that differ from those of a run with a policy."""
         assert self._settings is not None
         info = self._setup.info
         return {
@@ -239,18 +239,18 @@ class Demonstrations:
         }
 
     def on_episode_started(self, episode: str, asked: RunRequest) -> None:
-        """An episode is asked for."""
+        """Record that an episode was requested."""
         self.task = asked.task or ""
         if episode:
             self._asked.append(episode)
 
     def on_open_failed(self) -> None:
-        """The recording of the open run could not be opened: there is no such episode to speak of."""
+        """Remove the open run's episode, because its recording could not be opened."""
         if self.run is not None and self.run.uuid in self._asked:
             self._asked.remove(self.run.uuid)
 
     def on_episode_closed(self, message: EpisodeClosed) -> None:
-        """An episode is on disk."""
+        """Record that an episode is on disk, and emit an event if it is too short."""
         if self._settings is None or message.uuid not in self._asked or message.waits:
             return
         label = latest_label(self._data, message.uuid)
@@ -266,14 +266,14 @@ class Demonstrations:
             self._event("episode_short", text)
 
     def label(self, asked: LabelRequest, by: str) -> Mapping[str, Any]:
-        """Write down how an episode went."""
+        """Write the result of an episode; return the label."""
         episode, before = self._find_episode(asked.episode)
         return self._write(
             episode, replace(before, time=time.time(), by=by, result=asked.result, note=asked.note)
         )
 
     def discard(self, asked: DiscardRequest, by: str) -> Mapping[str, Any]:
-        """Mark an episode as one that is never published; its files stay."""
+        """Mark an episode as never to be published, without deleting its files; return the label."""
         episode, before = self._find_episode(asked.episode)
         return self._write(episode, replace(before, time=time.time(), by=by, discarded=True))
 
@@ -293,7 +293,11 @@ class Demonstrations:
         return data
 
     def _find_episode(self, given: str | None) -> tuple[str, Label]:
-        """The episode that is spoken of, and what was last said of it; RuntimeFault where it is none of ours."""
+        """Return the uuid of the named episode, and its latest label.
+
+        Raises:
+            RuntimeFault: it is no demonstration of this station, or the open one.
+        """
         run = self.run
         if given is None:
             episode = run.uuid if run is not None else self._newest
@@ -311,7 +315,7 @@ class Demonstrations:
         return episode, before or Label(0.0, "")
 
     def _require_demonstration(self, episode: str) -> None:
-        latest_label(self._data, episode)  # refuses what is no uuid, before it becomes a path
+        latest_label(self._data, episode)  # raises if it is no uuid, before it becomes part of a path
         path = self._plan.deployment.episodes_dir / episode / "manifest.json"
         try:
             kind = json.loads(path.read_text("utf-8")).get("kind")
@@ -323,7 +327,7 @@ class Demonstrations:
     # --- for pages -------------------------------------------------------------------------------------------
 
     def status(self) -> dict[str, Any] | None:
-        """For the snapshot; None where the deployment says nothing of collecting."""
+        """Return the status for the snapshot; None if the deployment configures no collection."""
         if self._settings is None:
             return None
         settings, run, cameras = self._settings, self.run, self._plan.cameras
@@ -346,7 +350,7 @@ class Demonstrations:
         }
 
     def _fingerprint(self) -> dict[str, Any] | None:
-        """The next episode's fingerprint, in its manifest's words; None before every picture was seen."""
+        """Return the next episode's fingerprint, with the keys of its manifest; None before all pictures arrived."""
         assert self._settings is not None
         record, robot = self._shared_state.observation.read(), self._plan.robot
         described = self._settings.manifest_entry(self._plan.cameras)

@@ -1,4 +1,4 @@
-"""Events that the coordinator notices by itself: siblings, e-stop, lease, link, the end of a run."""
+"""Health checks of the coordinator: sibling processes, e-stop, lease, link, end of the run."""
 
 from __future__ import annotations
 
@@ -56,23 +56,23 @@ _SOURCE_ENDED = fixed("health.source_ended", "the recording that is the source h
 
 SIBLING_PROCESSES = ("control", "reception", "media", "guard")
 _TO_RECORD = ("minutes", "ticks", "observations")  # rings that media reads
-_MOST_WAITING = 0.5  # of a ring: what comes after it is full is lost
+_MOST_WAITING = 0.5  # share of a ring; when it is full, further messages are lost
 _LINK_LOST_S = 2.0
 _CONNECTED_S = 1.0
-_EARLY_S = 1e-6  # moments are sums of floats
-_LATCH_S = 0.2  # how long the e-stop's flag may be ahead of its latch on the disk
+_EARLY_S = 1e-6  # rounding tolerance of summed times
+_LATCH_S = 0.2  # [s] by which the e-stop flag may precede its latch on disk
 
 
 class HealthEvent(NamedTuple):
-    """Something for the session, and the sentence that goes with it."""
+    """An event for the session, with its reason."""
 
     happening: SessionEvent
     reason: str
-    process: str = ""  # that was restarted
+    process: str = ""  # the restarted process
 
 
 class HealthMonitor:
-    """Looks at page, lease and run once per pump; the session decides what follows."""
+    """Monitor of shared state, lease and run; it yields events, and the session decides."""
 
     def __init__(
         self,
@@ -84,24 +84,24 @@ class HealthMonitor:
         reception: Callable[[], ReceptionReport],
         stoppable: Callable[[], bool],
     ) -> None:
-        """`stoppable` says whether somebody beside the robot can stop it: its panel is served."""
+        """`stoppable` returns whether a person at the robot can stop it, because its panel is served."""
         self._plan = spec
         self._shared_state = shared
         self._lease = lease
         self._clock = clock
         self._people = people  # the clock of leases
-        self._reception = reception  # what it last reported
+        self._reception = reception  # its latest report
         self._stoppable = stoppable
         self._latch = Latch(spec.deployment.station_dir)
         self._generations = {name: shared.generation(name) for name in SIBLING_PROCESSES}
         self._lease_held = False
-        self._unattended = False  # a run goes on though its holder is lost
+        self._unattended = False  # a run continues although its lease holder is lost
         self._recording_late = False
         self.estop = ""  # who pressed and why, while it is latched
-        self._pressed: float | None = None  # when the flag was seen without its latch
+        self._pressed: float | None = None  # when the flag was set without its latch
 
     def poll(self, state: SessionState, run: Run | None) -> Iterator[HealthEvent]:
-        """News for the session, which is in `state` before the first of it."""
+        """Yield events for the session, which is in `state` before the first of them."""
         yield from self._check_heartbeats(state)
         yield from self._estop(state)
         yield from self._leases(run if state is SessionState.RUNNING else None)
@@ -110,7 +110,7 @@ class HealthMonitor:
             yield from self._end_of(run)
 
     def silent_sibling(self) -> str:
-        """A sibling that does not answer, "" where all do: what it is sent would be lost."""
+        """Return a process with an expired heartbeat, "" if there is none: messages to it would be lost."""
         return next((name for name in SIBLING_PROCESSES if not self._alive(name)), "")
 
     def _alive(self, name: str) -> bool:
@@ -119,11 +119,11 @@ class HealthMonitor:
 
     @property
     def _waiting_to_record(self) -> float:
-        """Part of the room for what waits to be recorded that is taken, of the fullest ring."""
+        """Used share of the fullest ring to media."""
         return max(self._shared_state.rings[ring].fill for ring in _TO_RECORD)
 
     def look_at_recorder(self, state: SessionState) -> Iterator[Event]:
-        """Events of a recorder that is silent in a run, and of one that goes on."""
+        """Yield events when the recorder's heartbeat expires during a run, and when it returns."""
         now, late = self._clock.now(), not self._alive("media")
         if late and not self._recording_late and state is SessionState.RUNNING:
             since, percent = (
@@ -137,7 +137,7 @@ class HealthMonitor:
             self._recording_late = False
 
     def missing_cameras(self) -> list[str]:
-        """Cameras that have not sent a picture yet."""
+        """Return the cameras that have not sent a picture yet."""
         numbers = self._shared_state.observation.read()["picture_number"]
         return [
             camera
@@ -152,10 +152,10 @@ class HealthMonitor:
                 self._generations[name] = generation
                 reason = _RESTARTED(process=name)
                 yield HealthEvent(SessionEvent.FAMILY_DIED, reason, name)
-        if state is not SessionState.RUNNING:  # a set-up looks for itself
+        if state is not SessionState.RUNNING:  # a set-up checks this itself
             return
         now = self._clock.now()
-        # Media moves nothing, and what it has not read yet is kept for it, unless it has ended.
+        # Media moves nothing, and unread messages wait for it in the rings, unless it has ended.
         ended = not self._shared_state.last_beat("media")
         silent = [name for name in SIBLING_PROCESSES if not self._alive(name) and (name != "media" or ended)]
         if silent:
@@ -172,7 +172,7 @@ class HealthMonitor:
         latched = self._shared_state.estop is EStop.LATCHED
         if latched and state is not SessionState.FAULTED:
             pressed = self._latch.read()
-            if not (pressed and pressed.wall) and self._just_pressed():  # absent, or half written
+            if not (pressed and pressed.wall) and self._just_pressed():  # missing, or half written
                 return
             self.estop = _PRESSED_BY(who=pressed.by, why=pressed.why) if pressed else _PRESSED
             yield HealthEvent(SessionEvent.ESTOPPED, _ESTOPPED(pressed=self.estop))
@@ -181,7 +181,7 @@ class HealthMonitor:
             yield HealthEvent(SessionEvent.RELEASED, _RELEASED)
 
     def _just_pressed(self) -> bool:
-        """Control obeys the flag already; who pressed and why is on the disk a moment later."""
+        """Return True while the latch may still be written: control obeys the flag, but user and reason follow."""
         now = self._clock.now()
         self._pressed = now if self._pressed is None else self._pressed
         return now - self._pressed < _LATCH_S
@@ -203,9 +203,9 @@ class HealthMonitor:
         self._lease_held = held
 
     def _goes_on_to(self, going: Run | None) -> float | None:
-        """The limit [s] of a run that goes on although its holder is lost; None where it is held.
+        """Return the duration [s] to which a run continues although its lease holder is lost; None if it is held.
 
-        Nothing begins to move that way, and nothing moves without an end, or where nobody could stop it.
+        Only a trial that has begun continues, if it has a limited duration and can be stopped at the station's panel.
         """
         if self._plan.deployment.lease.lost == "hold" or not self._lease.lost(self._people.now()):
             return None

@@ -1,4 +1,4 @@
-"""Inbox of the coordinator: what control, reception and media say, and what follows from it."""
+"""Inbox of the coordinator: messages from control, reception and media, and their consequences."""
 
 from __future__ import annotations
 
@@ -29,31 +29,31 @@ _STARVED_BECAUSE = Pattern("inbox.starved_because", "{why}: {trouble}")
 _RECORDING = Pattern("inbox.recording", "recording {episode}")
 
 _RINGS = ("control_events", "reception_events", "media_events")
-# Control's own reasons to hold, as events of these kinds.
+# Kinds of events with control's own reasons to hold.
 _HOLDS = ("refusals", "implausible", "unmeasured", "family", "orphaned", "too_far", "moved_away")
 
 
 class Inbox:
-    """Messages of the other processes, each carried to the parts that it is for; the newest of their reports."""
+    """Dispatcher of the other processes' messages to the coordinator's components; stores their latest reports."""
 
     def __init__(self, coordinator: Coordinator) -> None:
         self._to = coordinator
         self.media_report = MediaReport(0.0, 0, "", 0)
         self.reception_report = ReceptionReport(0.0)
-        self.unheard: dict[str, str] = {}  # as by Sink.unheard
+        self.unheard: dict[str, str] = {}  # as from Sink.missing_subscribers
         for (
             message
-        ) in self._waiting():  # of before there was a coordinator, or since one died: told to that one
+        ) in self._waiting():  # from before this coordinator started: its predecessor has handled them
             if isinstance(message, Event):
                 self._store_event(message)
 
     def poll(self) -> None:
-        """Hear all that waits."""
+        """Dispatch all waiting messages."""
         for message in self._waiting():
             self._dispatch(message)
 
     def reset_subscribers(self) -> None:
-        """Control is started anew: it says again who does not hear it."""
+        """Clear the missing subscribers: a restarted control reports them again."""
         self.unheard = {}
 
     def _waiting(self) -> Iterator[Message]:

@@ -1,4 +1,4 @@
-"""Lease, the right to command: one holder at a time, by epoch and time to live."""
+"""Lease, the right to command: one holder at a time, with epoch and time to live."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _NOBODY_HOLDS = fixed("lease.nobody_holds", "nobody commands the station: take i
 _HELD_BY = Pattern("lease.held_by", "{holder} holds the lease")
 _OTHER_EPOCH = Pattern("lease.other_epoch", "epoch {epoch} is not the lease's epoch {newest}")
 
-HIGHEST_EPOCH = 2**52  # of a claim; beyond 2**53 a browser counts no more
+HIGHEST_EPOCH = 2**52  # of a claim; beyond 2**53 a browser's integers are inexact
 
 
 @dataclass(frozen=True, slots=True)
 class LeaseState:
-    """A lease as it stands: who, in which epoch, until when on our monotonic clock; `by`: as whom he is known.
+    """A lease: holder, epoch, expiry on our monotonic clock; `by` is the holder's display name.
 
-    `hidden`: his page has said since it was last renewed that nobody looks at it.
+    `hidden`: since the last renewal the holder's page has reported that it is hidden.
     """
 
     holder: str
@@ -33,26 +33,26 @@ class LeaseState:
 
 
 class Lease:
-    """At most one holder; a higher epoch takes over, a lower one is refused, silence ends it."""
+    """At most one holder; a higher epoch takes over, a lower one is refused, and without renewal it expires."""
 
     def __init__(self, ttl: float) -> None:
         self._ttl = ttl
         self._held: LeaseState | None = None
-        self._epoch = 0  # of the newest lease there ever was
+        self._epoch = 0  # of the newest lease ever granted
 
     def current(self, now: float) -> LeaseState | None:
-        """The lease that is valid at `now`."""
+        """Return the lease that is valid at `now`, None if there is none."""
         return self._held if self._held and now < self._held.until else None
 
     def status(self, now: float) -> dict[str, Any]:
-        """Holder, name, epoch and the seconds that are left; for none the newest epoch and no holder."""
+        """Return holder, name, epoch and remaining seconds; without a lease the newest epoch and no holder."""
         held = self.current(now)
         if held is None:
             return {"holder": "", "by": "", "epoch": self._epoch, "expires_in": 0.0}
         return {"holder": held.holder, "by": held.by, "epoch": held.epoch, "expires_in": held.until - now}
 
     def lost(self, now: float) -> bool:
-        """True if the newest lease ended by silence alone: it was not given up, nor was its holder's page hidden."""
+        """Return True if the newest lease expired unintentionally: neither released nor with a hidden page."""
         return self._held is not None and now >= self._held.until and not self._held.hidden
 
     @property
@@ -60,13 +60,13 @@ class Lease:
         return self._epoch
 
     def raise_epoch_floor(self, epoch: int) -> None:
-        """Epochs up to `epoch` were in use before a restart: they are over."""
+        """Invalidate all epochs up to `epoch`, which were used before a restart."""
         self._epoch = max(self._epoch, epoch)
 
     def claim(self, holder: str, epoch: int, now: float, by: str = "") -> str:
-        """Take or keep the lease; "" where granted, else the reason for the refusal.
+        """Claim or extend the lease; return "" if granted, else the reason.
 
-        Epoch 0 is a terminal's: it takes a free lease under the next epoch, or keeps its own.
+        Epoch 0 is that of a terminal: it claims a free lease with the next epoch, or extends its own.
         """
         if not holder:
             return _NEEDS_A_HOLDER
@@ -80,6 +80,8 @@ class Lease:
             if held:
                 return _HELD_FOR_ANOTHER(holder=held.holder, seconds=held.until - now)
             epoch = self._epoch + 1
+        # An epoch that was used before can never be granted again, so that a delayed claim does not take the
+        # lease back.
         if epoch <= self._epoch:
             return _EPOCH_OVER(epoch=epoch, newest=self._epoch)
         self._epoch = epoch
@@ -87,26 +89,26 @@ class Lease:
         return ""
 
     def renew(self, holder: str, epoch: int, now: float, by: str = "") -> str:
-        """Extend the lease; "" where done, else the reason."""
+        """Extend the lease; return "" if done, else the reason."""
         refusal = self.check(holder, epoch, now)
         if not refusal and self._held:
             self._held = replace(self._held, until=now + self._ttl, hidden=False)
         return refusal
 
     def hide(self, holder: str, epoch: int, now: float) -> None:
-        """The page of this holder is hidden: the lease is not renewed, and when it ends it was not lost."""
+        """Record that the holder's page is hidden: the lease is not extended, and its expiry is no loss."""
         if not self.check(holder, epoch, now) and self._held:
             self._held = replace(self._held, hidden=True)
 
     def release(self, holder: str, epoch: int, now: float, by: str = "") -> str:
-        """End the lease before its time."""
+        """End the lease early; return "" if done, else the reason."""
         refusal = self.check(holder, epoch, now)
         if not refusal:
             self._held = None
         return refusal
 
     def check(self, holder: str, epoch: int, now: float) -> str:
-        """ "" where this holder may command at `now`, else the reason why not."""
+        """Return "" if this holder may command at `now`, else the reason."""
         held = self.current(now)
         if held is None:
             return _NOBODY_HOLDS

@@ -1,4 +1,4 @@
-"""Operations of the session's commands: set-up, runs, and what the operator does within one."""
+"""Operations of the session's commands: set-up, runs, and actions of the operator within a run."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ _FAMILY_STARTING = Pattern(
 
 @dataclass(frozen=True, slots=True)
 class SessionComponents:
-    """Parts that operations are carried out with."""
+    """Components that operations use."""
 
     shared: SharedState
     clock: Clock
@@ -114,10 +114,10 @@ class SessionComponents:
 
 
 class SessionActions:
-    """Carries out what the session has allowed and more than one part has to do with; `spec` is the one in force.
+    """Operations that the session has allowed and that involve several components; `spec` is the one in force.
 
-    `absent` names a process that is silent. Each method raises RuntimeFault to refuse, and has changed nothing then.
-    What is returned goes into the answer.
+    `absent` returns the name of a process with an expired heartbeat. A method that refuses raises RuntimeFault and
+    has changed nothing. Return values become part of the answer.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class SessionActions:
         make_policy: MakePolicy,
     ) -> None:
         self._own = spec  # the deployment's
-        self.spec = spec  # as it was last set up or tuned
+        self.spec = spec  # of the last set-up or tuning
         self.shared: SharedState = parts.shared
         self.clock = parts.clock
         self.inference: Inference = parts.inference
@@ -142,11 +142,11 @@ class SessionActions:
         self._state, self._absent, self._say = state, absent, say
         self._make_policy = make_policy
         self._tuned = False  # since the last set-up
-        self.by: str = ""  # the client whose command is being carried out
-        self.command: str = ""  # that command's uuid
+        self.by: str = ""  # the client of the present command
+        self.command: str = ""  # the present command's uuid
 
     def set_requester(self, by: str, command: str) -> None:
-        """What is carried out next was asked for by `by`, in the command with that uuid."""
+        """Record client `by` and uuid of the command that is executed next."""
         self.by, self.command = by, command
 
     # --- set-up and runs -------------------------------------------------------------------------------------
@@ -171,7 +171,11 @@ class SessionActions:
         return {"bench": reset["id"]} if reset else {}
 
     def _changed_spec(self, asked: SetUpRequest) -> StationSpec:
-        """The plan of a set-up; raises RuntimeFault where it is none, or an open recording would not be about it."""
+        """Return the specification of a set-up.
+
+        Raises:
+            RuntimeFault: it is invalid, or contradicts the manifest of an open recording.
+        """
         collects = self._collects(asked)
         changes = asked.changes | ({"strategy": {"kind": "naive"}} if collects else {})
         resolved = loader.apply_changes(self._own.resolved, changes, "setup")
@@ -180,7 +184,11 @@ class SessionActions:
         return replace(self._own, resolved=resolved, collecting=collects)
 
     def _collects(self, asked: SetUpRequest) -> bool:
-        """True if the operator is to drive the robot after this set-up; RuntimeFault if that does not fit."""
+        """Return True if the operator drives the robot after this set-up.
+
+        Raises:
+            RuntimeFault: the request contradicts the deployment.
+        """
         settings = self._own.deployment
         absent = settings.policy.kind == "none" and asked.policy is None
         collects = absent if asked.collect is None else asked.collect
@@ -207,7 +215,7 @@ class SessionActions:
         if mode == "manual":
             self.manual.require_robot(_WHAT_RUN_MANUAL)
             self.manual.prepare()
-        # A control that was restarted during the set-up merges as the deployment says until it is told.
+        # A control restarted during the set-up merges by the deployment's strategy until it gets this one.
         self._orders.tune(self.spec.deployment.strategy.model_dump())
         collecting = self.collecting
         if mode != "collect":
@@ -218,7 +226,11 @@ class SessionActions:
         return {"episode": episode}
 
     def _mode(self, asked: RunRequest) -> Mode:
-        """The mode of a run; RuntimeFault where the station is not set up for it."""
+        """Return the mode of a run.
+
+        Raises:
+            RuntimeFault: the station is not set up for it.
+        """
         collects, settings = self.spec.collecting, self.spec.deployment
         mode = asked.mode or ("collect" if collects else settings.run.mode)
         if collects and mode not in ("collect", "manual"):
@@ -231,7 +243,7 @@ class SessionActions:
         return mode
 
     def _require_comparable(self, asked: RunRequest) -> None:
-        """Refuse a trial of anything but the set-up: nothing by hand or tuned, the policy on the robot."""
+        """Raise RuntimeFault for a trial that is not exactly the set-up: tuned, manual, or not on the robot."""
         mode = self._mode(asked)
         if mode != "continuous":
             raise RuntimeFault(_TRIAL_MODE(mode=mode))
@@ -242,7 +254,7 @@ class SessionActions:
         if not np.isnan(self.manual.grippers.locks).all():
             raise RuntimeFault(_TRIAL_WITH_LOCKED_GRIPPER)
 
-    # --- what a person does within a run ------------------------------------------------------------
+    # --- actions within a run -----------------------------------------------------------------------
 
     @property
     def situation(self) -> GuardFacts:
@@ -264,7 +276,7 @@ class SessionActions:
         )
 
     def tune(self, asked: TuneRequest) -> TransitionResult:
-        """Another strategy, other parameters, another instruction from now on."""
+        """Change strategy, parameters or instruction from now on."""
         if self.spec.collecting and asked.strategy is not None:
             raise RuntimeFault(_TUNE_STRATEGY_WHILE_COLLECTING)
         spec = apply_tuning(self.spec, asked, self.setup.info)
@@ -282,7 +294,7 @@ class SessionActions:
         return {"strategy": strategy, "task": settings.task}
 
     def cancel(self) -> None:
-        """Forget the chunk that is shown, leave the rest of the one that is executed, end a motion; hold."""
+        """Discard the shown chunk, the rest of the executed one, or a motion; then hold."""
         self.runs.cancel()
         self.manual.stop_grippers()
 
@@ -294,7 +306,7 @@ class SessionActions:
         return self.manual.move_gripper(asked, free)
 
     def approach(self) -> None:
-        """Go to the policy's first action on a limited path: the one of the set-up, or the one that is shown."""
+        """Move to the policy's first action on a limited path: that of the set-up, or of the shown chunk."""
         made, first = self.inference.proposal, self.setup.first_action
         if self._state() is not SessionState.READY and made is not None:
             self.runs.approach(self.manual.check_motion("approach", made.answered.commands.intended_start))
@@ -304,21 +316,21 @@ class SessionActions:
     # --- demonstrations -----------------------------------------------------------------------------
 
     def arm(self) -> None:
-        """A collected episode may begin from now on."""
+        """Permit a demonstration to begin from now on."""
         self._require_family()
         self.collecting.arm()
 
     def discard(self, asked: DiscardRequest) -> TransitionResult:
-        """Mark an episode as discarded; the open one ends, as by `end_run`, where none is named."""
+        """Mark an episode as discarded; without a name the open episode, which ends as by `end_run`."""
         told = self.collecting.discard(asked, self.by)
         if asked.episode is None and self.collecting.run is not None:
             self.end_run("finished", DISCARDED)
         return told
 
-    # --- what goes on -------------------------------------------------------------------------------
+    # --- hold, end, home, record --------------------------------------------------------------------
 
     def hold(self, reason: str) -> None:
-        """Decelerate, hold, stop asking the policy; a run stays open."""
+        """Brake, hold, stop querying the policy; a run remains open."""
         self.runs.hold(reason)
         self.manual.stop_grippers()
 
@@ -327,7 +339,7 @@ class SessionActions:
         self.runs.resume()
 
     def end_run(self, status: str, reason: str) -> None:
-        """Decelerate, hold, close the run and its episode; nothing to do where no run is open."""
+        """Brake, hold, close the run and its episode, if one is open."""
         self.runs.end(status, reason)
         self.manual.stop_grippers()
 
@@ -340,7 +352,7 @@ class SessionActions:
         return {"episode": self.runs.start_standalone_recording(self.setup.info)}
 
     def _require_family(self) -> None:
-        """Refuse while a process is still starting: what it is sent would be lost."""
+        """Raise RuntimeFault while a process is starting: messages to it would be lost."""
         absent = self._absent()
         if absent:
             raise RuntimeFault(_FAMILY_STARTING(process=absent))

@@ -1,4 +1,4 @@
-"""Check of the straight way in joints from one posture to another, before a motion of ours goes it."""
+"""Check of the straight path in joint space before a generated motion."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _COLLIDES = Pattern(
     "hand first",
 )
 
-_STEP = 0.01  # [rad or m] of the joint that goes farthest, between postures that are looked at
-# What is begun must not be stopped half-way by control, which judges what is really sent, at other postures.
+_STEP = 0.01  # [rad, m] between checked postures, of the joint that moves farthest
+# Margin: control checks the sent commands at other postures, and must not stop an accepted motion half-way.
 _SPARE = 0.001  # [m]
 
 
 class PathCheck:
-    """The ways of one robot, within its workspace boxes and without collisions."""
+    """Check of a robot's paths against workspace boxes and collisions."""
 
     def __init__(self, spec: StationSpec) -> None:
         safety = spec.deployment.safety
@@ -37,7 +37,10 @@ class PathCheck:
         self._collisions = Collisions(spec.robot, safety.collision_margin + _SPARE)
 
     def check(self, what: str, start: Float64, goal: Float64) -> None:
-        """RuntimeFault for `what` where the way from `start` to `goal` [D] leaves a box it is in, or links collide."""
+        """Raise RuntimeFault if the path from `start` to `goal` [D] leaves a box or if links collide.
+
+        `what` begins the message. A box matters only if the path has been inside it.
+        """
         way = self._path(start, goal)
         if arm := self._workspace.arm_leaving_on(way):
             raise RuntimeFault(_LEAVES_WORKSPACE(what=what, arm=arm))
@@ -47,7 +50,7 @@ class PathCheck:
             raise RuntimeFault(_COLLIDES(what=what, collision=collision, percent=100 * at / (len(way) - 1)))
 
     def _path(self, start: Float64, goal: Float64) -> Float64:
-        """Postures [T, D] from `start` to `goal`, near enough to each other."""
+        """Return postures [T, D] from `start` to `goal` at most _STEP apart."""
         apart = difference(goal, start, self._wrapping)
         farthest = np.abs(apart).max(where=self._limits.position_mask, initial=0.0)
         count = max(2, math.ceil(farthest / _STEP) + 1)

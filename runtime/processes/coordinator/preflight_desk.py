@@ -1,4 +1,4 @@
-"""Answers of a station about preflights: one is begun, how it went, which server its policy has.
+"""Service for preflights of a station: start, report, and the server of its policy.
 
 Nothing moves, and no lease is needed; a run or a set-up is never disturbed.
 """
@@ -37,7 +37,7 @@ PREFLIGHT_QUERIES = ("preflight", "preflight_report", "policy_server")
 
 
 class PreflightService:
-    """Preflights of the coordinator: `in_force` is the plan last set up, `own` the deployment's, which is checked."""
+    """Preflights of the coordinator: `in_force` returns the last set-up, `own` is the deployment, which is checked."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class PreflightService:
         self._preflights = preflights or Preflights()
 
     def handle(self, command: Command, boot: str) -> Ack:
-        """The answer to one of PREFLIGHT_QUERIES."""
+        """Return the answer to one of PREFLIGHT_QUERIES."""
         answer = {
             "preflight": self._start,
             "preflight_report": self._report,
@@ -65,18 +65,18 @@ class PreflightService:
             return Ack(command.uuid, "refused", str(fault), boot=boot)
 
     def poll(self) -> None:
-        """Say what has ended; cheap."""
+        """Emit an event if a preflight has ended; cheap."""
         ended = self._preflights.poll()
         if ended is not None:
             verdict = ended.finished.get("verdict") or ended.failure
             self._emit(_ENDED(about=ended.about, verdict=verdict), {"id": ended.id})
 
     def cancel(self, why: str) -> None:
-        """The policy's server is wanted for something that counts."""
+        """Cancel a preflight, because the policy's server is needed for a run."""
         self._preflights.cancel(why)
 
     def close(self) -> None:
-        """End what is under way."""
+        """End a running preflight."""
         self._preflights.close()
 
     def _start(self, command: Command) -> dict[str, Any]:
@@ -87,7 +87,7 @@ class PreflightService:
         return {"id": asked.id, "longest_s": longest}
 
     def _require_free(self, asked: PreflightRequest) -> None:
-        """A server that serves one at a time would be taken from a station that is ready to run with it."""
+        """Raise RuntimeFault if the station is in use, or would lose its exclusive policy server."""
         state = self._state()
         if state.meaning.at_work:
             raise RuntimeFault(
@@ -107,7 +107,7 @@ class PreflightService:
         return self._preflights.report(read("preflight_report", PreflightReportRequest, command.args).id)
 
     def _server(self, command: Command) -> dict[str, Any]:
-        """The server of the policy that is in force, or that a preflight with this `policy` would ask."""
+        """Return the server of the policy in force, or of a preflight with this `policy`."""
         asked = read("policy_server", PolicyServerRequest, command.args)
         settings = self._in_force().deployment
         if asked.policy is not None:

@@ -1,4 +1,4 @@
-"""Sockets of the coordinator: stops at once, commands in turns; snapshots at 10 Hz (5 at rest), joints at 30."""
+"""Coordinator process: stops at once, commands in turns; snapshots at 10 Hz (5 at rest), joints at 30 Hz."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ _NOT_ON_DISK = Pattern("commands.not_journalled", "answers to commands are not o
 
 _NOT_JOURNALLED = ("status", "events_since", "aim", "lease_renew", "preflight_report", "policy_server")
 _MOST_WAITING = 100  # commands
-_SHARE = 8  # commands that are carried out in one turn, besides all stops
-_FLOOD_S = 5.0  # between two events about one
+_SHARE = 8  # commands that are executed per turn, in addition to all stops
+_FLOOD_S = 5.0  # [s] between two events about a flood
 _PERIODS = {"state": 0.1, "joints": 1 / 30, "poses": 1 / 30}  # of streams [s]
-_SLOWER = 2.0  # the period of snapshots of a station at rest, where every event brings one at once
-_WORK_S = 0.004  # between two looks at what goes on
+_SLOWER = 2.0  # factor on the period of snapshots at rest, when every event causes a snapshot at once
+_WORK_S = 0.004  # [s] between two polls while something is in progress
 
 
 Answered = tuple[Command, Ack, IncomingMessage]
 
 
 class CommandService:
-    """Service that clients of the station talk to."""
+    """Command server and publisher for the station's clients."""
 
     def __init__(self, coordinator: Coordinator, context: zmq.Context[Any]) -> None:
         self._coordinator = coordinator
@@ -75,11 +75,11 @@ class CommandService:
             if woken_by is not None:
                 self._poller.register(woken_by, zmq.POLLIN)
         self._due: dict[str, float] = {}
-        self._read: list[str] = []  # streams of _PERIODS that somebody reads
+        self._read: list[str] = []  # streams of _PERIODS with a subscriber
         self._told = 0
         self._shown: DisplayedChunk | None = None
         self._unjournalled = ""
-        self._waiting: list[QueuedCommand] = []  # for what is still being loaded
+        self._waiting: list[QueuedCommand] = []  # for kinematics that are being loaded
 
     def _write_endpoints(self) -> None:
         where = {
@@ -90,9 +90,9 @@ class CommandService:
         self._endpoints.write("coordinator", where)
 
     def serve(self, timeout: float) -> None:
-        """Wait up to `timeout` seconds for a command; answer all stops and some of the rest; publish what is due.
+        """Wait up to `timeout` seconds for a command; answer all stops and a share of the rest; publish what is due.
 
-        Who begins to read a stream, and a message of the family, end the wait too.
+        A new subscriber, and a message of another process, end the wait too.
         """
         if not self._turns.has_waiting:
             self._poller.poll(math.ceil(timeout * 1000))
@@ -107,6 +107,8 @@ class CommandService:
         journalled = [
             (command, ack) for command, ack, _ in (*stopped, *answered) if command.kind not in _NOT_JOURNALLED
         ]
+        # Answers are journalled before they are sent, so that a repeated command is never executed twice after
+        # a restart. Stops were answered already: they must not wait for the disk.
         if journalled:
             self._report_disk_failure(self._journal.append_all(journalled))
         for _, ack, call in answered:
@@ -119,14 +121,14 @@ class CommandService:
                 self._streams.rebind_if_unreachable(),
                 self._endpoints.is_missing("coordinator"),
             ]
-        ):  # all are looked after
+        ):  # a list: every call must be made
             self._write_endpoints()
 
     def _identified(self, call: IncomingMessage, command: Command) -> Command:
         return authenticate(command, call.payload, call.signature, call.uid, self._key)
 
     def _stop(self, stops: list[QueuedCommand]) -> list[Answered]:
-        """Answer stops without waiting for the disk; those alike in this turn get the same answer."""
+        """Answer stops without waiting for the disk; equal ones in this turn get the same answer."""
         first: dict[tuple[str, str, str, int], Ack] = {}
         fresh: list[Answered] = []
         for call, command in stops:
@@ -140,7 +142,7 @@ class CommandService:
         return fresh
 
     def _execute(self, asked: list[QueuedCommand]) -> list[Answered]:
-        """Answers that are new, to be given when they are on disk."""
+        """Execute commands; return the new answers, which are sent after they are on disk."""
         fresh: list[Answered] = []
         for call, command in asked:
             if (first := self._coordinator.session.answered(command)) is not None:
@@ -159,7 +161,7 @@ class CommandService:
         self._server.answer(call, Ack(command.uuid, "refused", reason, kind=command.kind))
 
     def _defer(self, call: IncomingMessage, command: Command) -> None:
-        """Answer it when what it needs is loaded; nobody waits for that here."""
+        """Answer the command when its kinematics are loaded, without waiting here."""
         if len(self._waiting) < _MOST_WAITING:
             self._waiting.append((call, command))
         else:
@@ -171,26 +173,26 @@ class CommandService:
             self._emit_rate_limited("flood", _TOO_MANY_REQUESTS(pid=call.pid, why=TOO_MANY))
 
     def _emit_rate_limited(self, kind: str, text: str) -> None:
-        """An event, unless there was one of its kind just now: a flood is not to fill the record."""
+        """Emit an event, unless there was one of its kind just before: a flood must not fill the record."""
         if (now := self._coordinator.client_clock.now()) >= self._due.get(kind, 0.0):
             self._due[kind] = now + _FLOOD_S
             self._coordinator.emit(Event(kind, text, self._coordinator.clock.now()))
 
     def _report_disk_failure(self, failure: str) -> None:
-        """A disk that is full stays so for a while: one event when it begins."""
+        """Emit one event when a disk failure begins."""
         if failure and not self._unjournalled:
             text = _NOT_ON_DISK(why=failure)
             self._coordinator.emit(Event("not_journalled", text, self._coordinator.clock.now()))
         self._unjournalled = failure
 
     def until_due(self) -> float:
-        """Seconds until a stream that somebody reads is due; inf where nobody reads any."""
+        """Return the seconds until a subscribed stream is due; inf without subscribers."""
         due = min((self._due.get(stream, 0.0) for stream in self._read), default=math.inf)
         return max(0.0, due - self._coordinator.client_clock.now())
 
     def _publish(self) -> None:
         coordinator, now = self._coordinator, self._coordinator.client_clock.now()
-        if begun := self._streams.hear():  # is shown at once what there is
+        if begun := self._streams.hear():  # new subscribers get the present content at once
             self._due = {name: due for name, due in self._due.items() if not name.startswith(tuple(begun))}
         self._read = [stream for stream in _PERIODS if self._streams.wanted(stream)]
         news = coordinator.events.newest != self._told
@@ -209,7 +211,7 @@ class CommandService:
             self._told = coordinator.events.newest
 
     def _publish_chunk(self, now: float) -> None:
-        """The newest chunk when there is another one, and once a second for who comes late."""
+        """Publish the newest chunk when it changes, and once a second for late subscribers."""
         if not self._streams.wanted("chunk"):
             return
         shown = self._coordinator.inference.shown
@@ -219,7 +221,7 @@ class CommandService:
             self._streams.publish("chunk", {"chunk": 0} if shown is None else self._chunk(shown))
 
     def _chunk(self, shown: DisplayedChunk) -> dict[str, Any]:
-        """Rows float32 [H, D], poses float32 [H, 8 * arms], the step each row is for (-1: none)."""
+        """Return rows float32 [H, D], poses float32 [H, 8 * arms], and the step of each row (-1: none)."""
         return {
             "chunk": shown.number,
             "run": shown.run,
@@ -234,11 +236,11 @@ class CommandService:
         }
 
     def _joints(self) -> dict[str, Any]:
-        """One control step joint by joint, float32 [D] each: NaN in `planned` and `raw` where there is none.
+        """Return one control step joint by joint, float32 [D] each; NaN in `planned` and `raw` if there is none.
 
-        `raw` is what the newest chunk wants for the step, `planned` what was made of all chunks before safety,
-        `simulated` where the robot of a run in simulation was told to be. `chunk` has the largest part in the step
-        (-1: none), `chunks` made it, safety has `limited` it.
+        `raw` is the newest chunk's action for the step, `planned` the action of all chunks before safety, `simulated`
+        the command of the simulated robot. `chunk` has the largest weight in the step (-1: none), `chunks` is the
+        number of contributing chunks, `limited` whether safety has changed the action.
         """
         status, seen = self._coordinator.shared.control.read(), self._coordinator.shared.observation.read()
         step = int(status["step"])
@@ -258,7 +260,7 @@ class CommandService:
         }
 
     def _poses(self) -> np.ndarray:
-        """End effectors as one float32 frame [2, 8 * arms]: measured, commanded (NaN while nothing is sent)."""
+        """Return end effector vectors float32 [2, 8 * arms]: measured, commanded (NaN if not engaged)."""
         status, seen = self._coordinator.shared.control.read(), self._coordinator.shared.observation.read()
         poses = self._coordinator.spaces.eef_of(np.stack([seen["qpos"], status["commanded"]]))
         if not status["engaged"]:
@@ -271,7 +273,7 @@ class CommandService:
 
 
 def main() -> None:
-    """The process coordinator: decide and serve until the supervisor is gone."""
+    """Run the coordinator until the supervisor has ended."""
     heap.keep_freed_memory()
     descriptors.raise_file_limit()
     member = join_station("coordinator")

@@ -1,4 +1,4 @@
-"""Queries of clients that the coordinator answers: nothing moves, and no lease is needed."""
+"""Queries of clients: nothing moves, and no lease is needed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUERIES = ("events_since", "aim", *PREFLIGHT_QUERIES)
 
 
 class Queries:
-    """Answers to QUERIES; any client that may ask at all may ask them."""
+    """Answers to QUERIES, for every client with access."""
 
     def __init__(
         self, boot: str, events: EventLog, manual: ManualControl, preflights: PreflightService
@@ -26,7 +26,7 @@ class Queries:
         self._boot, self._events, self._manual, self._preflights = boot, events, manual, preflights
 
     def answer(self, command: Command) -> Ack:
-        """The answer to one of QUERIES."""
+        """Return the answer to one of QUERIES."""
         if command.kind == "events_since":
             return self._events_since(command)
         if command.kind == "aim":
@@ -34,7 +34,7 @@ class Queries:
         return self._preflights.handle(command, self._boot)
 
     def is_loading(self, command: Command) -> bool:
-        """True if its answer needs what is still being loaded, so that it is to be asked again in a moment."""
+        """Return True if the answer needs kinematics that are still loading; ask again in a moment."""
         return command.kind == "aim" and self._manual.is_loading(command.args)
 
     def _events_since(self, command: Command) -> Ack:
@@ -44,7 +44,7 @@ class Queries:
         return Ack(command.uuid, "done", boot=self._boot, data={"events": self._events.since(number)})
 
     def _aim(self, command: Command) -> Ack:
-        """Preview of where the robot would go."""
+        """Return a preview of a target."""
         try:
             return Ack(command.uuid, "done", boot=self._boot, data=self._manual.aim(command.args))
         except RuntimeFault as error:

@@ -1,4 +1,4 @@
-"""The coordinator's side of runs and recordings: opens, holds, resumes and closes them, and notifies media."""
+"""Runs and recordings in the coordinator: open, hold, resume and close them, and notify media."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ _MEDIA_DOES_NOT_READ = fixed(
 
 
 class Runs:
-    """At most one open run, or one recording without a run."""
+    """Runs of a station: at most one open run, or one standalone recording."""
 
     def __init__(
         self,
@@ -79,30 +79,30 @@ class Runs:
         self._orders = orders
         self._provenance = provenance  # of the next manifest
         self._figures = figures  # of control, for the outcome
-        self._prepared = prepared  # begins to load what a person needs; whether it is there
+        self._prepared = prepared  # starts to load kinematics for jogs; whether they are loaded
         self.open: Run | None = None
         self._count = int(shared.control.read()["run"])
         self._generation = shared.generation("coordinator")
-        self._alone = ""  # uuid of a recording without a run
+        self._alone = ""  # uuid of a standalone recording
         self.last: dict[str, Any] = {}  # how the last run ended
         self.last_episode: dict[str, Any] = {}
 
     @property
     def _requires_recording(self) -> bool:
-        """True if a run that is not recorded must not go on."""
+        """Whether a run that is not recorded must not continue."""
         return self._plan.deployment.recording.on_failure == "hold"
 
     def _must_record(self, trial: bool, mode: str) -> bool:
-        """True if a run must not begin without its recording: a trial or demonstration is nothing without."""
+        """Return True if a run must not begin without its recording, like trials and demonstrations."""
         return self._requires_recording or trial or mode == "collect"
 
     def _require_room(self) -> None:
-        """RecordingError where the disk of the episodes has too little room for another one."""
+        """Raise RecordingError if the episodes' disk has too little room for another episode."""
         settings = self._plan.deployment
         require_room(settings.episodes_dir, settings.recording.min_free_bytes)
 
     def status(self, now: float) -> dict[str, Any]:
-        """The open run, how the last one and the last episode ended, and the checkpoint."""
+        """Return the open run, the results of the last run and episode, and the checkpoint."""
         none = {"number": 0, "uuid": "", "elapsed": 0.0, "held": 0.0, "duration_s": None}
         return {
             "checkpoint": dict(self._provenance.checkpoint),
@@ -112,7 +112,7 @@ class Runs:
         }
 
     def update_provenance(self, **changes: Any) -> None:
-        """Another plan, checkpoint or layout of the bench, for the manifests of what follows: fields of Provenance."""
+        """Change fields of Provenance (specification, checkpoint, bench) for later manifests."""
         self._provenance = replace(self._provenance, **changes)
 
     # --- runs ----------------------------------------------------------------------------------------------
@@ -124,10 +124,12 @@ class Runs:
         more: Mapping[str, Any] = MappingProxyType({}),
         command: str = "",
     ) -> str:
-        """Ask media to open an episode; the run begins when it has. Returns the episode's uuid, "" for none.
+        """Request an episode from media; return its uuid, "" without a recording. The run begins when it is open.
 
-        `more` stands in the manifest in place of what it would say else. RuntimeFault where the disk has no room for
-        what must be recorded.
+        `more` overrides fields of the manifest.
+
+        Raises:
+            RuntimeFault: a standalone recording is open, or the disk has no room for a required recording.
         """
         if self._alone:
             raise RuntimeFault(_RECORDING_ALONE_OPEN)
@@ -160,7 +162,7 @@ class Runs:
         return identity if manifest else ""
 
     def on_episode_opened(self, message: EpisodeOpened, running: bool) -> str:
-        """Media is ready, or could not be: returns why the run cannot go on, "" where it can."""
+        """Begin the run if its episode was opened; return why it cannot begin, "" if it can."""
         if message.error and message.run == 0:
             self._alone = ""
         run = self.open
@@ -177,10 +179,10 @@ class Runs:
         doubt = self._shared_state.joint_problem if running and self._plan.capabilities.moves_robot else ""
         if running and not doubt:
             self._start(run)
-        return doubt  # which came after the run was accepted
+        return doubt  # it arose after the run was accepted
 
     def hold(self, reason: str) -> None:
-        """Decelerate, hold, stop asking; an open run's clock pauses."""
+        """Brake, hold, stop querying; the clock of an open run pauses."""
         self._inference.pause()
         self._orders.send_order("hold", run=self._begun, reason=reason)
         if self.open:
@@ -188,11 +190,15 @@ class Runs:
 
     @property
     def _begun(self) -> int:
-        """The number of the open run, whose rows control's ticks are; 0 where none is open, or it has not begun."""
+        """Number of the open run for orders; 0 if there is none, or it has not begun."""
         return 0 if self.open is None or self.open.begun_at is None else self.open.number
 
     def resume(self) -> None:
-        """Go on with the open run; raises RuntimeFault where there is none, or its recording has failed."""
+        """Resume the open run.
+
+        Raises:
+            RuntimeFault: there is none, or its required recording has ended.
+        """
         run = self.open
         if run is None:
             raise RuntimeFault(_NONE_OPEN)
@@ -205,7 +211,7 @@ class Runs:
             self._start(run)
 
     def end(self, status: str, reason: str) -> None:
-        """Decelerate, hold, close the open run."""
+        """Brake, hold, close the open run."""
         self._inference.pause()
         self._inference.use_simulated(False)
         self._orders.send_order("hold", reason=reason)
@@ -218,12 +224,10 @@ class Runs:
             policy = self._inference.metrics.figures()
             details = {"run_seconds": seconds, "control": run.figures(self._figures()), "policy": policy}
             details |= {"reached": run.reached} if run.reached else {}
-            self.record_event(
-                EndEpisode(status, reason, details)
-            )  # a stop is not refused because media hangs
+            self.record_event(EndEpisode(status, reason, details))  # a stop must not fail because media hangs
 
     def update_truth(self, truth: Mapping[str, Any], running: bool) -> None:
-        """Note when a simulated bench first says of a milestone that it is reached, in a run that is not held."""
+        """Record when a simulated bench first reports a milestone as reached, in a run that is not held."""
         run, milestones = self.open, truth.get("milestones")
         if not running or run is None or run.begun_at is None or not isinstance(milestones, Mapping):
             return
@@ -232,12 +236,12 @@ class Runs:
                 run.reached.setdefault(str(name), round(run.elapsed(self._clock.now()), 2))
 
     def poll(self) -> None:
-        """Begin a run as soon as what it waited for is there."""
+        """Begin a run as soon as what it waits for is loaded."""
         if self.open is not None and self.open.waiting:
             self._start(self.open)
 
     def _start(self, run: Run) -> None:
-        """Begin it; by hand not before steps of an end effector can be answered at once."""
+        """Begin a run; a manual one only when jogs can be answered at once."""
         if run.mode == "manual" and not self._prepared():
             run.wait()
             return
@@ -253,29 +257,29 @@ class Runs:
         else:
             self._orders.send_order("follow", run=run.number, mode=run.mode)
             self._inference.begin(run.number, fresh, run.mode)
-            if run.mode == "collect":  # a leader has moved on while the robot was held: it is engaged anew
+            if run.mode == "collect":  # a leader has moved while the robot was held: it is engaged anew
                 self._inference.requests.reset_episode()
 
-    # --- by a person, within a run ---------------------------------------------------------------------------
+    # --- motions within a run --------------------------------------------------------------------------------
 
     def move(self, goal: Float64, speed: float) -> None:
-        """Go to `goal` on a limited path, within the open run where there is one."""
+        """Move to `goal` on a limited path, within the open run if there is one."""
         self._orders.send_order("motion", run=self._begun, goal=goal, speed=speed)
 
     def cancel(self) -> None:
-        """Leave what is planned or under way, and stand; the run goes on."""
+        """Discard plan or motion, and stop; the run continues."""
         if self.open is not None:
             self._inference.cancel()
             self._stand(self.open)
 
     def approach(self, goal: Float64) -> None:
-        """Go to where the chunk that is shown begins."""
+        """Move to the start of the shown chunk."""
         if self.open is not None:
             self.open.approach()
             self.move(goal, 1.0)
 
     def on_motion_done(self) -> None:
-        """Control has come to the end of a motion: an open run that asked for it stands and waits again."""
+        """End an approach of the open run, because control has finished the motion."""
         if self.open is not None and self.open.is_approaching:
             self._stand(self.open)
 
@@ -290,11 +294,16 @@ class Runs:
 
     @property
     def is_recording_standalone(self) -> bool:
-        """True if a recording without a run is open."""
+        """Whether a standalone recording is open."""
         return bool(self._alone)
 
     def start_standalone_recording(self, info: PolicyInfo | None) -> str:
-        """Open an episode of whatever control does; returns its uuid."""
+        """Open an episode that records everything that control does; return its uuid.
+
+        Raises:
+            RuntimeFault: a standalone recording is open already.
+            RecordingError: the disk has no room.
+        """
         if self._alone:
             raise RuntimeFault(_RECORDING_OPEN)
         self._require_room()
@@ -304,7 +313,11 @@ class Runs:
         return self._alone
 
     def stop_standalone_recording(self) -> None:
-        """Close it."""
+        """Close the standalone recording.
+
+        Raises:
+            RuntimeFault: there is none.
+        """
         if not self._alone:
             raise RuntimeFault(_NO_RECORDING_ALONE)
         self._tell(self._end_alone("finished", STOPPED))
@@ -314,20 +327,20 @@ class Runs:
         return EndEpisode(status, reason, {"control": self._figures()})
 
     def interrupt_standalone_recording(self, reason: str) -> None:
-        """Close a recording without a run, where one is open; media may hang."""
+        """Close a standalone recording as interrupted, if one is open; media may hang."""
         if self._alone:
             self.record_event(self._end_alone("interrupted", reason))
             self._alone = ""
 
     def on_process_restarted(self, process: str, reason: str) -> None:
-        """That process was restarted: of a recording without a run media held the files and control the ticks."""
+        """End a standalone recording if media, which had its files, or control, which had its ticks, restarted."""
         if process == "media":
             self._alone = ""  # repair closes it
         elif process == "control":
             self.interrupt_standalone_recording(reason)
 
     def on_episode_closed(self, message: EpisodeClosed) -> Event:
-        """An episode is on disk, or waits for room there; the event that says so."""
+        """Record that an episode is closed, or waits for room on the disk; return the event about it."""
         if self.open is not None and self.open.uuid == message.uuid:
             self.open.stop_recording(message.error or message.reason)
         if self._alone == message.uuid:
@@ -346,7 +359,7 @@ class Runs:
         return Event("episode_closed", text, self._clock.now(), data=self.last_episode)
 
     def record_event(self, message: Message) -> None:
-        """Something for the record; where media does not read, the record misses it and the log says so."""
+        """Send a message for the record; if media does not read, it is lost and that is logged."""
         try:
             self._tell(message)
         except RuntimeFault as error:

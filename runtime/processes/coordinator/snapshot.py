@@ -1,4 +1,4 @@
-"""Snapshot of a station for its clients: one whole map, never differences."""
+"""Snapshot of a station for its clients: one complete map, never differences."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 def build_snapshot(of: Coordinator) -> dict[str, Any]:
-    """The station's state; times in seconds on the runtime's clock, ages in seconds.
+    """Return the station's state; times in seconds on the runtime's clock, ages in seconds.
 
-    "clock" is the one that commands are valid by; in lockstep it goes on while the runtime's stands. "sentences" has
-    id and arguments of those of its texts that have one, by where they stand: "reason", "guarded.run".
+    "clock" is the clock of command validity; in lockstep it continues while the runtime's clock is stopped.
+    "sentences" has id and arguments of texts that have them, by path: "reason", "guarded.run".
     """
     told = _snapshot(of)
     changing = {key: value for key, value in told.items() if key != "facts"}
@@ -74,7 +74,7 @@ def _snapshot(of: Coordinator) -> dict[str, Any]:
 
 
 def station_facts(spec: StationSpec) -> dict[str, Any]:
-    """Constants of a running station: names, sizes, limits [rad or the gripper's unit], rates [Hz]."""
+    """Return constants of a running station: names, sizes, limits [rad or the gripper's unit], rates [Hz]."""
     robot, bus = spec.robot, spec.deployment.bus
     return {
         "robot": robot.name,
@@ -105,7 +105,7 @@ def station_facts(spec: StationSpec) -> dict[str, Any]:
 
 
 def _phase(of: Coordinator) -> str:
-    """Phase of a run that goes on, in one word; "" where none does, or it has not begun."""
+    """Return the phase of a running run in one word; "" if there is none, or it has not begun."""
     run, control = of.runs.open, of.shared.control.read()
     if run is None or run.begun_at is None or of.session.state is not SessionState.RUNNING:
         return ""
@@ -122,7 +122,7 @@ def _phase(of: Coordinator) -> str:
 
 
 def _proposal(of: Coordinator, now: float) -> dict[str, Any]:
-    """The chunk that is shown and waits to be committed."""
+    """Return the status of the chunk that waits to be committed, {} if there is none."""
     made = of.inference.proposal
     return (
         {}
@@ -132,7 +132,7 @@ def _proposal(of: Coordinator, now: float) -> dict[str, Any]:
 
 
 def control_figures(shared: SharedState, rate: float) -> dict[str, Any]:
-    """Figures of control: what it last did and how well it keeps time."""
+    """Return control's status figures: its last tick and its timing."""
     status = shared.control.read()
     return {
         "rate": rate,

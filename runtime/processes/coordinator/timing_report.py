@@ -1,4 +1,4 @@
-"""Says when control cannot be punctual here, or is not; once each, never once per tick."""
+"""Events about control's timing: real time not permitted, or ticks late; each once, not per tick."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from runtime.ipc.shared_state import SharedState
 _LATE = Pattern("timing.late", "one tick in a hundred begins more than {ms:.1f} ms late")
 _PUNCTUAL = Pattern("timing.punctual", "ticks are on time again: 99 of 100 within {ms:.2f} ms")
 
-_LATE_S, _PUNCTUAL_S = 1e-3, 0.5e-3  # p99: from here on it is told, below the other it is over
-_MEASURED_S = 2.0  # of ticks before they are judged
+_LATE_S, _PUNCTUAL_S = 1e-3, 0.5e-3  # [s] p99 that is late, p99 that is punctual again
+_MEASURED_S = 2.0  # [s] of ticks before they are judged
 _LOOK_S = 1.0
 
 
 class TimingReport:
-    """Looks at control's own figures once a second; `asked`: control asks for the real-time class."""
+    """Monitor of control's timing statistics, once a second; `asked`: control requests the real-time class."""
 
     def __init__(self, shared: SharedState, rate: float, priority: int, asked: bool) -> None:
         self._shared_state = shared
@@ -24,11 +24,11 @@ class TimingReport:
         self._priority = priority
         self._asked = asked
         self._next = 0.0
-        self._class = ""  # that was told of
+        self._class = ""  # the class that was reported
         self._late = False
 
     def poll(self, now: float) -> list[Event]:
-        """New events about control's timing; none before control has ticked for a while."""
+        """Return new events about control's timing; none before control has ticked for a while."""
         if now < self._next:
             return []
         self._next = now + _LOOK_S

@@ -1,1 +1,1 @@
-"""Asking the policy, and what its answers become."""
+"""Inference: requests to the policy, and their responses."""

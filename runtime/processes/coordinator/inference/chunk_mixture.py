@@ -1,4 +1,4 @@
-"""Mixtures of several answers, in the numbers in which the policy gave its rows."""
+"""Mixtures of several chunks, in the policy's own number format."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from runtime.spaces.relative_poses import relative
 if TYPE_CHECKING:
     from robots import Robot
 
-_ROUND = 0.02  # [rad] by which the model's own rows, mixed as numbers, may miss an angle or a turn
+_ROUND = 0.02  # [rad] by which linearly mixed model rows may deviate in an angle or rotation
 
 
 class MixtureParts(NamedTuple):
-    """Parts of N rows: numbers [P, N, W], weights [P, N] that sum to 1, and the newest of each [N, W]."""
+    """Components of N mixed rows: numbers [P, N, W], weights [P, N] that sum to 1, and the newest row [N, W]."""
 
     rows: Float64
     weights: Float64
@@ -32,27 +32,27 @@ class MixtureParts(NamedTuple):
 
 
 class Mixture:
-    """Mixes rows as control mixes plans; `dims` say what of joint rows does not mix as numbers do.
+    """Mixing of rows in the same way as control mixes plans; `dims` are joints that are not mixed linearly.
 
-    Joints are mixed as they are; poses are those of the mixed joints, because it is joints that control mixes.
-    Binary grippers are those of the newest row, as the policy gave them.
+    Joints are mixed directly; poses are those of the mixed joints, because control mixes joints. Binary grippers are
+    those of the newest row, as received.
     """
 
     def __init__(self, dims: DimensionKinds | None = None, robot: Robot | None = None) -> None:
         self._dims = DimensionKinds() if dims is None else dims
         self._robot = robot
-        self._layout: PoseRows | None = None  # a policy speaks one format
+        self._layout: PoseRows | None = None  # a policy uses a single format
 
     def joints(self, parts: MixtureParts) -> Float64:
-        """Joint rows [N, D], angles without limits on the newest one's branch."""
+        """Mix joint rows [N, D]; angles without limits are on the branch of the newest row."""
         return _mixed(parts, self._dims.switched, self._dims.wrapping)
 
     def numbers(self, parts: MixtureParts, like: ActionChunk) -> Float64:
-        """Rows [N, W] of which nobody but the model knows what they mean, in the order of the actions of `like`."""
+        """Mix rows [N, W] linearly, for example in model space, in the column order of the actions of `like`."""
         return _mixed(parts, self._switched(like), ())
 
     def poses(self, joints: Float64, newest: Float64, like: ActionChunk) -> Float64:
-        """The poses [N, W] of joints [N, D] in the format of `like`, each written as near to the newest as can be."""
+        """Return the poses [N, W] of joints [N, D] in the format of `like`, as close to `newest` as possible."""
         layout = self._layout_of(like)
         made = layout.encode(self._end_effectors.vectors(joints), joints, newest)
         switched = self._switched(like)
@@ -62,9 +62,9 @@ class Mixture:
     def relative(
         self, joints: Float64, newest: Float64, like: ActionChunk, observation: Observation
     ) -> Float64:
-        """Joints [N, D] of successive rows as rows [N, W] like those of `like`, from `observation` on.
+        """Return joints [N, D] of successive rows as rows [N, W] in the format of `like`, relative to `observation`.
 
-        They come to these joints again where they answer that observation. Binary grippers are those of `newest`.
+        The inverse of the conversion of such a chunk to joints. Binary grippers are those of `newest`.
         """
         robot, qpos = self._known, np.asarray(observation.qpos, np.float64)
         before = qpos if like.mode == "relative" else np.concatenate([qpos[None], joints[:-1]])
@@ -86,7 +86,7 @@ class Mixture:
         return made
 
     def mixes_linearly(self, straight: Float64, meant: Float64, like: ActionChunk) -> bool:
-        """True if rows mixed as numbers are what is meant: they are not where an angle goes round."""
+        """Return True if the linear mixture `straight` equals `meant` within tolerance; angles that wrap differ."""
         if like.space == "joint":
             return bool(np.abs(straight - meant).max(initial=0.0) <= _ROUND)
         try:
@@ -97,7 +97,7 @@ class Mixture:
         return bool(2.0 * np.arccos(np.clip(cosines, 0.0, 1.0)).max(initial=0.0) <= _ROUND)
 
     def _switched(self, like: ActionChunk) -> list[int]:
-        """The places of binary grippers in a row."""
+        """Return the columns of binary grippers in a row."""
         if like.space == "joint":
             return list(self._dims.switched)
         binary = self._known.binary_dims
@@ -120,7 +120,7 @@ class Mixture:
 
 
 def _mixed(parts: MixtureParts, switched: Sequence[int], wrapping: Sequence[int]) -> Float64:
-    """Written so that equal rows stay equal to the last bit."""
+    """Mix rows as newest + weighted differences, so that equal rows stay equal to the last bit."""
     apart = difference(parts.rows, parts.newest, wrapping)
     made: Float64 = parts.newest + (parts.weights[..., None] * apart).sum(axis=0)
     made[:, list(switched)] = parts.newest[:, list(switched)]

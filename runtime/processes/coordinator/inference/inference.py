@@ -1,4 +1,4 @@
-"""From observations to chunks during a run: when to ask, what becomes of the answer, what if there is none."""
+"""Inference during a run: when to query, what becomes of a response, and retries."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ _NOT_ANSWERED_YET = Pattern(
 )
 _ANSWER_UNUSABLE = fixed("policy.answer_unusable", "the policy's answer cannot be used")
 
-ON_DEMAND: tuple[Mode, ...] = ("step", "preview")  # modes that ask when a person says so
+ON_DEMAND: tuple[Mode, ...] = ("step", "preview")  # modes in which a person requests each chunk
 
 
 @dataclass(frozen=True, slots=True)
 class FaultTimeouts:
-    """Times that a run goes on without what it needs [s]."""
+    """Times for which a run continues without its inputs [s]."""
 
-    stale: float  # without a fresh observation, until waiting for one is an error
-    lost: float  # without an answer, until a policy that is tried again is given up
+    stale: float  # without a fresh observation, until that is an error
+    lost: float  # without a response, until a retried policy is given up
 
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """The asking half of a strategy, and its parameters."""
+    """The query half of a strategy, with its parameters."""
 
     query: Query
     parameters: StrategyParameters
@@ -53,21 +53,21 @@ class Strategy:
 
 @dataclass(frozen=True, slots=True)
 class PendingChunk:
-    """An answer in command space, under its number."""
+    """A response in command space, with its chunk number."""
 
     number: int
     rows: Float64
     answered: PolicyResponse
 
     def status(self, now: float) -> dict[str, Any]:
-        """Its number, its rows, and how old the joints are that the policy was shown [s]."""
+        """Return number, row count, and age of the joints in the policy's observation [s]."""
         age = now - self.answered.observation.captured.get("joints", now)
         return {"chunk": self.number, "rows": len(self.rows), "age_s": age}
 
 
 @dataclass(frozen=True, slots=True)
 class DisplayedChunk:
-    """The newest chunk, for pages: `state` is "proposed", "merged" or "dropped"; targets as in ChunkMerged."""
+    """The newest chunk for pages: `state` is "proposed", "merged" or "dropped"; targets as in ChunkMerged."""
 
     number: int
     run: int
@@ -76,11 +76,11 @@ class DisplayedChunk:
     targets: NDArray[np.int64]
     rows: Float64
     overlap: int = 0
-    ik: Mapping[str, Any] = field(default_factory=dict)  # as in asking.Answered
+    ik: Mapping[str, Any] = field(default_factory=dict)  # as in requests.PolicyResponse
 
 
 class Inference:
-    """Asks the policy during a run and posts what it answers; one request in flight."""
+    """Controller of a run's inference: queries the policy and sends its chunks; one request in flight."""
 
     def __init__(
         self,
@@ -97,9 +97,9 @@ class Inference:
         self.metrics = PolicyMetrics()
         self.proposal: PendingChunk | None = None  # shown, and neither committed nor cancelled
         self.shown: DisplayedChunk | None = None
-        self._planned: DisplayedChunk | None = None  # the newest that control has merged
+        self._planned: DisplayedChunk | None = None  # newest chunk that control has merged
         self.rtc_warning = ""
-        self._given: Conditioning | None = None  # with the newest request
+        self._given: Conditioning | None = None  # conditioning of the newest request
         self._strategy = strategy
         self._shared_state = shared
         self._orders = orders
@@ -109,12 +109,12 @@ class Inference:
         self.retry = Retry(clock, patience.lost, self._note)
         self._run = 0
         self._mode: Mode = "continuous"
-        self._wanted = False  # in a mode on demand: one chunk
+        self._wanted = False  # a chunk was requested, in a mode on demand
         self._flight: Future[PolicyResponse] | None = None
-        self._unmerged: dict[int, PendingChunk] = {}  # posted
+        self._unmerged: dict[int, PendingChunk] = {}  # sent to control
         self._stale_since: float | None = None
         self._asked_at = float("-inf")
-        self._generation = 0  # of the commitment, when the newest request went out
+        self._generation = 0  # of the RTC prefix at the newest request
 
     @property
     def policy(self) -> Policy:
@@ -122,11 +122,11 @@ class Inference:
 
     @property
     def pending_notes(self) -> list[Event]:
-        """For the coordinator to collect."""
+        """Events that the coordinator must emit and clear."""
         return self.requests.notes
 
     def status(self) -> dict[str, Any]:
-        """Figures of the answers of late, and whether the policy is lost."""
+        """Return recent metrics, and whether the policy is lost."""
         return {
             "answers": self.metrics.answers,
             **self.metrics.recent(),
@@ -137,24 +137,24 @@ class Inference:
 
     @property
     def simulated(self) -> bool:
-        """True if the policy is shown the joints of the simulated robot."""
+        """Whether the policy observes the joints of the simulated robot."""
         return self.requests.policy_observation.simulated
 
     @property
     def is_pending(self) -> bool:
-        """True if the policy is being asked, or its answer has not reached the timeline."""
+        """Whether a request is in flight, or its chunk is not merged yet."""
         return self._wanted or self._flight is not None or bool(self._unmerged)
 
     @property
     def problem(self) -> str:
-        """Why there may be no chunk: what the policy last failed of, or for how long it owes an answer; else ""."""
+        """Reason why there may be no chunk: the policy's last failure, or a pending request; "" if there is none."""
         if self.retry.failure or self._flight is None:
             return self.retry.failure
         return _NOT_ANSWERED_YET(seconds=self._clock.now() - self._asked_at)
 
     @property
     def rtc(self) -> dict[str, Any]:
-        """Last conditioning of a policy that continues its chunks; {} for other strategies."""
+        """Status of the last conditioning for a policy that continues its chunks; {} for other strategies."""
         if not self.continues:
             return {}
         given = self._given
@@ -166,30 +166,30 @@ class Inference:
 
     @property
     def continues(self) -> bool:
-        """True if requests carry what the robot is committed to (RTC)."""
+        """Whether requests carry committed rows (RTC)."""
         return self._strategy.query.uses_rtc
 
     def set_policy(self, policy: Policy, task: str) -> None:
-        """Ask `policy`, with the instruction `task`, from now on; figures are counted anew."""
+        """Use `policy` with the instruction `task` from now on; metrics restart."""
         self.pause()
         self.requests.set_policy(policy, task)
         self.metrics.reset()
         self.retry.reset()
 
     def tune(self, strategy: Strategy, task: str) -> None:
-        """Go on with another strategy, other parameters, another instruction; a request in flight stays."""
+        """Change strategy, parameters and instruction; a request in flight remains valid."""
         self._strategy = strategy
         self.requests.set_task(task)
         self.rtc_warning = ""
 
     def use_simulated(self, simulated: bool) -> None:
-        """Show the policy the joints of the simulated robot, or those of the real one."""
+        """Select the joints that the policy observes: the simulated or the real robot's."""
         self.requests.policy_observation.use_simulated(simulated)
 
     # --- a run ---------------------------------------------------------------------------------------------
 
     def begin(self, run: int, fresh: bool, mode: Mode = "continuous") -> None:
-        """Ask from now on, for this run; `fresh` lets the policy forget the episode before."""
+        """Begin to query for this run; `fresh`: the policy forgets the previous episode."""
         self._run, self._mode = run, mode
         if fresh:
             self.requests.reset_episode()
@@ -205,7 +205,7 @@ class Inference:
         self._asked_at = float("-inf")
 
     def pause(self) -> None:
-        """Stop asking; an answer still in flight is ignored."""
+        """Stop querying; a response in flight is ignored."""
         self._run = 0
         self._flight = None
         self._wanted, self.proposal, self.shown, self._planned = False, None, None, None
@@ -213,17 +213,17 @@ class Inference:
         self._commitment.clear()
 
     def step(self) -> None:
-        """Ask for one chunk, in a mode on demand."""
+        """Request one chunk, in a mode on demand."""
         self._wanted = True
 
     def commit(self) -> None:
-        """Have control execute the chunk that is shown: while a person looked the robot stood, nothing is stale."""
+        """Send the proposal to control; the robot was at rest during the review, so no row is stale."""
         if self.proposal is not None:
             made, self.proposal = self.proposal, None
             self._post(made)
 
     def cancel(self) -> None:
-        """Forget the chunk that is asked for, or shown, or under way to control, and what has failed meanwhile."""
+        """Discard the requested, shown or sent chunk, and clear failures."""
         self._flight, self._stale_since = None, None
         self.retry.reset()
         self._wanted, self.proposal, self.shown, self._planned = False, None, None, None
@@ -231,16 +231,16 @@ class Inference:
         self._commitment.clear()
 
     def forget_plan(self) -> None:
-        """Control has dropped its plan: the robot stood, is committed to nothing, and no answer still out counts."""
+        """Discard commitments and pending responses, because control has dropped its plan."""
         self._flight, self._stale_since = None, None
         self._unmerged.clear()
         self._commitment.clear()
         self.requests.resume()
 
-    # --- what control says -----------------------------------------------------------------------------------
+    # --- merged chunks ---------------------------------------------------------------------------------------
 
     def on_merged(self, merged: ChunkMerged) -> None:
-        """Control has put a chunk on the timeline, or dropped it."""
+        """Record that control has merged or dropped a chunk."""
         made = self._unmerged.pop(merged.chunk_id, None)
         if merged.run != self._run:
             return
@@ -263,16 +263,21 @@ class Inference:
                 self._planned = self.shown
 
     def raw_action(self, step: int) -> Float64 | None:
-        """Action for `step` [D] in the newest chunk that control has merged; None where it has none."""
+        """Return the action for `step` [D] in the newest merged chunk; None if it has none."""
         if self._planned is None:
             return None
         meant = np.flatnonzero(self._planned.targets == step)
         return self._planned.rows[meant[-1]] if len(meant) else None
 
-    # --- asking and answering --------------------------------------------------------------------------------
+    # --- requests and responses ------------------------------------------------------------------------------
 
     def poll(self) -> PolicyAnswer | None:
-        """Collect an answer, or ask; returns the answer, for the record. Raises PolicyError, and no other error."""
+        """Process a response, or send a request; return the response for the record, if any.
+
+        Raises:
+            PolicyError: the request failed; other exceptions are converted.
+            RuntimeFault: chunks cannot be sent to control.
+        """
         with as_policy_errors(_ANSWER_UNUSABLE):
             return self._pump() if self._run else None
 
@@ -283,13 +288,13 @@ class Inference:
                 return None
             flight, self._flight = self._flight, None
             return self._on_response(flight.result())
-        # A late answer of an earlier run may keep the policy busy: a request would grow old in the queue.
+        # A late response of an earlier run may occupy the policy: a request would grow old in the queue.
         if not self.runner.busy and self._should_request() and self._try_to_ask():
             return self._pump()
         return None
 
     def should_retry(self, error: RuntimeFault) -> bool:
-        """Count a failure; True if the policy will be tried again, False where patience is at its end."""
+        """Record a failure; return True if the policy will be retried, False if the time for that is over."""
         if isinstance(error, PolicyLostError):
             self.metrics.count_lost()
         if not self.retry.record_failure(error):
@@ -309,10 +314,10 @@ class Inference:
         return Progress(remaining, bool(self._unmerged), self._clock.now() - self._asked_at)
 
     def _try_to_ask(self) -> bool:
-        """Ask; True where the answer is there at once.
+        """Send a request; return True if its response is available at once.
 
-        A gap in the observations is control's to judge, action by action. But while a strategy waits for this
-        answer there is nothing to judge, so a gap that lasts is an error here too.
+        Control judges gaps in the observations action by action. But while a strategy waits for this response there
+        are no actions, so a lasting gap is an error here too.
         """
         now = self._clock.now()
         waited = self._mode in ON_DEMAND or self._strategy.query.requests_while_stopped
@@ -361,7 +366,7 @@ class Inference:
         else:
             self._post(made)
         recorded = self._record(made)
-        self.retry.record_success()  # not before: one whose answers cannot be used is not back
+        self.retry.record_success()  # only now: a policy with unusable responses has not recovered
         return recorded
 
     def _record(self, made: PendingChunk) -> PolicyAnswer:

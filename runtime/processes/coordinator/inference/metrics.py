@@ -1,4 +1,4 @@
-"""Figures of the policy over a run: latencies, measured delays, what was shifted or dropped."""
+"""Metrics of the policy over a run: latencies, measured delays, mistimed and dropped chunks."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 
 from runtime.ipc.messages import ChunkMerged
 
-_KEPT = 20_000  # answers; half an hour back to back at 10 Hz
+_KEPT = 20_000  # responses; half an hour back to back at 10 Hz
 _SHOWN = 60
-_JUDGED = 300  # answers that a page's figures are of; those of the whole run are for its record
+_JUDGED = 300  # responses for the metrics of a page; the record contains the whole run
 
 Number = TypeVar("Number", int, float)
 
 
 def quantile(values: Sequence[float], percent: float) -> float:
-    """The percentile of `values`, interpolated linearly; NaN where there are none.
+    """Return the percentile of `values`, interpolated linearly; NaN if there are none.
 
-    Without numpy, which takes longer for the few hundred that it is asked about ten times a second.
+    Without numpy, which is slower for the few hundred values of a call, ten times a second.
     """
     if not values:
         return math.nan
@@ -34,28 +34,26 @@ def quantile(values: Sequence[float], percent: float) -> float:
 
 
 class PolicyMetrics:
-    """Counts from the beginning of a run; memory is bounded, counts are not."""
+    """Metrics since the beginning of a run; memory is bounded, counts are not."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew."""
-        self.ik: dict[str, Any] = {}  # of the newest answer
-        self.poses: dict[
-            str, Any
-        ] = {}  # of all answers: rows that were solved for, flagged ones, worst errors
+        """Clear all metrics."""
+        self.ik: dict[str, Any] = {}  # of the newest response
+        self.poses: dict[str, Any] = {}  # of all responses: solved rows, flagged rows, largest errors
         self.answers = self.dropped = self.mistimed = self.starved = self.lost = 0
         self.latencies: deque[float] = deque(maxlen=_KEPT)  # [s]
-        self.ages: deque[float] = deque(maxlen=_KEPT)  # of what the policy was shown when it was asked [s]
+        self.ages: deque[float] = deque(maxlen=_KEPT)  # age of the observation at the request [s]
         self.delays: deque[int] = deque(maxlen=_KEPT)  # control steps, measured
 
     def add_response(
         self, seconds: float, age: float | None = None, ik: Mapping[str, Any] | None = None
     ) -> None:
-        """An answer came after so long [s]; what was shown was so old when the policy was asked [s].
+        """Add a response: latency `seconds` [s], age of its observation at the request [s].
 
-        `ik` says how its poses were met (asking.figures), {} for joints.
+        `ik` are the figures of its poses (`requests.ik_figures`), {} for joints.
         """
         for name, figure in (ik or {}).items():
             before = self.poses.get(name, 0)
@@ -67,21 +65,21 @@ class PolicyMetrics:
             self.ages.append(age)
 
     def count_starved(self) -> None:
-        """Control had nothing planned."""
+        """Count a start of starvation."""
         self.starved += 1
 
     def count_lost(self) -> None:
-        """The policy was lost."""
+        """Count a loss of the policy."""
         self.lost += 1
 
     def add_merge(self, merged: ChunkMerged) -> None:
-        """Control has placed it, or dropped it."""
+        """Add a merged or dropped chunk."""
         self.delays.append(merged.delay)
         self.mistimed += merged.mistimed > 0
         self.dropped += bool(merged.dropped)
 
     def recent(self) -> dict[str, Any]:
-        """The last answers, for a page: latencies [ms], delays [steps]; their spread is that of a few hundred."""
+        """Return metrics of the last responses for a page: latencies [ms], delays [steps]."""
         latencies, delays = _last(self.latencies, _JUDGED), _last(self.delays, _JUDGED)
         return {
             "latencies_ms": [round(seconds * 1000, 1) for seconds in latencies[-_SHOWN:]],
@@ -94,7 +92,7 @@ class PolicyMetrics:
         }
 
     def figures(self) -> dict[str, Any]:
-        """The run in numbers, None where nothing was measured."""
+        """Return metrics of the whole run, None for values that were not measured."""
         latencies, delays, ages = list(self.latencies), list(self.delays), list(self.ages)
         return {
             "answers": self.answers,
@@ -110,7 +108,7 @@ class PolicyMetrics:
 
 
 def _last(values: deque[Number], count: int) -> list[Number]:
-    """The newest `count` of them, oldest first, however many there are."""
+    """Return the newest `count` values, oldest first, in time independent of the total."""
     return list(islice(reversed(values), count))[::-1]
 
 

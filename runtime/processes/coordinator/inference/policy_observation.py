@@ -1,4 +1,4 @@
-"""The newest observation as a policy is shown it: not too old, of one tick, with its instruction."""
+"""Observation for a policy: fresh, assigned to a control step, with its instruction."""
 
 from __future__ import annotations
 
@@ -21,28 +21,32 @@ _NO_PICTURE = Pattern("observation.no_picture", "no picture has arrived from {ca
 
 
 class StaleObservationError(PolicyError):
-    """The newest observation is too old to ask a policy about."""
+    """The newest observation is too old for a request."""
 
 
 class ObservationProvider(Protocol):
-    """Source of a policy's observations; `simulated`: the joints of the simulated robot."""
+    """Source of a policy's observations; `simulated`: with the joints of the simulated robot."""
 
     @property
     def simulated(self) -> bool: ...
 
     def use_simulated(self, simulated: bool) -> None:
-        """Show the joints of the simulated robot in place of the real one's, or the latter again."""
+        """Select the joints of the simulated robot, or those of the real one."""
 
     def latest(self, prompt: str, pictures: bool = True) -> Observation:
-        """The newest observation, without `pictures` of joints alone; PolicyError where there is none, or it is old."""
+        """Return the newest observation; `pictures` False: joints only, without pictures.
+
+        Raises:
+            PolicyError: there is none, or it is too old.
+        """
 
     def commanded(self) -> tuple[int, Float64] | None:
-        """The newest control step and what the robot was told then [D]; None before that."""
+        """Return the newest control step and its commanded position [D]; None before the first."""
 
 
 @dataclass(frozen=True, slots=True)
 class StalenessLimits:
-    """Bounds on what may be shown: ages in seconds, the control rate in Hz."""
+    """Bounds on observations: ages in seconds, the control rate in Hz."""
 
     control_rate: float
     joint_age: float
@@ -50,7 +54,7 @@ class StalenessLimits:
 
 
 class PolicyObservation:
-    """Reads the shared state."""
+    """Observation provider that reads the shared state."""
 
     def __init__(self, shared: SharedState, clock: Clock, settings: StalenessLimits) -> None:
         self._shared_state = shared
@@ -59,11 +63,15 @@ class PolicyObservation:
         self.simulated = False
 
     def use_simulated(self, simulated: bool) -> None:
-        """Show the joints of the simulated robot in place of the real one's, or the latter again."""
+        """Select the joints of the simulated robot, or those of the real one."""
         self.simulated = simulated
 
     def latest(self, prompt: str, pictures: bool = True) -> Observation:
-        """The newest observation, without `pictures` of joints alone; PolicyError where there is none, or it is old."""
+        """Return the newest observation; `pictures` False: joints only, without pictures.
+
+        Raises:
+            PolicyError: there is none, or it is too old.
+        """
         cameras = self._shared_state.layout.cameras if pictures else ()
         seen = self._shared_state.read_observation(cameras)
         if seen is None:
@@ -86,7 +94,10 @@ class PolicyObservation:
         return self._of_the_simulated_robot(shown) if self.simulated else shown
 
     def commanded(self) -> tuple[int, Float64] | None:
-        """The newest control step and what the robot that chunks are for was told then [D]; None before that."""
+        """Return the newest control step and the commanded position [D] of the robot that executes chunks.
+
+        None if it is not engaged.
+        """
         status = self._shared_state.control.read()
         simulated = np.array(status["simulated"], np.float64)
         if int(status["step"]) >= 0 and np.isfinite(simulated).all() and bytes(status["behaviour"]):
@@ -96,9 +107,9 @@ class PolicyObservation:
         return int(status["step"]), np.array(status["commanded"], np.float64)
 
     def _step_of(self, seen: Observation) -> int:
-        """The control step that an observation is assembled for: the tick that saw it, or the next one.
+        """Return the control step of an observation: the tick that used it, or the next one.
 
-        While control stalls that is more than one step on: steps follow the clock, missed ticks are skipped.
+        If control stalls, that is more than one step ahead: steps follow the clock, and missed ticks are skipped.
         """
         status = self._shared_state.control.read()
         step, planned = int(status["step"]), float(status["planned"])
@@ -108,7 +119,10 @@ class PolicyObservation:
         return step + max(1, math.ceil(periods - 1e-6))
 
     def _of_the_simulated_robot(self, shown: Observation) -> Observation:
-        """Its joints; what only a real robot measures is left out. Before its first tick it stands where that does."""
+        """Return the observation with the simulated robot's joints, without other measurements of the real robot.
+
+        Before its first tick the simulated robot is where the real one is.
+        """
         joints = np.array(self._shared_state.control.read()["simulated"], np.float32)
         if not np.isfinite(joints).all():
             return shown

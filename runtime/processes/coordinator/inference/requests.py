@@ -1,4 +1,4 @@
-"""One question to the policy: what it is shown, where the call is made, what its answer means in commands."""
+"""Requests to the policy: observation, call on the runner, conversion of the response to commands."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ _TOO_FAR = Pattern(
     "{allowed:g} (safety.jump)",
 )
 _ROWS_REFUSED = Pattern("policy.rows_refused", "{wrong}; the {kept} rows before it are executed")
-_EARLY_S = 1e-6  # moments are sums of floats
+_EARLY_S = 1e-6  # [s] rounding tolerance of summed times
 Committed = Callable[[Observation], Conditioning | None]
 
 
 @dataclass(frozen=True, slots=True)
 class MissBound:
-    """Farthest that any joints may miss a pose of a policy, [m] and [rad], and that they may lag behind it [rad]."""
+    """Largest permitted pose errors of a policy's pose [m, rad], and lag of joints behind it [rad]."""
 
     position: float
     rotation: float
     jump: float
 
     def misses(self, solved: IkResult) -> NDArray[np.bool_]:
-        """bool [T, arms]: by more than that."""
+        """Return which poses are missed by more, bool [T, arms]."""
         over: NDArray[np.bool_] = (solved.position_error > self.position) | (
             solved.rotation_error > self.rotation
         )
@@ -66,10 +66,11 @@ class MissBound:
 
 @dataclass(frozen=True, slots=True)
 class PolicyResponse:
-    """An inference that came back: the chunk, how long it took [s], what it was asked about, what it means.
+    """A completed inference: chunk, duration [s], observation, and joint commands.
 
-    `made` are its rows in command space, up to the first that was `refused`. `waited`: the robot stood meanwhile. `eef`
-    says where the poses of the observation come from: the robot's own measurement, or its joints.
+    `commands` are its rows in command space, up to the first refused row; `refused` is the reason. If
+    `requested_while_stopped`, the robot was at rest meanwhile. `eef` is the origin of the observation's poses:
+    "measured" by the robot, or "fk" from its joints.
     """
 
     chunk: ActionChunk
@@ -77,18 +78,17 @@ class PolicyResponse:
     observation: Observation
     commands: CommandRows
     requested_while_stopped: bool = False
-    age: float | None = None  # of the oldest stream of the observation when the policy was asked [s]
+    age: float | None = None  # of the oldest stream of the observation at the request [s]
     eef: Literal["measured", "fk"] = "fk"
-    ik: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # how its poses were met, as by `figures`; {} for joints
+    ik: Mapping[str, Any] = field(default_factory=dict)  # from `ik_figures`; {} for joints
     refused: str = ""
 
 
 class PolicyRequests:
-    """Asks one policy; calls are made one after the other, and nobody waits for them here.
+    """Sender of requests to a policy; calls are executed one after the other, without waiting.
 
-    Kinematics belong to the call: for a chunk of poses they take as long as a small model; the coordinator must not.
+    Kinematics are part of the call: for a chunk of poses they take as long as a small model, too long for the
+    coordinator.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class PolicyRequests:
         clock: Clock,
         bound: MissBound | None = None,
     ) -> None:
-        """`bound`: poses that are missed by more are refused; None: they are flagged alone."""
+        """`bound`: poses with larger errors are refused; None: they are only flagged."""
         self.policy = policy
         self._bound = bound
         self.task = task
@@ -110,15 +110,15 @@ class PolicyRequests:
         self._spaces = spaces
         self._clock = clock
         self._fresh = True
-        self._held = False  # since it was last asked
+        self._held = False  # robot was held since the last request
         self._glance_at = float("-inf")
-        self.notes: list[Event] = []  # for the coordinator to collect
+        self.notes: list[Event] = []  # events that the coordinator must emit
 
     def set_policy(self, policy: Policy, task: str) -> None:
-        """Ask `policy`, with the instruction `task`, from now on.
+        """Use `policy` with the instruction `task` from now on.
 
-        Another policy takes the place of the former one, which is closed first. Calls are made one after the
-        other: the new one is reached when the last call of the former one is over, and nobody waits for that.
+        A replaced policy is closed first. Calls are executed one after the other: the new policy is called when the
+        last call of the old one has ended, without waiting here.
         """
         if policy is not self.policy:
             self.policy.close()
@@ -126,21 +126,21 @@ class PolicyRequests:
         self.task = task
 
     def set_task(self, task: str) -> None:
-        """Ask with another instruction from now on."""
+        """Use another instruction from now on."""
         self.task = task
 
     def reset_episode(self) -> None:
-        """Let the policy forget the episode before its next inference."""
+        """Reset the policy before its next inference."""
         self._fresh = True
 
     def resume(self) -> None:
-        """Let the policy know before its next inference that the robot was held meanwhile."""
+        """Inform the policy before its next inference that the robot was held."""
         self._held = True
 
     def end_episode(self) -> None:
-        """The rollout is over: the policy ends what its server keeps of it, and nobody waits for that.
+        """End the rollout on the policy's server, without waiting.
 
-        Where it cannot, the log says so: a policy that owes it does it before it is asked again, or says why not.
+        A failure is logged: the policy then ends it before its next request, or fails with the reason.
         """
         policy, self._fresh = self.policy, True
 
@@ -153,7 +153,7 @@ class PolicyRequests:
         self.runner.submit(end)
 
     def push_observation(self) -> None:
-        """Show the policy what is seen now, where it wants that and it is time; a gap in what is seen is left one."""
+        """Call `observe` of the policy, if it needs it and it is due; stale observations are skipped."""
         every, now = self.policy.observe_period_s, self._clock.now()
         if every is None or now < self._glance_at - _EARLY_S:
             return
@@ -161,11 +161,15 @@ class PolicyRequests:
         self._glance_at = due if due > now else now + every
         try:
             self.policy.observe(self.observe())
-        except PolicyError:  # what is missing or old is said of the next request
+        except PolicyError:  # a missing or old observation is reported at the next request
             return
 
     def observe(self) -> Observation:
-        """The observation to show the policy now; PolicyError where there is none, or it is old."""
+        """Return the current observation for the policy.
+
+        Raises:
+            PolicyError: there is none, or it is too old.
+        """
         return self.policy_observation.latest(self.task, self.policy.uses_images)
 
     def send(
@@ -175,10 +179,16 @@ class PolicyRequests:
         k_max: int | None = None,
         executed: bool = False,
     ) -> Future[PolicyResponse]:
-        """Send one request about the newest observation; raises PolicyError where that is too old.
+        """Send a request with the newest observation; return its future response.
 
-        `k_max` is how many rows of the answer may be dropped as stale at most, None: as many as are. The answer of one
-        that is to be `executed` ends before the first pose that is missed by far.
+        Args:
+            waited: the robot is at rest until the response is executed.
+            committed: returns the conditioning for the observation (RTC).
+            k_max: most rows that may be dropped as stale; None: no bound.
+            executed: the response will be executed, so it is cut before the first pose with too large an error.
+
+        Raises:
+            PolicyError: the observation is missing or too old.
         """
         observation = self.observe()
         policy, fresh, held = self.policy, self._fresh, self._held
@@ -197,7 +207,7 @@ class PolicyRequests:
                 shown = seen if measured else replace(seen, eef=self._spaces.eef_of(seen.qpos))
                 age = self._clock.now() - min(shown.captured.values())
                 chunk = policy.infer(shown, conditioning)
-            except PolicyLostError:  # the one that is there again has heard nothing of it
+            except PolicyLostError:  # the next connection knows nothing of the reset or resume
                 self._fresh, self._held = self._fresh or fresh, self._held or held
                 raise
             seconds = self._clock.now() - begun
@@ -211,26 +221,29 @@ class PolicyRequests:
         return self.runner.submit(infer)
 
     def _chunk_start(self, shown: Observation, waited: bool, rests: bool, k_max: int | None) -> ChunkStart:
-        """Onset of the answer, as far as it is known now: at what control was told to do last.
+        """Return where the chunk will take over: the commanded position, and the first row that can be executed.
 
-        Its first row that can still be executed follows the newest control step. A robot that rests starts from
-        where it is measured.
+        That row follows the newest control step. If the robot is at rest, the chunk starts from the measured joints.
         """
         qpos = np.asarray(shown.qpos, dtype=np.float64)
         told = self.policy_observation.commanded()
         if told is None:
             return ChunkStart(qpos, qpos)
         step, commanded = told
+        # Computed when the response has arrived, so that rows of steps already sent are counted as passed.
         passed = 0 if waited else max(0, step + 1 - shown.step)
         row = passed if k_max is None else min(passed, k_max)
         return ChunkStart(commanded, qpos if rests else commanded, row)
 
     def _within(self, made: CommandRows, first: int, begins: bool) -> tuple[CommandRows, str]:
-        """The rows before the first pose from row `first` on that is refused, and why no more; PolicyError for none.
+        """Return the rows before the first refused pose from row `first` on, and the reason, "" if none is refused.
 
-        Refused is what no joints meet, and what is farther from where joints can be by then than a jump: joints that
-        lag behind a pose by less are those of joint rows that the limits of safety hold back. Where a run `begins` so,
-        control says it, by that one row.
+        A pose is refused if it is out of reach, or farther than a jump from where the joints can be by then: a smaller
+        lag is the same as that of joint rows that the safety filter limits. If a run `begins` with such a distant
+        pose, that row is kept, so that control reports the distance.
+
+        Raises:
+            PolicyError: no row remains.
         """
         solved, bound = made.ik_result, self._bound
         if solved is None or bound is None:
@@ -251,7 +264,7 @@ class PolicyRequests:
         return cut, _ROWS_REFUSED(wrong=wrong, kept=kept - first)
 
     def _refused(self, made: CommandRows, row: int, bound: MissBound) -> tuple[str, bool]:
-        """Why that row is, "" where it is not, and whether any joints meet it."""
+        """Return why that row is refused, "" if it is not, and whether its pose is within reach."""
         free, distance = self._spaces.meet(made, row)
         over = bound.misses(free)[0]
         if over.any():
@@ -269,9 +282,12 @@ class PolicyRequests:
         return "", True
 
     def check_measured_poses(self, answered: PolicyResponse) -> None:
-        """Hold the poses that the robot measures against those of its joints: they may be of another frame.
+        """Compare measured poses with those of the joints: they may be in another frame.
 
-        Raises SetupError where the policy depends on them; else it is only said.
+        A difference is an event, unless the policy uses the poses.
+
+        Raises:
+            SetupError: they differ, and the policy uses them.
         """
         shown = answered.observation
         if answered.eef != "measured" or shown.eef is None:
@@ -283,7 +299,7 @@ class PolicyRequests:
             self.notes.append(Event("eef_disagrees", wrong, self._clock.now(), shown.step))
 
     def log_ik_problems(self, answered: PolicyResponse) -> None:
-        """Say what could not be done of an answer."""
+        """Queue an event if poses of a response were refused or not reached."""
         ik = answered.ik
         if answered.refused:
             self.notes.append(
@@ -304,7 +320,7 @@ class PolicyRequests:
 
 
 def ik_figures(solved: IkResult) -> dict[str, Any]:
-    """Rows of which any arm is flagged, by flag, and the worst errors [mm, degrees]."""
+    """Return the number of rows with each flag on any arm, and the largest errors [mm, degrees]."""
 
     def flagged(flag: IkFlag) -> int:
         return int(((solved.flags & flag) != 0).any(axis=1).sum())

@@ -1,4 +1,4 @@
-"""When a policy that has failed is asked again, and for how long it is borne with."""
+"""Retries of a failed policy: back-off, and a limit of time."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from runtime.core.sentences import Pattern
 _LOST = Pattern("policy.lost", "{error}; trying again for {seconds:g} s")
 _ANSWERS_AGAIN = Pattern("policy.answers_again", "the policy answers again after {seconds:.1f} s")
 
-_LONGEST_S = 0.5  # between two tries: one that is back shortly before patience ends is found in time
+_LONGEST_S = 0.5  # [s] between two attempts: finds a policy that returns just before the limit
 
 
 class Retry:
-    """Failures in a row, from the first to the answer after the last; `say(kind, text)` tells of both."""
+    """Consecutive failures of a policy; `say(kind, text)` reports the first failure and the recovery."""
 
     def __init__(self, clock: Clock, patience: float, say: Callable[[str, str], None]) -> None:
         self._clock = clock
-        self._patience = patience  # without an answer, until the policy is given up [s]
+        self._patience = patience  # without a response, until the policy is given up [s]
         self._say = say
         self._back_off = BackOff(longest=_LONGEST_S)
-        self.failure = ""  # why the policy is being tried again
+        self.failure = ""  # why the policy is being retried
 
     @property
     def lost_for(self) -> float:
-        """Time for which the policy has not answered [s], 0 where it does."""
+        """Time since the first of the consecutive failures [s], 0 if there is none."""
         return self._back_off.failing_for(self._clock.now())
 
     @property
     def due_in(self) -> float:
-        """When it is tried again [s]."""
+        """Time until the next attempt [s]."""
         return self._back_off.remaining_delay(self._clock.now())
 
     def record_failure(self, error: RuntimeFault) -> bool:
-        """Count a failure; True if the policy will be tried again, False where patience is at its end."""
+        """Record a failure; return True if the policy will be retried, False if the time for that is over."""
         first, self.failure = self._back_off.since is None, str(error)
         self._back_off.record_failure(self._clock.now())
         if self.lost_for > self._patience:
@@ -47,12 +47,12 @@ class Retry:
         return True
 
     def record_success(self) -> None:
-        """It answers."""
+        """Record a response, and report the recovery if there were failures."""
         if self._back_off.since is not None:
             self._say("policy_back", _ANSWERS_AGAIN(seconds=self.lost_for))
         self.reset()
 
     def reset(self) -> None:
-        """Nothing has failed."""
+        """Clear all failures."""
         self._back_off.reset()
         self.failure = ""

@@ -1,4 +1,4 @@
-"""Commitments of the robot in the policy's own space and rate: what real-time chunking (RTC) continues."""
+"""Committed rows in the policy's own space and rate, which real-time chunking (RTC) continues."""
 
 from __future__ import annotations
 
@@ -26,72 +26,72 @@ _DELAY_BEYOND_PLAN = Pattern(
     "strategy.execution_horizon, or take a faster policy",
 )
 
-_HAIR = 1e-9  # of a row: what rates divided by rates are off by
+_HAIR = 1e-9  # [rows] rounding tolerance of quotients of rates
 Numbers = Float32 | Float64
 Shares = dict[int, float]  # by chunk: its weight in a step; they sum to 1
 
 
 @dataclass(frozen=True, slots=True)
 class _PendingChunk:
-    """A chunk that is on its way to the timeline."""
+    """A chunk that was sent to control, and is not merged yet."""
 
     chunk: ActionChunk
     observation_step: int
     waited: bool
     commands: Float64
-    made: int  # of its rows, those that there are commands of
+    made: int  # number of its rows for which there are commands
 
 
 @dataclass(frozen=True, slots=True)
 class _CommittedChunk:
-    """A chunk on the timeline: `rows` as the server gave them, row 0 for control step `anchor`.
+    """A chunk on the timeline: `rows` as received, row 0 for control step `anchor`.
 
-    From control step `first` on it is the plan, but for the steps in `shares`, which others have a part in; None
-    where nobody knows which.
+    From control step `first` on it is the plan, except for the steps in `contributions`, which other chunks
+    contribute to; None if the contributions are unknown.
     """
 
     chunk: ActionChunk
-    rows: Float32  # [T, W] in model space where the server returned that, else its actions
-    commands: Float64  # [N, D] the joint rows that it became, row 0 for `anchor`
-    usable: int  # of its rows, those that there are actions for
+    rows: Float32  # [T, W] in model space if the server returned that, else its actions
+    commands: Float64  # [N, D] its joint rows, row 0 for `anchor`
+    usable: int  # number of its rows for which there are actions
     anchor: int
     first: int
-    end: int  # the step after the last that is planned
+    end: int  # the step after the last planned one
     contributions: Mapping[int, Shares] | None
     pace: float  # rows per control step
     delay: int  # control steps from its observation to its arrival
 
     @property
     def kind(self) -> tuple[object, ...]:
-        """Kind of its numbers: space, mode, format of poses, widths."""
+        """Format of its numbers: space, mode, pose format, widths."""
         chunk = self.chunk
         return chunk.space, chunk.mode, chunk.pose, chunk.actions.shape[1], self.rows.shape[1]
 
 
 class RtcPrefix:
-    """Says what is planned for the steps from a new observation on, in the rows of the newest merged chunk.
+    """The plan from a new observation on, in the format of the newest merged chunk.
 
-    These are as the server gave them, and not the joint rows that they became: those are solved, snapped and
-    resampled, the policy never saw them. Where control has blended chunks, rows of both are mixed by the same
-    weights; where it fades over from a target that no chunk says, or the blend is not known, nothing is said.
-    The chunk's place is the one control gave it: its observation step, shifted where it was mistimed, or the
-    step of its arrival where the robot waited for it. Source of the method: Black et al., Real-Time Execution
-    of Action Chunking Flow Policies, arXiv 2506.07339. No clock, no thread: steps are what it counts in.
+    The rows are used as received, and not the joint rows derived from them: these are solved, snapped and resampled,
+    so the policy has never seen them. If control has blended chunks, their rows are mixed with the same weights; if
+    it fades over from a held target, or the contributions are unknown, there is no conditioning. The place of a chunk
+    is the one that control assigned: its observation step, shifted if it was mistimed, or the step of its arrival if
+    the robot was waiting for it. Method: Black et al., Real-Time Execution of Action Chunking Flow Policies, arXiv
+    2506.07339. It uses no clock and no thread: time is counted in steps.
 
-    A reset is `clear`: `generation` rises, and an answer that was asked for in an earlier one never counts.
+    `clear` increments `generation`: a response requested in an earlier generation is ignored.
     """
 
     def __init__(self, control_rate: float, mixture: Mixture | None = None) -> None:
         self._control_rate = control_rate
         self._mixture = Mixture() if mixture is None else mixture
-        self.generation = 0  # what a request is asked in, see `answered`
-        self.warning = ""  # of the newest `conditioning`, "" where it fits
-        self.predicted_delay = 0  # rows, of the newest `conditioning`
+        self.generation = 0  # generation of new requests, see `add_chunk`
+        self.warning = ""  # about the newest `conditioning`, "" if there is none
+        self.predicted_delay = 0  # [rows] of the newest `conditioning`
         self._on_the_way: dict[int, _PendingChunk] = {}
         self._merged: dict[int, _CommittedChunk] = {}  # by chunk, the newest last
 
     def clear(self) -> None:
-        """The robot is committed to nothing, and no answer that is still out will change that."""
+        """Discard all commitments, including those of responses still in flight."""
         self.generation += 1
         self.warning = ""
         self.predicted_delay = 0
@@ -107,12 +107,10 @@ class RtcPrefix:
         generation: int | None = None,
         commands: Float64 | None = None,
     ) -> None:
-        """The policy gave `chunk` for `observation_step`; it counts when control has merged it.
+        """Add a response for `observation_step`; it counts when control has merged it.
 
-        `commands` [N, D] are the joint rows at control rate that it became; its actions where they are that.
-
-        `generation` is what it was when the request went out; without it the caller vouches that nothing was
-        cleared since.
+        `commands` [N, D] are its joint rows at control rate; None: its actions are that. `generation` is that of the
+        request; without it the caller guarantees that `clear` was not called since.
         """
         if generation is None or generation == self.generation:
             rows = chunk.actions.astype(np.float64) if commands is None else commands
@@ -121,7 +119,7 @@ class RtcPrefix:
             self._on_the_way[chunk_id] = _PendingChunk(chunk, observation_step, waited, rows, made)
 
     def on_merged(self, merged: ChunkMerged) -> None:
-        """Control has put a chunk on the timeline, or dropped it: what was dropped commits nobody."""
+        """Commit a chunk that control has merged; a dropped chunk is removed."""
         answer = self._on_the_way.pop(merged.chunk_id, None)
         if answer is None or merged.dropped or merged.chunk_id < max(self._merged, default=-1):
             return
@@ -129,7 +127,7 @@ class RtcPrefix:
         rows = chunk.actions if chunk.model_actions is None else chunk.model_actions
         pace = (chunk.rate or self._control_rate) / self._control_rate
         over = [number for number, held in self._merged.items() if held.end < answer.observation_step]
-        for number in over:  # no later request is about a step that it has made
+        for number in over:  # later requests are about later steps than all of its steps
             del self._merged[number]
         self._merged[merged.chunk_id] = _CommittedChunk(
             chunk=chunk,
@@ -152,16 +150,19 @@ class RtcPrefix:
         execution_horizon: int | None,
         observation: Observation | None = None,
     ) -> Conditioning | None:
-        """Conditioning of a request about `observation_step`; None if nothing is left, or none merged.
+        """Return the conditioning of a request about `observation_step`; None if no row is left, or none is merged.
 
-        Rows that are not absolute are said from `observation` on, in whose frame the answer will be: they need it.
+        Sets `warning` if the response is expected after the last planned step; then only planned rows count as
+        consumed until it arrives. A chunk with a rate of its own has no row exactly at the observation: the remaining
+        rows are resampled.
 
-        `delays` are recent measured ones in control steps (that of the chunk itself where there are none); their
-        `quantile` is predicted, in rows rounded up. `execution_horizon` is that of the answer in control steps, None
-        is the whole chunk: what is planned already stays planned, whatever it is now. Sets `warning` where the answer
-        is expected after the last planned step; no more rows than are planned are said to be executed until then.
-
-        At a rate of its own a chunk has no row exactly at the observation: what is left is resampled from there on.
+        Args:
+            observation_step: control step of the new observation.
+            delays: recent measured delays [control steps]; if empty, that of the chunk itself.
+            quantile: quantile of `delays` that is predicted, in rows, rounded up.
+            execution_horizon: that of the response [control steps]; None: the whole chunk. The present plan does not
+                depend on it.
+            observation: reference of rows that are not absolute, like that of the response; required for those.
         """
         self.warning, self.predicted_delay = "", 0
         if not self._merged:
@@ -184,7 +185,7 @@ class RtcPrefix:
         if previous is None:
             return None
         last = held.usable
-        if held.chunk.mode != "absolute":  # what is not planned is not said from here
+        if held.chunk.mode != "absolute":  # unplanned rows are not relative to the new observation
             last = min(last, len(steps))
         if execution_horizon is not None:
             last = min(last, math.ceil(execution_horizon * held.pace - _HAIR))
@@ -193,10 +194,10 @@ class RtcPrefix:
     def _planned(
         self, held: _CommittedChunk, steps: Float64, passed: int, observation: Observation | None
     ) -> Float32 | None:
-        """The rows of `held`, those for control `steps` as they are planned; None where that is not known.
+        """Return the rows of `held`, with those for control `steps` as planned; None if the plan is unknown.
 
-        `passed` is the row nearest to the first of these. Rows that are not absolute do not mix: the joints do that
-        they became, and are said as such rows again.
+        `passed` is the row nearest to the first step. Rows that are not absolute are not mixed: their joints are
+        mixed, and converted back to such rows.
         """
         made = [self._contributions_at(at) for at in steps.tolist()]
         if held.chunk.mode != "absolute":
@@ -204,7 +205,7 @@ class RtcPrefix:
         known = [shares for shares in made if shares is not None and self._same_kind(held, shares)]
         if len(known) < len(made):
             return None
-        whole = _held_on(held.rows, held.usable)  # without those that were refused
+        whole = _held_on(held.rows, held.usable)  # without refused rows
         exact = abs((steps[0] - held.anchor) * held.pace - max(0, passed)) < _HAIR
         alone = {max(self._merged): 1.0}
         mixed = [place for place, shares in enumerate(known) if not exact or shares != alone]
@@ -225,7 +226,7 @@ class RtcPrefix:
         passed: int,
         observation: Observation | None,
     ) -> Float32 | None:
-        """The rows of `held`, those for `steps` as they come to what is planned from `observation` on."""
+        """Return the rows of `held`, with those for `steps` as planned, relative to `observation`."""
         assert observation is not None, (
             "rows that are not absolute need the observation that they are said from"
         )
@@ -240,12 +241,12 @@ class RtcPrefix:
         return _held_on(rows, int(places[-1]) + 1)
 
     def _same_kind(self, held: _CommittedChunk, shares: Shares) -> bool:
-        """True if all these are chunks in the numbers of `held`."""
+        """Return True if all these chunks have the number format of `held`."""
         others = [self._merged.get(number) for number in shares]
         return all(other is not None and other.kind == held.kind for other in others)
 
     def _contributions_at(self, at: float) -> Shares | None:
-        """Shares of chunks in control step `at`, between steps in both; None where they are not known."""
+        """Return the weights of chunks at control step `at`, interpolated between steps; None if unknown."""
         before = math.floor(at + _HAIR)
         part = at - before
         if part < _HAIR:
@@ -266,7 +267,7 @@ class RtcPrefix:
         return held.contributions.get(step, {number: 1.0})
 
     def _mixed(self, steps: Float64, made: Sequence[Shares]) -> Float64 | None:
-        """Rows for these control steps, of what makes each; None where the model's own rows cannot be mixed."""
+        """Return rows for these control steps, mixed by weights; None if model rows cannot be mixed linearly."""
         like, mixture = self._merged[max(self._merged)].chunk, self._mixture
         actions = self._parts(steps, made, lambda held: (held.chunk.actions, held.pace))
         if like.space == "joint":
@@ -286,7 +287,7 @@ class RtcPrefix:
         made: Sequence[Shares],
         table: Callable[[_CommittedChunk], tuple[Numbers, float]],
     ) -> MixtureParts:
-        """Parts of the rows for these steps, out of a `table` of each chunk and its rows per step."""
+        """Return the components of the rows for these steps, from a `table` of each chunk and its rows per step."""
         numbers: list[Numbers] = []
         weights: list[Float64] = []
         newest = np.zeros(len(steps), np.int64)
@@ -304,18 +305,18 @@ class RtcPrefix:
         return MixtureParts(every, np.array(weights), every[newest, np.arange(len(steps))])
 
     def _judge(self, delay: float, left: int) -> None:
-        """RTC needs steps to go on with until the answer arrives."""
+        """Set the warning if the plan ends before the response is expected."""
         if delay > left:
             self.warning = _DELAY_BEYOND_PLAN(steps=delay, left=left)
 
 
 def _made_of(commands: int, pace: float) -> int:
-    """How many rows of a policy's so many commands were made of."""
+    """Return the number of a policy's rows from which so many commands were made."""
     return math.ceil((commands - 1) * pace - _HAIR) + 1
 
 
 def _held_on(rows: Float32, count: int) -> Float32:
-    """The first `count` rows [T, W], the last of them held to their length, which servers may want."""
+    """Return the first `count` rows [T, W], the last repeated to the original length, which servers may require."""
     return (
         rows
         if count >= len(rows)
@@ -324,12 +325,12 @@ def _held_on(rows: Float32, count: int) -> Float32:
 
 
 def _expected(delays: Sequence[int], quantile: float) -> float:
-    """The quantile of the delays [control steps], one that was measured."""
+    """Return the quantile of the delays [control steps], one that was measured."""
     return float(np.quantile(np.asarray(delays, np.float64), quantile, method="higher"))
 
 
 def _shares(merged: ChunkMerged) -> dict[int, Shares] | None:
-    """By step, of the steps that are not the chunk's alone; None where they were not told."""
+    """Return weights by step for steps that other chunks contribute to; None if unknown."""
     if merged.contributions is None:
         return None
     shares: dict[int, Shares] = {}

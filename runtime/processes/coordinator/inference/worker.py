@@ -1,4 +1,4 @@
-"""Runners of blocking calls to a policy: a thread beside the coordinator, or counted out in lockstep."""
+"""Runners of blocking policy calls: in a thread, or in lockstep."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ Result = TypeVar("Result")
 
 
 class Runner(ABC):
-    """Makes blocking calls to the policy, one after the other."""
+    """Executor of blocking calls to the policy, one after the other."""
 
     @abstractmethod
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
-        """Start `call`; its result or RuntimeFault is in the future when `ready` says so."""
+        """Start `call`; its result or RuntimeFault is in the future when `ready` returns True."""
 
     @abstractmethod
     def ready(self, future: Future[Result]) -> bool: ...
 
     @abstractmethod
     def run_in_background(self, call: Callable[[], Result]) -> Future[Result]:
-        """Start `call`, which has nothing to do with the policy, behind no other."""
+        """Start `call`, which is independent of the policy, without queueing."""
 
     @property
     @abstractmethod
     def busy(self) -> bool:
-        """True while an earlier call is still being made, and another would wait behind it."""
+        """Whether an earlier call is still running, so that another would wait."""
 
     def tick(self) -> None:  # noqa: B027  # only runners that count have something to do
-        """One control period has passed."""
+        """Advance by one control period."""
 
     def close(self) -> None:  # noqa: B027  # only runners with a thread have something to do
-        """Take no further calls."""
+        """Accept no further calls."""
 
 
 @contextmanager
 def as_policy_errors(what: str) -> Iterator[None]:
-    """Tell every error within as a PolicyError, its traceback in the log: no answer ends the coordinator."""
+    """Convert exceptions within to PolicyError and log the traceback: no response may end the coordinator."""
     try:
         yield
     except RuntimeFault:
@@ -75,7 +75,7 @@ def _settle(future: Future[Result], call: Callable[[], Result]) -> None:
 
 
 class ThreadRunner(Runner):
-    """One thread of its own, so that a slow policy never stops the coordinator."""
+    """Runner with one thread, so that a slow policy never blocks the coordinator."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
@@ -88,7 +88,7 @@ class ThreadRunner(Runner):
 
     def run_in_background(self, call: Callable[[], Result]) -> Future[Result]:
         future: Future[Result] = Future()
-        # A daemon: what is only being prepared keeps no process from ending.
+        # A daemon: preparation must not prevent the end of the process.
         threading.Thread(target=_settle, args=(future, call), name="aside", daemon=True).start()
         return future
 
@@ -104,14 +104,15 @@ class ThreadRunner(Runner):
 
 
 class DeclaredRunner(Runner):
-    """Makes calls between two ticks, and hands each result over as many ticks later as `declared` says of it.
+    """Runner that executes calls between two ticks; a result is ready after the number of ticks `declared` for it.
 
-    Calls wait for `begin`. They are made on a thread, so that who ticks can answer commands meanwhile; as long as one
-    is being made, no time may pass. So what is handed over when does not depend on how long a call really took.
+    Calls wait for `start_waiting`. They run on a thread, so that the ticking thread can answer commands meanwhile; no
+    tick may pass while a call is running. So the step at which a result is ready does not depend on the real
+    duration.
     """
 
     def __init__(self, declared: Callable[[Any], tuple[Any, int]]) -> None:
-        self._declared = declared  # from a result to what is handed over, and its delay [ticks]
+        self._declared = declared  # result -> (result to return, its delay [ticks])
         self._thread = ThreadRunner()
         self._now = 0
         self._waiting: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
@@ -130,13 +131,13 @@ class DeclaredRunner(Runner):
         return future
 
     def start_waiting(self) -> bool:
-        """Begin all calls that wait; whether one is being made now."""
+        """Start all waiting calls; return whether a call is running."""
         while self._waiting:
             self._thread.submit(partial(self._make, *self._waiting.popleft()))
         return self._thread.busy
 
     def ready(self, future: Future[Result]) -> bool:
-        # Never within the tick of the question: how often the coordinator looks in that time is chance.
+        # Never in the tick of the request: the number of polls within a tick is random.
         return future.done() and self._now >= self._asked[future] + max(1, self._late.get(future, 1))
 
     @property
@@ -158,7 +159,7 @@ class DeclaredRunner(Runner):
 
 
 class LockstepRunner(Runner):
-    """Calls at once and hands the result over `delay` ticks later, the same on every run."""
+    """Runner that calls at once; the result is ready `delay` ticks later, the same on every run."""
 
     def __init__(self, delay: int) -> None:
         self._delay = delay

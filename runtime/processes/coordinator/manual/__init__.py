@@ -1,1 +1,1 @@
-"""Joints, grippers and poses that a person gives."""
+"""Manual control: joints, grippers and poses from a person."""

@@ -1,4 +1,4 @@
-"""Grippers by hand: open, close, lock where they are, give back; beside whatever moves the arms."""
+"""Manual control of grippers: open, close, lock and unlock, also while the arms move."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from runtime.station.spec import StationSpec
 
 _NO_SUCH_ARM = Pattern("grippers.no_such_arm", "gripper: arm = {arm!r}; {robot} has grippers on {names}")
 
-_REACHED = 1e-3  # of its travel: a gripper that is so near to its lock is there
+_REACHED = 1e-3  # share of its travel within which a gripper has reached its lock
 
 
 @dataclass(frozen=True, slots=True)
 class GripperPlan:
-    """Result of a request: locks float64 [D] (NaN: free), and the goal of a motion, None for none.
+    """Result of a request: locks float64 [D] (NaN: unlocked), and the goal of a motion or None.
 
-    A goal float64 [D] is NaN for all that stays where it is.
+    A goal float64 [D] is NaN for dimensions that do not move.
     """
 
     locks: Float64
@@ -32,7 +32,7 @@ class GripperPlan:
 
 
 class Grippers:
-    """The locks in force, and what requests make of them."""
+    """Present locks of grippers, and planning of requests."""
 
     def __init__(self, spec: StationSpec) -> None:
         self._groups = [group for group in spec.robot.groups if group.gripper is not None]
@@ -42,9 +42,13 @@ class Grippers:
         self.locks: Float64 = np.full(spec.robot.dim, np.nan)
 
     def plan_request(self, request: GripperRequest, commanded: Float64, free: bool) -> GripperPlan:
-        """`free`: nothing else moves the arms, so that a gripper can be moved; else opening and closing lock it there.
+        """Return new locks and motion for a request; `commanded` [D] is the commanded position.
 
-        `commanded` [D] is where the robot was told to be. Raises RuntimeFault where it has no such gripper.
+        `free`: nothing else moves the arms, so that a gripper can be moved; otherwise opening and closing lock it
+        there.
+
+        Raises:
+            RuntimeFault: the robot has no such gripper.
         """
         chosen = self._chosen(request.arm)
         commanded = snap_grippers(self._switches, commanded, commanded)
@@ -65,14 +69,14 @@ class Grippers:
         return GripperPlan(locks, goal if moves else None)
 
     def lock(self, locks: Float64) -> None:
-        """Locks [D] are in force, NaN where a gripper is free."""
+        """Set the locks [D], NaN: unlocked."""
         self.locks = locks
 
     def settled_locks(self, commanded: Float64) -> Float64:
-        """The locks float64 [D], those that a gripper is still on its way to moved to where it was told to be."""
+        """Return the locks float64 [D]; a lock that its gripper has not reached is set to the commanded position."""
         commanded = snap_grippers(self._switches, commanded, commanded)
         travel = self._limits.upper - self._limits.lower
-        away = np.abs(self.locks - commanded) > _REACHED * travel  # NaN, what is free, is not
+        away = np.abs(self.locks - commanded) > _REACHED * travel  # NaN (unlocked) compares as False
         return np.where(away, commanded, self.locks)
 
     def _chosen(self, name: str | None) -> list[Group]:
@@ -85,7 +89,7 @@ class Grippers:
         return chosen
 
     def status(self, commanded: Float64) -> dict[str, Any]:
-        """For a snapshot: where each one was told to be [D], and whether it is locked."""
+        """Return for a snapshot the commanded position of each gripper, and whether it is locked."""
         return {
             group.name: {
                 "locked": not bool(np.isnan(self.locks[group.gripper_dim])),

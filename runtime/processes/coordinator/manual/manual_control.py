@@ -1,4 +1,4 @@
-"""The operator's own moves of the robot: motions, grippers, and previews of where one would go."""
+"""Manual control of the robot: motions, grippers, and previews of a target."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOVES_NO_ROBOT = Pattern("manual.moves_no_robot", "{what}: transport {transport
 
 
 class ManualControl:
-    """Motions within limits and the workspace box, locks of grippers; raises RuntimeFault where it refuses."""
+    """Motions within limits and workspace boxes, and locks of grippers; refusals are RuntimeFault."""
 
     def __init__(
         self, spec: StationSpec, shared: SharedState, orders: ControlQueue, runs: Runs, targets: Targets
@@ -41,43 +41,47 @@ class ManualControl:
             self.grippers.lock(np.array(status["locked"], np.float64))
 
     def prepare(self) -> None:
-        """A person will move the robot: load what steps of an end effector need, beside everything else."""
+        """Start to load in the background the kinematics that jogs need."""
         self._targets.prepare()
 
     def require_robot(self, what: str) -> None:
-        """Refuse where the transport moves no robot."""
+        """Raise RuntimeFault if the transport moves no robot."""
         if not self._plan.capabilities.moves_robot:
             kind = self._plan.deployment.transport.kind
             raise RuntimeFault(_MOVES_NO_ROBOT(what=what, transport=kind))
 
     def is_loading(self, arguments: Mapping[str, Any]) -> bool:
-        """True if such an aim needs what is still being loaded; loading begins with the first aim."""
+        """Return True if this aim needs kinematics that are still loading; starts to load them."""
         ready = self._targets.prepare()
         return not ready and arguments.get("jog") is not None
 
     def aim(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Preview of where the robot would go; nothing moves."""
+        """Return a preview of a target; nothing moves."""
         start = self.commanded()
         aim = self._targets.aim(read("aim", AimRequest, arguments), start)
         away = first_action(aim.joints, start, self._plan)["distance"]
         return aim_to_dict(aim, self._plan, away, self._targets.duration(start, aim.joints))
 
     def move(self, asked: MoveRequest) -> dict[str, Any]:
-        """Go there on a limited path, within the open run."""
+        """Move to a target on a limited path, within the open run."""
         start = self.commanded()
         goal = self._targets.motion_goal(asked, start)
         self._runs.move(goal, asked.speed)
         return {"duration_s": self._targets.duration(start, goal, asked.speed)}
 
     def check_motion(self, what: str, goal: Float64) -> Float64:
-        """`goal` [D], a policy's action, where a motion there is allowed all the way; grippers within their travel."""
+        """Return `goal` [D], a policy's action, if the path to it is allowed; grippers clipped to their travel.
+
+        Raises:
+            RuntimeFault: the path is not allowed.
+        """
         self.require_robot(what)
         limits = self._plan.limits
         goal = np.where(limits.grippers, np.clip(goal, limits.lower, limits.upper), goal)
         return self._targets.check_motion(what, goal, self.commanded())
 
     def move_gripper(self, asked: GripperRequest, free: bool) -> dict[str, Any]:
-        """Open, close, lock or give back; `free`: no policy moves the arms just now."""
+        """Open, close, lock or unlock grippers; `free`: no policy moves the arms now."""
         self.require_robot("gripper")
         grip = self.grippers.plan_request(asked, self.commanded(), free)
         self.lock(grip.locks)
@@ -86,29 +90,29 @@ class ManualControl:
         return self.status()
 
     def status(self) -> dict[str, Any]:
-        """How each gripper is commanded and locked."""
+        """Return the command and the lock of each gripper."""
         return {"grippers": self.grippers.status(self.commanded())}
 
     def stop_grippers(self) -> None:
-        """Whatever is stopped stops grippers too: one on its way to its lock is locked where it is."""
+        """Stop grippers: a gripper on its way to its lock is locked where it is."""
         locks = self.grippers.settled_locks(self.commanded())
         if not np.array_equal(locks, self.grippers.locks, equal_nan=True):
             try:
                 self.lock(locks)
-            except RuntimeFault as error:  # a stop is not refused for it
+            except RuntimeFault as error:  # a stop must not fail for it
                 log.error("a gripper goes on to its lock: %s", error)
 
     def unlock(self) -> None:
-        """Give all grippers back."""
+        """Unlock all grippers."""
         self.lock(np.full(self._plan.robot.dim, np.nan))
 
     def lock(self, locks: Float64) -> None:
-        """Lock grippers at these values [D], NaN for the rest."""
+        """Lock grippers at these values [D], NaN: unlocked."""
         self._orders.lock_grippers(locks)
         self.grippers.lock(locks)
 
     def commanded(self) -> Float64:
-        """Commanded position of the robot [D], or the measured one as long as nothing was commanded."""
+        """Return the commanded position of the robot [D], or the measured one if it is not engaged."""
         status = self._shared_state.control.read()
         known = status["commanded"] if status["engaged"] else self._shared_state.observation.read()["qpos"]
         return np.array(known, np.float64)

@@ -1,4 +1,4 @@
-"""Targets of the operator: named poses, joints, end effector steps, all checked before anything moves."""
+"""Targets of the operator: named poses, joints, end effector jogs, checked before anything moves."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ _TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class TargetPreview:
-    """A target float64 [D] within the limits, its poses float32 [8 * arms], and what became of the wish.
+    """A target float64 [D] within limits, its poses float32 [8 * arms], and its deviations.
 
-    `clipped` names the joints that a limit has moved; errors are those of a jog's pose, 0 where none was asked for.
+    `clipped` names joints that were clipped to a limit; errors are those of a jog's pose, 0 without a jog.
     """
 
     joints: Float64
@@ -55,7 +55,7 @@ class TargetPreview:
 
 
 class Targets:
-    """Turns what a person asks for into joint targets of one robot."""
+    """Conversion of an operator's requests to joint targets of one robot."""
 
     def __init__(self, spec: StationSpec, spaces: ActionSpaces, kinematics: Kinematics) -> None:
         self._plan = spec
@@ -64,18 +64,26 @@ class Targets:
         self._ways = PathCheck(spec)
 
     def prepare(self) -> bool:
-        """Begin to load what a jog needs, where nobody has; whether it is there."""
+        """Start to load what a jog needs; return True if it is loaded."""
         return self._kinematics.prepare()
 
     def aim(self, asked: AimRequest, commanded: Float64) -> TargetPreview:
-        """Preview of a target; RuntimeFault for a pose, arm or number of joints that the robot has not."""
+        """Return a preview of a target.
+
+        Raises:
+            RuntimeFault: the robot has no such pose, arm or number of joints.
+        """
         start = self._requested_joints("aim", asked.joints, asked.pose, commanded)
         if asked.jog is None:
             return self._clipped(start)
         return self._jogged(asked.jog, start)
 
     def motion_goal(self, asked: MoveRequest, commanded: Float64) -> Float64:
-        """The end of a motion from `commanded`, checked all the way: RuntimeFault says what is wrong with it."""
+        """Return the end of a motion from `commanded`, with its whole path checked.
+
+        Raises:
+            RuntimeFault: the request or the path is not allowed.
+        """
         if asked.joints is None and asked.pose is None:
             raise RuntimeFault(_NO_TARGET(robot=self._plan.robot.name, poses=self._poses()))
         goal = self._requested_joints("move", asked.joints, asked.pose, commanded)
@@ -86,9 +94,12 @@ class Targets:
         return self.check_motion("move", goal, commanded)
 
     def check_motion(self, what: str, goal: Float64, commanded: Float64) -> Float64:
-        """`goal` [D], where limits, workspace boxes and links allow the way there; RuntimeFault for `what` else.
+        """Return `goal` [D] with speeds 0, if limits, workspace boxes and collisions permit the path to it.
 
-        Motions of ours end at rest: what is a speed is 0 there.
+        Generated motions end at rest, hence the speeds. `what` begins the message of an error.
+
+        Raises:
+            RuntimeFault: the goal or the path is not allowed.
         """
         limits = self._plan.limits
         goal = limits.with_zero_speeds(goal)
@@ -108,7 +119,7 @@ class Targets:
         return goal
 
     def duration(self, start: Float64, goal: Float64, speed: float = 1.0) -> float:
-        """Duration of a motion of ours [s]."""
+        """Return the duration of a generated motion [s]."""
         safety, limits = self._plan.deployment.safety, self._plan.limits
         velocity = limits.velocity * safety.motion_velocity_scale * speed
         return Trajectory(start, goal, velocity, safety.motion_acceleration * limits.radian_scale).duration
@@ -162,7 +173,7 @@ class Targets:
 
 
 def _apply_jog(pose: Float64, jog: Jog) -> Float64:
-    """The pose [7] (x, y, z, qw, qx, qy, qz) after the step."""
+    """Return the pose [7] (x, y, z, qw, qx, qy, qz) after the jog."""
     turn, shift = matrix_of_rpy(*jog.rotation), np.array(jog.translation, np.float64)
     here = matrix_of_quaternion(pose[3:])
     there = here @ turn if jog.frame == "tool" else turn @ here
@@ -171,7 +182,7 @@ def _apply_jog(pose: Float64, jog: Jog) -> Float64:
 
 
 def aim_to_dict(aim: TargetPreview, spec: StationSpec, distance: float, duration: float) -> dict[str, Any]:
-    """The aim as an answer to a client: joints, poses, errors in mm and degrees."""
+    """Return the aim as an answer for a client: joints, poses, errors in mm and degrees."""
     return {
         "joints": aim.joints.tolist(),
         "poses": aim.poses.tolist(),

@@ -1,1 +1,1 @@
-"""The state machine of a session: which command is allowed when, and what follows."""
+"""State machine of a session: which command is allowed when, and what follows."""

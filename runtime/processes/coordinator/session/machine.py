@@ -1,4 +1,4 @@
-"""The one state machine of a station: what answers commands and happenings, by the table of transitions."""
+"""State machine of a station: answers to commands and events, from the table of transitions."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _OF_THE_LINK = (SessionEvent.CONNECTED, SessionEvent.INCOMPLETE, SessionEvent.LI
 
 
 class SessionMachine:
-    """Holds the state; `handle` and `observe` are the only places that change it."""
+    """The session's state; only `handle` and `handle_event` change it."""
 
     def __init__(self, effects: SessionActions, lease: Lease, boot: str, now: Callable[[], float]) -> None:
         self._effects = effects
@@ -72,18 +72,18 @@ class SessionMachine:
         self.state = SessionState.DISCONNECTED
         self.reason: str = _WAITING_FOR_OBSERVATION
         self.sequence = 0
-        self._connected = False  # complete observations arrive, by what was noticed last
-        self._unattended = False  # a run goes on though its holder is lost
+        self._connected = False  # whether complete observations arrive
+        self._unattended = False  # a run continues although its lease holder is lost
         self._answers: dict[str, Ack] = {}
 
     def restore_answers(self, answers: dict[str, Ack]) -> None:
-        """Answers given before a restart: the same uuid gets the same answer, and no epoch comes again."""
+        """Restore answers from before a restart: a repeated uuid gets its first answer, and no epoch is reused."""
         self._answers = answers | self._answers
         epochs = [ack.data.get("epoch") for ack in answers.values()]
         self._lease.raise_epoch_floor(max((e for e in epochs if isinstance(e, int)), default=0))
 
     def status(self) -> dict[str, Any]:
-        """State, why it is that, and the commands that it allows."""
+        """Return state, reason, and the allowed commands."""
         return {
             "sequence": self.sequence,
             "state": str(self.state),
@@ -94,7 +94,7 @@ class SessionMachine:
         }
 
     def allowed(self) -> list[str]:
-        """The commands that would be accepted now."""
+        """Return the commands that would be accepted now."""
         situation = self._effects.situation
         commands = [
             kind
@@ -106,7 +106,7 @@ class SessionMachine:
         return [*commands, "estop"]
 
     def blocked_commands(self) -> dict[str, str]:
-        """The commands of this state that would be refused just now, each with the reason."""
+        """Return the commands of this state that would be refused now, with the reasons."""
         situation = self._effects.situation
         reasons = {
             kind: rule.guard(self.state, situation)
@@ -116,9 +116,9 @@ class SessionMachine:
         return {kind: reason for kind, reason in reasons.items() if reason}
 
     def handle(self, command: Command) -> Ack:
-        """The answer to `command`; repeated uuids get the first answer again.
+        """Execute `command` and return the answer; a repeated uuid gets the first answer again.
 
-        A uuid that was another command's is no repetition: a stop is obeyed all the same, the rest refused.
+        A uuid of another command is no repetition: a stop is executed all the same, other commands are refused.
         """
         if not command.uuid:  # all such commands would be repetitions of each other
             return self._ack(command, "refused", _NO_UUID)
@@ -134,26 +134,26 @@ class SessionMachine:
             except RuntimeFault as error:
                 refusal = str(error)
         ack = self._ack(command, "refused" if refusal else "accepted", refusal, told)
-        if command.kind != "lease_renew":  # a stream, not a discrete command: nothing to repeat
+        if command.kind != "lease_renew":  # a stream, not a discrete command: there is nothing to repeat
             self._answers.setdefault(command.uuid, ack)
             if len(self._answers) > ANSWERS_KEPT:
                 del self._answers[next(iter(self._answers))]
         return ack
 
     def answered(self, command: Command) -> Ack | None:
-        """The first answer to a command that is a repetition."""
+        """Return the first answer if the command is a repetition, else None."""
         first = self._answers.get(command.uuid)
         return first if first is not None and first.kind in ("", command.kind) else None
 
     def state_meaning(self) -> dict[str, Any]:
-        """What the state means as a snapshot has it; it is not connected while observations are missing."""
+        """Return the state's meaning for a snapshot; not connected while observations are missing."""
         row = self.state.meaning
         return replace(row, connected=row.connected and self._connected).to_dict()
 
     def handle_event(self, happening: SessionEvent, reason: str = "") -> bool:
-        """Tell the session what happened; True where the state changed.
+        """Apply an event; return True if the state changed.
 
-        A RuntimeFault of an effect passes through, with the state as it was: nobody is there to be refused.
+        A RuntimeFault of an effect is passed on, with the state unchanged.
         """
         if happening in _OF_THE_LINK:
             self._connected = happening is SessionEvent.CONNECTED
@@ -201,7 +201,7 @@ class SessionMachine:
         return self._not_now(command.kind)
 
     def _stops_without(self, command: Command) -> bool:
-        """True if it is a stop that needs no lease: at the station's own panel, or of a run that nobody commands."""
+        """Return True if it is a stop that needs no lease: from the station's panel, or of an unattended run."""
         if command.kind not in STOPPING:
             return False
         return self._unattended or at_the_panel(command)
@@ -226,7 +226,11 @@ class SessionMachine:
         return _NOT_ALLOWED(command=kind, state=self.state, reason=self.reason, allowed=possible)
 
     def _carry_out(self, command: Command) -> TransitionResult | None:
-        """Do it; raises RuntimeFault where something in it, or who is to do it, refuses."""
+        """Execute a command.
+
+        Raises:
+            RuntimeFault: its arguments are invalid, or its effect refuses.
+        """
         if command.kind in LEASE_COMMANDS:
             self._lease_command(command)
             return None

@@ -1,4 +1,4 @@
-"""Every transition of a station's session: which command is allowed when, and what follows from what happens."""
+"""All transitions of a station's session: allowed commands by state, and transitions by events."""
 
 from __future__ import annotations
 
@@ -79,44 +79,44 @@ TransitionResult = Mapping[str, Any]  # for the data of an answer
 
 
 class SessionEvent(StrEnum):
-    """Events that the rest of the runtime tells the session."""
+    """Events from other parts of the runtime for the session."""
 
     CONNECTED = "connected"  # a complete observation arrived
     INCOMPLETE = "incomplete"  # observations arrive, but not from every camera
-    DISPLACED = "displaced"  # the arm is not where it was told to hold
-    LINK_LOST = "link_lost"  # observations have been missing for long
+    DISPLACED = "displaced"  # the arm is not at its commanded position
+    LINK_LOST = "link_lost"  # no observation for a long time
     SETUP_DONE = "setup_done"
     SETUP_FAILED = "setup_failed"
     HELD = "held"  # control holds, for a reason of its own
-    RUN_ENDED = "run_ended"  # the run is over by itself: its time, its source
-    RUN_FAILED = "run_failed"  # it could not begin
+    RUN_ENDED = "run_ended"  # the run ended by itself: its duration, its source
+    RUN_FAILED = "run_failed"  # it could not begin, or failed
     LEASE_ENDED = "lease_ended"
-    HOLDER_LOST = "holder_lost"  # its holder is silent, and the run is one that goes on without
+    HOLDER_LOST = "holder_lost"  # the lease holder is lost, but the run continues
     ESTOPPED = "estopped"
     RELEASED = "released"
-    FAMILY_DIED = "family_died"  # a process of the family was restarted
+    FAMILY_DIED = "family_died"  # a station process was restarted
 
 
 @dataclass(frozen=True, slots=True)
 class GuardFacts:
-    """Facts that the guards of commands look at, beside the state."""
+    """Facts for the guards of commands, in addition to the state."""
 
     mode: Mode | None = None  # of the open run
-    trial: bool = False  # the open run is one of a trial: nobody may change what is measured
+    trial: bool = False  # the open run is a trial: what is measured must not change
     has_proposal: bool = False  # a chunk is shown and waits to be committed
-    is_requesting: bool = False  # the policy is being asked, or its answer has not reached control
+    is_requesting: bool = False  # a request is in flight, or its chunk is not merged
     executing: bool = False  # steps are planned
-    first_action: bool = False  # the last set-up knows the policy's first action
+    first_action: bool = False  # the policy's first action is known from the last set-up
     opening: bool = False  # the open run has not begun: its recording is being opened
-    approaching: bool = False  # the robot is on its way to where the chunk that is shown begins
-    collection: bool = False  # the deployment says how to collect
+    approaching: bool = False  # the robot is moving to the start of the shown chunk
+    collection: bool = False  # the deployment configures collection
     collecting: bool = False  # it is set up to collect
-    armed: bool = False  # a person has switched on that a collected episode may begin
-    leader_problem: str = ""  # why the leader cannot be followed just now
-    doubt: str = ""  # why nothing may begin to move: joints are read where they cannot be, or are not held
+    armed: bool = False  # a person has permitted demonstrations to begin
+    leader_problem: str = ""  # why the leader cannot be followed now
+    doubt: str = ""  # why no motion may begin: joints implausible, or not at the commanded position
 
 
-Guard = Callable[[SessionState, GuardFacts], str]  # why it is not allowed just now, "" where it is
+Guard = Callable[[SessionState, GuardFacts], str]  # returns why it is not allowed now, "" if it is
 
 
 def _always(state: SessionState, situation: GuardFacts) -> str:
@@ -124,26 +124,26 @@ def _always(state: SessionState, situation: GuardFacts) -> str:
 
 
 def _placed(guard: Guard = _always) -> Guard:
-    """`guard` of a command that begins to move the robot: its joints are where they are held as well."""
+    """Return `guard` extended for commands that begin a motion: joints must be plausible and where they are held."""
     return lambda state, situation: guard(state, situation) or situation.doubt
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A command: the states it is allowed in, the state after it, what it does, its guard.
+    """Rule of a command: the states in which it is allowed, the state after it, its effect, its guard.
 
-    `after` None leaves the state as it is. What a command takes is in runtime.ipc.command_arguments.ARGUMENTS.
-    `effect` raises RuntimeFault to refuse, and has changed nothing then; what it returns goes into the answer.
+    `after` None does not change the state. Arguments are declared in runtime.ipc.command_arguments.ARGUMENTS.
+    `effect` raises RuntimeFault to refuse, and has then changed nothing; its return value becomes part of the answer.
     """
 
     allowed: tuple[SessionState, ...]
     after: SessionState | Mapping[SessionState, SessionState] | None
     effect: Callable[[SessionActions, Any], TransitionResult | None]
     guard: Guard = _always
-    stays: Callable[[Any], bool] = lambda asked: False  # by what it took, whether the state is left as it is
+    stays: Callable[[Any], bool] = lambda asked: False  # whether the state is unchanged, by the arguments
 
     def next(self, state: SessionState, asked: Any = None) -> SessionState | None:
-        """The state after it, None for the same; `asked` is what it took."""
+        """Return the state after the command, None if unchanged; `asked` are its arguments."""
         if self.stays(asked):
             return None
         return self.after.get(state) if isinstance(self.after, Mapping) else self.after
@@ -190,7 +190,7 @@ def _may_grip(state: SessionState, situation: GuardFacts) -> str:
 def _may_step(state: SessionState, situation: GuardFacts) -> str:
     if situation.mode not in ("step", "preview"):
         return _MODE_WITHOUT_STEP(mode=situation.mode)
-    if situation.opening:  # what is asked for now would be forgotten when it begins
+    if situation.opening:  # a request now would be discarded when the run begins
         return _OPENING
     if situation.has_proposal:
         return _CHUNK_SHOWN
@@ -202,7 +202,7 @@ def _may_step(state: SessionState, situation: GuardFacts) -> str:
 def _may_commit(state: SessionState, situation: GuardFacts) -> str:
     if situation.mode != "preview":
         return _MODE_WITHOUT_COMMIT(mode=situation.mode)
-    if situation.approaching:  # control would not take the chunk, and it would be gone
+    if situation.approaching:  # control would drop the chunk, and it would be lost
         return _APPROACHING
     return "" if situation.has_proposal else _NO_CHUNK_SHOWN
 
@@ -279,10 +279,10 @@ COMMANDS: dict[str, Rule] = {
         stays=lambda asked: asked is not None and asked.episode is not None,
     ),
 }
-# While it is being set up, both stopping commands mean the same: cancel.
+# During a set-up both stopping commands cancel it.
 CANCELLING = ("stop", "halt")
 STOPPING = ("stop", "halt", "estop")  # never stale
-# What happens by itself: (happening, state) -> the state after it. Pairs that are not here change nothing.
+# Transitions by events: (event, state) -> next state. Other pairs change nothing.
 EVENT_TRANSITIONS: dict[tuple[SessionEvent, SessionState], SessionState] = {
     (SessionEvent.CONNECTED, S.DISCONNECTED): S.IDLE,
     (SessionEvent.INCOMPLETE, S.DISCONNECTED): S.DISCONNECTED,
@@ -306,7 +306,8 @@ EVENT_TRANSITIONS: dict[tuple[SessionEvent, SessionState], SessionState] = {
     **{(SessionEvent.FAMILY_DIED, state): S.IDLE for state in (S.READY, S.RUNNING, S.HOLDING, S.SETTING_UP)},
 }
 
-# A gripper may be on its way in these, although no run goes on: the end of the lease stops it, and no more.
+# A gripper may be moving in these states although no run is executed: the end of the lease stops it, and no
+# more.
 MOVED_BY_HAND = (S.READY, S.HOLDING)
 
 CANCEL = Rule((S.SETTING_UP,), S.IDLE, lambda do, _: do.cancel_setup(CANCELLED))

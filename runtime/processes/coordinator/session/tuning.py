@@ -1,4 +1,4 @@
-"""Another strategy, other parameters, another instruction, on top of the plan in force."""
+"""Changes of strategy, parameters and instruction of the specification in force."""
 
 from __future__ import annotations
 
@@ -21,15 +21,18 @@ _POLICY_WITHOUT_RTC = Pattern(
 
 
 def strategy_of(spec: StationSpec) -> Strategy:
-    """The asking half of a plan's strategy."""
+    """Return the query half of the specification's strategy."""
     settings = spec.deployment.strategy
     return Strategy(variants("runtime.strategies")[settings.kind].query(settings), settings)
 
 
 def apply_tuning(spec: StationSpec, asked: TuneRequest, info: PolicyInfo | None) -> StationSpec:
-    """`plan` with what is asked; another kind keeps the parameters. RuntimeFault names what is wrong.
+    """Return `spec` with the requested changes; another kind of strategy inherits the parameters.
 
-    `info` is what the connected policy says of itself, None where none is.
+    `info` is the connected policy's description, None if there is none.
+
+    Raises:
+        RuntimeFault: nothing to change, an invalid value, or a policy without RTC.
     """
     if asked.strategy is None and asked.task is None:
         raise RuntimeFault(_NOTHING_TO_CHANGE)

@@ -1,1 +1,1 @@
-"""The set-up of a run: bench reset, homing, the policy's first action."""
+"""Set-up of a run: bench reset, homing, the policy's first action."""

@@ -1,4 +1,4 @@
-"""Laying out a simulated bench anew: asked of its node until the node says that it is done."""
+"""Reset of a simulated bench: requested from its node until it is confirmed."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _NODE_REFUSED = Pattern("bench.node_refused", "the robot refused it ({reasons})"
 _NODE_SILENT = fixed("bench.node_silent", "the node does not answer to it")
 _NO_TRUTH = fixed("bench.no_truth", "the node says no truth of a bench; does it simulate one?")
 
-_RESET_S = 3.0  # for a simulated bench to be laid out
-_REPEAT_S = 0.2  # a control word may be lost on its way
+_RESET_S = 3.0  # [s] for a simulated bench to be laid out
+_REPEAT_S = 0.2  # [s] a control word may be lost
 
 
 class BenchReset:
-    """One reset at a time; a node that simulates no bench has none."""
+    """One reset at a time of a node that simulates a bench."""
 
     def __init__(
         self, spec: StationSpec, orders: ControlQueue, clock: Clock, reception: Callable[[], ReceptionReport]
@@ -43,11 +43,15 @@ class BenchReset:
         self._plan = spec
         self._orders = orders
         self._clock = clock
-        self._reception = reception  # what it last reported
+        self._reception = reception  # its latest report
         self._refused = ""
 
     def from_request(self, bench: BenchRequest | None) -> dict[str, Any] | None:
-        """Reset that the node is to be told; SetupError where it has no bench, or has done that already."""
+        """Return the reset to send to the node, None without a request.
+
+        Raises:
+            SetupError: the transport simulates no bench, or this reset was done already.
+        """
         if bench is None:
             return None
         if not self._plan.capabilities.resets_bench:
@@ -57,7 +61,7 @@ class BenchReset:
         return bench.model_dump(exclude_none=True) | {"id": bench.id or str(uuid.uuid4())}
 
     def start(self, reset: dict[str, Any]) -> None:
-        """Ask for it from now on."""
+        """Request this reset from now on."""
         self._reset = reset
         self._refused = ""
         self._since = self._clock.now()
@@ -65,12 +69,16 @@ class BenchReset:
         self._refused_before = self._refused_by_node()
 
     def on_event(self, event: Event) -> None:
-        """Control's events: the one that says that it could not pass the word on."""
+        """Process an event of control: the control word could not be sent."""
         if event.kind == "word_refused":
             self._refused = event.text
 
     def is_done(self) -> bool:
-        """True if the policy is shown the new bench from now on; SetupError where it will not be."""
+        """Return True if the bench was reset; repeats the request if due.
+
+        Raises:
+            SetupError: it was refused, or did not happen in time.
+        """
         if self._reception().truth.get("reset") == self._reset["id"]:
             return True
         now = self._clock.now()

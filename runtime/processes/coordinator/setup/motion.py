@@ -1,4 +1,4 @@
-"""A motion of ours that a set-up waits for: sent to control, awaited there, then by the arm itself."""
+"""Generated motion of a set-up: sent to control, awaited there, then until the arm has arrived."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _NOT_ARRIVED = Pattern(
     "program commanding it?",
 )
 
-_SETTLE_S = 2.0  # for the arm to follow the last target of a motion
+_SETTLE_S = 2.0  # [s] for the arm to follow the last target of a motion
 _ARRIVED_RAD = 0.1
 
 
 class SetupMotion:
-    """One motion at a time; `where` names its goal in sentences."""
+    """One motion at a time; `where` names its goal in messages."""
 
     def __init__(self, spec: StationSpec, orders: ControlQueue, shared: SharedState, clock: Clock) -> None:
         self._plan = spec
@@ -39,7 +39,11 @@ class SetupMotion:
         self._ways = PathCheck(spec)
 
     def start(self, goal: Float64, where: str) -> None:
-        """Have control go to `goal` [D]; RuntimeFault, and nothing moves, where the way there is not free."""
+        """Send the motion to `goal` [D] to control.
+
+        Raises:
+            RuntimeFault: the path is not free; nothing moves.
+        """
         self._ways.check(_GOING(where=where), self._start(), goal)
         self._goal, self._where = goal, where
         self._allowed = self._motion_time() + _SETTLE_S
@@ -47,19 +51,23 @@ class SetupMotion:
         self._order = self._orders.send_order("motion", goal=np.array(goal, np.float64))
 
     def require_progress(self) -> None:
-        """SetupError where control should have been there by now."""
+        """Raise SetupError if control should have finished the motion by now."""
         if self._clock.now() - self._since > self._allowed:
             raise SetupError(_NOT_COME(where=self._where, seconds=self._allowed))
 
     def is_sent(self, event: Event) -> bool:
-        """True if `event` says that control has sent the end of this motion: then the arm is waited for."""
+        """Return True if `event` reports that control has sent the end of this motion; then wait for the arm."""
         over = event.kind == "motion_done" and event.data.get("order") == self._order
         if over:
             self._since = self._clock.now()
         return over
 
     def has_arrived(self) -> bool:
-        """True if the arm is there; SetupError, naming the joint, where it does not come."""
+        """Return True if the arm has arrived.
+
+        Raises:
+            SetupError: it has not arrived in time; names the joint.
+        """
         measured = np.array(self._shared_state.observation.read()["qpos"], np.float64)
         limits = self._plan.limits
         away = np.abs(difference(measured, self._goal, self._plan.dims.wrapping))
@@ -74,14 +82,14 @@ class SetupMotion:
         return False
 
     def _motion_time(self) -> float:
-        """Duration of the motion from where control will start it [s]."""
+        """Return the duration of the motion from its start [s]."""
         safety, limits = self._plan.deployment.safety, self._plan.limits
         velocity = limits.velocity * safety.motion_velocity_scale
         acceleration = safety.motion_acceleration * limits.radian_scale
         return Trajectory(self._start(), self._goal, velocity, acceleration).duration
 
     def _start(self) -> Float64:
-        """Position from which control will start [D]."""
+        """Return the position from which control will start [D]."""
         status = self._shared_state.control.read()
         start = status["commanded"] if status["engaged"] else self._shared_state.observation.read()["qpos"]
         return np.array(start, np.float64)

@@ -1,4 +1,4 @@
-"""Stages of `setup`, none of them blocking: connect, compile once, observe, home, reset, warm up, validate."""
+"""Stages of a set-up, all non-blocking: connect, compile once, observe, home, reset, warm up, validate."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Stage(StrEnum):
 
     @property
     def sentence(self) -> Sentence:
-        """Its name, with an id."""
+        """Name of the stage, with an id."""
         return _STAGES[self]
 
 
@@ -99,11 +99,11 @@ _ALL = (
 
 
 class DrivesDisabledError(SetupError):
-    """The robot can be seen, and cannot move."""
+    """The robot is observed, but its drives are disabled."""
 
 
 class SetUp:
-    """A set-up in progress; `pump` advances it and is cheap."""
+    """A set-up in progress; `poll` advances it and is cheap."""
 
     def __init__(
         self,
@@ -120,22 +120,22 @@ class SetUp:
         self._orders = orders
         self._shared_state = shared
         self._clock = clock
-        self._reception = reception  # what it last reported
-        self._compile = compile_  # begins that, None where there is nothing to compile
-        self._met = False  # control was asked to take the robot over where it is read
+        self._reception = reception  # its latest report
+        self._compile = compile_  # starts to compile; returns None if nothing has to be compiled
+        self._met = False  # control was ordered to converge to the measured joints
         self._going = SetupMotion(spec, orders, shared, clock)
         self.bench = BenchReset(spec, orders, clock, reception)
         self.stage = Stage.IDLE
         self.info: PolicyInfo | None = None
         self.validated = ""
-        self.first_action: Float64 | None = None  # [D] of the newest validated answer
-        self.stages: dict[Stage, float] = {}  # those that were entered, and when
-        self.took: dict[str, float] = {}  # how long the policy took for its stages [s], without rests
+        self.first_action: Float64 | None = None  # [D] of the newest validated response
+        self.stages: dict[Stage, float] = {}  # start times of the stages entered
+        self.took: dict[str, float] = {}  # duration of the policy's stages [s], without waiting
         self.failed: Stage | None = None
         self._least = LeastTimes()
         self._compiling: Future[Any] | None = None
-        self._motion_only = ""  # what a motion alone amounts to, "" in a whole set-up
-        self._reset: dict[str, Any] | None = None  # of the bench, that has been asked for
+        self._motion_only = ""  # result of a motion alone, "" in a whole set-up
+        self._reset: dict[str, Any] | None = None  # requested reset of the bench
 
     @property
     def active(self) -> bool:
@@ -147,7 +147,7 @@ class SetUp:
         return self._motion_only or self.validated
 
     def status(self, now: float) -> dict[str, Any]:
-        """How far it is, how long its stages took [s], what came of it, and how far the policy's first action is."""
+        """Return progress, durations of stages [s], result, and distance of the policy's first action."""
         first = self.first_action
         return {
             "stage": self.stage.sentence,
@@ -158,21 +158,21 @@ class SetUp:
         }
 
     def distance_of(self, action: Float64) -> dict[str, Any]:
-        """Distance of an action [D] from where the robot is now, as by `first_action`."""
+        """Return the distance of an action [D] from the robot's present joints, see `first_action`."""
         return first_action(
             action, np.array(self._shared_state.observation.read()["qpos"], np.float64), self._plan
         )
 
     @property
     def _stages(self) -> tuple[Stage, ...]:
-        """Stages of the newest set-up in their order: of a motion alone those that were entered."""
+        """Stages of the newest set-up in order; of a motion alone, those that were entered."""
         whole = Stage.CONNECT in self.stages or not self.stages
         if not whole or Stage.COMPILE not in self.stages:
             return _ALL if whole else tuple(self.stages)
         return (_ALL[0], Stage.COMPILE, *_ALL[1:])
 
     def _stage_status(self, stage: Stage, now: float) -> dict[str, Any]:
-        """Whether it is done, goes on, or failed, and how long it took."""
+        """Return state and duration of a stage."""
         since = self.stages.get(stage)
         if stage is self.stage:
             state = "active"
@@ -189,7 +189,7 @@ class SetUp:
         return {"name": stage.sentence, "state": state, "seconds": seconds}
 
     def begin(self, reset: dict[str, Any] | None, least: LeastTimes | None = None) -> None:
-        """Start from the first stage; `reset` as by `BenchReset.of`."""
+        """Begin with the first stage; `reset` as from `BenchReset.from_request`."""
         self._reset = reset
         self._least = least or LeastTimes()
         self.took = {}
@@ -200,18 +200,26 @@ class SetUp:
         self._enter(Stage.CONNECT)
 
     def begin_homing(self) -> None:
-        """Only go to the pose; RuntimeFault, and nothing has changed, where the way there is not free."""
+        """Only move to the pose.
+
+        Raises:
+            RuntimeFault: the path is not free; nothing has changed.
+        """
         pose = self._plan.deployment.setup.pose
         where = _THE_POSE(pose=pose)
         self._begin_motion_only(self._plan.robot.poses[pose], where, Stage.HOME)
 
     def begin_approach(self, first_action: Float64) -> None:
-        """Only go to the policy's first action [D], as it is allowed; RuntimeFault where the way there is not free."""
+        """Only move to the policy's first action [D], which must be allowed.
+
+        Raises:
+            RuntimeFault: the path is not free.
+        """
         self.set_first_action(first_action)
         self._begin_motion_only(first_action, _THE_FIRST_ACTION, Stage.APPROACH)
 
     def set_first_action(self, first_action: Float64 | None) -> None:
-        """The first action [D] of what drives the robot is this one from now on; None where it is not known."""
+        """Set the first action [D] of what drives the robot; None if unknown."""
         self.first_action = first_action
 
     def _begin_motion_only(self, goal: Float64, where: str, stage: Stage) -> None:
@@ -224,24 +232,28 @@ class SetUp:
         self.stages, self.failed = {}, None
 
     def fail(self) -> None:
-        """Give up the stage that it was at, and remember which failed."""
+        """Cancel the set-up, and record the stage that failed."""
         self.failed = self.stage
         self.cancel()
 
     def cancel(self) -> None:
-        """Stop where it is; a call to the policy that is under way is cut off."""
+        """Cancel the set-up; a running call to the policy is interrupted."""
         if self.stage in (Stage.CONNECT, Stage.WARM_UP):
             self._inference.policy.close()
         self.stage = Stage.IDLE
 
     def on_event(self, event: Event) -> None:
-        """Control's events: the one that says that the motion is done."""
+        """Process an event of control: the motion is done, or a control word was refused."""
         if self.stage in (Stage.HOME, Stage.APPROACH) and self._going.is_sent(event):
             self._enter(Stage.SETTLE)
         self.bench.on_event(event)
 
     def poll(self) -> bool:
-        """Advance; True when done. Raises RuntimeFault where it cannot go on."""
+        """Advance; return True when done.
+
+        Raises:
+            RuntimeFault: it cannot continue.
+        """
         if self.stage is Stage.CONNECT:
             ready = self._inference.runner.ready(self._connection)
             if ready and self._stage_lasted("connect_s", self._least.connect_s):
@@ -252,7 +264,7 @@ class SetUp:
                 waits = self._compiling is not None and not self._compiling.done()
                 self._enter(Stage.COMPILE if waits else Stage.OBSERVE)
         elif self.stage is Stage.COMPILE:
-            # What fails there is told to whoever needs it: most policies speak joints, and none of it.
+            # A failure is reported to the code that needs kinematics: most policies use joints and need none.
             if self._compiling is None or self._compiling.done():
                 self._enter(Stage.OBSERVE)
         elif self.stage is Stage.OBSERVE:
@@ -283,7 +295,10 @@ class SetUp:
         raise SetupError(doubt)
 
     def _report_zero_joints(self) -> None:
-        """From the first samples on a dead encoder looks like a joint that stands at 0: the operator knows."""
+        """Emit an event about joints at exactly 0: a dead encoder looks the same from the first sample on.
+
+        Only the operator can distinguish them.
+        """
         limits = self._plan.limits
         joints = self._shared_state.observation.read()["qpos"]
         zero = [limits.names[i] for i in np.flatnonzero(limits.position_mask & (joints == 0.0))]
@@ -325,7 +340,7 @@ class SetUp:
         return self._start_reset()
 
     def _require_family(self) -> None:
-        """An order to a control that is still starting would be lost, and without a guard it only holds."""
+        """Raise SetupError if a process is silent: orders to control would be lost, and without the guard it holds."""
         within = self._plan.deployment.heartbeat_timeout_s
         for process in SIBLING_PROCESSES:
             if not self._shared_state.alive(process, self._clock.now(), within(process)):
@@ -345,7 +360,7 @@ class SetUp:
         return self._start_reset()
 
     def _start_reset(self) -> bool:
-        """The arms are out of the way: lay the bench out anew, where that was asked for; True where all is done."""
+        """Reset the bench, if requested, now that the arms are out of the way; return True if all is done."""
         if self._reset is None:
             return self._start_warm_up()
         self.bench.start(self._reset)
@@ -353,7 +368,7 @@ class SetUp:
         return False
 
     def _start_warm_up(self) -> bool:
-        """Ask the policy; True where there is nobody to ask, and all is done."""
+        """Begin to query the policy; return True if there is none to query, so that all is done."""
         if not self._inference.policy.is_queried:
             self.validated = _DRIVES_ROBOT(who=self.info.name if self.info else "the node")
             self.stage = Stage.IDLE
@@ -372,7 +387,7 @@ class SetUp:
         return True
 
     def _answered(self) -> bool:
-        """Ask once more, and look at what came; whether something did."""
+        """Send a request, or validate its response; return True if a response was validated."""
         if self._asked is None:
             self._asked = self._inference.requests.send()
             return False
@@ -385,7 +400,7 @@ class SetUp:
         return True
 
     def _stage_lasted(self, name: str, least: float) -> bool:
-        """The policy is done with this stage: whether that lasted long enough to tell nothing of who it is."""
+        """Return True if the stage has lasted long enough, so that its duration does not identify the policy."""
         waited = self._waited()
         self.took.setdefault(name, waited)
         return waited >= least
@@ -405,14 +420,17 @@ class SetUp:
 
 
 def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
-    """Hold what a policy says of itself against the strategy that asks it; SetupError with both sides.
+    """Compare a policy's description with the strategy.
 
-    `continues`: the strategy's requests carry what the robot is committed to.
+    `continues`: the strategy's requests carry committed rows.
+
+    Raises:
+        SetupError: they contradict each other; names both sides.
     """
-    # A server that drops the conditioning without a word looks healthy, and does something else.
+    # A server that ignores the conditioning silently appears to work, but executes another method.
     if continues and info.supports_rtc is False:
         raise SetupError(_POLICY_WITHOUT_RTC(policy=info.name))
-    # More rows cannot be executed of each answer than it has.
+    # The horizon cannot exceed the rows of a response.
     strategy = spec.deployment.strategy
     wanted, uses = strategy.execution_horizon, variants("runtime.strategies")[strategy.kind].USES
     if wanted is None or info.horizon is None or "execution_horizon" not in uses:
@@ -423,7 +441,10 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
 
 
 def first_action(action: Float64, joints: Float64, spec: StationSpec) -> dict[str, Any]:
-    """Distance of an action [D] from `joints` [D]: {"distance" rad, "joint", "far"}; of joints alone."""
+    """Return the distance of an action [D] from `joints` [D]: {"distance" rad, "joint", "far"}.
+
+    Only joint positions count, neither grippers nor speeds.
+    """
     limits = spec.limits
     away = np.where(limits.position_mask, np.abs(difference(action, joints, spec.dims.wrapping)), 0.0)
     worst = int(away.argmax())
